@@ -1,0 +1,299 @@
+"""The keyspace: which keys there are, and what each says.
+
+`str(key)` gives the text of a key, `parse_key` reads one; both go through the same checks, because Zenoh itself takes
+blanks, line ends and NUL in a key. There is one text for a key and one key for a text.
+
+A lighthouse is named by its ENS name in lower case, or by its address if it has none. Addresses are in lower case (the
+classes take any case), hashes are 64 hexadecimal digits in lower case without `0x`. A topic is written as in ROS,
+`/a/b`, and becomes the chunks `a/b`. Selectors are key expressions with wildcards, for subscribers and queries.
+"""
+
+from __future__ import annotations
+
+from typing import Final, Literal, TypeAlias
+
+from msgspec import Struct
+from msgspec.structs import force_setattr
+
+from schemas.chunks import CANONICAL, address_chunk, check_event, cid_chunk, lighthouse_chunk, name_chunk
+from schemas.errors import InvalidKey
+
+LiabilityEvent: TypeAlias = Literal["incoming", "ready", "complete", "finalized"]
+EthEvent: TypeAlias = Literal["transfer", "approval"]
+MarketKind: TypeAlias = Literal["demand", "offer", "result", "feedback", "pending", "reject"]
+
+MAX_KEY_LENGTH: Final = 512
+
+_MARKET_PATTERNS: Final = {
+    "demand": "demand/{model}/*",
+    "offer": "offer/{model}/*",
+    "result": "result/*/*",
+    "feedback": "feedback/*/*",
+    "pending": "pending/*",
+    "reject": "reject/*/*",
+}
+
+
+class _Key(Struct, frozen=True, gc=False):
+    """A key of some family. Constructing one raises `InvalidKey` if a field holds what no key may hold."""
+
+    def __post_init__(self) -> None:
+        for field in self.__struct_fields__:
+            text = getattr(self, field)
+            canonical = CANONICAL[field](text)
+            if canonical != text:
+                force_setattr(self, field, canonical)
+
+
+class DemandKey(_Key, frozen=True):
+    """A Demand for `model` with this message hash; written by the promisee."""
+
+    lighthouse: str
+    model: str
+    hash: str
+
+    def __str__(self) -> str:
+        return f"aira/{self.lighthouse}/demand/{self.model}/{self.hash}"
+
+
+class OfferKey(_Key, frozen=True):
+    """An Offer of `model` with this message hash; written by the promisor."""
+
+    lighthouse: str
+    model: str
+    hash: str
+
+    def __str__(self) -> str:
+        return f"aira/{self.lighthouse}/offer/{self.model}/{self.hash}"
+
+
+class ResultKey(_Key, frozen=True):
+    """A Result of `liability` with this message hash; written by the promisor."""
+
+    lighthouse: str
+    liability: str
+    hash: str
+
+    def __str__(self) -> str:
+        return f"aira/{self.lighthouse}/result/{self.liability}/{self.hash}"
+
+
+class FeedbackKey(_Key, frozen=True):
+    """A generation-5 provider's feedback on the order with the hash `order`; `hash` tells several apart."""
+
+    lighthouse: str
+    order: str
+    hash: str
+
+    def __str__(self) -> str:
+        return f"aira/{self.lighthouse}/feedback/{self.order}/{self.hash}"
+
+
+class PendingKey(_Key, frozen=True):
+    """A generation-5 provider's note of the transaction `tx` that it has sent."""
+
+    lighthouse: str
+    tx: str
+
+    def __str__(self) -> str:
+        return f"aira/{self.lighthouse}/pending/{self.tx}"
+
+
+class RejectKey(_Key, frozen=True):
+    """Why `provider` can't match the order with the hash `order`."""
+
+    lighthouse: str
+    order: str
+    provider: str
+
+    def __str__(self) -> str:
+        return f"aira/{self.lighthouse}/reject/{self.order}/{self.provider}"
+
+
+class PresenceKey(_Key, frozen=True):
+    """The liveliness token of `agent` in its role (`provider`, `agent`, `edge`, …); no wildcard matches `@agent`."""
+
+    lighthouse: str
+    role: str
+    agent: str
+
+    def __str__(self) -> str:
+        return f"aira/{self.lighthouse}/@agent/{self.role}/{self.agent}"
+
+
+class EventKey(_Key, frozen=True):
+    """What happened to `liability`: `incoming`, `ready`, `complete` or `finalized`; written by the agent."""
+
+    agent: str
+    liability: str
+    event: LiabilityEvent
+
+    def __post_init__(self) -> None:
+        _Key.__post_init__(self)
+        check_event(self.event, "incoming", "ready", "complete", "finalized")
+
+    def __str__(self) -> str:
+        return f"aira/agent/{self.agent}/liability/{self.liability}/{self.event}"
+
+
+class ObjectiveTopicKey(_Key, frozen=True):
+    """A topic of the objective of `liability`, as the agent's executor plays it."""
+
+    agent: str
+    liability: str
+    topic: str
+
+    def __str__(self) -> str:
+        return f"aira/agent/{self.agent}/liability/{self.liability}/objective{self.topic}"
+
+
+class LiabilityTopicKey(_Key, frozen=True):
+    """A topic that the device publishes for `liability`: what is recorded."""
+
+    agent: str
+    liability: str
+    topic: str
+
+    def __str__(self) -> str:
+        return f"aira/agent/{self.agent}/liability/{self.liability}/topic{self.topic}"
+
+
+class DeviceTopicKey(_Key, frozen=True):
+    """A topic of a device outside any job."""
+
+    agent: str
+    device: str
+    topic: str
+
+    def __str__(self) -> str:
+        return f"aira/agent/{self.agent}/device/{self.device}{self.topic}"
+
+
+class RpcKey(_Key, frozen=True):
+    """A service of the agent, a queryable: `start`, `finish`, `eth/accounts`, …"""
+
+    agent: str
+    service: str
+
+    def __str__(self) -> str:
+        return f"aira/agent/{self.agent}/rpc/{self.service}"
+
+
+class EthEventKey(_Key, frozen=True):
+    """An event of the token that concerns the agent: `transfer` or `approval`."""
+
+    agent: str
+    event: EthEvent
+
+    def __post_init__(self) -> None:
+        _Key.__post_init__(self)
+        check_event(self.event, "transfer", "approval")
+
+    def __str__(self) -> str:
+        return f"aira/agent/{self.agent}/eth/event/{self.event}"
+
+
+class CidKey(_Key, frozen=True):
+    """A block or a file by its content; answered by whoever holds it."""
+
+    cid: str
+
+    def __str__(self) -> str:
+        return f"aira/cid/{self.cid}"
+
+
+MarketKey: TypeAlias = DemandKey | OfferKey | ResultKey | FeedbackKey | PendingKey | RejectKey
+AgentKey: TypeAlias = EventKey | ObjectiveTopicKey | LiabilityTopicKey | DeviceTopicKey | RpcKey | EthEventKey
+Key: TypeAlias = MarketKey | AgentKey | PresenceKey | CidKey
+
+
+def parse_key(text: str) -> Key:
+    """The key that `text` spells. Raises `InvalidKey` if it is none, or not in the one form that `str(key)` has."""
+    if len(text) > MAX_KEY_LENGTH:
+        raise InvalidKey(text, f"it is longer than {MAX_KEY_LENGTH} characters")
+    if str(key := _parse(text)) != text:
+        raise InvalidKey(text, f"it has to be written {key}")
+    return key
+
+
+def _parse(text: str) -> Key:
+    match text.split("/"):
+        case ["aira", lighthouse, "demand", model, digits]:
+            return DemandKey(lighthouse, model, digits)
+        case ["aira", lighthouse, "offer", model, digits]:
+            return OfferKey(lighthouse, model, digits)
+        case ["aira", lighthouse, "result", liability, digits]:
+            return ResultKey(lighthouse, liability, digits)
+        case ["aira", "agent", agent, *path]:
+            return _parse_of_agent(text, agent, path)
+        case ["aira", "cid", cid]:
+            return CidKey(cid)
+        case ["aira", lighthouse, "feedback", order, digits]:
+            return FeedbackKey(lighthouse, order, digits)
+        case ["aira", lighthouse, "pending", tx]:
+            return PendingKey(lighthouse, tx)
+        case ["aira", lighthouse, "reject", order, provider]:
+            return RejectKey(lighthouse, order, provider)
+        case ["aira", lighthouse, "@agent", role, agent]:
+            return PresenceKey(lighthouse, role, agent)
+    raise InvalidKey(text, "there is no such family")
+
+
+def _parse_of_agent(text: str, agent: str, path: list[str]) -> AgentKey:
+    match path:
+        case ["liability", liability, "objective", *topic] if topic:
+            return ObjectiveTopicKey(agent, liability, "/" + "/".join(topic))
+        case ["liability", liability, "topic", *topic] if topic:
+            return LiabilityTopicKey(agent, liability, "/" + "/".join(topic))
+        case ["liability", liability, event]:
+            return EventKey(agent, liability, event)  # type: ignore[arg-type]
+        case ["device", device, *topic] if topic:
+            return DeviceTopicKey(agent, device, "/" + "/".join(topic))
+        case ["rpc", *service]:
+            return RpcKey(agent, "/".join(service))
+        case ["eth", "event", event]:
+            return EthEventKey(agent, event)  # type: ignore[arg-type]
+    raise InvalidKey(text, "there is no such family under an agent")
+
+
+def market_selector(lighthouse: str, kind: MarketKind, model: str = "*") -> str:
+    """All messages of a kind on a lighthouse; demands and offers of one model only, if `model` is its CID."""
+    pattern = _MARKET_PATTERNS.get(kind)
+    if pattern is None:
+        raise InvalidKey(kind, f"it is none of the kinds {', '.join(_MARKET_PATTERNS)}")
+    if model != "*" and "{model}" not in pattern:
+        raise InvalidKey(model, f"the keys of a {kind} do not name a model")
+    chunk = model if model == "*" else cid_chunk(model)
+    return f"aira/{lighthouse_chunk(lighthouse)}/{pattern.format(model=chunk)}"
+
+
+def lighthouse_selector(lighthouse: str) -> str:
+    """All that is on a lighthouse's market, for who comes late; no wildcard matches presence."""
+    return f"aira/{lighthouse_chunk(lighthouse)}/**"
+
+
+def presence_selector(lighthouse: str, role: str = "*") -> str:
+    """The liveliness tokens of all agents on a lighthouse, or of those in one role."""
+    chunk = role if role == "*" else name_chunk(role)
+    return f"aira/{lighthouse_chunk(lighthouse)}/@agent/{chunk}/*"
+
+
+def event_selector(agent: str) -> str:
+    """All events of all liabilities of an agent."""
+    return f"aira/agent/{address_chunk(agent)}/liability/*/*"
+
+
+def objective_selector(agent: str, liability: str) -> str:
+    """All topics of a liability's objective."""
+    return f"aira/agent/{address_chunk(agent)}/liability/{address_chunk(liability)}/objective/**"
+
+
+def topic_selector(agent: str, liability: str) -> str:
+    """All topics that a device publishes for a liability."""
+    return f"aira/agent/{address_chunk(agent)}/liability/{address_chunk(liability)}/topic/**"
+
+
+def device_selector(agent: str, device: str = "*") -> str:
+    """All topics outside any job of one device of an agent, or of all."""
+    chunk = device if device == "*" else name_chunk(device)
+    return f"aira/agent/{address_chunk(agent)}/device/{chunk}/**"

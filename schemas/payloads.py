@@ -1,0 +1,114 @@
+"""What the bytes on a topic are: the type of a payload, in Zenoh's encoding field and in a recording's schema.
+
+A topic's payload is carried as it is; its type says how to read it. The two ROS types that the legacy network's lessons
+use, std_msgs/Empty and std_msgs/String, are here in full; of other types only the name travels with a message.
+"""
+
+from __future__ import annotations
+
+from struct import Struct as Layout
+from typing import ClassVar, Final
+
+from msgspec import Struct
+
+from schemas.errors import InvalidPayload
+
+_LENGTH: Final = Layout("<I")
+_MEDIA_TYPES: Final = {
+    "json": "application/json",
+    "cdr": "application/cdr",
+    "protobuf": "application/protobuf",
+    "application/octet-stream": "application/octet-stream",
+}
+_ENCODINGS: Final = {media_type: encoding for encoding, media_type in _MEDIA_TYPES.items()}
+_SCHEMA_ENCODINGS: Final = {"ros1": "ros1msg", "json": "jsonschema", "cdr": "ros2msg", "protobuf": "protobuf"}
+_NO_ENCODINGS: Final = ("", "zenoh/bytes")
+
+
+class PayloadType(Struct, frozen=True):
+    """How the bytes of a payload are to be read, in the words of MCAP.
+
+    `encoding` is the message encoding (`ros1`, `json`, `cdr`, `protobuf`, …), `schema_name` the type's name,
+    `schema_encoding` says how `schema_data` describes it; both are empty if the description is not at hand.
+    """
+
+    encoding: str
+    schema_name: str = ""
+    schema_encoding: str = ""
+    schema_data: bytes = b""
+
+    @property
+    def zenoh_encoding(self) -> str:
+        """The text of Zenoh's encoding field: `ros1;std_msgs/Empty`, `application/json`, …"""
+        media_type = _MEDIA_TYPES.get(self.encoding, self.encoding)
+        return f"{media_type};{self.schema_name}" if self.schema_name else media_type
+
+
+class Empty(Struct, frozen=True):
+    """std_msgs/Empty: no bytes at all."""
+
+    type: ClassVar[PayloadType] = PayloadType("ros1", "std_msgs/Empty", "ros1msg", b"")
+    md5: ClassVar[str] = "d41d8cd98f00b204e9800998ecf8427e"
+    definition: ClassVar[str] = ""
+
+    def encode(self) -> bytes:
+        """The payload."""
+        return b""
+
+    @classmethod
+    def decode(cls, payload: bytes) -> Empty:
+        """The message in a payload. Raises `InvalidPayload` if there are bytes in it."""
+        if payload:
+            raise InvalidPayload("std_msgs/Empty", f"it has {len(payload)} bytes")
+        return cls()
+
+
+class String(Struct, frozen=True):
+    """std_msgs/String: a length of four bytes, little-endian, and that many bytes of UTF-8."""
+
+    data: str
+
+    type: ClassVar[PayloadType] = PayloadType("ros1", "std_msgs/String", "ros1msg", b"string data\n")
+    md5: ClassVar[str] = "992ce8a1687cec8c8bd883ec73ca41d1"
+    definition: ClassVar[str] = "string data\n"
+
+    def encode(self) -> bytes:
+        """The payload. Raises `InvalidPayload` if the text has no UTF-8 form (a lone surrogate)."""
+        try:
+            text = self.data.encode()
+        except UnicodeEncodeError as error:
+            raise InvalidPayload("std_msgs/String", str(error)) from None
+        return _LENGTH.pack(len(text)) + text
+
+    @classmethod
+    def decode(cls, payload: bytes) -> String:
+        """The message in a payload. Raises `InvalidPayload` if the length does not fit or the text is not UTF-8."""
+        if len(payload) < _LENGTH.size or _LENGTH.unpack_from(payload)[0] != len(payload) - _LENGTH.size:
+            raise InvalidPayload("std_msgs/String", f"its length does not fit its {len(payload)} bytes")
+        try:
+            return cls(payload[_LENGTH.size :].decode())
+        except UnicodeDecodeError as error:
+            raise InvalidPayload("std_msgs/String", str(error)) from None
+
+
+EMPTY: Final = Empty.type
+STRING: Final = String.type
+JSON: Final = PayloadType("json", "", "jsonschema", b'{"type":"object"}')
+RAW: Final = PayloadType("application/octet-stream")
+
+_KNOWN: Final = {known.zenoh_encoding: known for known in (EMPTY, STRING, JSON, RAW)}
+
+
+def payload_type(zenoh_encoding: str) -> PayloadType:
+    """The type that the text of Zenoh's encoding field names; `RAW` for none.
+
+    Of a type that is not known here `schema_data` is empty.
+    """
+    known = _KNOWN.get(zenoh_encoding)
+    if known is not None:
+        return known
+    if zenoh_encoding in _NO_ENCODINGS:
+        return RAW
+    media_type, _, name = zenoh_encoding.partition(";")
+    encoding = _ENCODINGS.get(media_type, media_type)
+    return PayloadType(encoding, name, _SCHEMA_ENCODINGS.get(encoding, ""))

@@ -1,0 +1,88 @@
+"""Records: objects that agents hand each other as JSON outside the market, and the amounts in them.
+
+In a record an amount is a decimal string, as UInt256 was in the legacy stack: JSON numbers beyond 2^53 don't survive in
+every reader. In Python it is an `int` all the same.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Final, Self, TypeAlias
+
+import msgspec
+from msgspec.structs import force_setattr
+
+from schemas.errors import InvalidRecord
+from schemas.messages import MAX_UINT256
+
+MAX_RECORD_SIZE: Final = 65_536
+"""The longest record, in bytes, that is read."""
+
+_MAX_DIGITS: Final = len(str(MAX_UINT256))
+
+if TYPE_CHECKING:
+    UInt256: TypeAlias = int
+else:
+
+    class UInt256(int):
+        """The type of a field with an amount: an `int` that travels as a decimal string."""
+
+        __slots__ = ()
+
+
+class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The base of all records. Constructing one raises `InvalidRecord` if an amount is not from 0 to 2^256-1."""
+
+    def __post_init__(self) -> None:
+        for field in _amount_fields(type(self)):
+            value = getattr(self, field)
+            if type(value) not in (int, UInt256) or not 0 <= value <= MAX_UINT256:
+                raise InvalidRecord(type(self).__name__, f"{field}: expected an integer from 0 to 2^256-1")
+            force_setattr(self, field, UInt256(value))
+
+    def encode(self) -> bytes:
+        """The compact JSON of the record."""
+        return _ENCODER.encode(self)
+
+    @classmethod
+    def decode(cls, payload: bytes) -> Self:
+        """The record in `payload`. Raises `InvalidRecord` and nothing else, whatever the bytes are."""
+        if len(payload) > MAX_RECORD_SIZE:
+            raise InvalidRecord(cls.__name__, f"{len(payload)} bytes, and {MAX_RECORD_SIZE} are the most")
+        try:
+            record: Self = _decoder(cls).decode(payload)
+        except msgspec.ValidationError as error:
+            if isinstance(error.__cause__, InvalidRecord):
+                raise error.__cause__ from None
+            raise InvalidRecord(cls.__name__, _one_line(error)) from None
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+            raise InvalidRecord(cls.__name__, _one_line(error)) from None
+        return record
+
+
+@lru_cache(maxsize=128)
+def _amount_fields(kind: type[Record]) -> tuple[str, ...]:
+    return tuple(field.name for field in msgspec.structs.fields(kind) if field.type is UInt256)
+
+
+@lru_cache(maxsize=128)
+def _decoder(kind: type[Any]) -> msgspec.json.Decoder[Any]:
+    return msgspec.json.Decoder(kind, dec_hook=_read_amount)
+
+
+def _read_amount(_kind: type[Any], value: Any) -> UInt256:
+    if not isinstance(value, str) or not (value.isascii() and value.isdigit() and len(value) <= _MAX_DIGITS):
+        raise ValueError("Expected an amount, decimal digits in a string")
+    return UInt256(value)
+
+
+def _one_line(error: Exception) -> str:
+    """The text of an error, which may quote what it was given."""
+    return str(error)[:200].encode("unicode_escape").decode()
+
+
+def _write_amount(value: UInt256) -> str:
+    return str(int(value))
+
+
+_ENCODER: Final = msgspec.json.Encoder(enc_hook=_write_amount)

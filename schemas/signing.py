@@ -1,0 +1,150 @@
+"""Signatures of messages: ECDSA on secp256k1 over Ethereum's personal-message form of a message's hash.
+
+`verify` is what every received message passes, once, at the edge of the process. It costs one public-key recovery and
+little else; everything that repeats between messages (addresses, CIDs, the signers' addresses) is cached.
+
+The format has twins of each signature (v as 0/1, high s) that other readers accept; here there is only one signature
+for a hash and a key, so that a message can't travel twice under two texts.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Final, Generic, TypeVar
+
+from coincurve import PrivateKey, PublicKey
+from msgspec import Struct
+from msgspec.structs import replace
+
+from schemas.address import ZERO_ADDRESS, checksum_address
+from schemas.errors import InputError, InvalidMessage
+from schemas.keccak import keccak256
+from schemas.messages import (
+    SIGNATURE_SIZE,
+    OrderFeedback,
+    Result,
+    SignedMessage,
+    TransactionFeedback,
+)
+from schemas.packing import message_hash
+from schemas.wire import decode
+
+_M = TypeVar("_M", bound=SignedMessage)
+_M_co = TypeVar("_M_co", bound=SignedMessage, covariant=True)
+
+_PREFIX: Final = b"\x19Ethereum Signed Message:\n32"
+_CURVE_ORDER: Final = 0xFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFEBAAEDCE6AF48A03BBFD25E8CD0364141
+_HIGHEST_S: Final = (_CURVE_ORDER // 2).to_bytes(32, "big")
+_V_OFFSET: Final = 27
+_CACHED: Final = 8192
+
+
+class Verified(Struct, Generic[_M_co], frozen=True, gc=False):
+    """A message with its 32-byte hash and the EIP-55 address of the one who signed it."""
+
+    message: _M_co
+    hash: bytes
+    signer: str
+
+
+class Signer:
+    """A private key that signs messages; it never shows the key.
+
+    Raises `InputError` if `private_key` is not 32 bytes of a number from 1 to the order of the curve less one.
+    """
+
+    __slots__ = ("__key", "address")
+
+    def __init__(self, private_key: bytes) -> None:
+        if len(private_key) != 32 or not 0 < int.from_bytes(private_key, "big") < _CURVE_ORDER:
+            raise InputError("a private key is 32 bytes, neither zero nor beyond the order of secp256k1")
+        self.__key = PrivateKey(private_key)
+        self.address: Final = _address_of(self.__key.public_key.format(compressed=False))
+
+    def __repr__(self) -> str:
+        return f"Signer({self.address})"
+
+    def sign(self, message: _M) -> _M:
+        """The same message with this key's signature on it; deterministic (RFC 6979).
+
+        Raises `InvalidMessage`: `unresolved-name` if the message holds an ENS name, `sender` if it names another.
+        """
+        signature = self.sign_hash(message_hash(message))
+        _check_sender(message, self.address)
+        return replace(message, signature=signature.hex())
+
+    def sign_hash(self, digest: bytes) -> bytes:
+        """The 65-byte signature (r, s, v = 27 or 28) of a 32-byte message hash, as a personal message of Ethereum.
+
+        Raises `InputError` for a hash of another length.
+        """
+        if len(digest) != 32:
+            raise InputError(f"a message hash has 32 bytes, not {len(digest)}")
+        signature = self.__key.sign_recoverable(keccak256(_PREFIX + digest), hasher=None)
+        return signature[:64] + bytes((signature[64] + _V_OFFSET,))
+
+
+def recover(digest: bytes, signature: str | bytes) -> str:
+    """The EIP-55 address whose key made `signature` (65 bytes, or their hexadecimal digits) of a 32-byte message hash.
+
+    Raises `InvalidMessage` (`signature`) for any but 65 bytes with v 27 or 28 and a low s, if no key could have made
+    it, and if it gives the zero address.
+    """
+    if isinstance(signature, str):
+        try:
+            signature = bytes.fromhex(signature.removeprefix("0x"))
+        except ValueError:
+            raise InvalidMessage("signature", "not hexadecimal") from None
+    if len(signature) != SIGNATURE_SIZE:
+        raise InvalidMessage("signature", f"{len(signature)} bytes, expected {SIGNATURE_SIZE}")
+    recovery_id = signature[64] - _V_OFFSET
+    if recovery_id not in (0, 1):
+        raise InvalidMessage("signature", f"v is {signature[64]}, expected 27 or 28")
+    if signature[32:64] > _HIGHEST_S:
+        raise InvalidMessage("signature", "s is in the upper half of the curve's order")
+    compact = signature[:64] + (b"\1" if recovery_id else b"\0")
+    try:
+        key = PublicKey.from_signature_and_message(compact, keccak256(_PREFIX + digest), hasher=None)
+    except ValueError:  # coincurve's only word for r or s out of range and for points off the curve
+        raise InvalidMessage("signature", "no key could have made it") from None
+    return _address_of(key.format(compressed=False))
+
+
+def verify(payload: bytes) -> Verified[SignedMessage]:
+    """Decode a message, hash it and recover its signer: all that a receiver must know before anything else sees it.
+
+    Raises `InvalidMessage` and nothing else, whatever the bytes are: the reasons of `wire.decode`, and `unsigned`,
+    `unresolved-name`, `signature`, and `sender` if a generation-5 order is signed by another than its sender.
+    """
+    message = decode(payload)
+    if isinstance(message, (OrderFeedback, TransactionFeedback)):
+        raise InvalidMessage("unsigned", f"it is not defined what is signed in a {type(message).__name__}")
+    return verify_hashed(message, message_hash(message))
+
+
+def verify_message(message: _M) -> Verified[_M]:
+    """As `verify`, for a message that is decoded already and whose ENS names are resolved."""
+    return verify_hashed(message, message_hash(message))
+
+
+def verify_hashed(message: _M, digest: bytes) -> Verified[_M]:
+    """As `verify_message`, for a message whose `message_hash` is known already."""
+    signer = recover(digest, message.signature)
+    _check_sender(message, signer)
+    return Verified(message, digest, signer)
+
+
+def _check_sender(message: SignedMessage, signer: str) -> None:
+    if not isinstance(message, Result) and message.sender is not None and message.sender != signer:
+        raise InvalidMessage(
+            "sender", f"the order names {message.sender} as its sender, but the key is that of {signer}"
+        )
+
+
+@lru_cache(maxsize=_CACHED)
+def _address_of(public_key: bytes) -> str:
+    """The address of an uncompressed public key of 65 bytes."""
+    address = checksum_address(keccak256(public_key[1:])[12:])
+    if address == ZERO_ADDRESS:
+        raise InvalidMessage("signature", "the signer is the zero address")
+    return address

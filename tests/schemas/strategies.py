@@ -1,0 +1,75 @@
+"""Hypothesis strategies for what travels."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from hypothesis import strategies as st
+
+from schemas import (
+    MAX_UINT256,
+    Demand,
+    Message,
+    Offer,
+    OrderFeedback,
+    Result,
+    TransactionFeedback,
+    checksum_address,
+    cid_of_digest,
+)
+
+if TYPE_CHECKING:
+    from hypothesis.strategies import SearchStrategy
+
+addresses = st.binary(min_size=20, max_size=20).map(checksum_address)
+labels = st.text("abcdefghijklmnopqrstuvwxyz0123456789-_", min_size=1, max_size=12)
+names = st.builds(
+    lambda parts, top: ".".join((*parts, top)),
+    st.lists(labels, min_size=1, max_size=4),
+    st.sampled_from(("eth", "sid", "test")),
+)
+parties = addresses | names
+cids = st.binary(min_size=32, max_size=32).map(cid_of_digest)
+hashes = st.binary(min_size=32, max_size=32).map(bytes.hex)
+signatures = st.binary(min_size=65, max_size=65).map(bytes.hex)
+amounts = st.integers(0, MAX_UINT256) | st.sampled_from((0, 2**53 + 1, 2**64 - 1, 2**64, MAX_UINT256))
+
+
+def _terms(party: SearchStrategy[str], generation: int) -> dict[str, SearchStrategy[Any]]:
+    return {
+        "model": cids,
+        "objective": cids,
+        "token": party,
+        "cost": amounts,
+        "lighthouse": party,
+        "validator": party,
+        "deadline": amounts,
+        "nonce": hashes if generation == 3 else amounts,
+        "sender": st.none() if generation == 3 else party,
+        "signature": signatures,
+    }
+
+
+def orders(party: SearchStrategy[str] = parties) -> SearchStrategy[Demand | Offer]:
+    """Demands and offers of both generations, with some signature."""
+    return st.one_of(
+        st.builds(Demand, validator_fee=amounts, **_terms(party, 3)),
+        st.builds(Demand, validator_fee=amounts, **_terms(party, 5)),
+        st.builds(Offer, lighthouse_fee=amounts, **_terms(party, 3)),
+        st.builds(Offer, lighthouse_fee=amounts, **_terms(party, 5)),
+    )
+
+
+def results(party: SearchStrategy[str] = parties) -> SearchStrategy[Result]:
+    """Results, with some signature."""
+    return st.builds(Result, liability=party, result=cids, success=st.booleans(), signature=signatures)
+
+
+def messages() -> SearchStrategy[Message]:
+    """Messages of every kind, with some signature."""
+    return st.one_of(
+        orders(),
+        results(),
+        st.builds(OrderFeedback, order=hashes, accepted=amounts, signature=signatures),
+        st.builds(TransactionFeedback, tx=hashes),
+    )

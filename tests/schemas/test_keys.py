@@ -1,0 +1,226 @@
+"""The keyspace."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import Any
+
+import pytest
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from schemas import (
+    CidKey,
+    DemandKey,
+    DeviceTopicKey,
+    EthEventKey,
+    EventKey,
+    InvalidKey,
+    Key,
+    LiabilityTopicKey,
+    ObjectiveTopicKey,
+    OfferKey,
+    PendingKey,
+    PresenceKey,
+    ResultKey,
+    RpcKey,
+    parse_key,
+)
+from tests.schemas.sample_keys import KEYS, A, L
+from tests.schemas.samples import LIGHTHOUSE, MODEL, SENDER
+from tests.schemas.samples import LIGHTHOUSE_NAME as NAME
+from tests.schemas.samples import NONCE as HASH
+
+
+@pytest.mark.parametrize(("key", "text"), KEYS, ids=lambda value: value if isinstance(value, str) else "")
+def test_key_and_text_belong_together(key: Key, text: str) -> None:
+    assert str(key) == text
+    assert parse_key(text) == key
+    assert type(parse_key(text)) is type(key)
+    assert str(zenoh.KeyExpr(text)) == text
+
+
+def test_keys_are_held_in_canonical_form() -> None:
+    key = ResultKey(NAME.upper(), LIGHTHOUSE, HASH)
+    assert (key.lighthouse, key.liability) == (NAME, L)
+    assert key == ResultKey(NAME, L, HASH)
+
+
+def test_lighthouse_without_a_name_is_named_by_its_address() -> None:
+    assert str(PendingKey(LIGHTHOUSE, HASH)) == f"aira/{L}/pending/{HASH}"
+    assert parse_key(f"aira/{L}/pending/{HASH}") == PendingKey(L, HASH)
+
+
+@pytest.mark.parametrize("topic", ["/blink", "/a/b/c", "/liability/eth_0x1/blink", "/~x", "/a.b", "/" + "a" * 256])
+def test_topics_come_back_as_they_were(topic: str) -> None:
+    key = parse_key(str(ObjectiveTopicKey(A, L, topic)))
+    assert isinstance(key, ObjectiveTopicKey)
+    assert key.topic == topic
+
+
+@pytest.mark.parametrize(
+    "topic",
+    [
+        "",
+        "/",
+        "blink",
+        "//a",
+        "/a/",
+        "/a//b",
+        "/*",
+        "/a/**",
+        "/a$*",
+        "/a?b",
+        "/a#b",
+        "/a b",
+        "/a\n",
+        "/a\0",
+        "/@a",
+        "/é",
+        "/..",
+        "/a/../b",
+        "/" + "a" * 257,
+    ],
+)
+def test_texts_that_no_key_may_hold_are_refused_in_topics(topic: str) -> None:
+    for build in (ObjectiveTopicKey, LiabilityTopicKey):
+        with pytest.raises(InvalidKey):
+            build(A, L, topic)
+    with pytest.raises(InvalidKey):
+        DeviceTopicKey(A, "device", topic)
+
+
+@pytest.mark.parametrize("text", ["", "*", "**", "a/b", "a b", "@a", "a\n", "\0", "é", "..", "a" * 257])
+def test_texts_that_no_key_may_hold_are_refused_in_names(text: str) -> None:
+    with pytest.raises(InvalidKey):
+        DeviceTopicKey(A, text, "/a")
+    with pytest.raises(InvalidKey):
+        PresenceKey(NAME, text, A)
+    if text != "a/b":
+        with pytest.raises(InvalidKey):
+            RpcKey(A, text)
+
+
+@pytest.mark.parametrize("text", ["", "airalab", "*", "airalab.com", "a/b.eth", "air alab.eth", "agent", "cid", L[:-1]])
+def test_lighthouse_is_a_name_or_an_address(text: str) -> None:
+    with pytest.raises(InvalidKey):
+        DemandKey(text, MODEL, HASH)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "0x" + HASH, HASH.upper(), HASH[:-1], HASH + "0", "*", " " * 64, HASH[:-2] + "  ", "g" * 64]
+)
+def test_hash_is_64_lower_case_digits(text: str) -> None:
+    with pytest.raises(InvalidKey):
+        DemandKey(NAME, MODEL, text)
+    with pytest.raises(InvalidKey):
+        PendingKey(NAME, text)
+
+
+@pytest.mark.parametrize("text", ["", "*", MODEL[:-1], "Q" * 46])
+def test_model_is_a_cid(text: str) -> None:
+    with pytest.raises(InvalidKey):
+        OfferKey(NAME, text, HASH)
+    with pytest.raises(InvalidKey):
+        CidKey(text)
+
+
+@pytest.mark.parametrize("text", ["", "*", NAME, L[2:], "0x" + "g" * 40])
+def test_agent_is_an_address(text: str) -> None:
+    with pytest.raises(InvalidKey):
+        RpcKey(text, "start")
+
+
+def test_events_are_those_known() -> None:
+    event: Any
+    for event in ("transfer", "started", "*", "", "READY"):
+        with pytest.raises(InvalidKey):
+            EventKey(A, L, event)
+    for event in ("ready", "mint", "*", ""):
+        with pytest.raises(InvalidKey):
+            EthEventKey(A, event)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "/",
+        "aira",
+        "aira/",
+        "/aira/cid/" + MODEL,
+        "other/cid/" + MODEL,
+        f"aira/cid/{MODEL}/",
+        f"aira/cid/{MODEL}/{MODEL}",
+        "aira/**",
+        f"aira/{NAME}/demand/*/*",
+        f"aira/{NAME}/demand/{MODEL}/*",
+        f"aira/{NAME}/demand/{MODEL}",
+        f"aira/{NAME}/bid/{MODEL}/{HASH}",
+        f"aira/{NAME}/@agent/provider/*",
+        f"aira/agent/{A}",
+        f"aira/agent/{A}/liability/{L}",
+        f"aira/agent/{A}/liability/{L}/objective",
+        f"aira/agent/{A}/liability/{L}/topic",
+        f"aira/agent/{A}/liability/{L}/topic/",
+        f"aira/agent/{A}/liability/{L}/unheard",
+        f"aira/agent/{A}/device/d",
+        f"aira/agent/{A}/rpc",
+        f"aira/agent/{A}/rpc/",
+        f"aira/agent/{A}/eth/event",
+        f"aira/agent/{A}/liability/{L}/topic/" + "a/" * 300 + "a",
+    ],
+)
+def test_what_is_no_key_is_refused(text: str) -> None:
+    with pytest.raises(InvalidKey):
+        parse_key(text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"aira/{NAME.upper()}/pending/{HASH}",
+        f"aira/agent/{SENDER}/rpc/start",
+        f"aira/{NAME}/result/{LIGHTHOUSE}/{HASH}",
+    ],
+)
+def test_there_is_one_text_for_a_key(text: str) -> None:
+    with pytest.raises(InvalidKey, match="has to be written"):
+        parse_key(text)
+
+
+chunks = st.sampled_from(
+    (
+        "aira",
+        "agent",
+        "cid",
+        "demand",
+        "liability",
+        "objective",
+        "topic",
+        "rpc",
+        "eth",
+        "event",
+        NAME,
+        A,
+        MODEL,
+        HASH,
+        "",
+    )
+)
+
+
+@given(st.text(max_size=60) | st.lists(chunks | st.text(max_size=5), max_size=8).map("/".join))
+def test_no_text_raises_anything_but_invalid_key(text: str) -> None:
+    with suppress(InvalidKey):
+        assert str(parse_key(text)) == text
+
+
+@given(st.lists(chunks | st.text(max_size=5), min_size=5, max_size=8).map("/".join))
+def test_every_key_is_a_key_of_zenoh_without_wildcards(text: str) -> None:
+    try:
+        parse_key(text)
+    except InvalidKey:
+        return
+    assert "*" not in str(zenoh.KeyExpr(text))

@@ -1,0 +1,122 @@
+"""Hashes and contract bytes, against an independent implementation of Solidity's encodings."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import pytest
+from eth_abi.abi import encode
+from eth_abi.packed import encode_packed
+from hypothesis import given
+
+from schemas import (
+    Demand,
+    InvalidMessage,
+    Offer,
+    Order,
+    OrderFeedback,
+    Result,
+    TransactionFeedback,
+    address_bytes,
+    keccak256,
+    message_hash,
+    order_abi,
+    parse_cid,
+)
+from tests.schemas.samples import DEMAND, DEMAND_5, LIGHTHOUSE_NAME, NONCE, OFFER, RESULT, SIGNATURE
+from tests.schemas.strategies import addresses, orders, results
+
+
+def typed_terms(order: Order) -> list[tuple[str, Any]]:
+    """The fields before nonce and sender with their Solidity types, in the order of the wire format's description."""
+    lighthouse = ("address", address_bytes(order.lighthouse))
+    validator = ("address", address_bytes(order.validator))
+    if isinstance(order, Demand):
+        parties, fee = [lighthouse, validator], order.validator_fee
+    else:
+        parties, fee = [validator, lighthouse], order.lighthouse_fee
+    return [
+        ("bytes", parse_cid(order.model)),
+        ("bytes", parse_cid(order.objective)),
+        ("address", address_bytes(order.token)),
+        ("uint256", order.cost),
+        *parties,
+        ("uint256", fee),
+        ("uint256", order.deadline),
+    ]
+
+
+def tail(order: Order) -> list[tuple[str, Any]]:
+    if order.sender is None:
+        return [("bytes32", bytes.fromhex(str(order.nonce)))]
+    return [("uint256", order.nonce), ("address", address_bytes(order.sender))]
+
+
+@given(orders(addresses))
+def test_hash_of_an_order_is_that_of_its_packed_fields(order: Order) -> None:
+    types, values = zip(*typed_terms(order), *tail(order), strict=True)
+    assert message_hash(order) == keccak256(encode_packed(types, values))
+
+
+@given(results(addresses))
+def test_hash_of_a_result_is_that_of_its_packed_fields(result: Result) -> None:
+    values = (address_bytes(result.liability), parse_cid(result.result), result.success)
+    assert message_hash(result) == keccak256(encode_packed(("address", "bytes", "bool"), values))
+
+
+@given(orders(addresses))
+def test_contract_bytes_are_the_plain_abi_encoding(order: Order) -> None:
+    fields = [*typed_terms(order), tail(order)[-1], ("bytes", bytes.fromhex(order.signature))]
+    types, values = zip(*fields, strict=True)
+    if order.sender is None and str(order.nonce).startswith("00" * 12):
+        return
+    assert order_abi(order) == encode(types, values)
+
+
+def test_hash_does_not_depend_on_the_signature() -> None:
+    assert message_hash(DEMAND) == message_hash(msgspec.structs.replace(DEMAND, signature=""))
+
+
+def test_demand_and_offer_of_equal_terms_have_different_hashes() -> None:
+    assert len({message_hash(message) for message in (DEMAND, OFFER, DEMAND_5, RESULT)}) == 4
+
+
+@pytest.mark.parametrize("field", ["token", "lighthouse", "validator"])
+@pytest.mark.parametrize("order", [DEMAND, OFFER])
+def test_a_name_must_be_resolved_first(order: Demand | Offer, field: str) -> None:
+    named = msgspec.structs.replace(order, **{field: LIGHTHOUSE_NAME})
+    for function in (message_hash, order_abi):
+        with pytest.raises(InvalidMessage) as caught:
+            function(named)
+        assert caught.value.reason == "unresolved-name"
+        assert LIGHTHOUSE_NAME in caught.value.detail
+
+
+def test_a_named_sender_or_liability_must_be_resolved_first() -> None:
+    for named in (
+        msgspec.structs.replace(DEMAND_5, sender="robot.eth"),
+        msgspec.structs.replace(RESULT, liability="robot.eth"),
+    ):
+        with pytest.raises(InvalidMessage, match=r"robot\.eth"):
+            message_hash(named)
+
+
+def test_feedback_has_no_hash() -> None:
+    for feedback in (OrderFeedback(order=NONCE, accepted=1, signature=SIGNATURE), TransactionFeedback(tx=NONCE)):
+        with pytest.raises(InvalidMessage) as caught:
+            message_hash(feedback)
+        assert caught.value.reason == "unsigned"
+
+
+def test_unsigned_order_has_no_contract_bytes() -> None:
+    with pytest.raises(InvalidMessage) as caught:
+        order_abi(msgspec.structs.replace(DEMAND, signature=""))
+    assert caught.value.reason == "signature"
+
+
+def test_nonce_that_looks_like_a_sender_has_no_contract_bytes() -> None:
+    with pytest.raises(InvalidMessage) as caught:
+        order_abi(msgspec.structs.replace(DEMAND, nonce="00" * 12 + "11" * 20))
+    assert caught.value.reason == "nonce"
+    assert order_abi(msgspec.structs.replace(DEMAND, nonce="00" * 11 + "11" * 21))

@@ -1,0 +1,78 @@
+"""Selectors find the keys that they are for, and no others."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import zenoh
+
+from schemas import (
+    InvalidKey,
+    Key,
+    device_selector,
+    event_selector,
+    lighthouse_selector,
+    market_selector,
+    objective_selector,
+    presence_selector,
+    topic_selector,
+)
+from tests.schemas.sample_keys import KEYS, A, L
+from tests.schemas.samples import LIGHTHOUSE, MODEL, SENDER
+from tests.schemas.samples import LIGHTHOUSE_NAME as NAME
+
+
+def test_market_selectors() -> None:
+    assert market_selector(NAME, "demand") == f"aira/{NAME}/demand/*/*"
+    assert market_selector(NAME.upper(), "offer", MODEL) == f"aira/{NAME}/offer/{MODEL}/*"
+    assert market_selector(NAME, "result") == f"aira/{NAME}/result/*/*"
+    assert market_selector(NAME, "pending") == f"aira/{NAME}/pending/*"
+
+
+@pytest.mark.parametrize(("key", "text"), KEYS[:6], ids=lambda value: value if isinstance(value, str) else "")
+def test_market_selector_finds_its_kind(key: Key, text: str) -> None:
+    kind: Any = text.split("/")[2]
+    found = zenoh.KeyExpr(market_selector(NAME, kind))
+    assert [found.intersects(zenoh.KeyExpr(other)) for _, other in KEYS] == [
+        type(other) is type(key) for other, _ in KEYS
+    ]
+    assert zenoh.KeyExpr(lighthouse_selector(NAME)).includes(zenoh.KeyExpr(text))
+
+
+def test_selectors_of_an_agent_find_their_keys() -> None:
+    for selector, index in (
+        (event_selector(SENDER), 7),
+        (objective_selector(SENDER, LIGHTHOUSE), 8),
+        (topic_selector(SENDER, LIGHTHOUSE), 9),
+        (device_selector(SENDER), 10),
+        (device_selector(SENDER, "tty-0"), 10),
+    ):
+        found = [zenoh.KeyExpr(selector).intersects(zenoh.KeyExpr(text)) for _, text in KEYS]
+        assert found == [position == index for position in range(len(KEYS))]
+
+
+def test_presence_is_found_by_its_own_selector_only() -> None:
+    presence = zenoh.KeyExpr(KEYS[6][1])
+    assert zenoh.KeyExpr(presence_selector(NAME)).includes(presence)
+    assert zenoh.KeyExpr(presence_selector(NAME, "provider")).includes(presence)
+    assert not zenoh.KeyExpr(presence_selector(NAME, "agent")).intersects(presence)
+    assert not zenoh.KeyExpr(lighthouse_selector(NAME)).intersects(presence)
+
+
+def test_selectors_are_checked() -> None:
+    wrong: Any = "bid"
+    with pytest.raises(InvalidKey):
+        market_selector(NAME, wrong)
+    with pytest.raises(InvalidKey):
+        market_selector(NAME, "demand", "**")
+    with pytest.raises(InvalidKey):
+        market_selector(NAME, "result", MODEL)
+    with pytest.raises(InvalidKey):
+        lighthouse_selector("*")
+    with pytest.raises(InvalidKey):
+        presence_selector(NAME, "**")
+    with pytest.raises(InvalidKey):
+        device_selector(A, "a/b")
+    with pytest.raises(InvalidKey):
+        topic_selector("*", L)
