@@ -1,0 +1,127 @@
+"""Services: questions to an agent over Zenoh, answered in its event loop; the queryables of `aira/agent/…/rpc/…`.
+
+Requests and replies are the JSON of the structs in `schemas.rpc`. An `AiraError` travels back as an error reply and is
+raised again where the question was asked.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Any, Final, Self
+
+from mesh.errors import AiraError, RemoteError
+from schemas import InvalidRecord, Record, RpcKey
+from schemas.rpc import SERVICES
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+    from types import TracebackType
+
+    import zenoh
+
+log = logging.getLogger(__name__)
+
+TIMEOUT: Final = 10.0
+"""Seconds to wait for an answer."""
+
+
+class Failure(Record, frozen=True):
+    """What an error reply holds: the error's line and what to do about it."""
+
+    error: str
+    hint: str = ""
+
+
+class ServiceFailed(RemoteError):
+    """The agent that was asked answered with an error, or did not answer; `service` is what was asked."""
+
+    def __init__(self, service: str, why: str, *, hint: str = "") -> None:
+        super().__init__(f"{service}: {why}", hint=hint)
+        self.service = service
+
+
+class Services:
+    """The services of the agent at `address`: `async with Services(session, address)`, then `offer` each."""
+
+    def __init__(self, session: zenoh.Session, address: str) -> None:
+        self._session = session
+        self._address = address
+        self._queryables: list[Any] = []
+        self._answers: set[asyncio.Task[None]] = set()
+
+    async def __aenter__(self) -> Self:
+        self._loop = asyncio.get_running_loop()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        queryables, self._queryables = self._queryables, []
+        if not self._session.is_closed():
+            for queryable in queryables:
+                queryable.undeclare()
+        for answer in self._answers:
+            answer.cancel()
+        if self._answers:
+            await asyncio.wait(self._answers)
+
+    def offer(self, service: str, handler: Callable[[Any], Awaitable[Record]]) -> None:
+        """Answer `service` (one of `schemas.rpc.SERVICES`) with what `handler` makes of each request.
+
+        Requests are handled concurrently; an `AiraError` of the handler travels to who asked.
+        """
+        key, request_type = str(RpcKey(self._address, service)), SERVICES[service].request
+
+        def asked(query: zenoh.Query) -> None:
+            self._loop.call_soon_threadsafe(self._answer_soon, query, key, request_type, handler)
+
+        self._queryables.append(self._session.declare_queryable(key, asked))
+
+    def _answer_soon(
+        self, query: zenoh.Query, key: str, request_type: type[Record], handler: Callable[[Any], Awaitable[Record]]
+    ) -> None:
+        answer = asyncio.ensure_future(self._answer(query, key, request_type, handler))
+        self._answers.add(answer)
+        answer.add_done_callback(self._answers.discard)
+
+    async def _answer(
+        self, query: zenoh.Query, key: str, request_type: type[Record], handler: Callable[[Any], Awaitable[Record]]
+    ) -> None:
+        with query:
+            try:
+                payload = b"{}" if query.payload is None else query.payload.to_bytes()
+                reply = await handler(request_type.decode(payload))
+            except AiraError as error:
+                query.reply_err(Failure(str(error), error.hint).encode())
+            except Exception:
+                log.exception("service %s failed", key)
+                query.reply_err(Failure("the agent failed; its log says why").encode())
+            else:
+                query.reply(key, reply.encode(), encoding="application/json")
+
+
+async def call(session: zenoh.Session, agent: str, service: str, request: Record, *, timeout: float = TIMEOUT) -> Any:
+    """Ask `service` (one of `schemas.rpc.SERVICES`) of the agent at `agent` (address); its reply is that service's.
+
+    Raises `ServiceFailed` with the agent's own words, or that nobody answers within `timeout` seconds.
+    """
+    return await asyncio.to_thread(_call, session, agent, service, request, timeout)
+
+
+def _call(session: zenoh.Session, agent: str, service: str, request: Record, timeout: float) -> Record:
+    key = str(RpcKey(agent, service))
+    for reply in session.get(key, payload=request.encode(), encoding="application/json", timeout=timeout):
+        if reply.ok is not None:
+            return SERVICES[service].reply.decode(reply.ok.payload.to_bytes())
+        if reply.err is not None:
+            raise _failed(service, reply.err.payload.to_bytes(), timeout)
+    raise ServiceFailed(service, "nobody answers", hint="is the agent running, and on the same router?")
+
+
+def _failed(service: str, payload: bytes, timeout: float) -> ServiceFailed:
+    try:
+        failure = Failure.decode(payload)
+    except InvalidRecord:
+        return ServiceFailed(service, f"no answer within {timeout:g} s")  # Zenoh's own reply says `Timeout`
+    return ServiceFailed(service, failure.error, hint=failure.hint)

@@ -1,0 +1,174 @@
+"""Settings: one TOML file, then `AIRA_*` variables, then flags; the later wins.
+
+The options keep the names and the defaults of the legacy stack where it had them. An option that does not exist is
+an error which names the nearest one that does.
+"""
+
+from __future__ import annotations
+
+import difflib
+import logging
+import os
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+import msgspec
+from msgspec import Meta
+
+from mesh.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+log = logging.getLogger(__name__)
+
+PREFIX: Final = "AIRA_"
+RETIRED: Final = {
+    "master_check_interval": "there is no ROS master any more; delete the option",
+}
+"""Options of the legacy stack that mean nothing here, and why. They are reported, not obeyed."""
+
+NOT_OPTIONS: Final = frozenset({"AIRA_CONFIG", "AIRA_REQUIRE_PEERS", "AIRA_KUBO", "AIRA_PEERS_CACHE"})
+"""`AIRA_*` variables that belong to the command line or to the tests, not to the settings."""
+
+PositiveInt = Annotated[int, Meta(ge=1)]
+Seconds = Annotated[float, Meta(ge=0)]
+
+
+class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Every option of the mesh, with its default. See `describe` for what each means."""
+
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    connect_timeout: float = 10.0
+    data_dir: str = ""
+    web3_http_provider: str = "http://127.0.0.1:8545"
+    web3_ws_provider: str = "ws://127.0.0.1:8546"
+    ipfs_http_provider: str = "http://127.0.0.1:5001"
+    ens_contract: str = ""
+    factory_contract: str = "factory.3.robonomics.eth"
+    lighthouse_contract: str = "airalab.lighthouse.3.robonomics.eth"
+    erc20_token: str = "xrt.3.robonomics.eth"
+    generation: Literal[3, 5] = 3
+    poll_interval: Seconds = 1.0
+    keyfile: str = ""
+    keyfile_password_file: str = ""
+    enable_executor: bool = True
+    recording_topics: str = ""
+    playback: Literal["recorded", "at-once"] = "recorded"
+    objective_size_limit: PositiveInt = 256 * 1024 * 1024
+    objective_expanded_limit: PositiveInt = 1024 * 1024 * 1024
+    fetch_timeout: Seconds = 60.0
+    open_orders_limit: PositiveInt = 1_000_000
+
+    def with_lighthouse(self, name: str) -> Settings:
+        """The same settings on another lighthouse (an ENS name)."""
+        return msgspec.structs.replace(self, lighthouse_contract=name)
+
+    @property
+    def state_directory(self) -> Path:
+        """Where ledger, content and recordings are kept: `data_dir`, or the user's data folder."""
+        if self.data_dir:
+            return Path(self.data_dir).expanduser()
+        base = os.environ.get("XDG_DATA_HOME") or "~/.local/share"
+        return Path(base).expanduser() / "aira"
+
+    def keyfile_and_password(self) -> tuple[Path, Path]:
+        """The keyfile and its password file, for a role that signs.
+
+        Raises `ConfigurationError` when either is not set: there is no default account.
+        """
+        if not self.keyfile or not self.keyfile_password_file:
+            raise ConfigurationError(
+                "this needs an account, and keyfile or keyfile_password_file is not set",
+                hint="make one with `aira account new`, then give --keyfile and --keyfile-password-file",
+            )
+        return Path(self.keyfile).expanduser(), Path(self.keyfile_password_file).expanduser()
+
+
+MEANING: Final[Mapping[str, str]] = {
+    "connect": "Zenoh routers to connect to, tried in turn (several fail over)",
+    "listen": "where `aira router` listens",
+    "connect_timeout": "seconds to wait for a router at the start; -1 waits for ever",
+    "data_dir": "folder of ledger, content and recordings (default: the user's data folder)",
+    "web3_http_provider": "JSON-RPC of the EVM node, HTTP",
+    "web3_ws_provider": "JSON-RPC of the EVM node, WebSocket",
+    "ipfs_http_provider": "RPC of the IPFS daemon",
+    "ens_contract": "address of the ENS registry (empty: the public one, or what the node's deployment says)",
+    "factory_contract": "ENS name or address of the factory",
+    "lighthouse_contract": "ENS name of the lighthouse, the market to trade on",
+    "erc20_token": "ENS name or address of the token that pays",
+    "generation": "generation of the messages made here: 3 or 5 (both are read)",
+    "poll_interval": "seconds between two looks for new blocks",
+    "keyfile": "the account's keyfile (Web3 secret storage)",
+    "keyfile_password_file": "file with the keyfile's password",
+    "enable_executor": "do the jobs; false only listens",
+    "recording_topics": "topics to record, separated by commas (empty: all of the liability's)",
+    "playback": "play an objective's messages at their recorded times, or at once",
+    "objective_size_limit": "largest objective fetched, bytes",
+    "objective_expanded_limit": "largest objective once decompressed, bytes",
+    "fetch_timeout": "seconds to look for an objective before the job is given up",
+    "open_orders_limit": "orders that a provider keeps open at most",
+}
+"""What each option means, in a line."""
+
+
+def load(
+    *, path: Path | None = None, environ: Mapping[str, str] | None = None, flags: Mapping[str, Any] | None = None
+) -> Settings:
+    """The settings from the file at `path` (none: no file), the `AIRA_*` variables of `environ` and `flags`.
+
+    A flag whose value is None was not given. Raises `ConfigurationError` for an unreadable file, an unknown option
+    or a value that can't be.
+    """
+    merged: dict[str, Any] = {}
+    if path is not None:
+        merged |= _checked(_read_toml(path), where=str(path))
+    merged |= _checked(_from_environment(os.environ if environ is None else environ), where="the environment")
+    merged |= {name: value for name, value in (flags or {}).items() if value is not None}
+    try:
+        return msgspec.convert(merged, Settings, strict=False)
+    except msgspec.ValidationError as error:
+        raise ConfigurationError(f"a setting can't be used: {error}") from None
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigurationError(f"can't read the settings {path}: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigurationError(f"{path} is not TOML: {error}") from None
+
+
+def _from_environment(environ: Mapping[str, str]) -> dict[str, Any]:
+    """The options among the variables; lists are written with commas."""
+    found: dict[str, Any] = {}
+    for variable, text in environ.items():
+        if variable.startswith(PREFIX) and variable not in NOT_OPTIONS:
+            name = variable.removeprefix(PREFIX).lower()
+            found[name] = _split(text) if name in ("connect", "listen") else text
+    return found
+
+
+def _split(text: str) -> tuple[str, ...]:
+    return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
+def _checked(options: dict[str, Any], *, where: str) -> dict[str, Any]:
+    """The options without the retired ones, each known by name."""
+    kept: dict[str, Any] = {}
+    for name, value in options.items():
+        if name in RETIRED:
+            log.warning("%s in %s has no meaning: %s", name, where, RETIRED[name])
+        elif name in Settings.__struct_fields__:
+            kept[name] = value
+        else:
+            raise _unknown(name, where)
+    return kept
+
+
+def _unknown(name: str, where: str) -> ConfigurationError:
+    nearest = difflib.get_close_matches(name, Settings.__struct_fields__, n=1, cutoff=0)[0]
+    return ConfigurationError(f"unknown option {name!r} in {where}", hint=f"did you mean {nearest!r}?")
