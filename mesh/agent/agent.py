@@ -1,0 +1,258 @@
+"""The agent: what users write. A model, handlers for what happens, and one `run`."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from contextlib import AsyncExitStack
+from typing import TYPE_CHECKING, Any, Self, TypeVar
+
+from mesh.agent.hooks import Handler, HandlerPerformer, Hooks, call
+from mesh.agent.parts import chain_of, load_account, watching, working
+from mesh.agent.party import Worker
+from mesh.agent.trade import LIFETIME, Contract
+from mesh.background import Background
+from mesh.errors import ClosedError, ConfigurationError
+from mesh.settings import load
+from schemas import Demand, Offer, Result, Verified
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+    from types import TracebackType
+
+    from mesh.agent.parts import Parts
+    from mesh.chain import Account, Chain
+    from mesh.network import Channel
+    from mesh.settings import Settings
+
+log = logging.getLogger(__name__)
+
+H = TypeVar("H", bound=Handler)
+
+
+class Agent:
+    """A participant of the market: `agent = Agent(model)`, handlers, then `agent.run()` or `async with agent`.
+
+    `model` is the CID of the behaviour that it serves or asks for ('' for any). With an account (a keyfile in the
+    settings, or `account`) it trades and works; without one it watches the market. Nothing is opened before `run` or
+    `async with`, and any number of agents live in one event loop. `chain` is an open chain to use instead of the one
+    that the settings name.
+    """
+
+    def __init__(
+        self,
+        model: str = "",
+        *,
+        settings: Settings | None = None,
+        account: Account | None = None,
+        chain: Chain | None = None,
+    ) -> None:
+        self.model = model
+        self.settings = load() if settings is None else settings
+        self._account = account
+        self._given_chain = chain
+        self._hooks = Hooks()
+        self._stack = AsyncExitStack()
+        self._channel: Channel | None = None
+        self._worker: Worker | None = None
+
+    def on(self, topic: str, kind: type | None = None) -> Callable[[H], H]:
+        """Handle what an objective plays on `topic` (`*`: on any other): `async def handler(job, message)`.
+
+        `message` is decoded (`Empty`, `String`, JSON data, bytes), or a msgspec Struct when `kind` names one. Messages
+        come one after the other. When the last handler has returned, the job is finished with success; an exception
+        (best `JobFailed("why")`) ends it without, and the promisee is refunded.
+        """
+
+        def register(handler: H) -> H:
+            if topic in self._hooks.topics:
+                raise ConfigurationError(f"two handlers for topic {topic}", hint="one topic has one handler")
+            self._hooks.topics[topic] = (handler, kind)
+            return handler
+
+        return register
+
+    def on_demand(self, handler: H) -> H:
+        """Handle each new Demand of the agent's model: `async def handler(demand: Verified[Demand])`."""
+        return self._on_market(Demand, handler)
+
+    def on_offer(self, handler: H) -> H:
+        """Handle each new Offer of the agent's model: `async def handler(offer: Verified[Offer])`."""
+        return self._on_market(Offer, handler)
+
+    def on_result(self, handler: H) -> H:
+        """Handle each new Result: `async def handler(result: Verified[Result])`."""
+        return self._on_market(Result, handler)
+
+    def on_liability(self, handler: H) -> H:
+        """Handle each phase of each of the agent's jobs: `async def handler(phase: Phase, liability: Liability)`."""
+        self._hooks.liabilities.append(handler)
+        return handler
+
+    def every(self, seconds: float) -> Callable[[H], H]:
+        """Call the handler, which takes no argument, every so many seconds, first at the start."""
+
+        def register(handler: H) -> H:
+            self._hooks.periodic.append((seconds, handler))
+            return handler
+
+        return register
+
+    async def __aenter__(self) -> Self:
+        if self._channel is not None:
+            raise ClosedError("this agent is running already")
+        async with AsyncExitStack() as stack:
+            await self._open(stack)
+            self._stack = stack.pop_all()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool | None:
+        self._channel = self._worker = None
+        return await self._stack.__aexit__(kind, error, trace)
+
+    def run(self) -> None:
+        """Serve until Ctrl-C or SIGTERM. Errors that a person can mend are one line, and exit code 1 or 2."""
+        from mesh.cli.running import run_until_stopped
+
+        run_until_stopped(self.serve)
+
+    async def serve(self) -> None:
+        """Serve until cancelled."""
+        async with self:
+            await asyncio.Event().wait()
+
+    @property
+    def parts(self) -> Parts:
+        """What the agent consists of while it runs. Raises `ClosedError` when it doesn't, or has no account."""
+        return self._working().parts
+
+    @property
+    def channel(self) -> Channel:
+        """The lighthouse's channel. Raises `ClosedError` when the agent does not run."""
+        if self._channel is None:
+            raise ClosedError("the agent is not running", hint="use it inside `async with`")
+        return self._channel
+
+    @property
+    def address(self) -> str:
+        """The account's address (EIP-55)."""
+        return self.parts.signer.address
+
+    async def offer(
+        self,
+        demand: Verified[Demand] | Demand | None = None,
+        *,
+        objective: str = "",
+        cost: int = 0,
+        token: str = "",
+        validator: str = "",
+        lighthouse_fee: int = 0,
+        lifetime: int = LIFETIME,
+    ) -> str:
+        """Offer to do a job; returns the order's hash (hex). Sent again until it is taken or expires.
+
+        With a `demand` the offer agrees to its terms; else `objective` (CID), `cost` (the token's smallest unit),
+        `token` and `validator` (names or addresses) are the terms, valid for `lifetime` blocks. `lighthouse_fee` is in
+        wn, and paid to the provider.
+        """
+        trader = self._working().trader
+        if demand is not None:
+            order = demand.message if isinstance(demand, Verified) else demand
+            fields = await trader.mirrored(order)
+        else:
+            fields = await trader.terms(
+                model=self.model, objective=objective, cost=cost, token=token, validator=validator, lifetime=lifetime
+            )
+        return await trader.offer(Offer(**fields, lighthouse_fee=lighthouse_fee))
+
+    async def demand(
+        self,
+        objective: str | Path,
+        *,
+        cost: int = 0,
+        model: str = "",
+        token: str = "",
+        validator: str = "",
+        validator_fee: int = 0,
+        lifetime: int = LIFETIME,
+    ) -> Contract:
+        """Ask for a job and wait for the contract: `contract = await agent.demand(…); await contract.outcome()`.
+
+        `objective` is a CID, or the path of a file, which is then served from here. The other terms are as for
+        `offer`; the factory gets the allowance that they need. Raises `OrderExpired`, `OrderRejected`, `ShortOfFunds`.
+        """
+        worker = self._working()
+        cid = objective if isinstance(objective, str) else await asyncio.to_thread(self.parts.store.put_file, objective)
+        fields = await worker.trader.terms(
+            model=model or self.model, objective=cid, cost=cost, token=token, validator=validator, lifetime=lifetime
+        )
+        return await worker.trader.demand(Demand(**fields, validator_fee=validator_fee))
+
+    async def contract(self, address: str) -> Contract:
+        """The contract at `address`, whoever made it, to be waited for. Raises `NotALiability`."""
+        worker = self._working()
+        return worker.trader.contract(await worker.parts.chain.liability(address))
+
+    async def finish(self, address: str, *, success: bool) -> str:
+        """End the job of the liability at `address` now; returns the recording's CID."""
+        return await self._working().executor.finish(address, success=success)
+
+    async def _open(self, stack: AsyncExitStack) -> None:
+        """Open the parts, then start what runs beside them."""
+        account = self._account
+        if account is None and self.settings.keyfile:
+            account = await asyncio.to_thread(load_account, self.settings)
+        if account is None:
+            network, self._channel = await stack.enter_async_context(watching(self.settings))
+            log.info("watching %s, Zenoh id %s", self.channel.lighthouse, network.id)
+        else:
+            await self._open_working(stack, account)
+        assert self._channel is not None
+        tasks = await stack.enter_async_context(Background())
+        if self._worker is not None:
+            tasks.start(self._worker.run(), "worker")
+        for kind, handlers in self._hooks.market.items():
+            model = self.model if kind is not Result and self.model else "*"
+            subscription = await stack.enter_async_context(self._channel.subscribe(kind, model=model))
+            tasks.start(self._hear(subscription, handlers), f"hear {kind.__name__}")
+        for seconds, handler in self._hooks.periodic:
+            tasks.start(_repeat(seconds, handler), f"every {seconds:g} s")
+
+    async def _open_working(self, stack: AsyncExitStack, account: Account) -> None:
+        chain = self._given_chain
+        if chain is None:
+            chain = await stack.enter_async_context(chain_of(self.settings, account))
+        parts = await stack.enter_async_context(working(self.settings, account, chain))
+        performer = HandlerPerformer(self._hooks) if self._hooks.topics else None
+        self._worker = Worker(parts, performer=performer, witnesses=self._hooks.liabilities)
+        self._channel = parts.channel
+        self._channel.announce("agent", account.address)
+        log.info("account %s on %s, Zenoh id %s", account.address, parts.channel.lighthouse, parts.network.id)
+
+    def _on_market(self, kind: type[Demand | Offer | Result], handler: H) -> H:
+        self._hooks.market.setdefault(kind, []).append(handler)
+        return handler
+
+    async def _hear(self, subscription: Any, handlers: list[Handler]) -> None:
+        await subscription.recall()
+        async for message in subscription:
+            for handler in handlers:
+                await call(handler, message)
+
+    def _working(self) -> Worker:
+        self.channel  # raises when the agent is not running  # noqa: B018
+        if self._worker is None:
+            raise ConfigurationError(
+                "this agent has no account, it only watches",
+                hint="give it one: keyfile and keyfile_password_file in the settings",
+            )
+        return self._worker
+
+
+async def _repeat(seconds: float, handler: Handler) -> None:
+    while True:
+        await call(handler)
+        await asyncio.sleep(seconds)

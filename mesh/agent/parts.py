@@ -1,0 +1,134 @@
+"""The parts of an agent, opened in their order and closed in the reverse one."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from mesh.content import Exchange, Store
+from mesh.network import Channel, Endpoints, Network, Services
+from mesh.work.ledger import Ledger
+from mesh.work.outbox import Outbox
+from mesh.work.workshop import Workshop
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from mesh.chain import Account, Chain
+    from mesh.settings import Settings
+    from schemas import Signer
+
+
+class Clock:
+    """The chain's time as this agent knows it: the number of the last block handled."""
+
+    def __init__(self) -> None:
+        self.head = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parts:
+    """What an agent that trades and works consists of; all of it is open."""
+
+    settings: Settings
+    network: Network
+    chain: Chain
+    channel: Channel
+    signer: Signer
+    ledger: Ledger
+    outbox: Outbox
+    store: Store
+    exchange: Exchange
+    services: Services
+    clock: Clock
+    directory: Path
+
+    def workshop(self) -> Workshop:
+        """The parts that the executor works with."""
+        recordings = self.directory / "recordings"
+        recordings.mkdir(parents=True, exist_ok=True)
+        return Workshop(
+            session=self.network.session,
+            signer=self.signer,
+            ledger=self.ledger,
+            outbox=self.outbox,
+            store=self.store,
+            exchange=self.exchange,
+            settings=self.settings,
+            recordings=recordings,
+        )
+
+
+def load_account(settings: Settings) -> Account:
+    """The account that the settings name. Blocks while the keyfile is decrypted. Raises `ConfigurationError`."""
+    from mesh.chain import Account
+
+    return Account.from_keyfile(*settings.keyfile_and_password())
+
+
+def chain_of(settings: Settings, account: Account | None) -> Chain:
+    """The chain that the settings name, not yet opened, for `account` or for reading only."""
+    from mesh.chain import Chain, Timing
+
+    return Chain(
+        settings.web3_http_provider,
+        account=account,
+        ens=settings.ens_contract,
+        factory=settings.factory_contract,
+        timing=Timing(poll_interval=settings.poll_interval),
+    )
+
+
+def endpoints_of(settings: Settings) -> Endpoints:
+    """Where the settings' client session connects to."""
+    return Endpoints(connect=settings.connect, timeout=settings.connect_timeout)
+
+
+@asynccontextmanager
+async def watching(settings: Settings) -> AsyncIterator[tuple[Network, Channel]]:
+    """The parts of an agent that only watches the market: it needs a router, no account and no chain."""
+    async with (
+        Network(endpoints_of(settings)) as network,
+        Channel(network.session, settings.lighthouse_contract) as channel,
+    ):
+        yield network, channel
+
+
+@asynccontextmanager
+async def working(settings: Settings, account: Account, chain: Chain) -> AsyncIterator[Parts]:
+    """The parts of an agent with an account, on `chain` (open). Its state is under the settings' folder, by address."""
+    directory = settings.state_directory / account.address
+    clock = Clock()
+    clock.head = await chain.block_number()
+    async with AsyncExitStack() as stack:
+        network = await stack.enter_async_context(Network(endpoints_of(settings)))
+        lighthouse = settings.lighthouse_contract
+        channel = await stack.enter_async_context(
+            Channel(
+                network.session,
+                lighthouse,
+                address=await chain.resolve(lighthouse),
+                resolver=chain.resolve,
+                head=lambda: clock.head,
+            )
+        )
+        ledger = await stack.enter_async_context(Ledger(directory / "ledger.sqlite"))
+        store = await asyncio.to_thread(Store, directory / "content", limit=settings.objective_expanded_limit)
+        stack.callback(store.close)
+        yield Parts(
+            settings=settings,
+            network=network,
+            chain=chain,
+            channel=channel,
+            signer=account.signer,
+            ledger=ledger,
+            outbox=Outbox(ledger, channel, network, head=lambda: clock.head),
+            store=store,
+            exchange=await stack.enter_async_context(Exchange(network.session, store)),
+            services=await stack.enter_async_context(Services(network.session, account.address)),
+            clock=clock,
+            directory=directory,
+        )

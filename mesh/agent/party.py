@@ -1,0 +1,111 @@
+"""An agent with an account at work: it listens to the chain, does its jobs, trades, and answers for them."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Final
+
+from mesh.agent.hooks import call
+from mesh.agent.trade import Outcome, Trader
+from mesh.work.executor import Executor
+from mesh.work.lifecycle import Phase, WrongPhase
+from mesh.work.listener import Listener
+from schemas.keys import EventKey, LiabilityEvent
+from schemas.rpc import Done, LiabilityRead, Nothing
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Sequence
+
+    from mesh.agent.hooks import Handler
+    from mesh.agent.parts import Parts
+    from mesh.work.run import Performer
+    from schemas import Liability
+    from schemas.rpc import FinishLiability, ReadLiability, RestartLiability, ResumeLiability, StartLiability
+
+log = logging.getLogger(__name__)
+
+PUBLISHED: Final[dict[Phase, LiabilityEvent]] = {
+    Phase.INCOMING: "incoming",
+    Phase.READY: "ready",
+    Phase.COMPLETE: "complete",
+    Phase.FINALIZED: "finalized",
+}
+"""Phases that are told on the agent's keys, and what they are called there."""
+
+
+class Worker:
+    """The working side of an agent: `run` in a task; the listener's party, the executor's witness."""
+
+    def __init__(self, parts: Parts, *, performer: Performer | None, witnesses: Sequence[Handler]) -> None:
+        self.parts = parts
+        self.trader = Trader(parts, parts.chain)
+        self.executor = Executor(parts.workshop(), performer=performer, witness=self._phase)
+        self._witnesses = witnesses
+        self._offer_services()
+
+    async def run(self) -> None:
+        """Work until cancelled."""
+        listener = Listener(self.parts.chain, self.parts.ledger, self.parts.signer.address, self)
+        async with asyncio.TaskGroup() as tasks:
+            if self.parts.settings.enable_executor:
+                tasks.create_task(self.executor.run(), name="executor")
+            tasks.create_task(self.parts.outbox.run(), name="outbox")
+            tasks.create_task(listener.run(), name="listener")
+
+    async def new_liability(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
+        """A contract names us: trade it as a promisee, work for it as a promisor (an account may be both)."""
+        await self.trader.matched(liability, demand_hash=demand_hash, offer_hash=offer_hash)
+        if liability.promisor == self.parts.signer.address and self.parts.settings.enable_executor:
+            await self.executor.accept(liability)
+
+    async def finalized(self, address: str, *, success: bool, result: str) -> None:
+        """A contract has ended, perhaps one of ours."""
+        await self.executor.finalized(address, success=success)
+        self.trader.finalized(address, Outcome(success=success, result=result))
+
+    async def new_head(self, block: int) -> None:
+        """The chain has grown."""
+        self.parts.clock.head = block
+        self.trader.passed(block)
+
+    async def _phase(self, phase: Phase, liability: Liability) -> None:
+        if phase in PUBLISHED:
+            key = str(EventKey(self.parts.signer.address, liability.address, PUBLISHED[phase]))
+            self.parts.channel.put(key, liability.encode())
+        for witness in self._witnesses:
+            await call(witness, phase, liability)
+
+    def _offer_services(self) -> None:
+        services, executor = self.parts.services, self.executor
+
+        async def start(request: StartLiability) -> Done:
+            return await _done(executor.start(request.address))
+
+        async def restart(request: RestartLiability) -> Done:
+            return await _done(executor.restart(request.address))
+
+        async def resume(request: ResumeLiability) -> Done:
+            return await _done(executor.resume(request.address))
+
+        async def finish(request: FinishLiability) -> Nothing:
+            await executor.finish(request.address, success=request.success)
+            return Nothing()
+
+        async def read(request: ReadLiability) -> LiabilityRead:
+            try:
+                return LiabilityRead(True, await executor.read(request.address))
+            except WrongPhase:
+                return LiabilityRead(False)
+
+        for handler in (start, restart, resume, finish, read):
+            services.offer(handler.__name__, handler)
+
+
+async def _done(work: Awaitable[object]) -> Done:
+    """The answer of the services that say whether they could."""
+    try:
+        await work
+    except WrongPhase as error:
+        return Done(False, str(error))
+    return Done(True)

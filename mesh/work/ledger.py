@@ -1,0 +1,210 @@
+"""The agent's memory: what it owes and is owed, what it has said, how far it has read the chain. SQLite, one file.
+
+Every write is committed and synced before the call returns, so that what an agent has done it remembers after
+`kill -9`. Writes are idempotent: handling the same block or message twice changes nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from typing import TYPE_CHECKING, Any, Final, Self
+
+import aiosqlite
+import msgspec
+
+from mesh.errors import ClosedError, ConfigurationError
+from mesh.work.lifecycle import UNFINISHED, Phase
+from schemas import Liability
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+    from types import TracebackType
+
+VERSION: Final = 1
+SCHEMA: Final = """
+CREATE TABLE IF NOT EXISTS jobs (
+    liability TEXT PRIMARY KEY,
+    phase TEXT NOT NULL,
+    record BLOB NOT NULL,
+    success INTEGER,
+    result TEXT,
+    position INTEGER NOT NULL DEFAULT 0,
+    note TEXT NOT NULL DEFAULT '',
+    changed REAL NOT NULL
+);
+CREATE TABLE IF NOT EXISTS outbox (
+    identity TEXT PRIMARY KEY,
+    kind TEXT NOT NULL,
+    payload BLOB NOT NULL,
+    deadline INTEGER,
+    posted REAL NOT NULL
+);
+CREATE TABLE IF NOT EXISTS cursors (name TEXT PRIMARY KEY, block INTEGER NOT NULL);
+"""
+POST: Final = "INSERT OR IGNORE INTO outbox (identity, kind, payload, deadline, posted) VALUES (?, ?, ?, ?, ?)"
+
+
+class Job(msgspec.Struct, frozen=True, kw_only=True):
+    """A job as the ledger holds it.
+
+    `success` and `result` (CIDv0 of the recording) are there from COMPLETE on; `position` counts the objective's
+    messages already played; `note` says why a job failed.
+    """
+
+    liability: Liability
+    phase: Phase
+    success: bool | None
+    result: str | None
+    position: int
+    note: str
+
+
+class Outgoing(msgspec.Struct, frozen=True, kw_only=True):
+    """A signed message that is sent until its effect is seen, or block `deadline` has passed (None: never)."""
+
+    identity: str
+    kind: str
+    payload: bytes
+    deadline: int | None
+
+
+class Ledger:
+    """The ledger in the file at `path`, made when missing: `async with Ledger(path) as ledger`.
+
+    One agent owns a file. Calls run in a thread of the ledger's own, in their order.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._database: aiosqlite.Connection | None = None
+        self._writing = asyncio.Lock()
+
+    async def __aenter__(self) -> Self:
+        if self._database is not None:
+            raise ClosedError("this ledger is open already")
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._database = await aiosqlite.connect(self._path, isolation_level=None)
+            await self._prepare()
+        except (OSError, aiosqlite.Error) as error:
+            await self.__aexit__(None, None, None)
+            raise ConfigurationError(
+                f"can't use the ledger {self._path}: {error}", hint="give another folder with --data-dir"
+            ) from None
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        database, self._database = self._database, None
+        if database is not None:
+            await database.close()
+
+    async def _prepare(self) -> None:
+        await self._run("PRAGMA journal_mode = WAL")
+        await self._run("PRAGMA synchronous = FULL")
+        version = (await self._rows("PRAGMA user_version"))[0][0]
+        if version > VERSION:
+            raise ConfigurationError(
+                f"the ledger {self._path} was written by a newer version (format {version}, this one knows {VERSION})",
+                hint="upgrade aira-mesh",
+            )
+        await self._open().executescript(SCHEMA)
+        await self._run(f"PRAGMA user_version = {VERSION}")
+
+    async def add_job(self, liability: Liability) -> bool:
+        """Write down a new job as INCOMING; False when it was known."""
+        return await self._run(
+            "INSERT OR IGNORE INTO jobs (liability, phase, record, changed) VALUES (?, ?, ?, ?)",
+            (liability.address, Phase.INCOMING, liability.encode(), time.time()),
+        )
+
+    async def set_phase(self, liability: str, phase: Phase, *, position: int | None = None) -> None:
+        """Write down where the job at `liability` (address) stands, and how many messages it has played."""
+        await self._run(
+            "UPDATE jobs SET phase = ?, position = COALESCE(?, position), changed = ? WHERE liability = ?",
+            (phase, position, time.time(), liability),
+        )
+
+    async def complete(self, liability: str, *, success: bool, result: str, note: str, outgoing: Outgoing) -> None:
+        """Write down the job's end and the signed Result that tells of it, both or neither."""
+        database = self._open()
+        async with self._writing:
+            await database.execute("BEGIN IMMEDIATE")
+            try:
+                await database.execute(
+                    "UPDATE jobs SET phase = ?, success = ?, result = ?, note = ?, changed = ? WHERE liability = ?",
+                    (Phase.COMPLETE, success, result, note, time.time(), liability),
+                )
+                await database.execute(POST, _posted(outgoing))
+            except BaseException:
+                await database.execute("ROLLBACK")
+                raise
+            await database.execute("COMMIT")
+
+    async def job(self, liability: str) -> Job | None:
+        """The job at `liability` (EIP-55 address), if it is ours."""
+        rows = await self._rows("SELECT * FROM jobs WHERE liability = ?", (liability,))
+        return _job(rows[0]) if rows else None
+
+    async def jobs(self, phases: Iterable[Phase] = UNFINISHED) -> list[Job]:
+        """The jobs in the given phases, oldest first."""
+        wanted = tuple(phases)
+        marks = ",".join("?" * len(wanted))
+        rows = await self._rows(f"SELECT * FROM jobs WHERE phase IN ({marks}) ORDER BY rowid", wanted)
+        return [_job(row) for row in rows]
+
+    async def post(self, outgoing: Outgoing) -> None:
+        """Keep a signed message for sending until `settle`."""
+        await self._run(POST, _posted(outgoing))
+
+    async def settle(self, identity: str) -> bool:
+        """The effect of the message was seen: send it no more. False when it was not in the outbox."""
+        return await self._run("DELETE FROM outbox WHERE identity = ?", (identity,))
+
+    async def outbox(self, *, head: int) -> list[Outgoing]:
+        """What is to be sent, oldest first; forgets what has passed its deadline at block `head`."""
+        await self._run("DELETE FROM outbox WHERE deadline <= ?", (head,))
+        rows = await self._rows("SELECT identity, kind, payload, deadline FROM outbox ORDER BY rowid")
+        return [Outgoing(identity=row[0], kind=row[1], payload=row[2], deadline=row[3]) for row in rows]
+
+    async def cursor(self, name: str) -> int | None:
+        """The last block handled by `name`; None when there was none."""
+        rows = await self._rows("SELECT block FROM cursors WHERE name = ?", (name,))
+        return int(rows[0][0]) if rows else None
+
+    async def set_cursor(self, name: str, block: int) -> None:
+        """All of `block` has been handled by `name`."""
+        await self._run("INSERT OR REPLACE INTO cursors (name, block) VALUES (?, ?)", (name, block))
+
+    def _open(self) -> aiosqlite.Connection:
+        if self._database is None:
+            raise ClosedError("the ledger is not open", hint="use it inside `async with`")
+        return self._database
+
+    async def _run(self, statement: str, values: tuple[Any, ...] = ()) -> bool:
+        async with self._writing:
+            cursor = await self._open().execute(statement, values)
+        changed = cursor.rowcount > 0
+        await cursor.close()
+        return changed
+
+    async def _rows(self, statement: str, values: tuple[Any, ...] = ()) -> list[Any]:
+        return list(await self._open().execute_fetchall(statement, values))
+
+
+def _job(row: Any) -> Job:
+    return Job(
+        liability=Liability.decode(row[2]),
+        phase=Phase(row[1]),
+        success=None if row[3] is None else bool(row[3]),
+        result=row[4],
+        position=row[5],
+        note=row[6],
+    )
+
+
+def _posted(outgoing: Outgoing) -> tuple[Any, ...]:
+    return (outgoing.identity, outgoing.kind, outgoing.payload, outgoing.deadline, time.time())

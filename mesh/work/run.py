@@ -1,0 +1,181 @@
+"""One run of a job: the objective played to the device, and all that the device says recorded."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import threading
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+import zenoh
+
+from mesh.errors import ClosedError
+from mesh.recording import Recorder, Unrecordable, play
+from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey, parse_key, topic_selector
+from schemas.payloads import STRING, PayloadType, String, payload_type
+from schemas.values import encode_value
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from mesh.recording import Objective, Pace, Played, RecordingSummary
+    from schemas import Liability
+
+log = logging.getLogger(__name__)
+
+AHEAD: Final = 1024
+"""Played messages that wait for the device's handler at most; then the player waits."""
+NOTE_TOPIC: Final = "/aira/note"
+"""Topic of the recording on which the agent says why a job failed."""
+FLUSH: Final = "aira/flush"
+"""Encoding of the mark that a run sends to itself when it has heard enough."""
+
+
+class Performer(Protocol):
+    """What does the work: the code that talks to the device."""
+
+    @property
+    def topics(self) -> frozenset[str] | None:
+        """The objective's topics that it understands; None for any."""
+
+    async def perform(self, run: Run, message: Played) -> None:
+        """Do what one played message asks; the next one waits. An exception fails the job."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What a run needs to know: the job, how fast to play, where to begin, what to record (None: all topics)."""
+
+    liability: Liability
+    objective: Objective | None
+    pace: Pace
+    position: int = 0
+    topics: frozenset[str] | None = None
+
+
+class Run:
+    """A run on an open session. `open`, then `play` once, then `close`; `publish` at any time between.
+
+    The recorder owns its file; what arrives on the liability's topics goes into it from Zenoh's thread directly,
+    never over the event loop. Not to be used again after `close`.
+    """
+
+    def __init__(self, session: zenoh.Session, agent: str, plan: Plan, recorder: Recorder) -> None:
+        self._session = session
+        self._agent = agent
+        self._plan = plan
+        self._recorder = recorder
+        self._subscriber: Any = None
+        self._flushed = threading.Event()
+        self.position = plan.position
+        """How many of the objective's messages have been done with."""
+        self.playing: Played | None = None
+        """The message that the performer is at: its topic, times and type."""
+        self.refused = 0
+        """Messages that were heard on the job's topics but can't be recorded."""
+
+    @property
+    def liability(self) -> Liability:
+        """The contract that this run works for."""
+        return self._plan.liability
+
+    def open(self) -> None:
+        """Begin to listen to the job's topics; from now on everything on them is recorded."""
+        selector = topic_selector(self._agent, self.liability.address)
+        self._subscriber = self._session.declare_subscriber(selector, self._hear)
+
+    def publish(self, topic: str, message: object) -> None:
+        """Say `message` on a topic of the job, as the device does; it becomes part of the recording.
+
+        `message` is bytes, or what `schemas.values.encode_value` takes: `Empty`, `String`, a str, a msgspec
+        Struct or plain JSON data.
+        """
+        if self._subscriber is None:
+            raise ClosedError(f"the run of {self.liability.address} is not open")
+        payload, kind = encode_value(message)
+        key = str(LiabilityTopicKey(self._agent, self.liability.address, topic))
+        self._put(key, payload, kind)
+
+    async def play(self, performer: Performer | None, *, progress: Callable[[int], Awaitable[None]]) -> None:
+        """Play the objective from its position to its end, each message at its time; returns when all is done.
+
+        Every message goes to the mesh, into the recording and, where there is a `performer`, to it: in order, one
+        after the other. `progress` is told the position after each. Raises what the performer raises.
+        """
+        waiting: asyncio.Queue[Played | None] = asyncio.Queue(AHEAD)
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(self._play(waiting), name=f"player {self.liability.address}")
+                tasks.create_task(
+                    self._perform(waiting, performer, progress), name=f"performer {self.liability.address}"
+                )
+        except ExceptionGroup as group:
+            raise group.exceptions[0] from None
+
+    async def close(self, note: str = "") -> RecordingSummary:
+        """Close the recording; everything heard before this call is in it. `note` is written at its end."""
+        if self._subscriber is not None:
+            await asyncio.to_thread(self._stop_listening)
+        if note:
+            self._recorder.record(NOTE_TOPIC, String(note).encode(), STRING, role="agent")
+        return await asyncio.to_thread(self._recorder.close)
+
+    async def _play(self, waiting: asyncio.Queue[Played | None]) -> None:
+        plan = self._plan
+        assert plan.objective is not None, "a run without an objective only records"
+        async for step in play(plan.objective, pace=plan.pace, start_index=plan.position):
+            message = step.message
+            if self._wanted(message.topic):
+                self._recorder.record(message.topic, message.payload, message.type, role="objective")
+            key = str(ObjectiveTopicKey(self._agent, self.liability.address, message.topic))
+            self._put(key, message.payload, message.type)
+            await waiting.put(message)
+        await waiting.put(None)
+
+    async def _perform(
+        self,
+        waiting: asyncio.Queue[Played | None],
+        performer: Performer | None,
+        progress: Callable[[int], Awaitable[None]],
+    ) -> None:
+        while (message := await waiting.get()) is not None:
+            if performer is not None:
+                self.playing = message
+                await performer.perform(self, message)
+            self.position += 1
+            await progress(self.position)
+
+    def _put(self, key: str, payload: bytes, kind: PayloadType) -> None:
+        self._session.put(
+            key, payload, encoding=kind.zenoh_encoding, congestion_control=zenoh.CongestionControl.DROP, express=True
+        )
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        """Zenoh's callback: a message on the job's topics, or our own mark that all before it has been heard."""
+        encoding = str(sample.encoding)
+        if encoding == FLUSH:
+            self._flushed.set()
+            return
+        try:
+            key = parse_key(str(sample.key_expr))
+            if isinstance(key, LiabilityTopicKey) and self._wanted(key.topic):
+                self._recorder.record(key.topic, sample.payload.to_bytes(), payload_type(encoding), role="device")
+        except Exception as error:
+            # Nobody stands behind a callback: what can't be recorded is counted and said, and the next one is heard.
+            self.refused += 1
+            level = logging.INFO if isinstance(error, Unrecordable) else logging.ERROR
+            log.log(level, "%s: not recorded from %s: %s", self.liability.address, sample.key_expr, error)
+
+    def _wanted(self, topic: str) -> bool:
+        return self._plan.topics is None or topic in self._plan.topics
+
+    def _stop_listening(self) -> None:
+        """Samples reach a subscriber in order, so once it has our mark it has all that came before."""
+        subscriber, self._subscriber = self._subscriber, None
+        with contextlib.suppress(zenoh.ZError):  # a session that broke has nothing more to say
+            mark = LiabilityTopicKey(self._agent, self.liability.address, NOTE_TOPIC)
+            self._session.put(str(mark), b"", encoding=FLUSH, allowed_destination=zenoh.Locality.SESSION_LOCAL)
+            self._flushed.wait(timeout=5)
+            subscriber.undeclare()

@@ -1,0 +1,101 @@
+"""What an executor works with, and how it gets from a liability to an objective in hand and a run of it."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import mesh
+from mesh.errors import InputError
+from mesh.recording import AtOnce, Limits, RecordedTimes, Recorder, RecordingAbout, preflight
+from mesh.work.run import Plan, Run
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import zenoh
+
+    from mesh.content import Exchange, Store
+    from mesh.recording import Objective
+    from mesh.settings import Settings
+    from mesh.work.ledger import Ledger
+    from mesh.work.outbox import Outbox
+    from schemas import Liability, Signer
+
+
+class UnfitObjective(InputError):
+    """An objective can't be played here; `reason` is preflight's machine-readable word."""
+
+    def __init__(self, cid: str, reason: str, detail: str) -> None:
+        super().__init__(f"objective {cid} can't be played ({reason}): {detail}")
+        self.cid = cid
+        self.reason = reason
+
+
+@dataclass(frozen=True, kw_only=True)
+class Workshop:
+    """The parts that an executor works with, all open, each the caller's to close.
+
+    `recordings` is the folder of recordings that are being made; finished ones are in the store.
+    """
+
+    session: zenoh.Session
+    signer: Signer
+    ledger: Ledger
+    outbox: Outbox
+    store: Store
+    exchange: Exchange
+    settings: Settings
+    recordings: Path
+
+    async def examine(self, liability: Liability, *, topics: frozenset[str] | None) -> Objective:
+        """The liability's objective: taken from the store or fetched from the mesh, and found fit to be played.
+
+        `topics` are those that the device understands; None for any. Raises `UnfitObjective` or a `ContentError`.
+        """
+        settings = self.settings
+        path = await asyncio.to_thread(self.store.checked, liability.objective)
+        if path is None:
+            path = await self.exchange.fetch(
+                liability.objective, size_limit=settings.objective_size_limit, timeout=settings.fetch_timeout
+            )
+        limits = Limits(size=settings.objective_size_limit, expanded=settings.objective_expanded_limit)
+        outcome = await asyncio.to_thread(preflight, path, limits, topics=topics)
+        if outcome.objective is None or not outcome.ok:
+            raise UnfitObjective(liability.objective, outcome.reason, outcome.detail)
+        return outcome.objective
+
+    async def new_run(self, liability: Liability, *, objective: Objective | None = None, position: int = 0) -> Run:
+        """A run of `objective` from message `position` on; without an objective, one that only records.
+
+        What an interrupted run of the same liability has recorded is gone on with.
+        """
+        chosen = frozenset(name.strip() for name in self.settings.recording_topics.split(",") if name.strip())
+        pace = AtOnce() if self.settings.playback == "at-once" else RecordedTimes()
+        plan = Plan(liability=liability, objective=objective, pace=pace, position=position, topics=chosen or None)
+        recorder = await asyncio.to_thread(self._new_recorder, liability)
+        return Run(self.session, self.signer.address, plan, recorder)
+
+    def discard_recording(self, address: str) -> None:
+        """Forget what an earlier run of the liability at `address` has recorded. Blocks on the disk."""
+        for leftover in self._recording_files(address):
+            leftover.unlink(missing_ok=True)
+
+    def _new_recorder(self, liability: Liability) -> Recorder:
+        finished, partial = self._recording_files(liability.address)
+        if finished.exists():  # closed, but a crash came before the Result was written down
+            finished.replace(partial)
+        about = RecordingAbout(
+            liability=liability.address,
+            agent=self.signer.address,
+            lighthouse=liability.lighthouse,
+            objective=liability.objective,
+            software=f"aira-mesh {mesh.__version__}",
+        )
+        return Recorder(finished, about)
+
+    def _recording_files(self, address: str) -> tuple[Path, Path]:
+        """Where the recording is when it is whole, and while it is being made."""
+        finished = self.recordings / f"{address}.mcap"
+        return finished, finished.with_name(f"{finished.name}.part")
