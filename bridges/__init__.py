@@ -1,0 +1,1 @@
+"""Doors to other worlds: the legacy IPFS channel, devices on serial lines."""

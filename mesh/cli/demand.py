@@ -1,0 +1,70 @@
+"""`aira demand`: a person's side of the market."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import msgspec
+
+from mesh.cli.options import with_settings
+from mesh.cli.running import run_to_end
+
+if TYPE_CHECKING:
+    from mesh.settings import Settings
+
+
+@click.command("demand")
+@click.option("--model", required=True, help="CID or ENS name of the behaviour that is wanted")
+@click.option("--objective", required=True, help="file to play, or its CID")
+@click.option("--cost", default=0, show_default=True, help="what it may cost, in the token's smallest unit (XRT: wn)")
+@click.option("--lifetime", default=1000, show_default=True, help="blocks for which the demand is valid")
+@click.option("--out", type=click.Path(path_type=Path), help="file to write the recording to")
+@click.option("--json", "as_json", is_flag=True, help="print one JSON object at the end")
+@with_settings(
+    "connect",
+    "data_dir",
+    "web3_http_provider",
+    "ens_contract",
+    "factory_contract",
+    "lighthouse_contract",
+    "erc20_token",
+    "generation",
+    "keyfile",
+    "keyfile_password_file",
+    "poll_interval",
+)
+def command(settings: Settings, **order: Any) -> None:
+    """Publish a Demand, wait for the contract, the work and the payment. Ctrl-C stops waiting; the contract goes on."""
+    run_to_end(lambda: _demand(settings, **order))
+
+
+async def _demand(
+    settings: Settings, *, model: str, objective: str, cost: int, lifetime: int, out: Path | None, as_json: bool
+) -> None:
+    from mesh.agent import Agent
+
+    say = (lambda text: None) if as_json else click.echo
+    settings.keyfile_and_password()
+    async with Agent(model, settings=settings) as agent:
+        say(f"demand by {agent.address} for {model}")
+        contract = await agent.demand(await asyncio.to_thread(_source, objective), cost=cost, lifetime=lifetime)
+        say(f"contract {contract.address} with {contract.liability.promisor}")
+        outcome = await contract.outcome()
+        say(f"{'paid' if outcome.success else 'refunded'}, result {outcome.result or 'none'}")
+        if out is not None and outcome.result:
+            recording = await contract.recording()
+            await asyncio.to_thread(shutil.copyfile, recording, out)
+            say(f"recording {out}")
+    if as_json:
+        facts = {"liability": contract.address, "success": outcome.success, "result": outcome.result}
+        click.echo(msgspec.json.encode(facts))
+
+
+def _source(objective: str) -> str | Path:
+    """A file where there is one of that name, else a CID."""
+    path = Path(objective)
+    return path if path.is_file() else objective

@@ -1,0 +1,28 @@
+"""`aira demo`: one job, end to end, in one process."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from mesh.cli.running import run_to_end
+
+
+@click.command("demo")
+@click.option("--objective", type=click.Path(path_type=Path), help="MCAP file or ROS 1 bag to play [three blinks]")
+@click.option("--generation", type=click.Choice(["3", "5"]), default="3", help="generation of the messages [3]")
+@click.option(
+    "--out", type=click.Path(file_okay=False, path_type=Path), help="folder that keeps objective and recording"
+)
+@click.option("--json", "as_json", is_flag=True, help="print a JSON object a line, the last one sums up")
+def command(objective: Path | None, generation: str, out: Path | None, as_json: bool) -> None:
+    """Show one whole job: a person's Demand and a robot's Offer meet, a contract holds the money, the robot plays the
+    objective to its device, records it and signs the Result, the contract pays. Everything is real and local: Zenoh
+    sessions, an EVM, signatures, files."""
+    from mesh.demo.demo import Demo
+    from mesh.demo.story import JsonStory, SpokenStory
+
+    story = JsonStory() if as_json else SpokenStory()
+    demo = Demo(objective=objective, generation=int(generation), out=out, story=story)
+    run_to_end(demo.run)

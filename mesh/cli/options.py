@@ -1,0 +1,55 @@
+"""Options that commands share: every setting as a flag, made from the settings themselves."""
+
+from __future__ import annotations
+
+from functools import wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from mesh.cli.running import fail
+from mesh.errors import AiraError
+from mesh.settings import MEANING, Settings, load
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+SEVERAL = frozenset({"connect", "listen"})
+
+
+def with_settings(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Give a command `--config` and a flag for each named setting; it is called with `settings`.
+
+    The settings come from the file, the `AIRA_*` variables and the flags, in that order of rising precedence.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(function)
+        def command(config: Path | None, **options: Any) -> Any:
+            flags = {name: options.pop(name) or None for name in names}
+            try:
+                settings = load(path=config, flags=flags)
+            except AiraError as error:
+                fail(error)
+            return function(settings=settings, **options)
+
+        decorated: Callable[..., Any] = command
+        for name in reversed(names):
+            decorated = _flag(name)(decorated)
+        return click.option(
+            "--config",
+            type=click.Path(dir_okay=False, path_type=Path),
+            envvar="AIRA_CONFIG",
+            help="settings file (TOML)",
+        )(decorated)
+
+    return decorate
+
+
+def _flag(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    default = getattr(Settings(), name)
+    shown = ", ".join(default) if isinstance(default, tuple) else str(default)
+    text = MEANING[name] + (f" [{shown}]" if shown else "")
+    flag = f"--{name.replace('_', '-')}"
+    return click.option(flag, name, multiple=name in SEVERAL, metavar=name.split("_")[-1].upper(), help=text)

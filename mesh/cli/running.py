@@ -1,0 +1,87 @@
+"""How a command runs and ends: signals, errors as one line, exit codes, the log."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import signal
+import sys
+from typing import TYPE_CHECKING, Any, Final, NoReturn
+
+from mesh.errors import AiraError, ConfigurationError, InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine
+
+INTERRUPTED: Final = 130
+"""Exit code of a command that Ctrl-C kept from its end."""
+
+
+def run_to_end(main: Callable[[], Coroutine[Any, Any, object]]) -> None:
+    """Run a command that has an end; Ctrl-C and SIGTERM break it off with exit code 130. Exits 1 or 2 on errors."""
+    if not _run(main):
+        sys.exit(INTERRUPTED)
+
+
+def run_until_stopped(main: Callable[[], Coroutine[Any, Any, object]]) -> None:
+    """Run a server; Ctrl-C and SIGTERM are its normal end. Exits 1 or 2 on errors."""
+    start_log()
+    _run(main)
+
+
+def start_log(level: int = logging.INFO) -> None:
+    """Write the log to stderr, a line an event; does nothing where logging is set up already."""
+    logging.basicConfig(level=level, format="%(asctime)s %(levelname)-7s %(message)s", datefmt="%H:%M:%S")
+
+
+def fail(error: AiraError) -> NoReturn:
+    """Say what is wrong and what to do in a line each, and exit: 2 for what the caller gave, 1 for the rest."""
+    print(f"aira: {error}", file=sys.stderr)
+    if error.hint:
+        print(f"      {error.hint}", file=sys.stderr)
+    sys.exit(2 if isinstance(error, InputError | ConfigurationError) else 1)
+
+
+def _run(main: Callable[[], Coroutine[Any, Any, object]]) -> bool:
+    """Whether `main` came to its end (false: a signal stopped it)."""
+    try:
+        return asyncio.run(_until_signal(main))
+    except AiraError as error:
+        fail(error)
+    except BaseExceptionGroup as group:
+        cause = _cause(group)
+        if cause is None:
+            raise
+        fail(cause)
+
+
+async def _until_signal(main: Callable[[], Coroutine[Any, Any, object]]) -> bool:
+    """Run `main` as a task; the first signal cancels it, a second one has its usual effect."""
+    loop = asyncio.get_running_loop()
+    work = loop.create_task(main(), name="main")
+    stopped = False
+
+    def stop() -> None:
+        nonlocal stopped
+        stopped = True
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.remove_signal_handler(number)
+        work.cancel()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop)
+    try:
+        await work
+    except asyncio.CancelledError:
+        if not stopped:
+            raise
+    return not stopped
+
+
+def _cause(group: BaseExceptionGroup[BaseException]) -> AiraError | None:
+    """The one error that explains a group, if there is one: tasks that fail together mostly fail for one reason."""
+    matching, rest = group.split(AiraError)
+    if matching is None or rest is not None:
+        return None
+    first = matching.exceptions[0]
+    return _cause(first) if isinstance(first, BaseExceptionGroup) else first

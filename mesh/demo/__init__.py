@@ -1,0 +1,1 @@
+"""A whole market in one process: for a first look, and for development."""
