@@ -10,6 +10,7 @@ block number (the order is valid while `block.number < deadline`). Source: the w
 
 from __future__ import annotations
 
+from sys import intern
 from typing import Final, Literal, NoReturn, TypeAlias
 
 from msgspec import Struct
@@ -50,6 +51,7 @@ class _Terms(_Message, frozen=True, kw_only=True, rename="camel"):
     def __post_init__(self) -> None:
         try:
             parse_cid(self.model)
+            force_setattr(self, "model", intern(self.model))
             parse_cid(self.objective)
             _settle_address(self, "token", self.token)
             _settle_address(self, "lighthouse", self.lighthouse)
@@ -160,8 +162,9 @@ Message: TypeAlias = Demand | Offer | Result | OrderFeedback | TransactionFeedba
 
 
 def _settle_address(message: Struct, field: str, text: str) -> None:
+    # The cached text replaces its equal: the same few addresses stand in a million open orders, and in memory once.
     canonical = parse_address_or_name(text)
-    if canonical != text:
+    if canonical is not text:
         force_setattr(message, field, canonical)
 
 

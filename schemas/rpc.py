@@ -9,7 +9,7 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from schemas.liability import Liability  # noqa: TC001  # msgspec reads the annotations
+from schemas.liability import Liability  # msgspec reads the annotations
 from schemas.records import Record, UInt256
 
 if TYPE_CHECKING:

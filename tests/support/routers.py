@@ -1,0 +1,99 @@
+"""Zenoh routers for tests: one inside this process, and the stand-alone program."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import TYPE_CHECKING, Any, Self
+
+import zenoh
+
+from tests.support.peers import require
+from tests.support.ports import answers, free_port
+from tests.support.processes import Server
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+
+class EmbeddedRouter:
+    """A Zenoh session in mode `router` inside this process: no peer to install, up in milliseconds.
+
+    `stop` and `start` are a router that goes away and comes back on the same port. Both block for as long as Zenoh
+    takes, some milliseconds.
+    """
+
+    def __init__(self, port: int | None = None) -> None:
+        self.port = port or free_port()
+        self.endpoint = f"tcp/127.0.0.1:{self.port}"
+        self._session: zenoh.Session | None = None
+
+    def start(self) -> None:
+        """Open the session; clients may connect when this returns."""
+        if self._session is not None:
+            raise RuntimeError("this router runs already")
+        self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(_router_config(self.endpoint, {}))))
+
+    def stop(self) -> None:
+        """Close the session and all its connections. Nothing happens if it is not open."""
+        session, self._session = self._session, None
+        if session is not None:
+            session.close()  # type: ignore[no-untyped-call]
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.stop()
+
+    async def __aenter__(self) -> Self:
+        return await asyncio.to_thread(self.__enter__)
+
+    async def __aexit__(self, *exc_info: object) -> None:
+        await asyncio.to_thread(self.stop)
+
+
+class Zenohd(Server):
+    """The stand-alone router as a process. `config` is added to its configuration: access control, TLS, limits."""
+
+    name = "zenohd"
+
+    def __init__(self, *, port: int | None = None, config: Mapping[str, Any] | None = None) -> None:
+        self._program: Path = require("zenohd")
+        super().__init__()
+        self.port = port or free_port()
+        self.endpoint = f"tcp/127.0.0.1:{self.port}"
+        self._config = dict(config or {})
+
+    def command(self) -> Sequence[str | Path]:
+        file = self.folder / "zenohd.json5"
+        file.write_text(json.dumps(_router_config(self.endpoint, self._config)))
+        return [self._program, "--config", file]
+
+    def is_ready(self) -> bool:
+        return answers(self.port)
+
+
+def client_config(endpoint: str) -> zenoh.Config:
+    """The configuration of a client of the router at `endpoint`, which looks for nobody else."""
+    config = {
+        "mode": "client",
+        "connect": {"endpoints": [endpoint]},
+        "scouting": {"multicast": {"enabled": False}},
+    }
+    return zenoh.Config.from_json5(json.dumps(config))
+
+
+def _router_config(endpoint: str, more: Mapping[str, Any]) -> dict[str, Any]:
+    """Nothing is looked for on the network: tests that run side by side must not find each other's routers.
+
+    The delay is the half second that a router would otherwise wait for others when it opens.
+    """
+    return {
+        "mode": "router",
+        "listen": {"endpoints": [endpoint]},
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}, "delay": 0},
+        **more,
+    }

@@ -1,0 +1,41 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.support.peers import require
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.fixture(autouse=True)
+def nothing_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AIRA_PEERS_CACHE", str(tmp_path))
+    monkeypatch.delenv("AIRA_REQUIRE_PEERS", raising=False)
+    monkeypatch.delenv("AIRA_KUBO", raising=False)
+
+
+def test_a_missing_peer_skips_the_test_with_the_reason() -> None:
+    with pytest.raises(pytest.skip.Exception, match="anvil: not installed: run `make peers`"):
+        require("anvil")
+
+
+def test_a_missing_peer_fails_the_test_where_all_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AIRA_REQUIRE_PEERS", "1")
+    with pytest.raises(pytest.fail.Exception, match="zenohd: not installed"):
+        require("zenohd")
+
+
+def test_a_peer_without_a_recipe_is_skipped_even_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AIRA_REQUIRE_PEERS", "1")
+    with pytest.raises(pytest.skip.Exception, match="AIRA_KUBO=/path/to/ipfs"):
+        require("kubo")
+
+
+def test_the_caller_may_name_a_kubo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / "ipfs"
+    program.touch()
+    monkeypatch.setenv("AIRA_KUBO", str(program))
+    assert require("kubo") == program

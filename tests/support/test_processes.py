@@ -1,0 +1,126 @@
+from __future__ import annotations
+
+import gc
+import os
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.support import processes
+from tests.support.ports import answers, free_port
+from tests.support.processes import Server, ServerFailed
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+SERVE = "import http.server, sys; http.server.HTTPServer(('127.0.0.1', int(sys.argv[1])), None).serve_forever()"
+STUBBORN = f"import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); {SERVE}"
+POLITE = f"import signal; signal.signal(signal.SIGTERM, lambda *_: sys.exit(0)); {SERVE}"
+BROKEN = "print('the disk is on fire'); raise SystemExit(3)"
+
+
+class Scripted(Server):
+    """A few lines of Python as a server."""
+
+    name = "scripted"
+
+    def __init__(self, script: str) -> None:
+        super().__init__()
+        self.port = free_port()
+        self._script = script
+
+    def command(self) -> Sequence[str | Path]:
+        return [sys.executable, "-c", self._script, str(self.port)]
+
+    def is_ready(self) -> bool:
+        return answers(self.port)
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_a_server_serves_inside_with_and_is_gone_with_its_folder_afterwards() -> None:
+    with Scripted(SERVE) as server:
+        pid, folder = server.pid, server.folder
+        assert answers(server.port)
+    assert not answers(server.port)
+    assert not is_alive(pid)
+    assert not folder.exists()
+
+
+async def test_a_server_is_an_async_context_too() -> None:
+    async with Scripted(SERVE) as server:
+        assert answers(server.port)
+    assert not answers(server.port)
+
+
+def test_a_server_starts_again_on_the_same_port_and_folder() -> None:
+    with Scripted(SERVE) as server:
+        (server.folder / "state").write_text("kept")
+        server.kill()
+        assert not answers(server.port)
+        server.start()
+        assert answers(server.port)
+        assert (server.folder / "state").read_text() == "kept"
+
+
+def test_a_stopped_server_that_nobody_closes_leaves_no_folder_behind() -> None:
+    server = Scripted(SERVE)
+    folder = server.folder
+    server.start()
+    server.stop()
+    assert folder.exists()
+    del server
+    gc.collect()
+    assert not folder.exists()
+
+
+def test_a_failed_start_shows_the_end_of_the_log() -> None:
+    server = Scripted(BROKEN)
+    with pytest.raises(ServerFailed, match=r"ended with 3(.|\n)*the disk is on fire"), server:
+        pass
+    assert not server.folder.exists()
+
+
+def test_a_server_that_is_never_ready_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(processes, "START_SECONDS", 0.2)
+    with pytest.raises(ServerFailed, match="not ready within"), Scripted("import time; time.sleep(600)"):
+        pass
+
+
+def test_stopping_never_hangs_on_a_process_that_ignores_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(processes, "STOP_SECONDS", 0.2)
+    server = Scripted(STUBBORN)
+    server.start()
+    pid = server.pid
+    server.close()
+    assert not is_alive(pid)
+
+
+def test_a_paused_server_stops_without_being_killed() -> None:
+    server = Scripted(POLITE)
+    server.start()
+    server.pause()
+    started = time.monotonic()
+    server.close()
+    assert time.monotonic() - started < processes.STOP_SECONDS / 2
+
+
+def test_a_paused_server_goes_on_after_resume() -> None:
+    with Scripted(SERVE) as server:
+        server.pause()
+        server.resume()
+        assert answers(server.port)
+
+
+def test_starting_twice_is_refused() -> None:
+    with Scripted(SERVE) as server, pytest.raises(RuntimeError, match="runs already"):
+        server.start()
