@@ -1,0 +1,102 @@
+"""Fetching one file: from its root down, several blocks at once, each checked before it is kept."""
+
+from __future__ import annotations
+
+import threading
+import time
+from concurrent.futures import FIRST_COMPLETED, wait
+from typing import TYPE_CHECKING, Final
+
+from mesh.content.errors import ContentCorrupt, ContentUnavailable
+from mesh.errors import ClosedError, ContentError
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor, Future
+    from pathlib import Path
+
+    from mesh.content.asking import Asker
+    from mesh.content.assembly import Assembly
+    from mesh.content.dag import Place
+    from mesh.content.store import Store
+
+_FIRST_PAUSE: Final = 0.05
+_LONGEST_PAUSE: Final = 1.0
+_SHORTEST_QUERY: Final = 0.5
+"""Seconds: pauses between two attempts at a block that nobody gave, and what the last attempt gets at least."""
+
+
+class Download:
+    """One fetch of one file, in threads. `stop` may be called from anywhere; what came by then is kept on the disk."""
+
+    def __init__(self, store: Store, asker: Asker, cid: str, *, size_limit: int | None = None, patience: float) -> None:
+        self._store = store
+        self._asker = asker
+        self._cid = cid
+        self._size_limit = size_limit
+        self._patience = patience
+        self._stopped = threading.Event()
+        self._lock = threading.Lock()
+        self._last = time.monotonic()
+        self.blocks = 0
+        self.bytes = 0
+
+    def stop(self) -> None:
+        """End `run` soon, with `ClosedError`."""
+        self._stopped.set()
+        self._asker.cancel()
+
+    def run(self, pool: Executor, width: int) -> Path:
+        """Fetch the file with at most `width` blocks on their way in threads of `pool`; where it is in the store.
+
+        Blocks until it is there or fails. Raises what `Exchange.fetch` does, and `ClosedError` after `stop`.
+        """
+        with self._store.assemble(self._cid, size_limit=self._size_limit) as assembly:
+            waiting = [assembly.root]
+            running: set[Future[list[Place]]] = set()
+            try:
+                while waiting or running:
+                    while waiting and len(running) < width:
+                        running.add(pool.submit(self._take, assembly, waiting.pop()))
+                    done, running = wait(running, return_when=FIRST_COMPLETED)
+                    for taken in done:
+                        # The last found is taken first: parts come in the order of the file, and few wait at a time.
+                        waiting.extend(reversed(taken.result()))
+            except BaseException:
+                self.stop()
+                wait(running)
+                raise
+            return assembly.finish()
+
+    def _take(self, assembly: Assembly, place: Place) -> list[Place]:
+        block = assembly.local(place)
+        if block is None:
+            block = self._get(place.cid)
+        return assembly.put(place, block)
+
+    def _get(self, cid: str) -> bytes:
+        """The block from the network, asked for again and again until nothing came for as long as patience lasts."""
+        pause = _FIRST_PAUSE
+        while not self._stopped.is_set():
+            left = self._last + self._patience - time.monotonic()
+            block = self._asker.ask(cid, seconds=max(left, _SHORTEST_QUERY))
+            if block is not None:
+                self._count(block)
+                return block
+            if time.monotonic() > self._last + self._patience:
+                raise self._failure(cid)
+            self._stopped.wait(pause)
+            pause = min(pause * 1.5, _LONGEST_PAUSE)
+        raise ClosedError(f"fetching {self._cid} was stopped", hint="fetch it again: it goes on from what came")
+
+    def _count(self, block: bytes) -> None:
+        with self._lock:
+            self._last = time.monotonic()
+            self.blocks += 1
+            self.bytes += len(block)
+
+    def _failure(self, cid: str) -> ContentError:
+        what = "its root" if cid == self._cid else f"its block {cid}"
+        lies = self._asker.lies
+        if lies:
+            return ContentCorrupt(self._cid, f"nobody gave the true bytes of {what}", holders=lies)
+        return ContentUnavailable(self._cid, f"nobody gave {what} within {self._patience:g} s")

@@ -1,0 +1,110 @@
+"""Opening a recording of unknown origin to read or play it."""
+
+from __future__ import annotations
+
+import os
+import stat
+from typing import TYPE_CHECKING, Final
+
+from msgspec import Struct
+
+from mesh.recording import bag_source, mcap_records
+from mesh.recording.bag_source import open_bag
+from mesh.recording.errors import NotARecording, RecordingTooLarge
+from mesh.recording.limits import Limits
+from mesh.recording.mcap_source import open_mcap
+from schemas.payloads import PayloadType
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+    from mesh.recording.source import Source
+
+_DEFAULT: Final = Limits()
+
+
+class Topic(Struct, frozen=True):
+    """A topic of a recording, and how its payloads are to be read. Its name is whatever the file says."""
+
+    name: str
+    type: PayloadType
+
+
+class Played(Struct, frozen=True):
+    """A message of a recording. Times are nanoseconds of the recorder's clock."""
+
+    topic: str
+    payload: bytes
+    log_time_ns: int
+    publish_time_ns: int
+    sequence: int
+    type: PayloadType
+
+
+class Objective:
+    """A recording whose every byte was checked. Keeps no file open; its messages are read anew each time.
+
+    `format` is `mcap` or `bag`, `size` that of the file in bytes, `count` the number of messages, `metadata` the
+    records of that kind by their names (none in a bag).
+    """
+
+    def __init__(self, source: Source) -> None:
+        self._source = source
+        self.path: Final = source.path
+        self.format: Final = source.format
+        self.size: Final = source.size
+        self.metadata: Final[Mapping[str, Mapping[str, str]]] = source.metadata
+        self.count: Final = sum(segment.count for segment in source.segments)
+        self.start_ns: Final = min((segment.start for segment in source.segments), default=0)
+        self.duration_ns: Final = max((segment.end for segment in source.segments), default=0) - self.start_ns
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """The topics in the order in which the file names them; twice if payloads of two types are on one."""
+        found = {Topic(channel.topic, channel.type): None for channel in self._source.channels.values()}
+        return tuple(found)
+
+    def messages(self, *, from_index: int = 0) -> Iterator[Played]:
+        """The messages by their log time, without the first `from_index`; those of one time in the file's order.
+
+        Reads the file as it goes, in blocks of it: do so in a thread. Raises `CorruptRecording` if the file is not
+        any more what it was.
+        """
+        channels = self._source.channels
+        for channel, sequence, log_time, publish_time, payload in self._source.in_time_order(skip=from_index):
+            there = channels[channel]
+            yield Played(there.topic, payload, log_time, publish_time, sequence, there.type)
+
+
+def open_objective(path: Path, limits: Limits = _DEFAULT) -> Objective:
+    """Check the whole of the recording at `path`, an MCAP file or a ROS 1 bag by its first bytes, and open it.
+
+    Reads the whole file: do so in a thread. Memory is bounded by the limits whatever the file says, and no schema
+    text is ever looked into. Raises `NotARecording`, `RecordingTooLarge`, `CorruptRecording`.
+    """
+    return Objective(open_source(path, limits))
+
+
+def open_source(path: Path, limits: Limits) -> Source:
+    """As `open_objective`, for what needs the messages in the order of the file."""
+    size, magic = _look(path)
+    if size > limits.size:
+        raise RecordingTooLarge(path, f"it has {size} bytes, more than the {limits.size} allowed", reason="too-large")
+    if magic.startswith(mcap_records.MAGIC):
+        return open_mcap(path, size, limits)
+    if magic.startswith(bag_source.MAGIC):
+        return open_bag(path, size, limits)
+    raise NotARecording(path, "it is neither an MCAP file nor a ROS 1 bag")
+
+
+def _look(path: Path) -> tuple[int, bytes]:
+    """The size and the first bytes of a regular file; anything else might block whoever opens it."""
+    try:
+        status = os.stat(path)
+        if not stat.S_ISREG(status.st_mode):
+            raise NotARecording(path, "it is not a file")
+        with path.open("rb") as file:
+            return status.st_size, file.read(len(bag_source.MAGIC))
+    except OSError as error:
+        raise NotARecording(path, f"it can't be read: {error.strerror}") from error

@@ -1,0 +1,205 @@
+"""Recording what passes, from any thread, without ever making it wait.
+
+One thread owns the file. It closes a chunk and hands it to the operating system every second and every 128 KiB, so
+that a crash of the process costs a second of the recording at most, and puts it on the disk every few seconds.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Final, Self
+
+from mesh.errors import ClosedError
+from mesh.recording.errors import RecordingFailed, Unrecordable
+from mesh.recording.mcap_file import check_message
+from mesh.recording.partial import Message, PartialFile
+
+if TYPE_CHECKING:
+    from pathlib import Path
+    from types import TracebackType
+
+    from mesh.recording.partial import Role
+    from schemas.payloads import PayloadType
+
+log = logging.getLogger(__name__)
+
+_COST: Final = 256
+"""Bytes of memory that a message takes in the queue besides its payload."""
+_AT_ONCE: Final = 512
+"""Messages written before the thread looks at the clock again."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingAbout:
+    """Whose recording it is: what goes into its metadata record `aira`. Any field may be empty."""
+
+    liability: str = ""
+    agent: str = ""
+    lighthouse: str = ""
+    objective: str = ""
+    software: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecorderSettings:
+    """How often a recording is handed over and put on the disk, in seconds, and how much may wait, in bytes."""
+
+    flush_seconds: float = 1.0
+    sync_seconds: float = 5.0
+    queue_bytes: int = 64 << 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingSummary:
+    """A finished recording. `recovered` of its `messages` came from a file that a crash had left.
+
+    `lost` messages were dropped because the disk could not keep up. `size` is in bytes.
+    """
+
+    path: Path
+    messages: int
+    lost: int
+    recovered: int
+    size: int
+
+
+_SETTINGS: Final = RecorderSettings()
+
+
+class Recorder:
+    """Makes the recording at `path`, `NAME.mcap`; it is `NAME.mcap.part` until `close`.
+
+    A `.part` that a crash left is gone on with: the new recording begins with what can be read of it. Opening blocks
+    on the disk for a moment, `close` until all is written; use threads. Raises `RecordingExists` if `path` is there or
+    somebody else is recording it, `RecordingFailed` if the file can't be made.
+    """
+
+    def __init__(self, path: Path, about: RecordingAbout, *, settings: RecorderSettings = _SETTINGS) -> None:
+        self.path: Final = path
+        self._settings = settings
+        self._about = about
+        self._lock = threading.Lock()
+        self._wake = threading.Event()
+        self._queue: deque[Message] = deque()
+        self._queued = 0
+        self._closing = False
+        self._lost = 0
+        self._failure: Exception | None = None
+        self._summary: RecordingSummary | None = None
+        try:
+            self._file = PartialFile(path)
+        except OSError as error:
+            raise RecordingFailed(path, error.strerror or str(error)) from error
+        self._thread = threading.Thread(target=self._run, name=f"aira-recorder-{path.stem[-8:]}", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def lost(self) -> int:
+        """Messages dropped so far, because too much was waiting or the disk refused it."""
+        return self._lost
+
+    def record(
+        self,
+        topic: str,
+        payload: bytes,
+        type: PayloadType,
+        *,
+        role: Role = "device",
+        log_time_ns: int | None = None,
+        publish_time_ns: int | None = None,
+    ) -> None:
+        """Add a message, without waiting for anything; from any thread. Times are nanoseconds, now if not given.
+
+        `role` tells what was played from what the device said. Over `queue_bytes` waiting, the message is dropped and
+        counted. Raises `Unrecordable` for what no file can hold, `ClosedError`, and `RecordingFailed` once the disk
+        has refused the recording.
+        """
+        log_time = time.time_ns() if log_time_ns is None else log_time_ns
+        publish_time = log_time if publish_time_ns is None else publish_time_ns
+        check_message(topic, payload, log_time, publish_time)
+        message = Message(topic, payload, type, role, log_time, publish_time)
+        with self._lock:
+            if self._closing:
+                raise ClosedError(f"the recording {self.path} is closed")
+            if self._failure is not None:
+                self._lost += 1
+                raise RecordingFailed(self.path, str(self._failure))
+            cost = len(payload) + _COST
+            if self._queued + cost > self._settings.queue_bytes:
+                self._lost += 1
+                return
+            self._queue.append(message)
+            self._queued += cost
+            first = len(self._queue) == 1
+        if first:
+            self._wake.set()
+
+    def close(self) -> RecordingSummary:
+        """Write what waits, end the file, put it on the disk and give it its name. Safe to call twice.
+
+        Raises `RecordingFailed` if the disk refused any of it; the `.part` stays for `recover`.
+        """
+        with self._lock:
+            self._closing = True
+        self._wake.set()
+        self._thread.join()
+        if self._failure is not None:
+            raise RecordingFailed(self.path, str(self._failure)) from self._failure
+        assert self._summary is not None
+        return self._summary
+
+    def _run(self) -> None:
+        try:
+            with self._file as file:
+                file.begin(asdict(self._about))
+                self._write(file)
+                lost, recovered = self._lost, file.recovered
+                messages, size = file.finish({"lost": str(lost)})
+            self._summary = RecordingSummary(
+                path=self.path, messages=messages, lost=lost, recovered=recovered, size=size
+            )
+        except Exception as error:
+            with self._lock:
+                self._failure = error
+                self._lost += len(self._queue)
+                self._queue.clear()
+
+    def _write(self, file: PartialFile) -> None:
+        """Write what comes until `close` was called and nothing waits any more."""
+        while True:
+            self._wake.wait(file.seconds_to_flush(self._settings.flush_seconds))
+            self._wake.clear()
+            closing = self._closing
+            while batch := self._take():
+                for message in batch:
+                    self._add(file, message)
+                file.flush_if_due(self._settings.flush_seconds, sync_every=self._settings.sync_seconds)
+            file.flush_if_due(self._settings.flush_seconds, sync_every=self._settings.sync_seconds)
+            if closing:
+                return
+
+    def _add(self, file: PartialFile, message: Message) -> None:
+        try:
+            file.add(message)
+        except Unrecordable as error:
+            with self._lock:
+                self._lost += 1
+            log.warning("%s: a message on %s is lost: %s", self.path.name, message.topic, error)
+
+    def _take(self) -> list[Message]:
+        with self._lock:
+            batch = [self._queue.popleft() for _ in range(min(_AT_ONCE, len(self._queue)))]
+            self._queued -= sum(len(message.payload) + _COST for message in batch)
+        return batch

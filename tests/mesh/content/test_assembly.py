@@ -1,0 +1,172 @@
+from __future__ import annotations
+
+import io
+import random
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.content import Assembly, ContentCorrupt, ContentTooLarge, Place, Store
+from mesh.content.dag import MAX_DEPTH
+from schemas.unixfs import CHUNK_SIZE, blocks_of_stream
+from tests.mesh.content.trees import leaf, named, parent
+
+if TYPE_CHECKING:
+    from schemas.unixfs import Block
+
+
+def put_all(assembly: Assembly, blocks: dict[str, bytes], *, at_most: int = 10_000) -> int:
+    """Give the blocks from the root down; how many of them had to be given, because they were nowhere on the disk."""
+    waiting, given = [assembly.root], 0
+    while waiting and given < at_most:
+        place = waiting.pop(0)
+        block = assembly.local(place)
+        if block is None:
+            block = blocks[place.cid]
+            given += 1
+        waiting.extend(assembly.put(place, block))
+    return given
+
+
+def blocks_of(data: bytes) -> tuple[str, dict[str, bytes]]:
+    blocks = {block.cid: block.data for block in blocks_of_stream(io.BytesIO(data))}
+    return list(blocks)[-1], blocks
+
+
+def refused(store: Store, blocks: list[Block]) -> ContentCorrupt:
+    """The error of assembling a tree, the root last."""
+    with store.assemble(blocks[-1].cid) as assembly, pytest.raises(ContentCorrupt) as caught:
+        put_all(assembly, {block.cid: block.data for block in blocks})
+    assert caught.value.cid == blocks[-1].cid
+    assert store.list() == ()
+    return caught.value
+
+
+def test_a_file_comes_together_in_any_order_of_its_parts(store: Store) -> None:
+    data = random.Random(1).randbytes(200 * CHUNK_SIZE)
+    cid, blocks = blocks_of(data)
+    with store.assemble(cid) as assembly:
+        waiting = assembly.put(assembly.root, blocks[cid])
+        while waiting:
+            place = waiting.pop(random.Random(len(waiting)).randrange(len(waiting)))
+            waiting.extend(assembly.put(place, blocks[place.cid]))
+        assert assembly.finish() == store.path(cid)
+    with store.open(cid) as file:
+        assert file.read() == data
+    assert all(store.get_block(name) == block for name, block in blocks.items())
+
+
+def test_bytes_of_another_hash_are_refused_and_the_true_ones_still_taken(store: Store) -> None:
+    cid, blocks = blocks_of(b"the truth")
+    with store.assemble(cid) as assembly:
+        with pytest.raises(ContentCorrupt):
+            assembly.put(assembly.root, leaf(b"a lie").data)
+        assert assembly.put(assembly.root, blocks[cid]) == []
+        assert assembly.finish().read_bytes() == b"the truth"
+
+
+def test_the_root_tells_when_a_file_is_too_large(store: Store) -> None:
+    cid, blocks = blocks_of(bytes(CHUNK_SIZE + 1))
+    with store.assemble(cid, size_limit=CHUNK_SIZE) as assembly, pytest.raises(ContentTooLarge) as caught:
+        assembly.put(assembly.root, blocks[cid])
+    assert (caught.value.cid, caught.value.size, caught.value.limit) == (cid, CHUNK_SIZE + 1, CHUNK_SIZE)
+
+
+def test_the_limit_of_the_store_holds_whatever_the_caller_allows(store: Store) -> None:
+    huge = parent([(leaf(b"x"), 1)], sizes=[store.limit + 1])
+    with store.assemble(huge.cid, size_limit=1 << 60) as assembly, pytest.raises(ContentTooLarge):
+        assembly.put(assembly.root, huge.data)
+
+
+def test_a_part_longer_than_its_link_says_is_refused(store: Store) -> None:
+    part = leaf(bytes(1000))
+    assert "1000 bytes where its parent says 1" in str(refused(store, [part, parent([(part, 1000)], sizes=[1])]))
+
+
+def test_what_is_no_file_is_refused(store: Store) -> None:
+    refused(store, [named(b"\x0a\x02\x08\x01")])
+
+
+def test_empty_parts_are_refused_since_there_could_be_any_number(store: Store) -> None:
+    empty = leaf(b"")
+    assert "empty" in str(refused(store, [empty, parent([(empty, 0), (empty, 0)])]))
+
+
+def test_a_tree_without_end_is_refused(store: Store) -> None:
+    chain = [leaf(b"x")]
+    for _ in range(MAX_DEPTH + 1):
+        chain.append(parent([(chain[-1], 1)]))
+    assert "deeper" in str(refused(store, chain))
+
+
+def test_a_node_may_hold_bytes_of_the_file_before_its_parts(store: Store) -> None:
+    tail = leaf(b"and these")
+    root = parent([(tail, 9)], data=b"these ")
+    with store.assemble(root.cid) as assembly:
+        put_all(assembly, {root.cid: root.data, tail.cid: tail.data})
+        assert assembly.finish().read_bytes() == b"these and these"
+
+
+def test_a_block_that_repeats_is_needed_once(store: Store) -> None:
+    cid, blocks = blocks_of(bytes(50 * CHUNK_SIZE))
+    with store.assemble(cid) as assembly:
+        assert put_all(assembly, blocks) == 2
+        assert assembly.finish().read_bytes() == bytes(50 * CHUNK_SIZE)
+
+
+def test_blocks_of_files_already_held_are_not_needed(store: Store) -> None:
+    data = random.Random(2).randbytes(4 * CHUNK_SIZE)
+    store.put_bytes(data)
+    cid, blocks = blocks_of(data + b"more")
+    with store.assemble(cid) as assembly:
+        assert put_all(assembly, blocks) == 2
+        assembly.finish()
+    assert store.has(cid)
+
+
+def test_an_interrupted_assembly_is_gone_on_with(store: Store) -> None:
+    cid, blocks = blocks_of(random.Random(3).randbytes(10 * CHUNK_SIZE))
+    with store.assemble(cid) as assembly:
+        put_all(assembly, blocks, at_most=7)
+    assert not store.has(cid)
+    with Store(store.directory) as again, again.assemble(cid) as assembly:
+        assert put_all(assembly, blocks) == 5
+        assembly.finish()
+    assert store.verify(cid) == store.path(cid)
+
+
+def test_remains_that_have_rotted_are_not_believed(store: Store) -> None:
+    data = random.Random(4).randbytes(3 * CHUNK_SIZE)
+    cid, blocks = blocks_of(data)
+    with store.assemble(cid) as assembly:
+        put_all(assembly, blocks, at_most=3)
+    part = next(store.directory.glob(".part-*"))
+    part.write_bytes(b"\0" + part.read_bytes()[1:] + b"longer than the file will be" * 100_000)
+    with store.assemble(cid) as assembly:
+        assert put_all(assembly, blocks) == 3
+        assert assembly.finish().read_bytes() == data
+
+
+def test_two_assemblies_of_one_file_do_not_disturb_each_other(store: Store) -> None:
+    data = random.Random(5).randbytes(3 * CHUNK_SIZE)
+    cid, blocks = blocks_of(data)
+    with store.assemble(cid) as first, store.assemble(cid) as second:
+        put_all(first, blocks)
+        put_all(second, blocks, at_most=2)
+        first.finish()
+        put_all(second, blocks)
+        second.finish()
+    assert store.verify(cid).read_bytes() == data
+    assert list(store.directory.glob(".p*")) == []
+
+
+def test_a_place_knows_where_it_belongs(store: Store) -> None:
+    cid, blocks = blocks_of(random.Random(6).randbytes(2 * CHUNK_SIZE + 7))
+    with store.assemble(cid) as assembly:
+        places = assembly.put(assembly.root, blocks[cid])
+    assert [(place.offset, place.size, place.depth) for place in places] == [
+        (0, CHUNK_SIZE, 1),
+        (CHUNK_SIZE, CHUNK_SIZE, 1),
+        (2 * CHUNK_SIZE, 7, 1),
+    ]
+    assert assembly.root == Place(cid)

@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.content import ContentCorrupt, Exchange, Store
+from schemas.unixfs import CHUNK_SIZE, cid_of_bytes
+from tests.mesh.content.holders import answering, some
+
+if TYPE_CHECKING:
+    import zenoh
+
+
+async def test_a_liar_is_counted_and_named_and_somebody_elses_answer_used(
+    store: Store,
+    holder_store: Store,
+    session: zenoh.Session,
+    other_session: zenoh.Session,
+    third_session: zenoh.Session,
+) -> None:
+    data = some(3 * CHUNK_SIZE)
+    cid = holder_store.put_bytes(data)
+    lied = 0
+
+    def lie(query: zenoh.Query) -> None:
+        nonlocal lied
+        query.reply(query.key_expr, b"not what was asked for")
+        lied += 1
+
+    with answering(third_session, lie):
+        async with Exchange(session, store) as exchange:
+            # The liar is alone at first, so that its answer is the one that comes.
+            fetching = asyncio.create_task(exchange.fetch(cid))
+            while not lied:
+                await asyncio.sleep(0.01)
+            async with Exchange(other_session, holder_store):
+                assert (await fetching).read_bytes() == data
+            lies = exchange.statistics().lies
+    assert list(lies) == [str(third_session.zid())]
+    assert lies[str(third_session.zid())] >= 1
+
+
+async def test_a_holder_of_the_root_that_lies_about_the_parts_is_left_for_another(
+    store: Store,
+    holder_store: Store,
+    session: zenoh.Session,
+    other_session: zenoh.Session,
+    third_session: zenoh.Session,
+) -> None:
+    data = some(20 * CHUNK_SIZE)
+    cid = holder_store.put_bytes(data)
+    root = holder_store.get_block(cid)
+    assert root is not None
+    true_root = root
+    lied = asyncio.Event()
+    loop = asyncio.get_running_loop()
+
+    def half_lie(query: zenoh.Query) -> None:
+        if str(query.key_expr).endswith(cid):
+            query.reply(query.key_expr, true_root)
+        else:
+            query.reply(query.key_expr, true_root[:-1])
+            loop.call_soon_threadsafe(lied.set)
+
+    with answering(third_session, half_lie):
+        async with Exchange(session, store) as exchange:
+            fetching = asyncio.create_task(exchange.fetch(cid))
+            await lied.wait()
+            async with Exchange(other_session, holder_store):
+                assert (await fetching).read_bytes() == data
+            assert str(third_session.zid()) in exchange.statistics().lies
+
+
+async def test_if_all_lie_the_content_is_corrupt_and_they_are_named(
+    store: Store, session: zenoh.Session, other_session: zenoh.Session
+) -> None:
+    cid = cid_of_bytes(b"true")
+    with answering(other_session, lambda query: query.reply(query.key_expr, bytes(3 << 20))):
+        async with Exchange(session, store) as exchange:
+            with pytest.raises(ContentCorrupt) as caught:
+                await exchange.fetch(cid, timeout=0.3)
+    assert caught.value.cid == cid
+    assert caught.value.holders == (str(other_session.zid()),)
+    assert store.list() == ()
+
+
+async def test_a_holder_that_never_answers_does_not_hold_up_another(
+    store: Store,
+    holder_store: Store,
+    session: zenoh.Session,
+    other_session: zenoh.Session,
+    third_session: zenoh.Session,
+) -> None:
+    data = some(10 * CHUNK_SIZE)
+    cid = holder_store.put_bytes(data)
+    kept: list[zenoh.Query] = []
+    silent = third_session.declare_queryable("aira/cid/*", kept.append)
+    async with Exchange(other_session, holder_store), Exchange(session, store) as exchange:
+        path = await asyncio.wait_for(exchange.fetch(cid, timeout=60), 10)
+        assert path.read_bytes() == data
+    silent.undeclare()  # type: ignore[no-untyped-call]
+    kept.clear()
