@@ -1,0 +1,95 @@
+"""The chain: accounts, names, contracts, events, and a node of one's own for demonstrations and tests.
+
+Importing this package loads web3, which takes a second: what also runs without a chain imports it where it is needed.
+"""
+
+from __future__ import annotations
+
+from mesh.chain.accounts import Account, SignedTransaction, keyfile_address, new_private_key, write_keyfile
+from mesh.chain.client import Chain
+from mesh.chain.deploy import XRT, Deployment, DeploymentPlan, deploy
+from mesh.chain.embedded import EmbeddedChain, ServedChain, serve_embedded
+from mesh.chain.errors import (
+    ChainWentBack,
+    InsufficientFunds,
+    InvalidName,
+    KeyfileError,
+    NoAccount,
+    NoContracts,
+    NodeUnreachable,
+    NotALiability,
+    RequestRefused,
+    Reverted,
+    TransactionTimeout,
+    UnknownName,
+    WrongPassword,
+)
+from mesh.chain.events import (
+    Approval,
+    ChainEvent,
+    Current,
+    Finalized,
+    NewLiability,
+    NewLighthouse,
+    Offline,
+    Online,
+    Transfer,
+)
+from mesh.chain.names import namehash
+from mesh.chain.node import Node
+from mesh.chain.reader import BlockEvents
+from mesh.chain.records import Created, LighthouseState, Settled
+from mesh.chain.recursion import restrain_recursion
+from mesh.chain.rpc_server import JsonRpcServer
+from mesh.chain.timing import Timing
+from mesh.chain.transactions import Receipt, Sender
+
+restrain_recursion()
+
+__all__ = [
+    "XRT",
+    "Account",
+    "Approval",
+    "BlockEvents",
+    "Chain",
+    "ChainEvent",
+    "ChainWentBack",
+    "Created",
+    "Current",
+    "Deployment",
+    "DeploymentPlan",
+    "EmbeddedChain",
+    "Finalized",
+    "InsufficientFunds",
+    "InvalidName",
+    "JsonRpcServer",
+    "KeyfileError",
+    "LighthouseState",
+    "NewLiability",
+    "NewLighthouse",
+    "NoAccount",
+    "NoContracts",
+    "Node",
+    "NodeUnreachable",
+    "NotALiability",
+    "Offline",
+    "Online",
+    "Receipt",
+    "RequestRefused",
+    "Reverted",
+    "Sender",
+    "ServedChain",
+    "Settled",
+    "SignedTransaction",
+    "Timing",
+    "TransactionTimeout",
+    "Transfer",
+    "UnknownName",
+    "WrongPassword",
+    "deploy",
+    "keyfile_address",
+    "namehash",
+    "new_private_key",
+    "serve_embedded",
+    "write_keyfile",
+]

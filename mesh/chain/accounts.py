@@ -1,0 +1,129 @@
+"""Accounts: private keys that sign transactions here and messages by `schemas.signing`.
+
+Keyfiles are the Web3 secret storage (version 3) that geth, parity and the legacy stack wrote. A key leaves this module
+only inside a signature; nothing of it is logged or shown.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from coincurve import PrivateKey
+from eth_account import Account as EthAccount
+from eth_keyfile.keyfile import create_keyfile_json, decode_keyfile_json
+
+from mesh.chain.errors import KeyfileError, WrongPassword
+from mesh.errors import InputError
+from schemas.address import parse_address
+from schemas.signing import Signer
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+class SignedTransaction(NamedTuple):
+    """A transaction as it goes to a node, and the hash it will have (0x…)."""
+
+    raw: bytes
+    hash: str
+
+
+class Account:
+    """One private key: its address, and what it signs. `repr` shows the address only."""
+
+    def __init__(self, private_key: bytes) -> None:
+        self.signer = Signer(private_key)
+        self._key = EthAccount.from_key(private_key)
+        self.address: str = self.signer.address
+        """EIP-55."""
+
+    @classmethod
+    def from_key(cls, private_key: bytes) -> Account:
+        """The account of a 32-byte private key. Raises `InputError` when it is none."""
+        return cls(private_key)
+
+    @classmethod
+    def from_keyfile(cls, keyfile: Path | str, password_file: Path | str) -> Account:
+        """The account of a keyfile, opened with the first line of a password file.
+
+        Takes most of a second, as keyfiles are made to. Raises `KeyfileError`, `WrongPassword`.
+        """
+        content = _read_keyfile(Path(keyfile))
+        password = _read_password(Path(password_file))
+        try:
+            return cls(decode_keyfile_json(content, password))
+        except InputError:
+            raise KeyfileError(keyfile, "holds no private key") from None
+        except ValueError as error:
+            if "MAC" in str(error):
+                raise WrongPassword(keyfile, password_file) from None
+            raise KeyfileError(keyfile, f"is not a keyfile: {error}") from None
+        except (KeyError, TypeError, AttributeError, NotImplementedError) as error:
+            raise KeyfileError(keyfile, f"is not a keyfile that can be read here ({error})") from None
+
+    def sign_transaction(self, fields: Mapping[str, Any]) -> SignedTransaction:
+        """Sign a transaction's fields, named as in JSON-RPC with ints for quantities, all of them given."""
+        signed = self._key.sign_transaction(dict(fields))
+        return SignedTransaction(raw=bytes(signed.raw_transaction), hash="0x" + bytes(signed.hash).hex())
+
+    def __repr__(self) -> str:
+        return f"Account({self.address})"
+
+    def __reduce__(self) -> Any:
+        raise TypeError("an account is not pickled: it would carry its key along")
+
+
+def new_private_key() -> bytes:
+    """A fresh private key, from the system's random source."""
+    return bytes(PrivateKey().secret)
+
+
+def write_keyfile(path: Path | str, private_key: bytes, password: str) -> str:
+    """Write a key, encrypted, to a new file that only its owner reads; the account's address.
+
+    Takes most of a second. Raises `KeyfileError` when the file exists or can't be written, `InputError` when
+    `private_key` is none.
+    """
+    address = Account(private_key).address
+    content = create_keyfile_json(private_key, password.encode())
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    except FileExistsError:
+        raise KeyfileError(path, "exists already", hint="keyfiles are never overwritten; choose another name") from None
+    except OSError as error:
+        raise KeyfileError(path, f"can't be written: {error.strerror}") from None
+    with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+        json.dump(content, file)
+        file.flush()
+        os.fsync(file.fileno())
+    return address
+
+
+def keyfile_address(keyfile: Path | str) -> str | None:
+    """The address that a keyfile claims, without its password; None if it does not say. Raises `KeyfileError`."""
+    claimed = _read_keyfile(Path(keyfile)).get("address")
+    return parse_address("0x" + claimed.removeprefix("0x").lower()) if isinstance(claimed, str) else None
+
+
+def _read_keyfile(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        hint = "make one with `aira account new`" if isinstance(error, FileNotFoundError) else ""
+        raise KeyfileError(path, f"can't read the keyfile: {error.strerror}", hint=hint) from None
+    except ValueError:
+        raise KeyfileError(path, "is not a keyfile: not JSON") from None
+    if not isinstance(content, dict):
+        raise KeyfileError(path, "is not a keyfile: not a JSON object")
+    return content
+
+
+def _read_password(path: Path) -> bytes:
+    try:
+        lines = path.read_bytes().splitlines()
+    except OSError as error:
+        raise KeyfileError(path, f"can't read the password file: {error.strerror}") from None
+    return lines[0] if lines else b""

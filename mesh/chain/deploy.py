@@ -1,0 +1,129 @@
+"""Putting the contracts on a chain: names, token, factory, and the first lighthouse."""
+
+from __future__ import annotations
+
+from contextlib import AsyncExitStack
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from mesh.chain.artifacts import load_artifact
+from mesh.chain.events import lighthouse_created
+from mesh.chain.names import GENERATIONS, namehash
+from mesh.chain.node import Node
+from mesh.chain.transactions import Sender
+from schemas.keccak import keccak256
+
+if TYPE_CHECKING:
+    from web3.contract import AsyncContract
+    from web3.providers.async_base import AsyncBaseProvider
+
+    from mesh.chain.accounts import Account
+
+WN: Final = 1
+XRT: Final = 10**9 * WN
+"""One XRT in wn."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeploymentPlan:
+    """What a deployment is made with. Amounts are wn (10^-9 XRT), times are blocks."""
+
+    lighthouse: str = "airalab"
+    """Label of the first lighthouse: `airalab.lighthouse.N.robonomics.eth`."""
+
+    initial_supply: int = 1_000_000 * XRT
+    """XRT given to the deployer; all else is minted for work."""
+
+    minimal_stake: int = 1 * XRT
+    """What a provider stakes at least; each such amount is one transaction a turn."""
+
+    timeout_blocks: int = 25
+    """Silence of the provider whose turn it is, until another may take the turn."""
+
+    refund_delay: int = 50_400
+    """From the creation of a liability until its promisee may take the tokens back (a week of 12-second blocks)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Deployment:
+    """Addresses of what was deployed, EIP-55, and the number of the last block that it took."""
+
+    ens: str
+    resolver: str
+    xrt: str
+    factory: str
+    lighthouse: str
+    lighthouse_name: str
+    block_number: int
+
+
+async def deploy(
+    endpoint: str | AsyncBaseProvider | Node,
+    account: Account,
+    *,
+    plan: DeploymentPlan | None = None,
+) -> Deployment:
+    """Deploy everything with one account, which then owns the names and holds the initial supply.
+
+    About twenty transactions, one after another. Raises `NodeUnreachable`, `InsufficientFunds`, `Reverted`.
+    """
+    async with AsyncExitStack() as stack:
+        node = endpoint if isinstance(endpoint, Node) else await stack.enter_async_context(Node(endpoint))
+        return await _Deployer(node, account, plan or DeploymentPlan()).run()
+
+
+class _Deployer:
+    """The steps; the order matters, as each uses what the one before made."""
+
+    def __init__(self, node: Node, account: Account, plan: DeploymentPlan) -> None:
+        self._node = node
+        self._sender = Sender(node, account)
+        self._owner = account.address
+        self._plan = plan
+
+    async def run(self) -> Deployment:
+        plan = self._plan
+        ens = await self._create("ENSRegistry")
+        resolver = await self._create("Resolver", ens)
+        xrt = await self._create("XRT", plan.initial_supply)
+        factory = await self._create("Factory", ens, xrt, plan.refund_delay)
+        await self._sender.call(self._node.contract("XRT", xrt).functions.setMinter(factory))
+        await self._name(self._node.contract("ENSRegistry", ens), resolver, xrt=xrt, factory=factory)
+        create = self._node.contract("Factory", factory).functions.createLighthouse
+        receipt = await self._sender.call(create(plan.minimal_stake, plan.timeout_blocks, plan.lighthouse))
+        return Deployment(
+            ens=ens,
+            resolver=resolver,
+            xrt=xrt,
+            factory=factory,
+            lighthouse=lighthouse_created(receipt.logs).lighthouse,
+            lighthouse_name=f"{plan.lighthouse}.lighthouse.{GENERATIONS[0]}.robonomics.eth",
+            block_number=receipt.block_number,
+        )
+
+    async def _create(self, name: str, *arguments: Any) -> str:
+        artifact = load_artifact(name)
+        contract = self._node.web3.eth.contract(abi=artifact.abi, bytecode=artifact.bytecode)
+        data = contract.constructor(*arguments).data_in_transaction
+        receipt = await self._sender.send(to=None, data=bytes.fromhex(data[2:]))
+        assert receipt.contract is not None
+        return receipt.contract
+
+    async def _name(self, registry: AsyncContract, resolver: str, *, xrt: str, factory: str) -> None:
+        """Both generations' roots lead to the same contracts; lighthouses are named by the factory."""
+        set_record = registry.functions.setSubnodeRecord
+        set_address = self._node.contract("Resolver", resolver).functions.setAddr
+
+        async def own(parent: str, label: str, owner: str) -> None:
+            await self._sender.call(set_record(namehash(parent), keccak256(label.encode()), owner, resolver, 0))
+
+        await own("", "eth", self._owner)
+        await own("eth", "robonomics", self._owner)
+        for generation in GENERATIONS:
+            root = f"{generation}.robonomics.eth"
+            await own("robonomics.eth", str(generation), self._owner)
+            await own(root, "lighthouse", factory)
+            await own(root, "model", self._owner)
+            for label, address in (("xrt", xrt), ("factory", factory)):
+                await own(root, label, self._owner)
+                await self._sender.call(set_address(namehash(f"{label}.{root}"), address))

@@ -1,0 +1,152 @@
+"""An Ethereum node inside this process, for demonstrations and tests: nothing to install, gone when closed."""
+
+from __future__ import annotations
+
+import asyncio
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager, suppress
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from web3.providers.async_base import AsyncBaseProvider
+
+from mesh.chain.jsonrpc import RpcError
+from mesh.chain.recursion import restrain_recursion
+from mesh.chain.rpc_server import JsonRpcServer
+from mesh.errors import ClosedError, ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+    from types import TracebackType
+    from typing import Self
+
+    from web3.types import RPCEndpoint, RPCResponse
+
+    from mesh.chain.methods import Methods
+
+T = TypeVar("T")
+
+
+class EmbeddedChain:
+    """A chain of its own: eth-tester's py-evm in one dedicated thread, so that the event loop never waits for it.
+
+    Each transaction is mined at once, in a block of its own. With `block_time` (seconds) an empty block is mined
+    that often as well, for deadlines and turns that are counted in blocks. The state lives in memory.
+
+    Used with `async with`; `provider` and `mine` raise `ClosedError` after that. Cancelling a request leaves its work
+    in the thread to finish.
+    """
+
+    def __init__(self, *, block_time: float | None = None) -> None:
+        self._block_time = block_time
+        self._thread: ThreadPoolExecutor | None = None
+        self._methods: Methods | None = None
+        self._clock: asyncio.Task[None] | None = None
+        self._funded_keys: tuple[bytes, ...] = ()
+        self.provider = EmbeddedProvider(self)
+
+    @property
+    def funded_keys(self) -> tuple[bytes, ...]:
+        """Private keys of ten accounts with 1,000,000 ETH each: those of anvil's accounts, in the same order."""
+        return self._funded_keys
+
+    async def __aenter__(self) -> Self:
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="aira-embedded-chain")
+        await self._in_thread(self._start)
+        if self._block_time is not None:
+            self._clock = asyncio.create_task(self._mine_by_time(self._block_time), name="aira-embedded-chain-clock")
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._clock is not None:
+            self._clock.cancel()
+            with suppress(asyncio.CancelledError):
+                await self._clock
+        thread, self._thread, self._methods = self._thread, None, None
+        if thread is not None:
+            thread.shutdown(wait=False, cancel_futures=True)
+
+    async def mine(self, blocks: int = 1) -> None:
+        """Mine that many empty blocks."""
+        await self.request("evm_mine", [blocks])
+
+    async def request(self, method: str, params: Any) -> Any:
+        """The result of a JSON-RPC method. Raises `RpcError` for what the node refuses."""
+        return await self._in_thread(lambda: self._opened().answer(method, params))
+
+    def _start(self) -> None:
+        # Imported here as py-evm takes most of a second to load, which the event loop need not wait for.
+        try:
+            from mesh.chain.evm import Evm
+            from mesh.chain.methods import Methods
+        except ModuleNotFoundError as error:
+            raise ConfigurationError(
+                f"the embedded chain needs {error.name}, which is not installed", hint="pip install 'aira-mesh[demo]'"
+            ) from None
+        restrain_recursion()
+        evm = Evm()
+        self._funded_keys = evm.funded_keys
+        self._methods = Methods(evm)
+
+    def _opened(self) -> Methods:
+        if self._methods is None:
+            raise ClosedError("the embedded chain is closed")
+        return self._methods
+
+    async def _in_thread(self, work: Callable[[], T]) -> T:
+        if self._thread is None:
+            raise ClosedError("the embedded chain is closed")
+        return await asyncio.get_running_loop().run_in_executor(self._thread, work)
+
+    async def _mine_by_time(self, seconds: float) -> None:
+        while True:
+            await asyncio.sleep(seconds)
+            await self.mine()
+
+
+class EmbeddedProvider(AsyncBaseProvider):
+    """What web3 talks to: the requests of an `EmbeddedChain`."""
+
+    def __init__(self, chain: EmbeddedChain) -> None:
+        super().__init__()
+        self._chain = chain
+
+    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+        """A JSON-RPC response with the result or the error."""
+        try:
+            return {"jsonrpc": "2.0", "id": 0, "result": await self._chain.request(method, params)}
+        except RpcError as error:
+            return {"jsonrpc": "2.0", "id": 0, "error": error.as_object()}  # type: ignore[typeddict-item]
+
+    async def is_connected(self, show_traceback: bool = False) -> bool:
+        """Whether the chain is open."""
+        return self._chain._thread is not None
+
+    def __str__(self) -> str:
+        return "the embedded chain"
+
+
+class ServedChain:
+    """An embedded chain and the server in front of it."""
+
+    def __init__(self, node: EmbeddedChain, server: JsonRpcServer) -> None:
+        self.node = node
+        self.server = server
+
+    @property
+    def url(self) -> str:
+        """Where other processes reach it, e.g. `http://127.0.0.1:8545`."""
+        return self.server.url
+
+
+@asynccontextmanager
+async def serve_embedded(
+    host: str = "127.0.0.1", port: int = 8545, *, block_time: float | None = None
+) -> AsyncIterator[ServedChain]:
+    """An embedded chain that other processes share over JSON-RPC; port 0 takes a free one."""
+    async with (
+        EmbeddedChain(block_time=block_time) as node,
+        JsonRpcServer(node.provider, host=host, port=port) as server,
+    ):
+        yield ServedChain(node, server)

@@ -1,0 +1,145 @@
+"""What can go wrong on the chain, by whose fault it is. Every error is one line, with a hint where one helps."""
+
+from __future__ import annotations
+
+from mesh.errors import ChainError, ConfigurationError, InputError
+
+
+class NodeUnreachable(ChainError):
+    """No node answers at the endpoint, or what answers is no Ethereum node. Trying again later may help."""
+
+    def __init__(self, endpoint: str, why: str) -> None:
+        super().__init__(
+            f"no Ethereum node answers at {endpoint} ({why})",
+            hint="start a node there, or name another with web3_http_provider",
+        )
+        self.endpoint = endpoint
+        self.why = why
+
+
+class RequestRefused(ChainError):
+    """The node answered with an error that has no better name here. `code` is JSON-RPC's."""
+
+    def __init__(self, method: str, code: int, message: str) -> None:
+        super().__init__(f"the node refused {method}: {message} (code {code})")
+        self.method = method
+        self.code = code
+        self.detail = message
+
+
+class NoContracts(ChainError):
+    """The chain does not hold the contracts: another network, or nothing deployed yet."""
+
+    def __init__(self, what: str, chain_id: int) -> None:
+        super().__init__(
+            f"the chain {chain_id} has no {what}",
+            hint="check web3_http_provider and ens_contract, or deploy the contracts with `aira chain deploy`",
+        )
+        self.what = what
+        self.chain_id = chain_id
+
+
+class UnknownName(ChainError):
+    """An ENS name that no resolver on this chain knows."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"the ENS name {name!r} is not known on this chain", hint="check its spelling and the network")
+        self.name = name
+
+
+class NotALiability(ChainError):
+    """An address that the factory did not make: its terms can't be trusted."""
+
+    def __init__(self, address: str) -> None:
+        super().__init__(f"{address} is not a liability of this factory")
+        self.address = address
+
+
+class InsufficientFunds(ChainError):
+    """The account can't pay for the transaction's gas (and value). Amounts are wei."""
+
+    def __init__(self, address: str, *, balance: int, needed: int) -> None:
+        super().__init__(
+            f"{address} has {balance} wei, and the transaction may need {needed} wei",
+            hint="send ETH to the account; gas is paid in it",
+        )
+        self.address = address
+        self.balance = balance
+        self.needed = needed
+
+
+class Reverted(ChainError):
+    """A contract refused.
+
+    `reason` is the name of its custom error (`CostMismatch`), or the text of a plain revert, `Panic`, `OutOfGas`, or
+    empty when it gave none; `arguments` are the custom error's; `data` is what it reverted with.
+    """
+
+    def __init__(self, reason: str, *, arguments: tuple[object, ...] = (), data: bytes = b"") -> None:
+        shown = ", ".join(_show(argument) for argument in arguments)
+        super().__init__(f"the contract refused: {reason or 'no reason given'}" + (f" ({shown})" if shown else ""))
+        self.reason = reason
+        self.arguments = arguments
+        self.data = data
+
+
+class TransactionTimeout(ChainError):
+    """A sent transaction was not mined in time; it may still be."""
+
+    def __init__(self, tx: str, seconds: float) -> None:
+        super().__init__(
+            f"the transaction {tx} was not mined within {seconds:g} s",
+            hint="it may still be mined: look for it before sending another",
+        )
+        self.tx = tx
+        self.seconds = seconds
+
+
+class ChainWentBack(ChainError):
+    """The chain is shorter than what was already read of it: it was started afresh, or the node is still syncing."""
+
+    def __init__(self, cursor: int, head: int) -> None:
+        super().__init__(
+            f"block {cursor} was to be read next, but the chain ends at block {head}",
+            hint="wait for the node to sync; if the chain was started afresh, start with a fresh data_dir too",
+        )
+        self.cursor = cursor
+        self.head = head
+
+
+class NoAccount(ConfigurationError):
+    """Something was to be signed and no account was given."""
+
+    def __init__(self) -> None:
+        super().__init__("this needs an account", hint="set keyfile and keyfile_password_file")
+
+
+class KeyfileError(ConfigurationError):
+    """A keyfile or its password file can't be read or written, or is no Web3 secret storage."""
+
+    def __init__(self, path: object, why: str, *, hint: str = "") -> None:
+        super().__init__(f"{path}: {why}", hint=hint)
+        self.path = str(path)
+
+
+class WrongPassword(KeyfileError):
+    """The password does not open the keyfile."""
+
+    def __init__(self, keyfile: object, password_file: object) -> None:
+        super().__init__(
+            keyfile,
+            f"the password in {password_file} does not open it",
+            hint="one line with the password; a line break at its end does not count",
+        )
+
+
+class InvalidName(InputError):
+    """A text that can't be an ENS name."""
+
+    def __init__(self, text: str, why: str) -> None:
+        super().__init__(f"{text[:80]!r} is not an ENS name: {why}")
+        self.text = text
+
+
+def _show(argument: object) -> str:
+    return "0x" + argument.hex() if isinstance(argument, bytes) else str(argument)

@@ -1,0 +1,175 @@
+"""What happens on a chain: the events of the factory, the lighthouses, the liabilities and the token."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
+
+from eth_abi.abi import decode
+from eth_abi.exceptions import DecodingError
+
+from mesh.chain.artifacts import load_artifact, signature_of
+from schemas.address import checksum_address
+from schemas.cid import format_cid
+from schemas.errors import InvalidCid
+from schemas.keccak import keccak256
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+
+@dataclass(frozen=True, slots=True)
+class NewLiability:
+    """A contract between a promisee and a promisor was made."""
+
+    liability: str
+    tx: str
+
+
+@dataclass(frozen=True, slots=True)
+class Finalized:
+    """A liability was finalized. `result` is a CID, empty when it was refunded."""
+
+    liability: str
+    success: bool
+    result: str
+    tx: str
+
+
+@dataclass(frozen=True, slots=True)
+class NewLighthouse:
+    """A market was made; `name` is its label."""
+
+    lighthouse: str
+    name: str
+    tx: str
+
+
+@dataclass(frozen=True, slots=True)
+class Transfer:
+    """XRT changed hands; `value` in wn. The zero address mints and burns."""
+
+    sender: str
+    recipient: str
+    value: int
+    tx: str
+
+
+@dataclass(frozen=True, slots=True)
+class Approval:
+    """An owner let a spender take up to `value` wn of its XRT."""
+
+    owner: str
+    spender: str
+    value: int
+    tx: str
+
+
+@dataclass(frozen=True, slots=True)
+class Online:
+    """A provider staked on a lighthouse and takes part in its turns."""
+
+    lighthouse: str
+    provider: str
+    tx: str
+
+
+@dataclass(frozen=True, slots=True)
+class Offline:
+    """A provider took its stake off a lighthouse."""
+
+    lighthouse: str
+    provider: str
+    tx: str
+
+
+@dataclass(frozen=True, slots=True)
+class Current:
+    """A provider has its turn on a lighthouse, with `quota` transactions left."""
+
+    lighthouse: str
+    provider: str
+    quota: int
+    tx: str
+
+
+ChainEvent: TypeAlias = NewLiability | Finalized | NewLighthouse | Transfer | Approval | Online | Offline | Current
+
+
+def decode_log(log: Any) -> ChainEvent | None:
+    """The event in a log; None for another contract's that only looks alike."""
+    entry = _layouts().get(bytes(log["topics"][0]))
+    if entry is None:
+        return None
+    name, indexed, plain = entry
+    if len(log["topics"]) != 1 + len(indexed):
+        return None
+    try:
+        keys = [decode([kind], bytes(topic))[0] for kind, topic in zip(indexed, log["topics"][1:], strict=True)]
+        values = decode(plain, bytes(log["data"]))
+        return _event(name, _address(log["address"]), (*keys, *values), "0x" + bytes(log["transactionHash"]).hex())
+    except (DecodingError, UnicodeDecodeError, InvalidCid):
+        return None
+
+
+def topics_of(*contracts: str) -> list[str]:
+    """The topics (0x…) of the events that are read of these contracts (keys of `EVENTS`)."""
+    names = {name for contract in contracts for name in EVENTS[contract]}
+    return ["0x" + topic.hex() for topic, layout in _layouts().items() if layout[0] in names]
+
+
+def lighthouse_created(logs: Iterable[Any]) -> NewLighthouse:
+    """The one lighthouse that a transaction made."""
+    return next(event for log in logs if isinstance(event := decode_log(log), NewLighthouse))
+
+
+def liability_created(logs: Iterable[Any]) -> NewLiability:
+    """The one liability that a transaction made."""
+    return next(event for log in logs if isinstance(event := decode_log(log), NewLiability))
+
+
+def _event(name: str, emitter: str, values: tuple[Any, ...], tx: str) -> ChainEvent:
+    match name, values:
+        case "NewLiability", (liability,):
+            return NewLiability(_address(liability), tx)
+        case "Finalized", (success, result):
+            return Finalized(emitter, success, format_cid(result) if result else "", tx)
+        case "NewLighthouse", (lighthouse, label):
+            return NewLighthouse(_address(lighthouse), label, tx)
+        case "Transfer", (sender, recipient, value):
+            return Transfer(_address(sender), _address(recipient), value, tx)
+        case "Approval", (owner, spender, value):
+            return Approval(_address(owner), _address(spender), value, tx)
+        case "Online", (provider,):
+            return Online(emitter, _address(provider), tx)
+        case "Offline", (provider,):
+            return Offline(emitter, _address(provider), tx)
+        case "Current", (provider, quota):
+            return Current(emitter, _address(provider), quota, tx)
+    raise AssertionError(name)
+
+
+def _address(text: str) -> str:
+    return checksum_address(bytes.fromhex(text[2:]))
+
+
+EVENTS: Final = {
+    "Factory": ("NewLiability", "NewLighthouse"),
+    "Liability": ("Finalized",),
+    "XRT": ("Transfer", "Approval"),
+    "Lighthouse": ("Online", "Offline", "Current"),
+}
+
+
+@cache
+def _layouts() -> dict[bytes, tuple[str, list[str], list[str]]]:
+    """Name, types of the indexed and of the other members of each of `EVENTS`, by topic."""
+    layouts = {}
+    for contract, names in EVENTS.items():
+        for entry in load_artifact(contract).abi:
+            if entry["type"] == "event" and entry["name"] in names:
+                indexed = [member["type"] for member in entry["inputs"] if member["indexed"]]
+                plain = [member["type"] for member in entry["inputs"] if not member["indexed"]]
+                layouts[keccak256(signature_of(entry).encode())] = (entry["name"], indexed, plain)
+    return layouts

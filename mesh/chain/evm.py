@@ -1,0 +1,259 @@
+"""A whole Ethereum node in this process: py-evm as eth-tester sets it up, behind JSON-RPC methods.
+
+A transaction is mined at once into a block of its own, so there is no pool, no reorganisation and no "pending" state
+apart from the latest. Calls and estimates run in the block that would come next, as that is where a transaction lands.
+
+eth-tester's own front end is not used: it looks through the whole chain for each receipt, gives reverts as printed
+Python bytes, and speaks no JSON-RPC. Nothing here is safe for several threads; `EmbeddedChain` gives it one.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+from eth.exceptions import Revert
+from eth.vm.spoof import SpoofTransaction
+from eth_tester import PyEVMBackend  # type: ignore[import-untyped]
+from eth_tester.exceptions import BlockNotFound  # type: ignore[import-untyped]
+from eth_utils.exceptions import ValidationError
+
+from mesh.chain.jsonrpc import REVERTED, SERVER_ERROR, RpcError, to_json
+
+if TYPE_CHECKING:
+    from eth.abc import BlockHeaderAPI, ComputationAPI, SignedTransactionAPI
+
+MNEMONIC: Final = "test test test test test test test test test test test junk"
+"""The phrase that development chains share (anvil, hardhat): its keys are public, and worth nothing elsewhere."""
+
+DERIVATION_PATH: Final = "m/44'/60'/0'/0"
+FUNDED_KEYS: Final = 10
+FUNDS_WEI: Final = 1_000_000 * 10**18
+GAS_LIMIT: Final = 30_000_000
+"""Gas that a block may use."""
+
+PRIORITY_FEE_WEI: Final = 1
+CALL_STIPEND: Final = 2_300
+"""Gas that a value transfer passes on for free; an estimate leaves room for it, as geth's does."""
+
+Call = dict[str, Any]
+"""A call's fields by their JSON-RPC names, values parsed: from, to, data (bytes), value, gas (int)."""
+
+
+class Evm:
+    """The chain's state and what may be asked of it. Heights are block numbers; amounts are wei."""
+
+    def __init__(self) -> None:
+        self._backend = PyEVMBackend.from_mnemonic(
+            MNEMONIC,
+            genesis_state_overrides={"balance": FUNDS_WEI},
+            num_accounts=FUNDED_KEYS,
+            hd_path=DERIVATION_PATH,
+            genesis_parameters=PyEVMBackend.generate_genesis_params({"gas_limit": GAS_LIMIT}),
+        )
+        self._receipts: dict[bytes, dict[str, Any]] = {}
+        self._transactions: dict[bytes, dict[str, Any]] = {}
+        self._logs: dict[int, list[dict[str, Any]]] = {}
+
+    @property
+    def funded_keys(self) -> tuple[bytes, ...]:
+        """Private keys of the accounts that the first block gave `FUNDS_WEI` each."""
+        return tuple(key.to_bytes() for key in self._backend.account_keys)
+
+    @property
+    def chain_id(self) -> int:
+        """EIP-155 number of the chain."""
+        return int(self._backend.chain.chain_id)
+
+    @property
+    def head(self) -> int:
+        """Number of the latest block."""
+        return int(self._backend.chain.header.block_number) - 1
+
+    @property
+    def base_fee(self) -> int:
+        """Base fee of the next block, wei a gas."""
+        return int(self._backend.chain.header.base_fee_per_gas)
+
+    def height(self, tag: object) -> int:
+        """The block number behind a tag (`latest`, …) or a number. Raises `RpcError` for a block that is not there."""
+        match tag:
+            case "latest" | "pending" | "safe" | "finalized":
+                return self.head
+            case "earliest":
+                return 0
+            case int() if 0 <= tag <= self.head:
+                return tag
+        raise RpcError(SERVER_ERROR, f"block {tag!r} not found; the latest is {self.head}")
+
+    def balance(self, address: bytes, height: int) -> int:
+        """Wei of an account."""
+        return int(self._backend.get_balance(address, height))
+
+    def nonce(self, address: bytes, height: int) -> int:
+        """Number of transactions that an account has sent."""
+        return int(self._backend.get_nonce(address, height))
+
+    def code(self, address: bytes, height: int) -> bytes:
+        """A contract's code, empty for an account."""
+        return bytes(self._backend.get_code(address, height))
+
+    def storage(self, address: bytes, slot: int, height: int) -> bytes:
+        """A storage slot, 32 bytes."""
+        value = self._backend.get_storage(address, slot, height)
+        return (value if isinstance(value, bytes) else value.to_bytes(32, "big")).rjust(32, b"\0")
+
+    def block(self, identifier: int | bytes, *, transactions: str) -> dict[str, Any] | None:
+        """A block by number or hash, None if there is none; its `transactions` as `"hashes"` or as `"objects"`."""
+        get = self._backend.get_block_by_hash if isinstance(identifier, bytes) else self._backend.get_block_by_number
+        try:
+            raw = get(identifier, full_transaction=False)
+        except BlockNotFound:
+            return None
+        block: dict[str, Any] = to_json(raw)
+        block["miner"] = block.pop("coinbase")
+        block["logsBloom"] = f"0x{raw['logs_bloom']:0512x}"
+        if transactions == "objects":
+            block["transactions"] = [self._transactions[hash_] for hash_ in raw["transactions"]]
+        return block
+
+    def transaction(self, hash_: bytes) -> dict[str, Any] | None:
+        """A mined transaction, None if there is none."""
+        return self._transactions.get(hash_)
+
+    def receipt(self, hash_: bytes) -> dict[str, Any] | None:
+        """The receipt of a mined transaction, None if there is none."""
+        return self._receipts.get(hash_)
+
+    def logs(self, first: int, last: int) -> list[dict[str, Any]]:
+        """All logs of the blocks from `first` to `last`, both included, in order."""
+        return [log for height in range(max(first, 0), min(last, self.head) + 1) for log in self._logs.get(height, ())]
+
+    def mine(self, blocks: int) -> None:
+        """Mine empty blocks."""
+        for _ in range(blocks):
+            self._set_clock()
+            self._backend.mine_blocks(1)
+
+    def call(self, fields: Call, height: int) -> bytes:
+        """What a call returns. Raises `RpcError` with the revert data when it fails."""
+        computation = self._run(fields, height, gas=fields.get("gas") or GAS_LIMIT)
+        _raise_if_failed(computation)
+        return bytes(computation.output)
+
+    def estimate(self, fields: Call, height: int) -> int:
+        """Gas limit with which a transaction goes through; raises as `call` does.
+
+        What a run with all gas used; if that is not enough, with the 64th part that a call inside keeps back
+        (EIP-150) and the stipend; else, as geth does, a search up to the whole limit, to within a 64th.
+        """
+        limit: int = fields.get("gas") or GAS_LIMIT
+        computation = self._run(fields, height, gas=limit)
+        _raise_if_failed(computation)
+        used = limit - int(computation.get_gas_remaining())
+        low = used - 1
+        for attempt in (used, (used + CALL_STIPEND) * 64 // 63):
+            if attempt >= limit:
+                return limit
+            if self._suffices(fields, height, gas=attempt):
+                return attempt
+            low = attempt
+        high = limit
+        while (high - low) * 64 > high:
+            attempt = (low + high) // 2
+            if self._suffices(fields, height, gas=attempt):
+                high = attempt
+            else:
+                low = attempt
+        return high
+
+    def send(self, raw: bytes) -> bytes:
+        """Apply a signed transaction and mine its block; its hash. Raises `RpcError` for one that no block can hold."""
+        chain = self._backend.chain
+        try:
+            transaction = chain.get_vm().get_transaction_builder().decode(raw)
+            sender = bytes(transaction.sender)
+        except Exception as error:
+            raise RpcError(SERVER_ERROR, f"the transaction can't be decoded: {error}") from None
+        if transaction.hash in self._receipts:
+            raise RpcError(SERVER_ERROR, "already known")
+        self._check(transaction, sender)
+        self._set_clock()
+        try:
+            self._backend.send_raw_transaction(raw)
+        except ValidationError as error:
+            raise RpcError(SERVER_ERROR, str(error)) from None
+        self._backend.mine_blocks(1)
+        self._remember(bytes(transaction.hash))
+        return bytes(transaction.hash)
+
+    def _check(self, transaction: SignedTransactionAPI, sender: bytes) -> None:
+        """Refuse with geth's words what the chain would refuse with py-evm's."""
+        expected = self.nonce(sender, self.head)
+        if transaction.nonce != expected:
+            which = "low" if transaction.nonce < expected else "high"
+            raise RpcError(SERVER_ERROR, f"nonce too {which}: next nonce {expected}, tx nonce {transaction.nonce}")
+        price = getattr(transaction, "max_fee_per_gas", None) or transaction.gas_price
+        wanted, funds = transaction.gas * price + transaction.value, self.balance(sender, self.head)
+        if wanted > funds:
+            raise RpcError(SERVER_ERROR, f"insufficient funds for gas * price + value: have {funds} want {wanted}")
+
+    def _remember(self, hash_: bytes) -> None:
+        receipt = to_json(self._backend.get_transaction_receipt(hash_))
+        receipt["to"] = None if receipt["to"] == "0x" else receipt["to"]
+        receipt["logsBloom"] = self._logs_bloom()
+        for log in receipt["logs"]:
+            del log["type"]
+            log["removed"] = False
+        transaction = to_json(self._backend.get_transaction_by_hash(hash_))
+        transaction["input"] = transaction.pop("data")
+        transaction["to"] = receipt["to"]
+        self._transactions[hash_] = transaction
+        self._receipts[hash_] = receipt
+        if receipt["logs"]:
+            self._logs[self.head] = receipt["logs"]
+
+    def _logs_bloom(self) -> str:
+        header = self._backend.chain.get_canonical_head()
+        return f"0x{int(header.bloom):0512x}"
+
+    def _set_clock(self) -> None:
+        """Give the next block the time of day; py-evm fixed it when the block before was mined."""
+        chain = self._backend.chain
+        chain.set_header_timestamp(max(int(time.time()), int(chain.header.timestamp)))
+
+    def _suffices(self, fields: Call, height: int, *, gas: int) -> bool:
+        try:
+            return not self._run(fields, height, gas=gas).is_error
+        except RpcError:
+            return False
+
+    def _run(self, fields: Call, height: int, *, gas: int) -> ComputationAPI:
+        """Execute a call in the block after `height`, at no price, and forget what it changed."""
+        chain = self._backend.chain
+        header: BlockHeaderAPI = chain.get_canonical_block_header_by_number(height)
+        sender = fields.get("from") or bytes(20)
+        with chain.get_vm(header).in_costless_state() as state:
+            unsigned = chain.create_unsigned_transaction(
+                nonce=state.get_nonce(sender),
+                gas_price=0,
+                gas=gas,
+                to=fields.get("to") or b"",
+                value=fields.get("value") or 0,
+                data=fields.get("data") or b"",
+            )
+            try:
+                computation: ComputationAPI = state.costless_execute_transaction(
+                    SpoofTransaction(unsigned, from_=sender)
+                )
+            except ValidationError as error:
+                raise RpcError(SERVER_ERROR, str(error)) from None
+        return computation
+
+
+def _raise_if_failed(computation: ComputationAPI) -> None:
+    if not computation.is_error:
+        return
+    if isinstance(computation.error, Revert):
+        raise RpcError(REVERTED, "execution reverted", data="0x" + bytes(computation.output).hex())
+    raise RpcError(SERVER_ERROR, f"{type(computation.error).__name__}: {computation.error}")

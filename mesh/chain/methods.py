@@ -1,0 +1,147 @@
+"""The JSON-RPC methods that the embedded node answers, by name: parameters parsed, results as JSON.
+
+Enough for this project's clients, for web3.py and ethers, and for the legacy JavaScript (which polls blocks and
+receipts): no node-side filters, no account that the node would sign for.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from mesh.chain.evm import PRIORITY_FEE_WEI, Call, Evm
+from mesh.chain.jsonrpc import (
+    INTERNAL_ERROR,
+    INVALID_PARAMS,
+    METHOD_NOT_FOUND,
+    SERVER_ERROR,
+    RpcError,
+    parse_data,
+    parse_quantity,
+    to_json,
+)
+from schemas.keccak import keccak256
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+TAGS = frozenset({"latest", "pending", "safe", "finalized", "earliest"})
+
+
+class Methods:
+    """An `Evm` behind JSON-RPC method names."""
+
+    def __init__(self, evm: Evm) -> None:
+        self._evm = evm
+        self._table: dict[str, Callable[..., Any]] = {
+            "web3_clientVersion": lambda: "aira-embedded/py-evm",
+            "web3_sha3": lambda data: keccak256(parse_data(data)),
+            "net_version": lambda: str(evm.chain_id),
+            "net_listening": lambda: True,
+            "net_peerCount": lambda: 0,
+            "eth_syncing": lambda: False,
+            "eth_accounts": list,
+            "eth_chainId": lambda: evm.chain_id,
+            "eth_blockNumber": lambda: evm.head,
+            "eth_gasPrice": lambda: evm.base_fee + PRIORITY_FEE_WEI,
+            "eth_maxPriorityFeePerGas": lambda: PRIORITY_FEE_WEI,
+            "eth_getBalance": self._state(evm.balance),
+            "eth_getTransactionCount": self._state(evm.nonce),
+            "eth_getCode": self._state(evm.code),
+            "eth_getStorageAt": self._storage,
+            "eth_getBlockByNumber": self._block_by_number,
+            "eth_getBlockByHash": self._block_by_hash,
+            "eth_getTransactionByHash": lambda hash_: evm.transaction(parse_data(hash_, length=32)),
+            "eth_getTransactionReceipt": lambda hash_: evm.receipt(parse_data(hash_, length=32)),
+            "eth_getLogs": self._logs,
+            "eth_call": lambda call, block="latest": evm.call(_call(call), self._height(block)),
+            "eth_estimateGas": lambda call, block="latest": evm.estimate(_call(call), self._height(block)),
+            "eth_sendRawTransaction": lambda raw: evm.send(parse_data(raw)),
+            "evm_mine": self._mine,
+        }
+
+    def answer(self, method: str, params: Sequence[Any]) -> Any:
+        """The result of a method, as JSON. Raises `RpcError`, and nothing else whatever the parameters."""
+        function = self._table.get(method)
+        if function is None:
+            raise RpcError(METHOD_NOT_FOUND, f"the method {method} does not exist or is not available")
+        try:
+            return to_json(function(*params))
+        except RpcError:
+            raise
+        except RecursionError:
+            raise RpcError(SERVER_ERROR, "contracts call each other too deep for this node") from None
+        except (TypeError, ValueError, AttributeError, KeyError) as error:
+            raise RpcError(INVALID_PARAMS, f"the parameters of {method} can't be: {error}") from error
+        except Exception as error:
+            raise RpcError(INTERNAL_ERROR, f"{method} failed: {type(error).__name__}: {error}") from error
+
+    def _height(self, block: object) -> int:
+        return self._evm.height(block if block in TAGS else parse_quantity(block))
+
+    def _state(self, read: Callable[[bytes, int], Any]) -> Callable[..., Any]:
+        def method(address: object, block: object = "latest") -> Any:
+            return read(parse_data(address, length=20), self._height(block))
+
+        return method
+
+    def _storage(self, address: object, slot: object, block: object = "latest") -> bytes:
+        return self._evm.storage(parse_data(address, length=20), parse_quantity(slot), self._height(block))
+
+    def _block_by_number(self, block: object, full: object = False) -> dict[str, Any] | None:
+        number = parse_quantity(block) if block not in TAGS else self._height(block)
+        return self._evm.block(number, transactions="objects" if full else "hashes")
+
+    def _block_by_hash(self, hash_: object, full: object = False) -> dict[str, Any] | None:
+        return self._evm.block(parse_data(hash_, length=32), transactions="objects" if full else "hashes")
+
+    def _mine(self, blocks: object = 1) -> str:
+        self._evm.mine(parse_quantity(blocks))
+        return "0x0"
+
+    def _logs(self, query: dict[str, Any]) -> list[dict[str, Any]]:
+        if "blockHash" in query:
+            block = self._block_by_hash(query["blockHash"])
+            if block is None:
+                raise RpcError(INVALID_PARAMS, "unknown block")
+            first = last = int(block["number"], 16)
+        else:
+            first = self._bound(query.get("fromBlock"))
+            last = self._bound(query.get("toBlock"))
+        addresses = {_hex(parse_data(address, length=20)) for address in _alternatives(query.get("address")) or ()}
+        topics = [_alternatives(topic) for topic in query.get("topics") or ()]
+        wanted = [None if one is None else {_hex(parse_data(topic, length=32)) for topic in one} for one in topics]
+        return [log for log in self._evm.logs(first, last) if _matches(log, addresses, wanted)]
+
+    def _bound(self, block: object) -> int:
+        """A bound of a range of blocks, which unlike the block of a call may lie past the head."""
+        return self._evm.height(block or "latest") if block is None or block in TAGS else parse_quantity(block)
+
+
+def _call(call: dict[str, Any]) -> Call:
+    fields: Call = {"data": parse_data(call.get("input") or call.get("data") or "0x")}
+    for name in ("from", "to"):
+        if call.get(name) not in (None, "0x"):
+            fields[name] = parse_data(call[name], length=20)
+    for name in ("gas", "value"):
+        if call.get(name) is not None:
+            fields[name] = parse_quantity(call[name])
+    return fields
+
+
+def _alternatives(value: Any) -> list[Any] | None:
+    """A member of a log query as the list of what it accepts; None accepts anything."""
+    if value is None:
+        return None
+    return list(value) if isinstance(value, list | tuple) else [value]
+
+
+def _hex(data: bytes) -> str:
+    return "0x" + data.hex()
+
+
+def _matches(log: dict[str, Any], addresses: set[str], topics: Sequence[set[str] | None]) -> bool:
+    if addresses and log["address"] not in addresses:
+        return False
+    if len(topics) > len(log["topics"]):
+        return False
+    return all(wanted is None or topic in wanted for topic, wanted in zip(log["topics"], topics, strict=False))

@@ -1,0 +1,128 @@
+"""Names on a chain: ENS by two calls.
+
+A name under a root (`N.robonomics.eth`) is asked of the root's resolver, as every client of the network does: one
+resolver for all its names, looked up once. web3's own helper wants a universal resolver, which a private chain lacks.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from mesh.chain.errors import InvalidName, NoContracts, Reverted, UnknownName
+from schemas.address import ZERO_ADDRESS, is_ens_name, parse_address
+from schemas.cid import format_cid, parse_cid
+from schemas.errors import InvalidAddress, InvalidCid
+from schemas.keccak import keccak256
+
+if TYPE_CHECKING:
+    from mesh.chain.node import Node
+
+PUBLIC_REGISTRY: Final = "0x00000000000C2E074eC69A0dFb2997BA6C7d2e1e"
+"""The ENS registry of the public networks."""
+
+DEVELOPMENT_REGISTRY: Final = "0x5FbDB2315678afecb367f032d93F642f64180aa3"
+"""Where `deploy` puts the registry when the first account of a development chain deploys first."""
+
+ROOT_PARENT: Final = ".robonomics.eth"
+GENERATIONS: Final = (3, 5)
+MULTIHASH_ABI: Final = (
+    {
+        "type": "function",
+        "name": "multihash",
+        "stateMutability": "view",
+        "inputs": [{"name": "node", "type": "bytes32"}],
+        "outputs": [{"name": "", "type": "bytes"}],
+    },
+)
+"""What the public resolver of 2018 answers for a name of content; not every resolver does."""
+
+NAME_RULE: Final = "names end in .eth, .sid or .test, and hold ASCII letters, digits, - and _"
+
+
+def namehash(name: str) -> bytes:
+    """The 32-byte node of a name (EIP-137); the empty name is the root."""
+    node = bytes(32)
+    for label in reversed(name.split(".")) if name else ():
+        node = keccak256(node + keccak256(label.encode()))
+    return node
+
+
+def parse_name(text: str) -> str:
+    """A name in lower case. Raises `InvalidName`."""
+    if not is_ens_name(text):
+        raise InvalidName(text, NAME_RULE)
+    return text.lower()
+
+
+def root_of(name: str) -> str:
+    """The name whose resolver knows `name`: `3.robonomics.eth` for all below it, elsewhere the name itself."""
+    return ".".join(name.split(".")[-3:]) if name.endswith(ROOT_PARENT) else name
+
+
+class Names:
+    """What names mean on the chain behind a node. `registry` is the address of the ENS registry."""
+
+    def __init__(self, node: Node, registry: str) -> None:
+        self.registry = registry
+        self._node = node
+        self._resolvers: dict[str, str] = {}
+
+    async def address(self, name_or_address: str) -> str:
+        """The address behind a name, or the given address itself; EIP-55.
+
+        Raises `InvalidName`, `InvalidAddress`, `UnknownName`, `NodeUnreachable`.
+        """
+        if not is_ens_name(name_or_address):
+            return _parse_address(name_or_address)
+        name = parse_name(name_or_address)
+        resolver = self._node.contract("Resolver", await self._resolver(name))
+        address = str(await self._node.read(resolver.functions.addr(namehash(name))))
+        if address == ZERO_ADDRESS:
+            raise UnknownName(name)
+        return parse_address(address)
+
+    async def model(self, name_or_cid: str) -> str:
+        """The CID of a model behind a name (`NAME.model.N.robonomics.eth`), or the given CID itself.
+
+        Raises `InvalidCid` for what is neither, `UnknownName`, `NodeUnreachable`.
+        """
+        if not is_ens_name(name_or_cid):
+            parse_cid(name_or_cid)
+            return name_or_cid
+        name = parse_name(name_or_cid)
+        resolver = self._node.web3.eth.contract(self._node.checksum(await self._resolver(name)), abi=MULTIHASH_ABI)
+        try:
+            return format_cid(bytes(await self._node.read(resolver.functions.multihash(namehash(name)))))
+        except (InvalidCid, Reverted):
+            raise UnknownName(name) from None
+
+    async def _resolver(self, name: str) -> str:
+        root = root_of(name)
+        if root not in self._resolvers:
+            registry = self._node.contract("ENSRegistry", self.registry)
+            resolver = str(await self._node.read(registry.functions.resolver(namehash(root))))
+            if resolver == ZERO_ADDRESS:
+                raise UnknownName(name)
+            self._resolvers[root] = parse_address(resolver)
+        return self._resolvers[root]
+
+
+async def find_registry(node: Node, ens: str) -> str:
+    """The ENS registry to use: the given one, else the public or the development one, whichever is there.
+
+    Raises `NoContracts`, `InvalidAddress`, `NodeUnreachable`.
+    """
+    candidates = (parse_address(ens),) if ens else (PUBLIC_REGISTRY, DEVELOPMENT_REGISTRY)
+    for candidate in candidates:
+        if await node.web3.eth.get_code(node.checksum(candidate)):
+            return candidate
+    raise NoContracts("ENS registry" + (f" at {ens}" if ens else ""), node.chain_id)
+
+
+def _parse_address(text: str) -> str:
+    try:
+        return parse_address(text)
+    except InvalidAddress:
+        if "." in text:
+            raise InvalidName(text, NAME_RULE) from None
+        raise

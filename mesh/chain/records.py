@@ -1,0 +1,122 @@
+"""What contracts hold, read as a whole, and what transactions with them came to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from mesh.chain.errors import NotALiability
+from schemas.address import parse_address
+from schemas.cid import format_cid
+from schemas.liability import Liability
+
+if TYPE_CHECKING:
+    from mesh.chain.node import Node
+
+LIABILITY_GETTERS = (
+    "model",
+    "objective",
+    "result",
+    "promisee",
+    "promisor",
+    "lighthouse",
+    "lighthouseFee",
+    "token",
+    "cost",
+    "validator",
+    "validatorFee",
+    "isSuccess",
+    "isFinalized",
+)
+LIGHTHOUSE_GETTERS = ("minimalStake", "timeoutInBlocks", "keepAliveBlock", "quota", "current")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LighthouseState:
+    """A lighthouse as it stands: stakes in wn, times in blocks, heights as block numbers."""
+
+    address: str
+    minimal_stake: int
+    timeout_blocks: int
+    keep_alive_block: int
+    """The last block in which the provider whose turn it is sent something."""
+
+    quota: int
+    """Transactions that are left of the turn."""
+
+    current: str
+    """Whose turn it is; the zero address where nobody staked."""
+
+    stakes: dict[str, int]
+    """Providers in the order of their turns, with what each staked."""
+
+
+@dataclass(frozen=True, slots=True)
+class Created:
+    """A liability that a transaction made, and the gas that it took."""
+
+    liability: str
+    tx: str
+    gas_used: int
+
+
+@dataclass(frozen=True, slots=True)
+class Settled:
+    """The transaction that finalized or refunded a liability, and the gas that it took."""
+
+    tx: str
+    gas_used: int
+
+
+async def read_liability(node: Node, factory: str, address: str) -> Liability:
+    """A liability's terms and outcome, as of one block.
+
+    Raises `NotALiability` unless the factory recognises it, `NodeUnreachable`.
+    """
+    if not await is_liability(node, factory, address):
+        raise NotALiability(address)
+    block = await node.block_number()
+    functions = node.contract("Liability", address).functions
+    values = await node.read_all((functions[getter]() for getter in LIABILITY_GETTERS), block=block)
+    held: dict[str, Any] = dict(zip(LIABILITY_GETTERS, values, strict=True))
+    return Liability(
+        address=address,
+        model=format_cid(held["model"]),
+        objective=format_cid(held["objective"]),
+        result=format_cid(held["result"]) if held["result"] else "",
+        promisee=parse_address(held["promisee"]),
+        promisor=parse_address(held["promisor"]),
+        lighthouse=parse_address(held["lighthouse"]),
+        lighthouse_fee=held["lighthouseFee"],
+        token=parse_address(held["token"]),
+        cost=held["cost"],
+        validator=parse_address(held["validator"]),
+        validator_fee=held["validatorFee"],
+        is_success=held["isSuccess"],
+        is_finalized=held["isFinalized"],
+    )
+
+
+async def is_liability(node: Node, factory: str, address: str) -> bool:
+    """Whether the factory made the contract at `address`. Raises `NodeUnreachable`."""
+    return bool(await node.read(node.contract("Factory", factory).functions.isLiability(address)))
+
+
+async def read_lighthouse(node: Node, address: str) -> LighthouseState:
+    """The state of a lighthouse, as of one block. Raises `NoContracts` if there is none, `NodeUnreachable`."""
+    block = await node.block_number()
+    functions = node.contract("Lighthouse", address).functions
+    count = await node.read(functions.providersLength(), block=block)
+    found = await node.read_all((functions.providers(index) for index in range(count)), block=block)
+    stakes = await node.read_all((functions.stakes(provider) for provider in found), block=block)
+    values = await node.read_all((functions[getter]() for getter in LIGHTHOUSE_GETTERS), block=block)
+    minimal_stake, timeout_blocks, keep_alive_block, quota, current = values
+    return LighthouseState(
+        address=address,
+        minimal_stake=minimal_stake,
+        timeout_blocks=timeout_blocks,
+        keep_alive_block=keep_alive_block,
+        quota=quota,
+        current=parse_address(current),
+        stakes={parse_address(provider): stake for provider, stake in zip(found, stakes, strict=True)},
+    )

@@ -1,0 +1,79 @@
+"""Why a contract refused: the errors of nodes turned into `Reverted`.
+
+Revert data is the 4-byte selector of an error and its ABI-encoded arguments: one of our custom errors, `Error(string)`
+or `Panic(uint256)`. Geth, anvil and the embedded chain put it into the `data` of the JSON-RPC error, others deeper.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final
+
+from eth_abi.abi import decode
+from eth_abi.exceptions import DecodingError
+
+from mesh.chain.artifacts import NAMES, load_artifact, signature_of
+from mesh.chain.errors import Reverted
+from mesh.chain.jsonrpc import REVERTED
+from schemas.address import parse_address
+from schemas.keccak import keccak256
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+PLAIN: Final = bytes.fromhex("08c379a0")
+"""Selector of `Error(string)`, a revert with a text."""
+
+PANIC: Final = bytes.fromhex("4e487b71")
+"""Selector of `Panic(uint256)`, a failed assertion of the compiler's."""
+
+
+def decode_revert(error: Mapping[str, Any]) -> Reverted | None:
+    """The refusal that a node's JSON-RPC error tells of; None if it is another kind of error."""
+    data = _revert_data(error.get("data"))
+    message = str(error.get("message", ""))
+    if data is None and error.get("code") != REVERTED and "revert" not in message.lower():
+        return None
+    return explain(data or b"", said=message)
+
+
+def explain(data: bytes, *, said: str = "") -> Reverted:
+    """The refusal in revert data; `said` is what the node said of it, for a revert that left no data."""
+    selector, body = data[:4], data[4:]
+    try:
+        if selector == PLAIN:
+            return Reverted(str(decode(["string"], body)[0]), data=data)
+        if selector == PANIC:
+            return Reverted("Panic", arguments=decode(["uint256"], body), data=data)
+        if selector in custom_errors():
+            name, types = custom_errors()[selector]
+            values = decode(types, body)
+            arguments = (parse_address(v) if t == "address" else v for t, v in zip(types, values, strict=True))
+            return Reverted(name, arguments=tuple(arguments), data=data)
+    except (DecodingError, UnicodeDecodeError):
+        return Reverted("", data=data)
+    _, _, reason = said.partition("execution reverted: ")
+    return Reverted("" if data else reason, data=data)
+
+
+@cache
+def custom_errors() -> dict[bytes, tuple[str, list[str]]]:
+    """Name and argument types of every custom error of our contracts, by selector."""
+    errors = (entry for name in NAMES for entry in load_artifact(name).abi if entry["type"] == "error")
+    return {
+        keccak256(signature_of(entry).encode())[:4]: (entry["name"], [member["type"] for member in entry["inputs"]])
+        for entry in errors
+    }
+
+
+def _revert_data(data: object) -> bytes | None:
+    """The data, wherever the node put it; None if there is none."""
+    if isinstance(data, dict):
+        data = data.get("data") or data.get("result")
+    if not isinstance(data, str):
+        return None
+    _, found, digits = data.rpartition("0x")
+    try:
+        return bytes.fromhex(digits) if found else None
+    except ValueError:
+        return None

@@ -1,0 +1,34 @@
+"""How long the chain's client waits, and how often it looks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mesh.errors import ConfigurationError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Timing:
+    """Waiting times, all in seconds."""
+
+    poll_interval: float = 1.0
+    """Between two looks for a new block."""
+
+    receipt_interval: float = 0.1
+    """Between the first looks for a transaction's receipt; it grows up to `poll_interval`."""
+
+    receipt_timeout: float = 180.0
+    """Until a sent transaction is given up as not mined."""
+
+    request_timeout: float = 15.0
+    """For one answer of the node."""
+
+    attempts: int = 4
+    """How often a request is made before the node counts as unreachable."""
+
+    retry_delay: float = 0.25
+    """Before the second attempt; doubled before each further one."""
+
+    def __post_init__(self) -> None:
+        if self.attempts < 1 or self.request_timeout <= 0 or min(self.poll_interval, self.receipt_interval) <= 0:
+            raise ConfigurationError("intervals and timeouts are above zero, and a request is made at least once")

@@ -1,0 +1,111 @@
+"""JSON-RPC to a node over HTTP or WebSocket: one connection kept open, closed when told to.
+
+web3's own HTTP provider opens a connection for each request and its WebSocket provider waits by spinning; these are
+providers for it all the same.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import TYPE_CHECKING, Any, cast
+
+from aiohttp import ClientSession, ClientWebSocketResponse, WSMsgType
+from web3.providers.async_base import AsyncJSONBaseProvider
+
+if TYPE_CHECKING:
+    from web3.types import RPCEndpoint, RPCResponse
+
+
+class HttpTransport(AsyncJSONBaseProvider):
+    """A node at `http(s)://…`. Raises aiohttp's errors, `OSError`, and `ValueError` for an answer that is not JSON."""
+
+    def __init__(self, url: str) -> None:
+        super().__init__()
+        self._url = url
+        self._session: ClientSession | None = None
+
+    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+        """The node's response, with a result or an error."""
+        if self._session is None:
+            self._session = ClientSession(headers={"Content-Type": "application/json"})
+        async with self._session.post(self._url, data=self.encode_rpc_request(method, params)) as response:
+            body = await response.read()
+            # Some nodes answer errors with HTTP 4xx or 5xx and say what is wrong in the body.
+            if not response.ok and not body.lstrip().startswith(b"{"):
+                response.raise_for_status()
+            return self.decode_rpc_response(body)
+
+    async def close(self) -> None:
+        """Close the connection; a later request opens another."""
+        session, self._session = self._session, None
+        if session is not None:
+            await session.close()
+
+    def __str__(self) -> str:
+        return self._url
+
+
+class WebSocketTransport(AsyncJSONBaseProvider):
+    """A node at `ws(s)://…`. Raises as `HttpTransport`, `ConnectionError` for a connection that breaks meanwhile."""
+
+    def __init__(self, url: str) -> None:
+        super().__init__()
+        self._url = url
+        self._opening = asyncio.Lock()
+        self._session: ClientSession | None = None
+        self._socket: ClientWebSocketResponse | None = None
+        self._listening: asyncio.Task[None] | None = None
+        self._waiting: dict[int, asyncio.Future[RPCResponse]] = {}
+
+    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+        """The node's response, with a result or an error."""
+        socket = await self._opened()
+        request = self.form_request(method, params)
+        number = cast("int", request["id"])
+        answer: asyncio.Future[RPCResponse] = asyncio.get_running_loop().create_future()
+        self._waiting[number] = answer
+        try:
+            await socket.send_bytes(self.encode_rpc_dict(request))
+            return await answer
+        finally:
+            self._waiting.pop(number, None)
+
+    async def close(self) -> None:
+        """Close the connection; a later request opens another."""
+        session, self._session, self._socket = self._session, None, None
+        if session is not None:
+            await session.close()
+        if self._listening is not None:
+            await self._listening
+            self._listening = None
+
+    async def _opened(self) -> ClientWebSocketResponse:
+        async with self._opening:
+            if self._socket is None or self._socket.closed:
+                await self.close()
+                self._session = ClientSession()
+                self._socket = await self._session.ws_connect(self._url, max_msg_size=0, heartbeat=30)
+                self._listening = asyncio.create_task(self._read(self._socket), name="aira-chain-websocket")
+            return self._socket
+
+    async def _read(self, socket: ClientWebSocketResponse) -> None:
+        """Hand answers to who waits for them, until the connection ends."""
+        async for message in socket:
+            if message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
+                self._hand_over(message.data)
+        for answer in self._waiting.values():
+            if not answer.done():
+                answer.set_exception(ConnectionResetError("the connection was closed"))
+
+    def _hand_over(self, text: str | bytes) -> None:
+        try:
+            response = json.loads(text)
+        except ValueError:
+            return
+        answer = self._waiting.get(response.get("id", -1)) if isinstance(response, dict) else None
+        if answer is not None and not answer.done():
+            answer.set_result(response)
+
+    def __str__(self) -> str:
+        return self._url

@@ -1,0 +1,115 @@
+"""Chains with the contracts on them, for the tests of `mesh.chain`.
+
+One chain serves all tests of a module; tests make orders of their own and compare balances, not absolute numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import pytest_asyncio
+
+from mesh.chain import XRT, Account, Chain, Deployment, DeploymentPlan, EmbeddedChain, Node, Timing, deploy
+from schemas.address import ZERO_ADDRESS
+from schemas.cid import cid_of_digest
+from schemas.keccak import keccak256
+from schemas.messages import Demand, Offer, Result
+from tests.support.nodes import Anvil
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    import pytest
+    from web3.providers.async_base import AsyncBaseProvider
+
+QUICK = Timing(poll_interval=0.02, receipt_interval=0.01, attempts=2, retry_delay=0.01, receipt_timeout=30)
+PLAN = DeploymentPlan(refund_delay=10, timeout_blocks=5)
+
+
+def cid(seed: int) -> str:
+    """A CID of nothing, different for each seed."""
+    return cid_of_digest(keccak256(seed.to_bytes(32, "big")))
+
+
+@dataclass(frozen=True)
+class Market:
+    """A deployment with a staked provider, a promisee and a promisor, who all approved the factory."""
+
+    endpoint: str | AsyncBaseProvider
+    deployment: Deployment
+    deployer: Account
+    provider: Account
+    promisee: Account
+    promisor: Account
+    stranger: Account
+
+    def chain(self, account: Account | None = None, **options: Any) -> Chain:
+        return Chain(self.endpoint, account=account, **({"timing": QUICK} | options))
+
+    def demand(self, account: Account | None = None, **fields: Any) -> Demand:
+        """A signed demand of the promisee's, of generation 5 where `sender` is given."""
+        account = account or self.promisee
+        demand = Demand(**(self._terms() | {"validator_fee": 0} | fields))
+        return account.signer.sign(demand)
+
+    def offer(self, account: Account | None = None, **fields: Any) -> Offer:
+        """A signed offer of the promisor's that matches `demand` with the same fields."""
+        account = account or self.promisor
+        return account.signer.sign(Offer(**(self._terms() | {"lighthouse_fee": 0} | fields)))
+
+    def result(self, liability: str, *, account: Account | None = None, **fields: Any) -> Result:
+        """The promisor's signed result."""
+        terms: dict[str, Any] = {"liability": liability, "result": cid(3), "success": True}
+        return (account or self.promisor).signer.sign(Result(**(terms | fields)))
+
+    def _terms(self) -> dict[str, Any]:
+        return {
+            "model": cid(1),
+            "objective": cid(2),
+            "token": self.deployment.xrt,
+            "cost": 0,
+            "lighthouse": self.deployment.lighthouse,
+            "validator": ZERO_ADDRESS,
+            "deadline": 1_000_000,
+            "nonce": next_nonce(),
+        }
+
+
+_used = 0
+
+
+def next_nonce() -> str:
+    """A generation-3 nonce that no order of this run has had."""
+    global _used
+    _used += 1
+    return keccak256(b"nonce" + _used.to_bytes(8, "big")).hex()
+
+
+async def prepare(endpoint: str | AsyncBaseProvider, keys: tuple[bytes, ...]) -> Market:
+    """Deploy everything; stake the provider; give promisee and promisor XRT, and let the factory take it."""
+    deployer, provider, promisee, promisor, stranger = (Account.from_key(key) for key in keys[:5])
+    async with Node(endpoint, timing=QUICK) as node:
+        market = Market(
+            endpoint, await deploy(node, deployer, plan=PLAN), deployer, provider, promisee, promisor, stranger
+        )
+        async with Chain(node, account=deployer) as chain:
+            for account in (provider, promisee, promisor):
+                await chain.transfer(account.address, 1000 * XRT)
+        for account, spender in ((promisee, "factory"), (promisor, "factory"), (provider, "lighthouse")):
+            async with Chain(node, account=account) as chain:
+                await chain.approve(getattr(market.deployment, spender), 1000 * XRT)
+        async with Chain(node, account=provider) as chain:
+            await chain.refill(market.deployment.lighthouse, 500 * XRT)
+    return market
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module", params=["embedded", "anvil"])
+async def market(request: pytest.FixtureRequest) -> AsyncIterator[Market]:
+    """A market on the embedded chain and on anvil."""
+    if request.param == "embedded":
+        async with EmbeddedChain() as node:
+            yield await prepare(node.provider, node.funded_keys)
+    else:
+        async with Anvil() as anvil:
+            yield await prepare(anvil.url, anvil.private_keys)

@@ -1,0 +1,142 @@
+"""Accounts and keyfiles."""
+
+from __future__ import annotations
+
+import json
+import logging
+import pickle
+import stat
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.chain import Account, KeyfileError, WrongPassword, keyfile_address, new_private_key, write_keyfile
+from mesh.errors import ConfigurationError, InputError
+from schemas.signing import recover
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+KEY = bytes.fromhex("4c0883a69102937d6231471b5dbb6204fe5129617082792ae468d01a3f362318")
+ADDRESS = "0x2c7536E3605D9C16a7a3D7b1898e529396a65c23"
+
+GETH = {
+    "address": "008aeeda4d805471df9b2a5b0f38a0c3bcba786b",
+    "crypto": {
+        "cipher": "aes-128-ctr",
+        "ciphertext": "d172bf743a674da9cdad04534d56926ef8358534d458fffccd4e6ad2fbde479c",
+        "cipherparams": {"iv": "83dbcc02d8ccb40e466191a123791e0e"},
+        "kdf": "scrypt",
+        "kdfparams": {
+            "dklen": 32,
+            "n": 262144,
+            "r": 1,
+            "p": 8,
+            "salt": "ab0c7876052600dd703518d6fc3fe8984592145b591fc8fb5c6d43190334ba19",
+        },
+        "mac": "2103ac29920d71da29f15d75b4a16dbe95cfd7ff8faea1056c33131d846e3097",
+    },
+    "id": "3198bc9c-6672-5ab3-d995-4942343ae5b6",
+    "version": 3,
+}
+"""The Web3 secret storage's own test vector."""
+
+
+@pytest.fixture(scope="module")
+def keyfile(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("keys") / "key.json"
+    write_keyfile(path, KEY, "sesame")
+    return path
+
+
+def _password_file(folder: Path, text: str) -> Path:
+    path = folder / "password"
+    path.write_text(text)
+    return path
+
+
+def test_an_account_has_the_address_of_its_key() -> None:
+    assert Account.from_key(KEY).address == ADDRESS
+
+
+@pytest.mark.parametrize("key", [b"", bytes(32), b"\xff" * 32, KEY + b"\0"])
+def test_bytes_that_are_no_key_are_refused_without_being_shown(key: bytes) -> None:
+    with pytest.raises(InputError) as caught:
+        Account.from_key(key)
+    assert not key or key.hex() not in str(caught.value)
+
+
+def test_new_keys_differ_and_are_keys() -> None:
+    keys = {new_private_key() for _ in range(5)}
+    assert len(keys) == 5
+    assert all(Account.from_key(key).address for key in keys)
+
+
+def test_a_written_keyfile_opens_with_its_password(keyfile: Path, tmp_path: Path) -> None:
+    account = Account.from_keyfile(keyfile, _password_file(tmp_path, "sesame\n"))
+    assert account.address == ADDRESS
+    assert recover(bytes(32), account.signer.sign_hash(bytes(32))) == ADDRESS
+
+
+def test_a_keyfile_of_geth_opens(tmp_path: Path) -> None:
+    path = tmp_path / "UTC--geth"
+    path.write_text(json.dumps(GETH))
+    account = Account.from_keyfile(path, _password_file(tmp_path, "testpassword"))
+    assert account.address == "0x008AeEda4D805471dF9b2A5B0f38A0C3bCBA786b"
+
+
+def test_a_keyfile_is_for_its_owner_only(keyfile: Path) -> None:
+    assert stat.S_IMODE(keyfile.stat().st_mode) == 0o600
+
+
+def test_a_keyfile_is_never_overwritten(keyfile: Path) -> None:
+    before = keyfile.read_bytes()
+    with pytest.raises(KeyfileError, match="exists already"):
+        write_keyfile(keyfile, new_private_key(), "other")
+    assert keyfile.read_bytes() == before
+
+
+def test_a_keyfile_says_its_address_without_the_password(keyfile: Path) -> None:
+    assert keyfile_address(keyfile) == ADDRESS
+
+
+def test_a_wrong_password_is_one_clear_error(keyfile: Path, tmp_path: Path) -> None:
+    with pytest.raises(WrongPassword, match="does not open it") as caught:
+        Account.from_keyfile(keyfile, _password_file(tmp_path, "mellon"))
+    assert isinstance(caught.value, ConfigurationError)
+    assert caught.value.hint
+    assert "mellon" not in str(caught.value)
+
+
+def test_a_missing_keyfile_says_how_to_make_one(tmp_path: Path) -> None:
+    with pytest.raises(KeyfileError, match=r"no\.json") as caught:
+        Account.from_keyfile(tmp_path / "no.json", _password_file(tmp_path, "x"))
+    assert "account new" in caught.value.hint
+
+
+def test_a_missing_password_file_is_named(keyfile: Path, tmp_path: Path) -> None:
+    with pytest.raises(KeyfileError, match="password file"):
+        Account.from_keyfile(keyfile, tmp_path / "none")
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '"text"', '{"version": 3, "crypto": {}}', '{"version": 9}'])
+def test_a_file_that_is_no_keyfile_is_refused(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "key.json"
+    path.write_text(content)
+    with pytest.raises(KeyfileError, match="is not a keyfile"):
+        Account.from_keyfile(path, _password_file(tmp_path, "x"))
+
+
+def test_neither_key_nor_password_is_shown_or_logged(
+    keyfile: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG)
+    account = Account.from_keyfile(keyfile, _password_file(tmp_path, "sesame"))
+    shown = repr(account) + repr(account.signer) + repr(vars(account)) + caplog.text
+    assert KEY.hex() not in shown
+    assert "sesame" not in shown
+
+
+def test_an_account_is_not_pickled() -> None:
+    with pytest.raises(TypeError):
+        pickle.dumps(Account.from_key(KEY))

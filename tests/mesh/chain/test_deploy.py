@@ -1,0 +1,61 @@
+"""Deploying everything on a chain of one's own."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from mesh.chain import (
+    XRT,
+    Account,
+    Chain,
+    DeploymentPlan,
+    EmbeddedChain,
+    InsufficientFunds,
+    NoContracts,
+    deploy,
+    new_private_key,
+)
+from mesh.chain.names import DEVELOPMENT_REGISTRY
+from tests.mesh.chain.conftest import QUICK
+
+
+async def test_a_fresh_chain_is_ready_in_well_under_three_seconds() -> None:
+    started = time.perf_counter()
+    async with EmbeddedChain() as node:
+        await deploy(node.provider, Account.from_key(node.funded_keys[0]))
+    assert time.perf_counter() - started < 3
+
+
+async def test_the_plan_is_what_is_deployed() -> None:
+    plan = DeploymentPlan(lighthouse="home", initial_supply=7 * XRT, minimal_stake=5, timeout_blocks=9, refund_delay=33)
+    async with EmbeddedChain() as node:
+        account = Account.from_key(node.funded_keys[3])
+        deployment = await deploy(node.provider, account, plan=plan)
+        async with Chain(node.provider, ens=deployment.ens, timing=QUICK) as chain:
+            assert await chain.balance_of(account.address) == 7 * XRT
+            assert await chain.resolve("home.lighthouse.5.robonomics.eth") == deployment.lighthouse
+            assert deployment.lighthouse_name == "home.lighthouse.3.robonomics.eth"
+            state = await chain.lighthouse("home")
+            assert (state.minimal_stake, state.timeout_blocks) == (5, 9)
+            assert await chain.block_number() == deployment.block_number
+            refund_delay = chain.node.contract("Factory", chain.factory).functions.refundDelay()
+            assert await chain.node.read(refund_delay) == 33
+
+
+async def test_the_first_deployment_of_a_development_chain_is_found_without_an_address() -> None:
+    async with EmbeddedChain() as node:
+        with pytest.raises(NoContracts, match="ENS registry"):
+            async with Chain(node.provider, timing=QUICK):
+                pass
+        deployment = await deploy(node.provider, Account.from_key(node.funded_keys[0]))
+        assert deployment.ens == DEVELOPMENT_REGISTRY
+        async with Chain(node.provider, timing=QUICK) as chain:
+            assert chain.factory == deployment.factory
+
+
+async def test_deploying_needs_funds() -> None:
+    async with EmbeddedChain() as node:
+        with pytest.raises(InsufficientFunds):
+            await deploy(node.provider, Account.from_key(new_private_key()))

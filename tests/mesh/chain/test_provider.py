@@ -1,0 +1,184 @@
+"""The way to a node that is not there, is lost, or is no node."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from aiohttp import web
+
+from mesh.chain import Chain, EmbeddedChain, JsonRpcServer, Node, NodeUnreachable, RequestRefused
+from mesh.errors import ClosedError, ConfigurationError, RemoteError
+from tests.mesh.chain.conftest import QUICK
+from tests.support.nodes import Anvil
+from tests.support.ports import free_port
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Awaitable, Callable
+
+
+@asynccontextmanager
+async def _server(handler: Callable[[web.Request], Awaitable[web.StreamResponse]]) -> AsyncIterator[str]:
+    """A web server that answers everything by `handler`."""
+    app = web.Application()
+    app.router.add_route("*", "/", handler)
+    runner = web.AppRunner(app, shutdown_timeout=0.1)
+    await runner.setup()
+    await web.TCPSite(runner, "127.0.0.1", 0).start()
+    yield f"http://127.0.0.1:{runner.addresses[0][1]}"
+    await runner.cleanup()
+
+
+@pytest.mark.parametrize("scheme", ["http", "ws"])
+async def test_a_node_that_is_not_there_is_one_clear_error(scheme: str) -> None:
+    endpoint = f"{scheme}://127.0.0.1:{free_port()}"
+    with pytest.raises(NodeUnreachable, match=endpoint) as caught:
+        async with Chain(endpoint, timing=QUICK):
+            pass
+    assert isinstance(caught.value, RemoteError)
+    assert caught.value.endpoint == endpoint
+    assert "\n" not in str(caught.value)
+    assert caught.value.hint
+
+
+async def test_attempts_are_bounded_and_spaced() -> None:
+    seen: list[float] = []
+
+    async def busy(request: web.Request) -> web.Response:
+        seen.append(time.monotonic())
+        return web.Response(status=503)
+
+    timing = replace(QUICK, attempts=4, retry_delay=0.02)
+    async with _server(busy) as url:
+        with pytest.raises(NodeUnreachable, match="503"):
+            async with Node(url, timing=timing):
+                pass
+    pauses = [later - earlier for earlier, later in pairwise(seen)]
+    assert len(seen) == 4
+    assert all(pause >= wanted for pause, wanted in zip(pauses, (0.02, 0.04, 0.08), strict=True))
+
+
+async def test_a_node_that_comes_back_in_time_is_not_noticed() -> None:
+    count = 0
+
+    async def hesitant(request: web.Request) -> web.Response:
+        nonlocal count
+        count += 1
+        if count < 3:
+            return web.Response(status=502)
+        return web.json_response({"jsonrpc": "2.0", "id": (await request.json())["id"], "result": "0x7"})
+
+    async with _server(hesitant) as url, Node(url, timing=replace(QUICK, attempts=3)) as node:
+        assert node.chain_id == 7
+
+
+@pytest.mark.parametrize(
+    ("response", "why"),
+    [
+        ({"text": "<html>hello</html>"}, "not JSON"),
+        ({"text": "{}"}, "not a JSON-RPC server"),
+        ({"text": "[1]"}, "not a JSON-RPC server"),
+        ({"status": 401, "text": "who are you?"}, "401"),
+        ({"status": 404}, "404"),
+    ],
+)
+async def test_what_is_no_node_is_found_out_at_once(response: dict[str, Any], why: str) -> None:
+    count = 0
+
+    async def answer(request: web.Request) -> web.Response:
+        nonlocal count
+        count += 1
+        return web.Response(**response)
+
+    async with _server(answer) as url:
+        with pytest.raises(NodeUnreachable, match=why):
+            async with Node(url, timing=QUICK):
+                pass
+    assert count == 1
+
+
+async def test_a_node_that_never_answers_is_given_up() -> None:
+    async def sleepy(request: web.Request) -> web.Response:
+        await asyncio.Event().wait()
+        raise AssertionError
+
+    async with _server(sleepy) as url:
+        with pytest.raises(NodeUnreachable, match="no answer in time"):
+            async with Node(url, timing=replace(QUICK, request_timeout=0.05)):
+                pass
+
+
+async def test_an_error_that_comes_with_a_http_status_is_still_the_nodes_word() -> None:
+    async def rude(request: web.Request) -> web.Response:
+        error = {"code": -32005, "message": "limit exceeded"}
+        return web.json_response({"jsonrpc": "2.0", "id": 1, "error": error}, status=400)
+
+    async with _server(rude) as url:
+        with pytest.raises(RequestRefused, match="limit exceeded") as caught:
+            async with Node(url, timing=QUICK):
+                pass
+    assert caught.value.code == -32005
+
+
+@pytest.mark.parametrize("endpoint", ["", "127.0.0.1:8545", "ftp://127.0.0.1"])
+def test_a_text_that_is_no_endpoint_is_refused(endpoint: str) -> None:
+    with pytest.raises(ConfigurationError, match="not the address of a node"):
+        Node(endpoint)
+
+
+@pytest.mark.parametrize("scheme", ["http", "ws"])
+async def test_a_node_that_goes_and_comes_again_is_found_again(scheme: str) -> None:
+    anvil = Anvil()
+    endpoint = anvil.url if scheme == "http" else anvil.ws_url
+    await asyncio.to_thread(anvil.start)
+    try:
+        async with Node(endpoint, timing=QUICK) as node:
+            assert await node.block_number() == 0
+            await asyncio.to_thread(anvil.stop)
+            with pytest.raises(NodeUnreachable):
+                await node.block_number()
+            await asyncio.to_thread(anvil.start)
+            assert await node.block_number() == 0
+    finally:
+        await asyncio.to_thread(anvil.stop)
+
+
+async def test_a_websocket_that_closes_without_an_answer_is_not_waited_for() -> None:
+    async def hang_up(request: web.Request) -> web.WebSocketResponse:
+        socket = web.WebSocketResponse()
+        await socket.prepare(request)
+        await socket.receive()
+        await socket.close()
+        return socket
+
+    async with _server(hang_up) as url, asyncio.timeout(5):
+        with pytest.raises(NodeUnreachable, match="connection was closed"):
+            async with Node(url.replace("http", "ws"), timing=QUICK):
+                pass
+
+
+async def test_many_requests_share_a_websocket() -> None:
+    async with Anvil() as anvil, Node(anvil.ws_url, timing=QUICK) as node:
+        assert await asyncio.gather(*(node.block_number() for _ in range(50))) == [0] * 50
+
+
+async def test_a_closed_node_is_not_asked() -> None:
+    async with EmbeddedChain() as chain, JsonRpcServer(chain.provider) as server:
+        async with Node(server.url, timing=QUICK) as node:
+            pass
+        with pytest.raises(ClosedError):
+            await node.block_number()
+        with pytest.raises(ClosedError):
+            _ = node.chain_id
+
+
+async def test_a_closed_embedded_chain_is_told_as_closed() -> None:
+    async with EmbeddedChain() as chain, Node(chain.provider, timing=QUICK) as node:
+        await chain.__aexit__(None, None, None)
+        with pytest.raises(ClosedError, match="embedded"):
+            await node.block_number()

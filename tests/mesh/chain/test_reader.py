@@ -1,0 +1,231 @@
+"""Reading events from a cursor."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import aclosing
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from mesh.chain import (
+    XRT,
+    Account,
+    Approval,
+    BlockEvents,
+    Chain,
+    ChainWentBack,
+    Current,
+    EmbeddedChain,
+    Finalized,
+    NewLiability,
+    NewLighthouse,
+    NodeUnreachable,
+    Online,
+    Transfer,
+    deploy,
+)
+from mesh.chain.embedded import EmbeddedProvider
+from mesh.chain.errors import RequestRefused
+from mesh.chain.jsonrpc import RpcError
+from schemas.address import ZERO_ADDRESS
+from tests.mesh.chain.conftest import QUICK
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from web3.types import RPCEndpoint, RPCResponse
+
+    from mesh.chain import ChainEvent
+    from tests.mesh.chain.conftest import Market
+
+pytestmark = pytest.mark.asyncio(loop_scope="module")
+
+
+async def _read(chain: Chain, first: int, last: int, *, lighthouses: Iterable[str] = ()) -> list[BlockEvents]:
+    """What is told of the blocks from `first` to `last`."""
+    blocks: list[BlockEvents] = []
+    async with asyncio.timeout(10), aclosing(chain.events(first, lighthouses=lighthouses)) as events:
+        async for block in events:
+            blocks.append(block)
+            if block.block_number >= last:
+                break
+    return blocks
+
+
+def _events(blocks: list[BlockEvents]) -> list[ChainEvent]:
+    return [event for block in blocks for event in block.events]
+
+
+async def test_a_job_is_told_from_the_liability_to_the_payment(market: Market) -> None:
+    cost = 5 * XRT
+    async with market.chain(market.provider) as chain:
+        start = await chain.block_number()
+        created = await chain.create_liability("airalab", market.demand(cost=cost), market.offer(cost=cost))
+        result = market.result(created.liability)
+        settled = await chain.finalize("airalab", result)
+        head = await chain.block_number()
+        events = _events(await _read(chain, start + 1, head))
+    factory = market.deployment.factory
+    assert NewLiability(created.liability, created.tx) in events
+    assert Finalized(created.liability, True, result.result, settled.tx) in events
+    assert Transfer(market.promisee.address, factory, cost, created.tx) in events
+    assert Transfer(factory, market.promisor.address, cost, settled.tx) in events
+    minted = [event for event in events if isinstance(event, Transfer) and event.sender == ZERO_ADDRESS]
+    assert [event.recipient for event in minted] == [market.provider.address]
+
+
+async def test_lighthouses_are_told_and_those_asked_for_tell_their_turns(market: Market) -> None:
+    async with market.chain() as chain:
+        head = await chain.block_number()
+        everything = _events(await _read(chain, 0, head, lighthouses=[market.deployment.lighthouse]))
+        without = _events(await _read(chain, 0, head))
+    lighthouse, provider = market.deployment.lighthouse, market.provider.address
+    assert next(event.name for event in everything if isinstance(event, NewLighthouse)) == "airalab"
+    assert [event.provider for event in everything if isinstance(event, Online)] == [provider]
+    turns = [event for event in everything if isinstance(event, Current)]
+    assert (turns[0].lighthouse, turns[0].provider, turns[0].quota) == (lighthouse, provider, 500)
+    assert not [event for event in without if isinstance(event, Online | Current)]
+
+
+async def test_an_approval_is_told(market: Market) -> None:
+    async with market.chain(market.promisee) as chain:
+        tx = await chain.approve(market.stranger.address, 17)
+        head = await chain.block_number()
+        assert _events(await _read(chain, head, head)) == [
+            Approval(market.promisee.address, market.stranger.address, 17, tx)
+        ]
+
+
+async def test_a_refund_is_told_without_a_result(market: Market) -> None:
+    async with market.chain(market.provider) as chain:
+        created = await chain.create_liability("airalab", market.demand(cost=1), market.offer(cost=1))
+        while await chain.block_number() + 1 < await chain.refundable_from(created.liability):
+            await chain.approve(market.stranger.address, 0)
+        settled = await chain.refund(created.liability)
+        head = await chain.block_number()
+        events = _events(await _read(chain, head, head))
+    assert Finalized(created.liability, False, "", settled.tx) in events
+
+
+async def test_block_numbers_grow_and_the_head_is_told_without_events(market: Market) -> None:
+    async with market.chain(market.promisee) as chain:
+        await chain.send_eth(market.stranger.address, 1)
+        head = await chain.block_number()
+        blocks = await _read(chain, 0, head)
+    numbers = [block.block_number for block in blocks]
+    assert numbers == sorted(set(numbers))
+    assert blocks[-1] == BlockEvents(head, ())
+
+
+async def test_reading_goes_on_with_new_blocks_and_a_cursor_takes_it_up(market: Market) -> None:
+    async with market.chain(market.promisee) as chain:
+        cursor = await chain.block_number() + 1
+        reading = asyncio.create_task(_read(chain, cursor, cursor + 1))
+        await chain.approve(market.stranger.address, 1)
+        await chain.approve(market.stranger.address, 2)
+        live = await reading
+        again = await _read(chain, cursor, cursor + 1)
+        rest = await _read(chain, cursor + 1, cursor + 1)
+    assert _events(live) == _events(again)
+    assert _events(rest) == _events(again)[1:]
+
+
+async def test_a_cursor_past_the_head_means_that_the_chain_went_back(market: Market) -> None:
+    async with market.chain() as chain:
+        head = await chain.block_number()
+        with pytest.raises(ChainWentBack) as caught:
+            await _read(chain, head + 2, head + 2)
+    assert (caught.value.cursor, caught.value.head) == (head + 2, head)
+
+
+async def test_a_finalized_event_of_somebody_elses_contract_is_not_told(market: Market) -> None:
+    """A second factory on the same chain makes liabilities of its own; they are no business of the first."""
+    async with market.chain(market.deployer) as chain:
+        other = await deploy(chain.node, market.deployer)
+    elsewhere: dict[str, Any] = {"lighthouse": other.lighthouse, "token": other.xrt}
+    options = {"ens": other.ens}
+    async with market.chain(market.deployer, **options) as theirs:
+        await theirs.transfer(market.provider.address, XRT)
+    async with market.chain(market.provider, **options) as theirs, market.chain() as ours:
+        start = await theirs.block_number()
+        await theirs.approve(other.lighthouse, XRT)
+        await theirs.refill(other.lighthouse, XRT)
+        created = await theirs.create_liability(other.lighthouse, market.demand(**elsewhere), market.offer(**elsewhere))
+        await theirs.finalize(other.lighthouse, market.result(created.liability))
+        head = await theirs.block_number()
+        assert [type(event) for event in _events(await _read(theirs, start + 1, head))][-1] is Finalized
+        assert _events(await _read(ours, start + 1, head)) == []
+
+
+class _Choosy(EmbeddedProvider):
+    """An embedded chain that, like many public nodes, answers only short ranges of logs."""
+
+    def __init__(self, chain: EmbeddedChain, *, limit: int) -> None:
+        super().__init__(chain)
+        self.limit = limit
+        self.ranges: list[int] = []
+
+    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+        if method == "eth_getLogs":
+            span = int(params[0]["toBlock"], 16) - int(params[0]["fromBlock"], 16) + 1
+            self.ranges.append(span)
+            if span > self.limit:
+                refused = RpcError(-32005, "query returned more than 10000 results")
+                return {"jsonrpc": "2.0", "id": 1, "error": refused.as_object()}  # type: ignore[typeddict-item]
+        return await super().make_request(method, params)
+
+
+async def test_a_node_that_refuses_long_ranges_is_asked_for_shorter_ones() -> None:
+    async with EmbeddedChain() as node:
+        deployer = await _prepare_lonely(node)
+        async with Chain(node.provider, account=deployer, timing=QUICK) as chain:
+            for value in range(25):
+                await chain.approve(deployer.address, value)
+            everything = _events(await _read(chain, 0, await chain.block_number()))
+        choosy = _Choosy(node, limit=10)
+        async with Chain(choosy, timing=QUICK) as chain:
+            head = await chain.block_number()
+            blocks = await _read(chain, 0, head)
+        assert _events(blocks) == everything
+        assert blocks[-1].block_number == head
+        assert min(choosy.ranges) >= 3
+
+        choosy.limit = 0
+        async with Chain(choosy, timing=QUICK) as chain:
+            with pytest.raises(RequestRefused, match="10000 results"):
+                await _read(chain, 0, head)
+
+
+async def _prepare_lonely(node: EmbeddedChain) -> Account:
+    """Contracts and nothing else; the account that deployed them."""
+    deployer = Account.from_key(node.funded_keys[0])
+    await deploy(node.provider, deployer)
+    return deployer
+
+
+async def test_a_lost_node_ends_the_reading_and_the_cursor_takes_it_up() -> None:
+    async with EmbeddedChain() as node:
+        await _prepare_lonely(node)
+        flaky = _Flaky(node)
+        async with Chain(flaky, timing=QUICK) as chain:
+            head = await chain.block_number()
+            events = chain.events(head + 1)
+            waiting = asyncio.create_task(anext(events))
+            flaky.is_lost = True
+            with pytest.raises(NodeUnreachable, match="wire is cut"):
+                await waiting
+            flaky.is_lost = False
+            await node.mine(1)
+            assert (await _read(chain, head + 1, head + 1))[-1] == BlockEvents(head + 1, ())
+
+
+class _Flaky(EmbeddedProvider):
+    """An embedded chain behind a wire that can be cut."""
+
+    is_lost = False
+
+    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+        if self.is_lost:
+            raise ConnectionError("the wire is cut")
+        return await super().make_request(method, params)

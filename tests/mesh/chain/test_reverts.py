@@ -1,0 +1,70 @@
+"""Why contracts refuse, in the words of several nodes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from eth_abi.abi import encode
+
+from mesh.chain.reverts import custom_errors, decode_revert, explain
+from schemas.keccak import keccak256
+
+ADDRESS = "0x00000000219ab540356cBB839Cbe05303d7705Fa"
+NOT_A_PROVIDER = keccak256(b"NotAProvider(address)")[:4] + encode(["address"], [ADDRESS])
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        {"code": 3, "message": "execution reverted", "data": "0x" + NOT_A_PROVIDER.hex()},
+        {"code": 3, "message": "execution reverted: custom error 0x…", "data": "0x" + NOT_A_PROVIDER.hex()},
+        {"code": -32603, "message": "Error: VM reverted", "data": {"message": "", "data": "0x" + NOT_A_PROVIDER.hex()}},
+        {"code": -32015, "message": "VM execution error.", "data": "Reverted 0x" + NOT_A_PROVIDER.hex()},
+    ],
+    ids=["geth", "anvil", "hardhat", "parity"],
+)
+def test_a_custom_error_is_found_where_a_node_puts_it(error: dict[str, Any]) -> None:
+    reverted = decode_revert(error)
+    assert reverted is not None
+    assert (reverted.reason, reverted.arguments) == ("NotAProvider", (ADDRESS,))
+    assert str(reverted) == f"the contract refused: NotAProvider ({ADDRESS})"
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        {"code": -32000, "message": "nonce too low"},
+        {"code": -32000, "message": "insufficient funds for gas * price + value"},
+        {"code": -32601, "message": "the method does not exist"},
+        {},
+    ],
+)
+def test_other_errors_are_no_refusals_of_a_contract(error: dict[str, Any]) -> None:
+    assert decode_revert(error) is None
+
+
+def test_a_plain_revert_gives_its_text() -> None:
+    assert explain(bytes.fromhex("08c379a0") + encode(["string"], ["too late"])).reason == "too late"
+
+
+def test_a_text_without_data_is_taken_from_the_message() -> None:
+    reverted = decode_revert({"code": 3, "message": "execution reverted: too late"})
+    assert reverted is not None
+    assert reverted.reason == "too late"
+
+
+def test_a_panic_tells_its_code() -> None:
+    panic = explain(bytes.fromhex("4e487b71") + encode(["uint256"], [0x11]))
+    assert (panic.reason, panic.arguments) == ("Panic", (0x11,))
+
+
+@pytest.mark.parametrize("data", [b"", b"\1", b"\xde\xad\xbe\xef", NOT_A_PROVIDER[:10], bytes.fromhex("08c379a0ff")])
+def test_data_that_means_nothing_is_kept(data: bytes) -> None:
+    reverted = explain(data)
+    assert (reverted.reason, reverted.arguments, reverted.data) == ("", (), data)
+
+
+def test_every_error_of_the_contracts_is_known() -> None:
+    names = {name for name, _ in custom_errors().values()}
+    assert {"CostMismatch", "ERC20InsufficientAllowance", "OrderUsed", "NotYourTurn", "AlreadyFinalized"} <= names

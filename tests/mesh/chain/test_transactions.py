@@ -1,0 +1,211 @@
+"""Sending, when the way or the chain does not do what is hoped for."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from mesh.chain import (
+    XRT,
+    Account,
+    Chain,
+    EmbeddedChain,
+    Node,
+    NodeUnreachable,
+    Reverted,
+    Sender,
+    TransactionTimeout,
+    deploy,
+    new_private_key,
+)
+from mesh.chain.embedded import EmbeddedProvider
+from mesh.chain.transports import HttpTransport
+from tests.mesh.chain.conftest import QUICK
+from tests.support.nodes import Anvil
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Awaitable, Callable
+
+    from web3.types import RPCEndpoint, RPCResponse
+
+
+class _Wire(EmbeddedProvider):
+    """The way to an embedded chain, where things happen around the sending of transactions."""
+
+    def __init__(self, chain: EmbeddedChain) -> None:
+        super().__init__(chain)
+        self.before: Callable[[], Awaitable[object]] | None = None
+        self.answers_to_lose = 0
+        self.sent = 0
+
+    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+        if method != "eth_sendRawTransaction":
+            return await super().make_request(method, params)
+        self.sent += 1
+        before, self.before = self.before, None
+        if before is not None:
+            await before()
+        response = await super().make_request(method, params)
+        if self.answers_to_lose > 0:
+            self.answers_to_lose -= 1
+            raise ConnectionResetError("the answer was lost")
+        return response
+
+
+@pytest.fixture
+async def node() -> AsyncIterator[EmbeddedChain]:
+    async with EmbeddedChain() as node:
+        yield node
+
+
+def _stranger() -> str:
+    return Account.from_key(new_private_key()).address
+
+
+async def test_a_transaction_whose_answer_was_lost_goes_through_once(node: EmbeddedChain) -> None:
+    wire, friend = _Wire(node), _stranger()
+    async with Node(wire, timing=QUICK) as way:
+        sender = Sender(way, Account.from_key(node.funded_keys[0]))
+        wire.answers_to_lose = 1
+        receipt = await sender.send(to=friend, data=b"", value=5)
+        assert receipt.block_number == 1
+        assert wire.sent == 2
+        assert await way.eth_balance(friend) == 5
+
+
+async def test_a_node_that_stays_away_while_sending_is_told(node: EmbeddedChain) -> None:
+    wire = _Wire(node)
+    async with Node(wire, timing=QUICK) as way:
+        sender = Sender(way, Account.from_key(node.funded_keys[0]))
+        wire.answers_to_lose = 100
+        with pytest.raises(NodeUnreachable, match="lost"):
+            await sender.send(to=_stranger(), data=b"", value=5)
+
+
+async def test_a_number_taken_by_another_client_is_replaced(node: EmbeddedChain) -> None:
+    """Even by the very same transaction, byte for byte: it is another one all the same."""
+    wire, friend = _Wire(node), _stranger()
+    account = Account.from_key(node.funded_keys[0])
+    async with Node(wire, timing=QUICK) as one, Node(node.provider, timing=QUICK) as other:
+        wire.before = lambda: Sender(other, account).send(to=friend, data=b"", value=5)
+        await Sender(one, account).send(to=friend, data=b"", value=5)
+        assert await one.eth_balance(friend) == 10
+
+
+async def test_what_fails_only_when_mined_is_explained(node: EmbeddedChain) -> None:
+    """Between the simulation and the block somebody else takes the tokens."""
+    wire = _Wire(node)
+    deployer, friend = (Account.from_key(key) for key in node.funded_keys[:2])
+    deployment = await deploy(node.provider, deployer)
+    async with (
+        Chain(wire, account=friend, timing=QUICK) as chain,
+        Chain(node.provider, account=deployer, timing=QUICK) as rival,
+    ):
+        await rival.transfer(friend.address, XRT)
+        await chain.approve(deployer.address, XRT)
+        wire.before = lambda: rival.transfer_from(friend.address, deployer.address, XRT)
+        with pytest.raises(Reverted, match="ERC20InsufficientBalance") as caught:
+            await chain.transfer(deployment.factory, XRT)
+        assert caught.value.arguments == (friend.address, 0, XRT)
+
+
+async def test_transactions_of_one_node_do_not_fight_for_numbers(node: EmbeddedChain) -> None:
+    wire, friend = _Wire(node), _stranger()
+    account = Account.from_key(node.funded_keys[0])
+    async with Node(wire, timing=QUICK) as way:
+        await asyncio.gather(*(Sender(way, account).send(to=friend, data=b"", value=1) for _ in range(10)))
+        assert await way.eth_balance(friend) == 10
+    assert wire.sent == 10
+
+
+async def test_senders_of_one_node_fill_a_block_together() -> None:
+    """On a chain that makes blocks by time, many transactions of an account wait at once, each with its number."""
+    friend = _stranger()
+    async with Anvil(arguments=("--block-time", "1")) as anvil, Node(anvil.url, timing=QUICK) as node:
+        account = Account.from_key(anvil.private_keys[0])
+        senders = [Sender(node, account) for _ in range(3)]
+        receipts = await asyncio.gather(*(sender.send(to=friend, data=b"", value=1) for sender in senders * 5))
+        assert await node.eth_balance(friend) == 15
+        assert len({receipt.block_number for receipt in receipts}) < 15
+
+
+class _Forgetful(HttpTransport):
+    """A node behind a balancer: the one that counts has not heard of what another was given."""
+
+    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+        if method == "eth_getTransactionCount":
+            params = [params[0], "latest"]
+        return await super().make_request(method, params)
+
+
+async def test_numbers_go_on_where_the_node_forgets_what_is_pending() -> None:
+    friend = _stranger()
+    async with Anvil(arguments=("--block-time", "1")) as anvil:
+        forgetful = _Forgetful(anvil.url)
+        async with Node(forgetful, timing=QUICK) as node:
+            sender = Sender(node, Account.from_key(anvil.private_keys[0]))
+            await asyncio.gather(*(sender.send(to=friend, data=b"", value=value) for value in (1, 2, 4)))
+            assert await node.eth_balance(friend) == 7
+        await forgetful.close()
+
+
+async def test_a_transaction_that_is_not_mined_is_given_up_and_the_next_waits_behind_it() -> None:
+    timing = replace(QUICK, receipt_timeout=0.1)
+    friend = _stranger()
+    async with Anvil(arguments=("--no-mining",)) as anvil, Node(anvil.url, timing=timing) as node:
+        sender = Sender(node, Account.from_key(anvil.private_keys[0]))
+        with pytest.raises(TransactionTimeout) as caught:
+            await sender.send(to=friend, data=b"", value=1)
+        assert caught.value.tx.startswith("0x")
+        assert caught.value.hint
+        with pytest.raises(TransactionTimeout):
+            await sender.send(to=friend, data=b"", value=2)
+        await node.web3.provider.make_request("evm_mine", [])
+        assert await node.eth_balance(friend) == 3
+
+
+async def test_the_number_of_a_transaction_that_the_node_dropped_is_used_again() -> None:
+    friend = _stranger()
+    async with (
+        Anvil(arguments=("--no-mining",)) as anvil,
+        Node(anvil.url, timing=replace(QUICK, receipt_timeout=0.1)) as node,
+    ):
+        sender = Sender(node, Account.from_key(anvil.private_keys[0]))
+        with pytest.raises(TransactionTimeout) as dropped:
+            await sender.send(to=friend, data=b"", value=1)
+        await node.web3.provider.make_request("anvil_dropTransaction", [dropped.value.tx])
+        with pytest.raises(TransactionTimeout):
+            await sender.send(to=friend, data=b"", value=2)
+        await node.web3.provider.make_request("evm_mine", [])
+        assert await node.eth_balance(friend) == 2
+
+
+async def test_a_chain_without_a_base_fee_is_paid_by_gas_price() -> None:
+    arguments = ("--hardfork", "berlin", "--gas-price", "1000000000")
+    friend = _stranger()
+    async with Anvil(arguments=arguments) as anvil, Node(anvil.url, timing=QUICK) as node:
+        await Sender(node, Account.from_key(anvil.private_keys[0])).send(to=friend, data=b"", value=1)
+        assert await node.eth_balance(friend) == 1
+
+
+async def test_cancelling_does_not_hold_up_the_next(node: EmbeddedChain) -> None:
+    wire, friend = _Wire(node), _stranger()
+    reached = asyncio.Event()
+
+    async def hang() -> None:
+        reached.set()
+        await asyncio.Event().wait()
+
+    async with Node(wire, timing=QUICK) as way:
+        sender = Sender(way, Account.from_key(node.funded_keys[0]))
+        wire.before = hang
+        sending = asyncio.create_task(sender.send(to=friend, data=b"", value=1))
+        await reached.wait()
+        sending.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await sending
+        await sender.send(to=friend, data=b"", value=2)
+        assert await way.eth_balance(friend) == 2
