@@ -29,7 +29,7 @@ def at_fault(match: Match, reason: str, arguments: Sequence[Any]) -> tuple[Verif
         case "InvalidSignature", *_:
             return both
         case "ERC20InsufficientAllowance", _, _, needed if needed == match.offer.message.lighthouse_fee:
-            return both if needed == match.demand.message.cost else (match.offer,)
+            return both if needed in (match.demand.message.cost, match.demand.message.validator_fee) else (match.offer,)
         case "ERC20InsufficientAllowance" | "ValidatorWithoutCode", *_:
             return (match.demand,)
     return both

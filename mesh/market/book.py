@@ -1,9 +1,9 @@
 """The order book: open demands and offers of one lighthouse, matched first come, first served. Pure: no I/O.
 
-A demand and an offer agree when model, objective, token, cost, lighthouse and validator are equal. Orders wait in a
-queue for each such set of terms and in another for each deadline, and know their places in both, so that adding,
-matching, removing and expiring cost the same at a thousand open orders and at a million, and an order costs little more
-than its text.
+A demand and an offer agree when model, objective, token, cost, lighthouse and validator are equal; the book is of one
+lighthouse. Orders wait in a queue for each set of the other terms. Adding, matching and removing cost the same at a
+thousand open orders and at a million, and an order costs little more than its text. What is due at a block is a list
+of keys; an order that leaves earlier stays listed until then, by its key only.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from schemas import Offer, Verified
 
     Order = Demand | Offer
-    Terms = tuple[str, str, str, int, str, str]
+    Terms = tuple[str, str, str, int, str]
 
+HASH_SIZE: Final = 32
 LIMIT: Final = 1_000_000
 """Open orders that a book holds unless told otherwise."""
 
@@ -59,14 +60,6 @@ def order_id(order: Verified[Order]) -> bytes:
     return order.hash + address_bytes(order.signer)
 
 
-class _Entry(NamedTuple):
-    """An open order, and its places in the queue of its terms and in that of its deadline."""
-
-    order: Verified[Order]
-    among_terms: Link[Verified[Order]]
-    among_deadlines: Link[Verified[Order]]
-
-
 class OrderBook:
     """The open orders of the lighthouse at `lighthouse` (EIP-55 address), `limit` of them at most.
 
@@ -77,16 +70,16 @@ class OrderBook:
         self._lighthouse = lighthouse
         self._limit = limit
         self._head = 0
-        self._entries: dict[bytes, _Entry] = {}
+        self._links: dict[bytes, Link[Verified[Order]]] = {}
         self._demands: Queues[Terms, Verified[Order]] = Queues()
         self._offers: Queues[Terms, Verified[Order]] = Queues()
-        self._deadlines: Queues[int, Verified[Order]] = Queues()
+        self._due: dict[int, list[bytes]] = {}
 
     def __len__(self) -> int:
-        return len(self._entries)
+        return len(self._links)
 
     def __contains__(self, identity: bytes) -> bool:
-        return identity in self._entries
+        return self._key(identity) in self._links
 
     @property
     def head(self) -> int:
@@ -100,32 +93,26 @@ class OrderBook:
             return Refusal.LIGHTHOUSE
         if message.deadline <= self._head:
             return Refusal.EXPIRED
-        identity = order_id(order)
-        if identity in self._entries:
+        if order_id(order) in self:
             return Refusal.DUPLICATE
         waiting = self._offers if isinstance(message, Demand) else self._demands
         counterpart = waiting.first(_terms(message))
         if counterpart is not None:
-            self.remove(order_id(counterpart))
-            return _match(order, counterpart)
-        if len(self._entries) >= self._limit:
+            self.remove(order_id(counterpart.item))
+            return _match(order, counterpart.item)
+        if len(self._links) >= self._limit:
             return Refusal.FULL
-        self._entries[identity] = _Entry(
-            order,
-            self._side(message).append(_terms(message), order),
-            self._deadlines.append(message.deadline, order),
-        )
+        self._enter(order)
         return Added(order)
 
     def remove(self, identity: bytes) -> Verified[Order] | None:
         """Take the order named `identity` out; None when it is not open."""
-        entry = self._entries.pop(identity, None)
-        if entry is None:
+        link = self._links.pop(self._key(identity), None)
+        if link is None:
             return None
-        message = entry.order.message
-        self._side(message).remove(_terms(message), entry.among_terms)
-        self._deadlines.remove(message.deadline, entry.among_deadlines)
-        return entry.order
+        message = link.item.message
+        self._side(message).remove(_terms(message), link)
+        return link.item
 
     def expire(self, head: int) -> list[Verified[Order]]:
         """Take out every order whose deadline is not after block `head`. O(blocks passed + orders expired).
@@ -134,24 +121,42 @@ class OrderBook:
         """
         passed = range(self._head + 1, head + 1)
         self._head = max(self._head, head)
-        due = passed if len(passed) < len(self._deadlines) else sorted(d for d in self._deadlines if d <= head)
+        reached = passed if len(passed) < len(self._due) else sorted(block for block in self._due if block <= head)
         expired: list[Verified[Order]] = []
-        for deadline in due:
-            while (order := self._deadlines.first(deadline)) is not None:
-                self.remove(order_id(order))
-                expired.append(order)
+        for block in reached:
+            for key in self._due.pop(block, ()):
+                link = self._links.get(key)  # None, or another order, where the one due has left the book
+                if link is not None and link.item.message.deadline == block:
+                    self.remove(order_id(link.item))
+                    expired.append(link.item)
         return expired
 
     def orders(self) -> Iterator[Verified[Order]]:
         """The open orders, oldest first. O(orders); the book may not change meanwhile."""
-        return (entry.order for entry in self._entries.values())
+        return (link.item for link in self._links.values())
+
+    def _enter(self, order: Verified[Order]) -> None:
+        message = order.message
+        key = order.hash if order.hash not in self._links else order_id(order)
+        link = self._links[key] = Link(order)
+        self._side(message).append(_terms(message), link)
+        self._due.setdefault(message.deadline, []).append(key)
+
+    def _key(self, identity: bytes) -> bytes:
+        """Under what the order of this identity is or would be found.
+
+        Mostly its hash alone, which the order holds anyway; a second signer's order of the same hash has all of it.
+        """
+        digest = identity[:HASH_SIZE]
+        link = self._links.get(digest)
+        return digest if link is not None and order_id(link.item) == identity else identity
 
     def _side(self, message: Order) -> Queues[Terms, Verified[Order]]:
         return self._demands if isinstance(message, Demand) else self._offers
 
 
 def _terms(order: Order) -> Terms:
-    return (order.model, order.objective, order.token, order.cost, order.lighthouse, order.validator)
+    return (order.model, order.objective, order.token, order.cost, order.validator)
 
 
 def _match(order: Verified[Order], other: Verified[Order]) -> Match:

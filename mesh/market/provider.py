@@ -9,36 +9,38 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import Counter
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, aclosing
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Self
 
 import msgspec
-import zenoh
 
-from mesh.chain import NodeUnreachable, NotALiability, Reverted, TransactionTimeout
+from mesh.chain import NodeUnreachable, NotALiability, RequestRefused, Reverted
 from mesh.chain.events import Finalized, NewLiability
+from mesh.errors import ClosedError
 from mesh.market.blame import at_fault
 from mesh.market.book import LIMIT, Match, OrderBook, Refusal
-from mesh.network.channel import Channel, message_key
-from schemas import ZERO_ADDRESS, Demand, Offer, Result, Verified, address_bytes, encode
-from schemas.keys import RejectKey
+from mesh.market.memory import Memory
+from mesh.market.sending import RETRY, Sending
+from mesh.network.channel import Channel
+from schemas import ZERO_ADDRESS, Demand, Offer, RejectKey, Result, Verified, address_bytes
 from schemas.rejection import Rejection
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine
+    from collections.abc import Callable
     from types import TracebackType
 
-    from mesh.chain import Chain, Created
+    import zenoh
+
+    from mesh.chain import BlockEvents, Chain
     from mesh.market.book import Order
-    from mesh.network.channel import Subscription
+    from mesh.network import Subscription
     from schemas import Liability
 
 log = logging.getLogger(__name__)
 
-RETRY: Final = 1.0
-"""Seconds before a transaction is tried again that failed for a passing reason."""
-PASSING: Final = frozenset({"NotYourTurn"})
-"""Errors of the contracts that time heals."""
+NAMELESS: Final = "Reverted"
+"""The reason of a rejection when the contract that refused gave none by name."""
 
 
 class Earnings(msgspec.Struct, frozen=True, kw_only=True):
@@ -54,8 +56,8 @@ class Earnings(msgspec.Struct, frozen=True, kw_only=True):
 class Provider:
     """A provider of one lighthouse: `async with Provider(session, chain, lighthouse) as provider`, then `run`.
 
-    `lighthouse` is the ENS name; the chain's account must have its stake there. Session and chain stay the caller's
-    to close.
+    `lighthouse` is the ENS name; the chain's account must have its stake there. `matched` is told of each pair before
+    its contract is made. Session and chain stay the caller's to close.
     """
 
     def __init__(
@@ -76,23 +78,23 @@ class Provider:
         self._limit = limit
         self._matched = matched
         self._head = 0
-        self._stack = AsyncExitStack()
-        self._work: asyncio.Queue[Coroutine[Any, Any, None]] = asyncio.Queue()
+        self._stack: AsyncExitStack | None = None
         self._liabilities: dict[str, Liability] = {}
         self._rejected: Counter[str] = Counter()
         self._created = self._finalized = self._gas = self._fees = 0
 
     async def __aenter__(self) -> Self:
+        self._head = await self._chain.block_number()
+        self._market = await self._chain.resolve(self._lighthouse)
+        self.book = OrderBook(self._market, limit=self._limit)
+        self.book.expire(self._head)
+        self._sending = Sending(self._chain, self._market)
         async with AsyncExitStack() as stack:
-            self._head = await self._chain.block_number()
-            address = await self._chain.resolve(self._lighthouse)
-            self.book = OrderBook(address, limit=self._limit)
-            self.book.expire(self._head)
             self.channel = await stack.enter_async_context(
                 Channel(
                     self._session,
                     self._lighthouse,
-                    address=address,
+                    address=self._market,
                     resolver=self._chain.resolve,
                     head=lambda: self._head,
                 )
@@ -100,7 +102,7 @@ class Provider:
             self._demands = await stack.enter_async_context(self.channel.subscribe(Demand))
             self._offers = await stack.enter_async_context(self.channel.subscribe(Offer))
             self._results = await stack.enter_async_context(self.channel.subscribe(Result))
-            self._answer_queries(stack)
+            await stack.enter_async_context(Memory(self._session, self._lighthouse, self.book))
             self.channel.announce("provider", self.address)
             self._stack = stack.pop_all()
         return self
@@ -108,18 +110,20 @@ class Provider:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        await self._stack.aclose()
-        while not self._work.empty():
-            self._work.get_nowait().close()
+        stack, self._stack = self._stack, None
+        if stack is not None:
+            await stack.aclose()
 
     async def run(self) -> None:
         """Serve the lighthouse until cancelled. A transaction that is on its way then may still go through."""
+        if self._stack is None:
+            raise ClosedError("the provider is not open", hint="use it inside `async with`")
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._take(self._demands), name="provider demands")
             tasks.create_task(self._take(self._offers), name="provider offers")
             tasks.create_task(self._take_results(), name="provider results")
             tasks.create_task(self._follow_chain(), name="provider chain")
-            tasks.create_task(self._send_transactions(), name="provider transactions")
+            tasks.create_task(self._sending.run(), name="provider transactions")
 
     def earnings(self) -> Earnings:
         """What was done and spent so far."""
@@ -134,110 +138,109 @@ class Provider:
     async def _take(self, orders: Subscription[Any]) -> None:
         await orders.recall()
         async for order in orders:
-            self._add(order)
+            await self._sending.room()
+            if self._add(order) is Refusal.FULL:
+                orders.forget(order)
 
-    def _add(self, order: Verified[Order]) -> None:
+    def _add(self, order: Verified[Order]) -> Refusal | None:
+        """Take an order into the book, or to the chain with its counterpart; or say why not."""
         outcome = self.book.add(order)
         if isinstance(outcome, Match):
             log.info("matched demand %s and offer %s", outcome.demand.hash.hex(), outcome.offer.hash.hex())
             self._matched(outcome)
-            self._work.put_nowait(self._create(outcome))
-        elif isinstance(outcome, Refusal) and outcome is not Refusal.DUPLICATE:
-            self._reject(order, outcome.value, f"the order book refuses it: {outcome.value}")
-
-    async def _take_results(self) -> None:
-        async for result in self._results:
-            self._work.put_nowait(self._finalize(result))
-
-    async def _send_transactions(self) -> None:
-        """One after the other: the turn and the nonce are ours alone."""
-        while True:
-            await (await self._work.get())
+            self._sending.put(partial(self._create, outcome))
+        elif isinstance(outcome, Refusal):
+            if outcome is not Refusal.DUPLICATE:
+                self._reject(order, outcome.value, f"the order book refuses it: {outcome.value}")
+            return outcome
+        return None
 
     async def _create(self, match: Match) -> None:
         """Make the contract of a match; what can't become one leaves the market, the other order stays."""
         demand, offer = match
-        if self._head >= min(demand.message.deadline, offer.message.deadline):
-            self._put_back(match, gone=())
-            return
         try:
-            created = await self._chain.create_liability(self._lighthouse, demand.message, offer.message)
+            created = await self._sending.send(
+                lambda: self._chain.create_liability(self._market, demand.message, offer.message)
+            )
         except Reverted as error:
-            if error.reason in PASSING:
-                self._later(self._create(match))
-                return
-            gone = at_fault(match, error.reason, error.arguments)
-            for order in gone:
-                self._reject(order, error.reason, str(error))
-            self._put_back(match, gone=gone)
-        except (NodeUnreachable, TransactionTimeout) as error:
-            log.warning("the contract of demand %s waits: %s", demand.hash.hex(), error)
-            self._later(self._create(match))
+            await self._part(match, gone=at_fault(match, error.reason, error.arguments), error=error)
+        except RequestRefused as error:
+            await self._part(match, gone=match, error=error)
         else:
-            self._count(created, offer)
+            self._created += 1
+            self._gas += created.gas_used
+            self._fees += offer.message.lighthouse_fee
+            log.info("%s: created, gas %d", created.liability, created.gas_used)
 
-    def _count(self, created: Created, offer: Verified[Offer]) -> None:
-        self._created += 1
-        self._gas += created.gas_used
-        self._fees += offer.message.lighthouse_fee
-        log.info("%s: created, gas %d", created.liability, created.gas_used)
-
-    def _put_back(self, match: Match, *, gone: tuple[Verified[Order], ...]) -> None:
+    async def _part(self, match: Match, *, gone: tuple[Verified[Order], ...], error: Reverted | RequestRefused) -> None:
+        """Reject the orders that are to blame, and put back the other one, unless it was used meanwhile."""
         for order in match:
-            if order not in gone:
+            if order in gone:
+                self._reject(order, _reason(error), str(error))
+            elif not await self._sending.send(partial(self._is_used, order.message)):
                 self._add(order)
+
+    async def _is_used(self, order: Order) -> bool:
+        if order.sender is None:
+            return await self._chain.is_order_used(message_hash(order))
+        return await self._chain.nonce_of(order.sender) > int(order.nonce)
+
+    async def _take_results(self) -> None:
+        async for result in self._results:
+            await self._sending.room()
+            liability = await self._sending.send(partial(self._liability, result.message.liability))
+            if liability is None:
+                # An answer without a contract; or the node has not heard of the contract yet.
+                self._results.forget(result)
+            elif result.signer != liability.promisor and liability.validator == ZERO_ADDRESS:
+                self._reject(result, "WrongSigner", f"signed by {result.signer}, not by the promisor")
+            elif not liability.is_finalized:
+                self._sending.put(partial(self._finalize, result))
+
+    async def _liability(self, address: str) -> Liability | None:
+        """The record of a liability; None for another address."""
+        try:
+            return self._liabilities.get(address) or await self._chain.liability(address)
+        except NotALiability:
+            return None
 
     async def _finalize(self, result: Verified[Result]) -> None:
         message = result.message
         try:
-            liability = await self._liability(message.liability)
-            if liability is None or liability.is_finalized:
-                return
-            if result.signer != liability.promisor and liability.validator == ZERO_ADDRESS:
-                self._reject(result, "WrongSigner", f"signed by {result.signer}, not by the promisor")
-                return
-            finalized = await self._chain.finalize(self._lighthouse, message)
-        except Reverted as error:
-            if error.reason in PASSING:
-                self._later(self._finalize(result))
-            elif error.reason != "AlreadyFinalized":
-                self._reject(result, error.reason, str(error))
-        except (NodeUnreachable, TransactionTimeout) as error:
-            log.warning("%s: the Result waits: %s", message.liability, error)
-            self._later(self._finalize(result))
+            settled = await self._sending.send(lambda: self._chain.finalize(self._market, message))
+        except (Reverted, RequestRefused) as error:
+            if _reason(error) != "AlreadyFinalized":
+                self._reject(result, _reason(error), str(error))
         else:
             self._finalized += 1
-            self._gas += finalized.gas_used
-            self._liabilities.pop(message.liability, None)
-            log.info("%s: finalized, success %s, gas %d", message.liability, message.success, finalized.gas_used)
-
-    async def _liability(self, address: str) -> Liability | None:
-        """The record of a liability of this lighthouse; None for another address (an answer without a contract)."""
-        known = self._liabilities.get(address)
-        if known is None:
-            try:
-                known = await self._chain.liability(address)
-            except NotALiability:
-                return None
-        return known
-
-    def _later(self, again: Coroutine[Any, Any, None]) -> None:
-        asyncio.get_running_loop().call_later(RETRY, self._work.put_nowait, again)
+            self._gas += settled.gas_used
+            log.info("%s: finalized, success %s, gas %d", message.liability, message.success, settled.gas_used)
 
     async def _follow_chain(self) -> None:
         """Orders that others made into contracts, and those whose time has passed, leave the book."""
-        async for block in self._chain.events(self._head + 1):
-            for event in block.events:
-                if isinstance(event, NewLiability):
-                    await self._forget_orders(event.liability)
-                elif isinstance(event, Finalized):
-                    self._liabilities.pop(event.liability, None)
-            self._head = block.block_number
-            for order in self.book.expire(self._head):
-                log.info("expired order %s of %s", order.hash.hex(), order.signer)
+        while True:
+            try:
+                async with aclosing(self._chain.events(self._head + 1)) as blocks:
+                    async for block in blocks:
+                        await self._take_block(block)
+            except (NodeUnreachable, RequestRefused) as error:
+                log.warning("the chain can't be read on from block %d: %s", self._head + 1, error)
+                await asyncio.sleep(RETRY)
+
+    async def _take_block(self, block: BlockEvents) -> None:
+        for event in block.events:
+            if isinstance(event, NewLiability):
+                await self._forget_orders(event.liability)
+            elif isinstance(event, Finalized):
+                self._liabilities.pop(event.liability, None)
+        self._head = block.block_number
+        for order in self.book.expire(self._head):
+            log.info("expired order %s of %s", order.hash.hex(), order.signer)
 
     async def _forget_orders(self, address: str) -> None:
         liability = await self._chain.liability(address)
+        if liability.lighthouse != self._market:
+            return
         demand_hash, offer_hash = await self._chain.order_hashes(address)
         self.book.remove(demand_hash + address_bytes(liability.promisee))
         self.book.remove(offer_hash + address_bytes(liability.promisor))
@@ -253,20 +256,8 @@ class Provider:
             rejection = Rejection(order=order, reason=reason, detail=detail, provider=self.address)
             self.channel.put(str(RejectKey(self._lighthouse, order, self.address)), rejection.encode())
 
-    def _answer_queries(self, stack: AsyncExitStack) -> None:
-        """Be the market's memory: answer who asks for open orders."""
-        loop = asyncio.get_running_loop()
 
-        def asked(query: zenoh.Query) -> None:
-            loop.call_soon_threadsafe(lambda: loop.run_in_executor(None, self._answer, query, list(self.book.orders())))
-
-        queryable: Any = self._session.declare_queryable(f"aira/{self._lighthouse}/**", asked, complete=True)
-        stack.callback(queryable.undeclare)
-
-    def _answer(self, query: zenoh.Query, orders: list[Verified[Order]]) -> None:
-        """On a thread of its own: a market can be large. Leaving `with` tells the asker that this was all."""
-        with query:
-            for order in orders:
-                key = message_key(self._lighthouse, order.message)
-                if query.key_expr.intersects(zenoh.KeyExpr(key)):
-                    query.reply(key, encode(order.message), encoding="application/json")
+def _reason(error: Reverted | RequestRefused) -> str:
+    """A machine-readable word: the contracts' error, but never a text of a stranger's contract."""
+    name = error.reason if isinstance(error, Reverted) else type(error).__name__
+    return name if name.isidentifier() else NAMELESS

@@ -35,27 +35,24 @@ class Queues(Generic[K, T]):
     def __iter__(self) -> Iterator[K]:
         return iter(self._first)
 
-    def first(self, key: K) -> T | None:
-        """What has waited longest at `key`."""
-        link = self._first.get(key)
-        return None if link is None else link.item
+    def first(self, key: K) -> Link[T] | None:
+        """The link that has waited longest at `key`."""
+        return self._first.get(key)
 
-    def append(self, key: K, item: T) -> Link[T]:
-        """Put `item` at the end of the queue at `key`; the link takes it out again."""
-        link = Link(item)
+    def append(self, key: K, link: Link[T]) -> None:
+        """Put a link, which stands in no queue, at the end of the one at `key`."""
         first = self._first.setdefault(key, link)
         if first is not link:
             last = first.before
             last.after = first.before = link
             link.before, link.after = last, first
-        return link
 
     def remove(self, key: K, link: Link[T]) -> None:
-        """Take the link that `append` gave for `key` out; exactly once."""
+        """Take a link out of the queue at `key`, where it stands."""
         if link.after is link:
             del self._first[key]
         else:
             link.before.after, link.after.before = link.after, link.before
             if self._first[key] is link:
                 self._first[key] = link.after
-        del link.before, link.after
+        link.before = link.after = link
