@@ -1,0 +1,44 @@
+"""Gas of the contracts beside that of the original ones, and the bars; fails above the bars.
+
+The measuring is that of the contracts' tests, `tests/contracts/gas.py`, which says under which conditions.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import argparse
+import json
+
+from tests.contracts.gas import GENERATIONS, ROWS, Gas, exceeded, measure
+
+
+def table(gas: Gas) -> str:
+    """The measurements for people."""
+    lines = [f"{'':28}{'ours 5':>9}{'bar':>9}{'original 5':>12}   {'ours 3':>9}{'bar':>9}{'original 3':>12}"]
+    for key, row in ROWS.items():
+        line = f"{row.label:28}"
+        for index, column in enumerate(GENERATIONS.values()):
+            line += f"{gas[key][column]:>9,}{row.bars[index]:>9,}{row.originals[index]:>12}" + "   " * (index == 0)
+        lines.append(line)
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """Run from the command line; 1 if a bar is missed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", action="store_true", help="one JSON object: gas by row and generation")
+    arguments = parser.parse_args()
+    gas = measure()
+    print(json.dumps(gas) if arguments.json else table(gas))
+    too_much = exceeded(gas)
+    for line in too_much:
+        print(line, file=sys.stderr)
+    return 1 if too_much else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
