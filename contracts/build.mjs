@@ -1,0 +1,80 @@
+// Compiles the contracts and writes one JSON artifact each; with --check it writes nothing and fails where one differs.
+import { existsSync, mkdirSync, readFileSync, readdirSync, writeFileSync } from "node:fs";
+import { dirname, join } from "node:path";
+import { fileURLToPath } from "node:url";
+import solc from "solc";
+
+const here = dirname(fileURLToPath(import.meta.url));
+
+// Where each contract's artifact goes: the suite into the package, what only tests need beside the tests.
+const suite = join(here, "..", "mesh", "chain", "artifacts");
+const tests = join(here, "..", "tests", "contracts", "artifacts");
+const wanted = {
+  "src/ENSRegistry.sol": { ENSRegistry: suite },
+  "src/Resolver.sol": { Resolver: suite },
+  "src/XRT.sol": { XRT: suite },
+  "src/Factory.sol": { Factory: suite },
+  "src/Lighthouse.sol": { Lighthouse: suite },
+  "src/Liability.sol": { Liability: suite },
+  "fixtures/Tokens.sol": { FeeToken: tests, SilentToken: tests, RefusingToken: tests, HookedToken: tests },
+  "fixtures/Validators.sol": { OneSigner: tests, BrokenValidator: tests },
+};
+
+const settings = {
+  evmVersion: "cancun",
+  viaIR: true,
+  optimizer: { enabled: true, runs: 1_000_000 },
+  // Nothing in the bytecode that depends on comments or on where the sources lie.
+  metadata: { appendCBOR: false, bytecodeHash: "none" },
+  outputSelection: { "*": { "*": ["abi", "evm.bytecode.object", "evm.deployedBytecode.object"] } },
+};
+
+function compile() {
+  const input = { language: "Solidity", settings, sources: {} };
+  for (const folder of ["src", "fixtures"]) {
+    for (const name of readdirSync(join(here, folder)).sort()) {
+      input.sources[`${folder}/${name}`] = { content: readFileSync(join(here, folder, name), "utf8") };
+    }
+  }
+  const output = JSON.parse(solc.compile(JSON.stringify(input)));
+  const complaints = output.errors ?? [];
+  for (const complaint of complaints) console.error(complaint.formattedMessage);
+  if (complaints.length > 0) process.exit(1);
+  return output.contracts;
+}
+
+function artifact(contractName, contract) {
+  const compiler = { name: "solc", version: solc.version(), ...settings };
+  delete compiler.outputSelection;
+  return `${JSON.stringify(
+    {
+      contractName,
+      abi: contract.abi,
+      bytecode: `0x${contract.evm.bytecode.object}`,
+      deployedBytecode: `0x${contract.evm.deployedBytecode.object}`,
+      compiler,
+    },
+    null,
+    1,
+  )}\n`;
+}
+
+const checking = process.argv.includes("--check");
+const contracts = compile();
+let stale = 0;
+for (const [file, names] of Object.entries(wanted)) {
+  for (const [name, folder] of Object.entries(names)) {
+    const path = join(folder, `${name}.json`);
+    const text = artifact(name, contracts[file][name]);
+    if (existsSync(path) && readFileSync(path, "utf8") === text) continue;
+    if (checking) {
+      console.error(`${path} is not what the sources give: run "make contracts"`);
+      stale += 1;
+    } else {
+      mkdirSync(folder, { recursive: true });
+      writeFileSync(path, text);
+      console.log(`wrote ${path}`);
+    }
+  }
+}
+process.exit(stale > 0 ? 1 : 0);

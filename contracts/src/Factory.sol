@@ -1,0 +1,231 @@
+// SPDX-License-Identifier: Apache-2.0
+pragma solidity ^0.8.28;
+
+import {Clone} from "./Clone.sol";
+import {Emission} from "./Emission.sol";
+import {RobonomicsErrors} from "./Errors.sol";
+import {IENS} from "./IENS.sol";
+import {Liability} from "./Liability.sol";
+import {Lighthouse} from "./Lighthouse.sol";
+import {LighthouseNames} from "./LighthouseNames.sol";
+import {Order, Orders} from "./Orders.sol";
+import {Signatures} from "./Signatures.sol";
+import {Terms, TermsCode} from "./Terms.sol";
+import {Tokens} from "./Tokens.sol";
+import {XRT} from "./XRT.sol";
+
+/// @title The factory: makes lighthouses and liabilities, holds what liabilities cost, and pays.
+/// @notice It keeps no list of what it has made: a clone of its own is known by its code (see Clone). Money moves in
+/// before a liability exists and out after it has ended, so there is no state in between for a token's hook to come
+/// back to.
+contract Factory is RobonomicsErrors, LighthouseNames, Emission {
+    using Orders for Order;
+
+    /// Tell the two kinds of clones apart.
+    bytes32 private constant LIABILITY = bytes32(uint256(1));
+    bytes32 private constant LIGHTHOUSE = bytes32(uint256(2));
+
+    /// @notice Blocks after a liability's creation until its promisee may have the money back.
+    uint256 public immutable refundDelay;
+    /// @notice Implementation behind the liabilities.
+    address public immutable liabilityCode;
+    /// @notice Implementation behind the lighthouses.
+    address public immutable lighthouseCode;
+
+    /// @notice Generation 5: the nonce that an account's next order is signed with.
+    mapping(address account => uint256) public nonceOf;
+    /// @notice Generation 3: whether an order has made its liability. Generation 5 is guarded by nonces: always false.
+    mapping(bytes32 hash => bool) public isHashConsumed;
+
+    event NewLiability(address indexed liability);
+    event NewLighthouse(address indexed lighthouse, string name);
+    /// @notice An order has made its liability.
+    event HashConsumed(bytes32 indexed hash);
+
+    /// @param ens_ registry in which this factory owns the parents of the lighthouses' names.
+    /// @param xrt_ token that has, or will have, this factory as its minter.
+    /// @param refundDelay_ in blocks; longer than any work is to take.
+    constructor(IENS ens_, XRT xrt_, uint256 refundDelay_) LighthouseNames(ens_) Emission(xrt_) {
+        refundDelay = refundDelay_;
+        liabilityCode = address(new Liability(address(xrt_)));
+        lighthouseCode = address(new Lighthouse(xrt_));
+    }
+
+    /// @notice Makes a lighthouse and registers its names; anybody may.
+    /// @param minimalStake wn for one transaction a turn.
+    /// @param timeoutInBlocks silence after which the turn passes on.
+    /// @param name ENS label: 1 to 32 of `a-z`, `0-9` and `-`.
+    function createLighthouse(uint256 minimalStake, uint256 timeoutInBlocks, string calldata name)
+        external
+        returns (address lighthouse)
+    {
+        if (minimalStake == 0 || minimalStake > type(uint128).max) revert InvalidStake(minimalStake);
+        if (timeoutInBlocks == 0 || timeoutInBlocks > type(uint32).max) revert InvalidTimeout(timeoutInBlocks);
+        _requireFree(name);
+        bytes memory arguments = abi.encodePacked(uint128(minimalStake), uint32(timeoutInBlocks), name);
+        lighthouse = Clone.create(lighthouseCode, LIGHTHOUSE, arguments);
+        _give(name, lighthouse);
+        emit NewLighthouse(lighthouse, name);
+    }
+
+    /// @notice Makes a liability; for lighthouses, which add the provider's address behind the arguments.
+    /// @param demand canonical ABI encoding of the promisee's order.
+    /// @param offer the same of the promisor's.
+    function createLiability(bytes calldata demand, bytes calldata offer) external {
+        if (!isLighthouse(msg.sender)) revert NotALighthouse(msg.sender);
+        Terms memory terms = _agree(Orders.read(demand), Orders.read(offer));
+        _collect(terms, _provider());
+        address liability = Clone.create(liabilityCode, LIABILITY, TermsCode.pack(terms, address(xrt)));
+        emit NewLiability(liability);
+    }
+
+    /// @notice Ends a liability; for its lighthouse, which adds the provider's address behind the arguments.
+    function finalizeLiability(address liability, bytes calldata result, bool success, bytes calldata signature)
+        external
+    {
+        Terms memory terms = _termsOf(liability);
+        if (msg.sender != terms.lighthouse) revert WrongLighthouse(terms.lighthouse, msg.sender);
+        (bytes32 digest, address signer) = _readResult(liability, result, success, signature);
+        if (terms.validator == address(0)) {
+            if (signer != terms.promisor) revert WrongSigner(terms.promisor, signer);
+        } else if (terms.generation == 3) {
+            revert NotTheValidator(_provider());
+        } else {
+            Liability(liability).askValidator(terms.validator, signer);
+        }
+        _end(liability, terms, digest, success);
+        _credit(terms, success, _provider());
+    }
+
+    /// @notice Ends a generation-3 liability with a validator; for the liability itself.
+    /// @param validator who called the liability.
+    function finalizeByValidator(
+        address validator,
+        bytes calldata result,
+        bool success,
+        bytes calldata signature,
+        bool agree
+    ) external {
+        Terms memory terms = _termsOf(msg.sender);
+        if (terms.generation != 3 || terms.validator != validator) revert NotTheValidator(validator);
+        (bytes32 digest, address signer) = _readResult(msg.sender, result, success, signature);
+        if (signer != terms.promisor) revert WrongSigner(terms.promisor, signer);
+        _end(msg.sender, terms, digest, success && agree);
+        _credit(terms, success && agree, address(0));
+    }
+
+    /// @notice Gives the promisee the money back when `refundDelay` blocks have brought no result; anybody may call.
+    function refund(address liability) external {
+        Terms memory terms = _termsOf(liability);
+        if (block.number < terms.createdAt + refundDelay) revert RefundTooEarly(terms.createdAt + refundDelay);
+        Liability(liability).settle(0, false);
+        if (terms.cost > 0) Tokens.pay(terms.token, terms.promisee, terms.cost);
+        if (_hasValidatorFee(terms)) xrt.transfer(terms.promisee, terms.validatorFee);
+        _credit(terms, false, address(0));
+    }
+
+    /// @notice Whether this factory made the lighthouse.
+    function isLighthouse(address account) public view returns (bool isClone) {
+        (isClone,) = Clone.read(account, LIGHTHOUSE);
+    }
+
+    /// @notice Whether this factory made the liability.
+    function isLiability(address account) public view returns (bool isClone) {
+        (isClone,) = Clone.read(account, LIABILITY);
+    }
+
+    /// @notice Gas that is counted for a liability: nothing before its end.
+    function gasConsumedOf(address liability) public view returns (uint256) {
+        return isLiability(liability) && Liability(liability).isFinalized() ? _gasOf(_termsOf(liability)) : 0;
+    }
+
+    /// @notice Generation 3's name of `gasConsumedOf`.
+    function gasUtilizing(address liability) external view returns (uint256) {
+        return gasConsumedOf(liability);
+    }
+
+    /// Checks both orders and uses them up.
+    function _agree(Order calldata demand, Order calldata offer) private returns (Terms memory terms) {
+        Orders.requireMatch(demand, offer);
+        terms.lighthouse = address(uint160(demand.firstAccount));
+        if (terms.lighthouse != msg.sender) revert WrongLighthouse(terms.lighthouse, msg.sender);
+        terms.validator = address(uint160(demand.secondAccount));
+        terms.generation = demand.isFifth() ? 5 : 3;
+        if (terms.generation == 5 && terms.validator != address(0) && terms.validator.code.length == 0) {
+            revert ValidatorWithoutCode(terms.validator);
+        }
+        terms.model = demand.model();
+        terms.objective = demand.objective();
+        terms.token = address(uint160(demand.token));
+        terms.cost = demand.cost;
+        terms.validatorFee = demand.fee;
+        terms.lighthouseFee = offer.fee;
+        terms.createdAt = block.number;
+        terms.demandDeadline = demand.deadline;
+        terms.offerDeadline = offer.deadline;
+        (terms.promisee, terms.demandHash, terms.demandNonce) = _use(demand);
+        (terms.promisor, terms.offerHash, terms.offerNonce) = _use(offer);
+    }
+
+    /// Checks an order's deadline and signature and makes sure that it is used once.
+    function _use(Order calldata order) private returns (address signer, bytes32 hash, uint256 nonce) {
+        if (block.number >= order.deadline) revert DeadlineReached(order.deadline);
+        if (order.isFifth()) {
+            address sender = address(uint160(order.nonceOrSender));
+            nonce = nonceOf[sender]++;
+            hash = order.hashFifth(nonce);
+            signer = order.recover(hash);
+            if (signer != sender) revert WrongSigner(sender, signer);
+        } else {
+            hash = order.hashThird();
+            signer = order.recover(hash);
+            if (isHashConsumed[hash]) revert OrderUsed(hash);
+            isHashConsumed[hash] = true;
+        }
+        emit HashConsumed(hash);
+    }
+
+    /// Takes what the liability costs into the factory and pays the provider's fee.
+    function _collect(Terms memory terms, address provider) private {
+        if (terms.lighthouseFee > 0) xrt.transferFrom(terms.promisor, provider, terms.lighthouseFee);
+        if (terms.cost > 0) {
+            if (terms.token == address(xrt)) xrt.transferFrom(terms.promisee, address(this), terms.cost);
+            else Tokens.takeExactly(terms.token, terms.promisee, terms.cost);
+        }
+        if (_hasValidatorFee(terms)) xrt.transferFrom(terms.promisee, address(this), terms.validatorFee);
+    }
+
+    /// Ends the liability, then pays: the promisor for success, or the promisee; and the validator for judging.
+    function _end(address liability, Terms memory terms, bytes32 digest, bool success) private {
+        Liability(liability).settle(digest, success);
+        if (terms.cost > 0) Tokens.pay(terms.token, success ? terms.promisor : terms.promisee, terms.cost);
+        if (_hasValidatorFee(terms)) xrt.transfer(terms.validator, terms.validatorFee);
+    }
+
+    function _readResult(address liability, bytes calldata result, bool success, bytes calldata signature)
+        private
+        pure
+        returns (bytes32 digest, address signer)
+    {
+        if (result.length != 34 || uint16(bytes2(result)) != Orders.MULTIHASH) revert MalformedResult();
+        digest = bytes32(result[2:]);
+        // Digests that nothing has; the liability means an empty slot and a refund by them.
+        if (uint256(digest) <= 1) revert MalformedResult();
+        signer = Signatures.recover(keccak256(abi.encodePacked(liability, result, success)), signature);
+    }
+
+    function _termsOf(address liability) private view returns (Terms memory) {
+        (bool isClone, uint256 arguments) = Clone.read(liability, LIABILITY);
+        if (!isClone) revert NotALiability(liability);
+        return TermsCode.unpack(arguments, address(xrt));
+    }
+
+    function _hasValidatorFee(Terms memory terms) private pure returns (bool) {
+        return terms.validator != address(0) && terms.validatorFee > 0;
+    }
+
+    /// The account behind the lighthouse's call; only to be believed when a lighthouse is calling.
+    function _provider() private pure returns (address) {
+        return address(bytes20(msg.data[msg.data.length - 20:]));
+    }
+}

@@ -1,0 +1,74 @@
+"""Gas of the contracts' transactions, and the bars that it stays below.
+
+Measured on py-evm with nonces that were used before, a quota above one, balances above zero (the factory's too, from a
+liability that is still open) and approvals that are used up bit by bit.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+from tests.contracts.chains import py_evm
+from tests.contracts.market import Market
+from tests.contracts.suite import XRT, Suite
+
+Gas = dict[str, dict[str, int]]
+"""Gas by row and generation (`generation_5`, `generation_3`)."""
+
+GENERATIONS: Final = {5: "generation_5", 3: "generation_3"}
+
+
+class Row(NamedTuple):
+    """A row of the table; a pair is generation 5, generation 3. A reverted original took what it was given."""
+
+    label: str
+    originals: tuple[str, str]
+    bars: tuple[int, int]
+
+
+ROWS: Final = {
+    "create_lighthouse": Row("createLighthouse", ("274,737", "447,535"), (185_000, 185_000)),
+    "create_cost_0": Row("createLiability, cost 0", ("796,277", "809,155"), (145_000, 190_000)),
+    "create_cost": Row("createLiability, cost > 0", ("858,781", "870,450"), (165_000, 212_000)),
+    "create_cost_fee": Row("  + lighthouseFee", ("901,585", "914,228"), (185_000, 232_000)),
+    "finalize_cost_0": Row("finalize, cost 0", ("268,656", "214,894"), (102_000, 102_000)),
+    "finalize_cost": Row("finalize, cost > 0", ("279,670", "226,793"), (115_000, 115_000)),
+    "revert_mismatch": Row("reverted create (mismatch)", ("the limit", "~700,000"), (60_000, 60_000)),
+}
+
+
+def measure() -> Gas:
+    """Gas used by each kind of transaction, in both generations."""
+    gas: Gas = {key: {} for key in ROWS}
+    for generation, column in GENERATIONS.items():
+        for key, used in _measure(Market(Suite(py_evm()), generation)).items():
+            gas[key][column] = used
+    return gas
+
+
+def _measure(market: Market) -> dict[str, int]:
+    suite = market.suite
+    warm = market.create(cost=XRT, lighthouse_fee=XRT)
+    market.finalize(warm)
+    market.create(cost=XRT)
+
+    used = {}
+    lighthouse = suite.factory.functions.createLighthouse(XRT, 10, "another")
+    used["create_lighthouse"] = suite.send(lighthouse)["gasUsed"]
+    for ending, terms in (("cost_0", {}), ("cost", {"cost": XRT}), ("cost_fee", {"cost": XRT, "lighthouse_fee": XRT})):
+        created = suite.send(market.creation(*market.pair(**terms)), market.provider)
+        used[f"create_{ending}"] = created["gasUsed"]
+        used[f"finalize_{ending}"] = market.finalize(market.liability_of(created))["gasUsed"]
+    mismatch = market.creation(market.demand(cost=XRT), market.offer(cost=2 * XRT))
+    used["revert_mismatch"] = suite.attempt(mismatch, market.provider)["gasUsed"]
+    return {key: used[key] for key in ROWS}
+
+
+def exceeded(gas: Gas) -> list[str]:
+    """One line for each measurement above its bar."""
+    return [
+        f"{key}, {column}: {gas[key][column]:,} is above the bar of {bar:,}"
+        for key, row in ROWS.items()
+        for column, bar in zip(GENERATIONS.values(), row.bars, strict=True)
+        if gas[key][column] > bar
+    ]

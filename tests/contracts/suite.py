@@ -1,0 +1,135 @@
+"""The contracts, deployed on a test chain, and the people who use them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from web3.logs import DISCARD
+
+from schemas import Signer
+from schemas.keccak import keccak256
+
+if TYPE_CHECKING:
+    from web3.contract import Contract
+    from web3.types import TxReceipt
+
+    from tests.contracts.chains import Chain
+
+ROOT: Final = Path(__file__).parents[2]
+SUITE: Final = ROOT / "mesh" / "chain" / "artifacts"
+FOR_TESTS: Final = Path(__file__).parent / "artifacts"
+
+XRT: Final = 10**9
+"""One XRT in wn."""
+
+SUPPLY: Final = 10**6 * XRT
+REFUND_DELAY: Final = 20
+"""Blocks."""
+
+
+@cache
+def artifact(name: str) -> dict[str, Any]:
+    """A built contract, of the suite or of those that only tests use."""
+    path = SUITE / f"{name}.json"
+    content: dict[str, Any] = json.loads((path if path.exists() else FOR_TESTS / f"{name}.json").read_text())
+    return content
+
+
+def namehash(name: str) -> bytes:
+    """The node of an ENS name (EIP-137)."""
+    node = bytes(32)
+    for label in reversed(name.split(".")):
+        node = keccak256(node + keccak256(label.encode()))
+    return node
+
+
+@dataclass(frozen=True)
+class Person:
+    """One with an account on the chain, whose key signs messages."""
+
+    address: str
+    signer: Signer
+
+
+class Suite:
+    """The deployed contracts. The first person deploys and holds the XRT that the others are given."""
+
+    def __init__(self, chain: Chain) -> None:
+        self.chain = chain
+        self.web3 = chain.web3
+        self.people = tuple(Person(Signer(key).address, Signer(key)) for key in chain.keys)
+        self.deployer = self.people[0]
+        self.ens = self.deploy("ENSRegistry")
+        self.resolver = self.deploy("Resolver", self.ens.address)
+        self.xrt = self.deploy("XRT", SUPPLY)
+        self.factory = self.deploy("Factory", self.ens.address, self.xrt.address, REFUND_DELAY)
+        self.send(self.xrt.functions.setMinter(self.factory.address))
+        self._name()
+
+    def deploy(self, name: str, *arguments: Any) -> Contract:
+        """A new contract of the deployer's."""
+        built = artifact(name)
+        constructor = self.web3.eth.contract(abi=built["abi"], bytecode=built["bytecode"]).constructor(*arguments)
+        address = self.send(constructor)["contractAddress"]
+        assert address is not None
+        return self.contract(name, address)
+
+    def contract(self, name: str, address: str) -> Contract:
+        """A contract that is there."""
+        return self.web3.eth.contract(address, abi=artifact(name)["abi"])  # type: ignore[call-overload, no-any-return]
+
+    def send(self, call: Any, sender: Person | None = None) -> TxReceipt:
+        """Send a transaction that is to succeed (by the deployer unless said otherwise)."""
+        receipt = self.attempt(call, sender)
+        assert receipt["status"] == 1, f"reverted: {self.chain.refusal(call, (sender or self.deployer).address)}"
+        return receipt
+
+    def attempt(self, call: Any, sender: Person | None = None) -> TxReceipt:
+        """Send a transaction, whatever becomes of it."""
+        fields = {"from": (sender or self.deployer).address, "gas": 8_000_000}
+        return self.web3.eth.wait_for_transaction_receipt(call.transact(fields))
+
+    def fund(self, person: Person, value: int, spender: str) -> None:
+        """Give a person XRT (wn) that `spender` may take."""
+        self.send(self.xrt.functions.transfer(person.address, value))
+        self.send(self.xrt.functions.approve(spender, value), person)
+
+    def create_lighthouse(self, *, stake: int = XRT, timeout: int = 10, name: str = "airalab") -> Contract:
+        """A lighthouse without providers; `stake` in wn, `timeout` in blocks."""
+        receipt = self.send(self.factory.functions.createLighthouse(stake, timeout, name))
+        (event,) = self.factory.events.NewLighthouse().process_receipt(receipt, errors=DISCARD)
+        return self.contract("Lighthouse", event["args"]["lighthouse"])
+
+    def join(self, lighthouse: Contract, provider: Person, stake: int) -> None:
+        """Make a person a provider with that stake in wn."""
+        self.fund(provider, stake, lighthouse.address)
+        self.send(lighthouse.functions.refill(stake), provider)
+
+    def balance(self, account: Person | Contract) -> int:
+        """wn that an account holds."""
+        return int(self.xrt.functions.balanceOf(account.address).call())
+
+    def address_of(self, name: str) -> str:
+        """What the resolver answers for a name."""
+        return str(self.resolver.functions.addr(namehash(name)).call())
+
+    def _name(self) -> None:
+        owner = self.deployer.address
+        self._own("", "eth", owner)
+        self._own("eth", "robonomics", owner)
+        for generation in "35":
+            root = f"{generation}.robonomics.eth"
+            self._own("robonomics.eth", generation, owner)
+            self._own(root, "lighthouse", self.factory.address)
+            for label, contract in (("xrt", self.xrt), ("factory", self.factory)):
+                self._own(root, label, owner)
+                self.send(self.resolver.functions.setAddr(namehash(f"{label}.{root}"), contract.address))
+
+    def _own(self, parent: str, label: str, owner: str) -> None:
+        node = namehash(parent) if parent else bytes(32)
+        record = self.ens.functions.setSubnodeRecord(node, keccak256(label.encode()), owner, self.resolver.address, 0)
+        self.send(record)
