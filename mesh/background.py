@@ -17,7 +17,7 @@ class Background:
     """
 
     def __init__(self) -> None:
-        self._tasks: list[asyncio.Task[Any]] = []
+        self._tasks: set[asyncio.Task[Any]] = set()
 
     async def __aenter__(self) -> Self:
         self._group = asyncio.TaskGroup()
@@ -26,7 +26,9 @@ class Background:
 
     def start(self, work: Coroutine[Any, Any, Any], name: str) -> None:
         """Run a coroutine as a task of that name."""
-        self._tasks.append(self._group.create_task(work, name=name))
+        task = self._group.create_task(work, name=name)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -34,6 +34,8 @@ NOT_OPTIONS: Final = frozenset({"AIRA_CONFIG", "AIRA_REQUIRE_PEERS", "AIRA_KUBO"
 
 PositiveInt = Annotated[int, Meta(ge=1)]
 Seconds = Annotated[float, Meta(ge=0)]
+Interval = Annotated[float, Meta(gt=0)]
+SecondsOrEver = Annotated[float, Meta(ge=-1)]
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -41,7 +43,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
-    connect_timeout: float = 10.0
+    connect_timeout: SecondsOrEver = 10.0
     data_dir: str = ""
     web3_http_provider: str = "http://127.0.0.1:8545"
     web3_ws_provider: str = "ws://127.0.0.1:8546"
@@ -51,7 +53,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     lighthouse_contract: str = "airalab.lighthouse.3.robonomics.eth"
     erc20_token: str = "xrt.3.robonomics.eth"
     generation: Literal[3, 5] = 3
-    poll_interval: Seconds = 1.0
+    poll_interval: Interval = 1.0
     keyfile: str = ""
     keyfile_password_file: str = ""
     enable_executor: bool = True
@@ -126,11 +128,12 @@ def load(
     if path is not None:
         merged |= _checked(_read_toml(path), where=str(path))
     merged |= _checked(_from_environment(os.environ if environ is None else environ), where="the environment")
-    merged |= {name: value for name, value in (flags or {}).items() if value is not None}
+    given = {name: value for name, value in (flags or {}).items() if value is not None}
+    merged |= _checked(given, where="the flags")
     try:
         return msgspec.convert(merged, Settings, strict=False)
     except msgspec.ValidationError as error:
-        raise ConfigurationError(f"a setting can't be used: {error}") from None
+        raise _unusable(error) from None
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
@@ -172,3 +175,10 @@ def _checked(options: dict[str, Any], *, where: str) -> dict[str, Any]:
 def _unknown(name: str, where: str) -> ConfigurationError:
     nearest = difflib.get_close_matches(name, Settings.__struct_fields__, n=1, cutoff=0)[0]
     return ConfigurationError(f"unknown option {name!r} in {where}", hint=f"did you mean {nearest!r}?")
+
+
+def _unusable(error: msgspec.ValidationError) -> ConfigurationError:
+    """The same with the option's name in front, which the original has as a path at its end."""
+    why, _, path = str(error).partition(" - at `$.")
+    name = path.rstrip("`").partition("[")[0]
+    return ConfigurationError(f"the setting {name} can't be used: {why}", hint=f"{name}: {MEANING[name]}")

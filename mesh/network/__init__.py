@@ -1,9 +1,12 @@
 """Zenoh: sessions, the channel of verified messages, services."""
 
-from mesh.network.channel import Channel, Subscription, message_key
+from mesh.network.addressing import message_key, verified_key
+from mesh.network.channel import Channel
+from mesh.network.endpoints import Endpoints, free_endpoint
 from mesh.network.pump import Pump
 from mesh.network.services import ServiceFailed, Services, call
-from mesh.network.session import Endpoints, Network, NetworkChange, free_endpoint
+from mesh.network.session import Network, NetworkChange
+from mesh.network.subscription import Subscription
 from mesh.network.verification import Door, Statistics
 
 __all__ = [
@@ -20,4 +23,5 @@ __all__ = [
     "call",
     "free_endpoint",
     "message_key",
+    "verified_key",
 ]

@@ -1,10 +1,10 @@
-"""From a Zenoh subscriber's thread into asyncio, fast, and bounded everywhere.
+"""From a Zenoh subscriber into asyncio, fast, and bounded everywhere.
 
-Zenoh's callback only puts the sample into a ring. One thread takes what is there (up to a batch), turns each sample
-into what the consumer wants (decoding and checking signatures happen here, off the event loop) and hands the batch to
-the loop in one call. At most two batches are on their way to the consumer; while it is busy the ring fills and the
-*oldest* samples fall out of it, counted. A consumer that stands still thus costs old messages, never memory, and
-never stalls the session.
+One thread takes samples out of Zenoh's queue into a ring, turns them into what the consumer wants (decoding and
+checking signatures happen here, off the event loop) and hands them to the loop in batches. At most two batches are on
+their way to the consumer; while it is busy the ring fills and the *oldest* samples fall out of it, counted. A consumer
+that stands still thus costs old messages, never memory, and never stalls the session: the thread goes on to empty
+Zenoh's queue whatever the consumer does.
 """
 
 from __future__ import annotations
@@ -12,15 +12,18 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-import time
 from collections import deque
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypeVar
+
+import zenoh
+
+from mesh.errors import ClosedError
+from mesh.network.crossing import call_in_loop
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from types import TracebackType
-
-    import zenoh
 
 log = logging.getLogger(__name__)
 
@@ -28,18 +31,24 @@ T = TypeVar("T")
 
 CAPACITY: Final = 8192
 """Samples that the ring holds before the oldest falls out."""
+FED_CAPACITY: Final = 65_536
+"""Samples from elsewhere that wait beside the ring; more are dropped."""
 BATCH: Final = 256
-"""Samples handed to the loop in one call at most."""
+"""Samples converted for one call of the loop at most."""
 IN_FLIGHT: Final = 2
 """Batches between the pump's thread and the consumer at most."""
+QUEUE: Final = 8192
+"""Samples in Zenoh's own queue; the pump's thread empties it many times faster than they come."""
+BUSY: Final = 0.002
+"""Seconds for which the thread waits for the consumer before it looks after Zenoh's queue again."""
 
 
 class Pump(Generic[T]):
     """An async iterator of what `convert` makes of each sample on `selector`: `async with Pump(...) as pump`.
 
-    `convert` runs on the pump's own thread and returns None for a sample that is not to be handed on; it must not
-    raise for bad input. Samples arrive in order. Leaving `async with` undeclares the subscriber and ends the thread;
-    samples not yet handed over are lost. One consumer.
+    `convert` runs on the pump's own thread and returns None for a sample that is not to be handed on; what it raises
+    comes out of the iterator. Samples arrive in order. Leaving `async with` undeclares the subscriber and ends thread
+    and iteration; samples not yet handed over are lost. One consumer. Raises `ClosedError` before it is entered.
     """
 
     def __init__(
@@ -53,36 +62,41 @@ class Pump(Generic[T]):
         self._session = session
         self._selector = selector
         self._convert = convert
-        self._capacity = capacity
+        self._lock = threading.Lock()
         self._ring: deque[zenoh.Sample] = deque(maxlen=capacity)
-        self._arrived = threading.Event()
+        self._fed = 0
         self._slots = threading.Semaphore(IN_FLIGHT)
         self._stopping = False
-        self._batches: deque[list[T]] = deque()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._batches: deque[tuple[list[T], Callable[[], None]]] = deque()
         self._current: deque[T] = deque()
         self._ready = asyncio.Event()
-        self._failure: BaseException | None = None
+        self._failure: Exception | None = None
         self.received = 0
-        """Samples that Zenoh delivered."""
+        """Samples that Zenoh delivered, and those that were fed."""
         self.dropped = 0
         """Samples that fell out of the ring because the consumer was too slow."""
 
     async def __aenter__(self) -> Self:
+        if self._loop is not None:
+            raise ClosedError("a subscription is used once", hint="subscribe again")
+        self._subscriber: Any = self._session.declare_subscriber(self._selector, zenoh.handlers.FifoChannel(QUEUE))
         self._loop = asyncio.get_running_loop()
-        self._thread = threading.Thread(target=self._run, name=f"pump {self._selector}", daemon=True)
+        self._thread = threading.Thread(
+            target=self._run, args=(self._loop, self._subscriber.handler), name=f"pump {self._selector}", daemon=True
+        )
         self._thread.start()
-        self._subscriber: Any = self._session.declare_subscriber(self._selector, self._arrive)
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stopping = True
-        self._arrived.set()
-        self._slots.release()
+        self._ready.set()
         await asyncio.to_thread(self._end)
 
     def _end(self) -> None:
+        """Undeclaring closes Zenoh's queue, which ends the thread."""
         if not self._session.is_closed():
             self._subscriber.undeclare()
         self._thread.join()
@@ -91,63 +105,90 @@ class Pump(Generic[T]):
         return self
 
     async def __anext__(self) -> T:
-        while not self._current:
-            if not self._batches:
-                if self._failure is not None:
-                    raise self._failure
+        self.check_entered()
+        while not self._stopping:
+            if self._current:
+                return self._current.popleft()
+            if self._batches:
+                batch, taken = self._batches.popleft()
+                self._current.extend(batch)
+                taken()
+            elif self._failure is not None:
+                raise self._failure
+            else:
                 self._ready.clear()
                 await self._ready.wait()
-                continue
-            self._current = deque(self._batches.popleft())
-            self._slots.release()
-        return self._current.popleft()
+        raise StopAsyncIteration
+
+    def check_entered(self) -> asyncio.AbstractEventLoop:
+        """The loop of the consumer. Raises `ClosedError` before `async with`."""
+        if self._loop is None:
+            raise ClosedError("the subscription is not open", hint="use it inside `async with`")
+        return self._loop
 
     def feed(self, sample: zenoh.Sample) -> None:
-        """Put a sample from elsewhere (a query's answer) into the ring; waits for room. On a thread of the caller's."""
-        while len(self._ring) >= self._capacity // 2 and not self._stopping:
-            time.sleep(0.001)
-        self._arrive(sample)
+        """Take a sample from elsewhere (a query's answer), and convert it, on any thread, without waiting.
 
-    def _arrive(self, sample: zenoh.Sample) -> None:
-        """Zenoh's callback: nothing here may block, or the whole session stands still."""
-        self.received += 1
-        if len(self._ring) == self._capacity:
-            self.dropped += 1
-        self._ring.append(sample)
-        if not self._arrived.is_set():
-            self._arrived.set()
+        It stands beside the ring, so that the live ones do not push it out; one that finds no room is dropped.
+        """
+        loop = self.check_entered()
+        with self._lock:
+            self.received += 1
+            if self._fed >= FED_CAPACITY:
+                self.dropped += 1
+                return
+            self._fed += 1
+        item = self._convert(sample)
+        call_in_loop(loop, self._receive, [] if item is None else [item], self._fed_taken)
 
-    def _run(self) -> None:
+    def _fed_taken(self) -> None:
+        with self._lock:
+            self._fed -= 1
+
+    def insert(self, item: T) -> None:
+        """Hand the consumer something that came another way. On the loop's thread."""
+        self._current.append(item)
+        self._ready.set()
+
+    def fail(self, error: Exception) -> None:
+        """Let the consumer have this error when all that has arrived is consumed. On the loop's thread."""
+        self._failure = error
+        self._ready.set()
+
+    def _run(self, loop: asyncio.AbstractEventLoop, queue: zenoh.handlers.Handler[zenoh.Sample]) -> None:
         try:
             while not self._stopping:
-                self._slots.acquire()
-                batch = self._next_batch()
-                if batch:
-                    self._hand_over(batch)
+                self._take(queue)
+                if self._ring and self._slots.acquire(timeout=BUSY):
+                    batch = [self._ring.popleft() for _ in range(min(BATCH, len(self._ring)))]
+                    items = [item for sample in batch if (item := self._convert(sample)) is not None]
+                    call_in_loop(loop, self._receive, items, self._slots.release)
+        except zenoh.ZError:  # the closed queue is how the thread is told to end
+            if not self._stopping:
+                call_in_loop(loop, self.fail, ClosedError("the network session of a subscription was closed"))
         except Exception as error:
             log.exception("the pump of %s failed", self._selector)
-            self._failure = error
-            self._hand_over([])
+            call_in_loop(loop, self.fail, error)
+            with suppress(zenoh.ZError):  # a full queue would stall the session
+                while True:
+                    queue.recv()
 
-    def _next_batch(self) -> list[T]:
-        """Wait until samples are there and convert them; empty only when the pump stops."""
-        batch: list[T] = []
-        while not self._stopping and not batch:
-            self._arrived.wait()
-            self._arrived.clear()
-            while self._ring and len(batch) < BATCH:
-                item = self._convert(self._ring.popleft())
-                if item is not None:
-                    batch.append(item)
-            if self._ring:
-                self._arrived.set()
-        return batch
+    def _take(self, queue: zenoh.handlers.Handler[zenoh.Sample]) -> None:
+        """Move what is in Zenoh's queue into the ring; wait for something to come when both are empty."""
+        sample = queue.try_recv() if self._ring else queue.recv()
+        dropped = received = 0
+        while sample is not None:
+            received += 1
+            dropped += len(self._ring) == self._ring.maxlen
+            self._ring.append(sample)
+            sample = queue.try_recv() if received < QUEUE else None
+        with self._lock:
+            self.received += received
+            self.dropped += dropped
 
-    def _hand_over(self, batch: list[T]) -> None:
-        if not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._receive, batch)
-
-    def _receive(self, batch: list[T]) -> None:
+    def _receive(self, batch: list[T], taken: Callable[[], None]) -> None:
         if batch:
-            self._batches.append(batch)
-        self._ready.set()
+            self._batches.append((batch, taken))
+            self._ready.set()
+        else:
+            taken()

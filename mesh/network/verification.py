@@ -1,18 +1,20 @@
 """The door of the channel: what a sample must hold before anything else sees it.
 
-Checks go from cheap to dear, so that rubbish costs little: the key is concrete, the JSON decodes, the key says what
-the message says, the deadline is ahead, the message is new; only then the signature is recovered, once.
+Checks go from cheap to dear, so that rubbish costs little: the JSON decodes, the message is new, the key says what the
+message says (so it is concrete, too), the deadline is ahead; only then the signature is recovered, once.
 """
 
 from __future__ import annotations
 
-from collections import Counter
+import threading
+from collections import Counter, OrderedDict
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
 
 import msgspec
 
 from mesh.errors import InvalidMessage
+from mesh.network.addressing import key_of, verified_key
 from schemas import Result, SignedMessage, Verified, decode, message_hash, names_in, resolve_names
 from schemas.signing import verify_hashed
 
@@ -47,18 +49,20 @@ class Door(Generic[M]):
     """Lets the verified messages of one kind pass, and counts the others.
 
     `lighthouse` is the market's name in keys; `address`, where it is known, must be the orders' lighthouse. `head`
-    tells the number of the latest block, or 0 when it isn't known (then no deadline is checked). Not thread-safe:
-    one thread calls `check` (the pump's).
+    tells the number of the latest block, or 0 when it isn't known (then no deadline is checked). A message is the same
+    as one that passed when key and signature are: two signers of equal generation-3 terms are two messages. Safe to
+    use from several threads.
     """
 
     def __init__(self, kind: type[M], *, lighthouse: str, address: str | None, head: Callable[[], int]) -> None:
         self._kind: type[M] = kind
-        self._prefix = f"aira/{lighthouse}/{kind.__name__.lower()}/"
+        self._lighthouse = lighthouse
         self._address = address
         self._head = head
-        self._passed: dict[tuple[bytes, str], None] = {}
-        self.invalid: Counter[str] = Counter()
-        self.duplicate = 0
+        self._lock = threading.Lock()
+        self._passed: OrderedDict[tuple[str, str], None] = OrderedDict()
+        self._invalid: Counter[str] = Counter()
+        self._duplicate = 0
 
     def __call__(self, sample: zenoh.Sample) -> Verified[M] | Unresolved[M] | None:
         """What a Zenoh sample holds, if it may pass."""
@@ -70,11 +74,12 @@ class Door(Generic[M]):
             message = decode(payload)
             if not isinstance(message, self._kind):
                 raise InvalidMessage("kind", f"a {type(message).__name__} on a key of {self._kind.__name__}")
-            if names_in(message):
-                return Unresolved(message, key)
-            return self._verified(message, key)
+            if (key, message.signature) in self._passed:
+                self._count_duplicate()
+                return None
+            return Unresolved(message, key) if names_in(message) else self._verified(message, key)
         except InvalidMessage as error:
-            self.invalid[error.reason] += 1
+            self.refuse(error.reason)
             return None
 
     def resolved(self, unresolved: Unresolved[M], addresses: Mapping[str, str]) -> Verified[M] | None:
@@ -82,21 +87,33 @@ class Door(Generic[M]):
         try:
             return self._verified(resolve_names(unresolved.message, addresses), unresolved.key)
         except InvalidMessage as error:
-            self.invalid[error.reason] += 1
+            self.refuse(error.reason)
             return None
+
+    def refuse(self, reason: str) -> None:
+        """Count a message that does not pass."""
+        with self._lock:
+            self._invalid[reason] += 1
+
+    def forget(self, verified: Verified[M]) -> None:
+        """Let a message that has passed pass once more, when it is sent again."""
+        with self._lock:
+            self._passed.pop((verified_key(self._lighthouse, verified), verified.message.signature), None)
+
+    def statistics(self, *, received: int, dropped: int) -> Statistics:
+        """What passed through this door, given what came to it and what was lost before."""
+        with self._lock:
+            return Statistics(
+                received=received, invalid=dict(self._invalid), duplicate=self._duplicate, dropped=dropped
+            )
 
     def _verified(self, message: M, key: str) -> Verified[M] | None:
         digest = message_hash(message)
-        chunk = message.liability.lower() if isinstance(message, Result) else message.model
-        if key != f"{self._prefix}{chunk}/{digest.hex()}":
+        if key != key_of(self._lighthouse, message, digest):
             raise InvalidMessage("key", f"the message does not belong on {key}")
         self._check_order(message)
-        if (digest, message.signature) in self._passed:
-            self.duplicate += 1
-            return None
         verified = verify_hashed(message, digest)
-        self._remember((digest, message.signature))
-        return verified
+        return verified if self._passes_first(message, key) else None
 
     def _check_order(self, order: SignedMessage) -> None:
         if isinstance(order, Result):
@@ -106,8 +123,17 @@ class Door(Generic[M]):
         if self._address is not None and order.lighthouse != self._address:
             raise InvalidMessage("lighthouse", f"made for {order.lighthouse}, not for this market")
 
-    def _remember(self, identity: tuple[bytes, str]) -> None:
-        """Keep the identity; the oldest is forgotten. Two signers of equal generation-3 terms are two messages."""
-        if len(self._passed) >= REMEMBERED:
-            del self._passed[next(iter(self._passed))]
-        self._passed[identity] = None
+    def _count_duplicate(self) -> None:
+        with self._lock:
+            self._duplicate += 1
+
+    def _passes_first(self, message: M, key: str) -> bool:
+        """Remember that the message passes, and forget the oldest; False if it passed meanwhile on another thread."""
+        with self._lock:
+            if (key, message.signature) in self._passed:
+                self._duplicate += 1
+                return False
+            if len(self._passed) >= REMEMBERED:
+                self._passed.popitem(last=False)
+            self._passed[key, message.signature] = None
+        return True

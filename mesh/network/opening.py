@@ -1,0 +1,76 @@
+"""Opening a Zenoh session: a blocking call that can't be interrupted, so it is made in short attempts."""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from typing import TYPE_CHECKING, Final
+
+import zenoh
+
+from mesh.errors import ClosedError, ConfigurationError, NetworkUnavailable
+
+if TYPE_CHECKING:
+    from mesh.network.endpoints import Endpoints
+
+PAUSE: Final = 0.2
+"""Seconds between two attempts."""
+CAUSE: Final = re.compile(r"\[\S+?: (?P<cause>.+?) at /")
+"""The cause in an error of Zenoh's about a listener."""
+
+
+class Opening:
+    """One way to a session: `run` in a thread; `abandon` from another, when nobody waits for it any more."""
+
+    def __init__(self, endpoints: Endpoints) -> None:
+        self._endpoints = endpoints
+        self._lock = threading.Lock()
+        self._session: zenoh.Session | None = None
+        self._abandoned = threading.Event()
+
+    def run(self) -> zenoh.Session:
+        """The open session.
+
+        Raises `NetworkUnavailable` when no router answers in the endpoints' time, `ConfigurationError` when it can't
+        listen, `ClosedError` when it was abandoned.
+        """
+        timeout = self._endpoints.timeout
+        ends = time.monotonic() + timeout if timeout >= 0 else float("inf")
+        while True:
+            try:
+                session = zenoh.open(self._endpoints.config())
+            except zenoh.ZError as error:
+                if self._endpoints.mode == "router":
+                    raise self._not_listening(error) from None
+                if time.monotonic() + PAUSE >= ends:
+                    raise NetworkUnavailable(self._endpoints.connect, f"no answer within {timeout:g} s") from None
+                self._abandoned.wait(PAUSE)
+                session = None
+            if (opened := self._wanted(session)) is not None:
+                return opened
+
+    def abandon(self) -> None:
+        """Nobody wants the session: close it if it is open, or as soon as it is."""
+        with self._lock:
+            self._abandoned.set()
+            session, self._session = self._session, None
+        if session is not None:
+            session.close()  # type: ignore[no-untyped-call]
+
+    def _wanted(self, session: zenoh.Session | None) -> zenoh.Session | None:
+        with self._lock:
+            if not self._abandoned.is_set():
+                self._session = session
+                return session
+        if session is not None:
+            session.close()  # type: ignore[no-untyped-call]
+        raise ClosedError("the opening of the network session was abandoned")
+
+    def _not_listening(self, error: zenoh.ZError) -> ConfigurationError:
+        found = CAUSE.search(str(error))
+        cause = found["cause"] if found else str(error).split(" at /", 1)[0]
+        return ConfigurationError(
+            f"can't listen at {', '.join(self._endpoints.listen)}: {cause}",
+            hint="is the port taken? give another with --listen tcp/HOST:PORT",
+        )

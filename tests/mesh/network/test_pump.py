@@ -1,0 +1,245 @@
+"""The pump between Zenoh's threads and the event loop: order, exact counts, and an end that never hangs."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import zenoh
+
+from mesh.errors import ClosedError
+from mesh.network import Pump, pump
+from tests.support.waiting import at_most, until, until_heard
+
+KEY = "test/numbers"
+LAST = -1
+
+
+def number(sample: zenoh.Sample) -> int:
+    return int(sample.payload.to_bytes())
+
+
+def put(session: zenoh.Session, *numbers: int) -> None:
+    """Put the numbers, and lose none of them on the way."""
+    for value in numbers:
+        session.put(KEY, str(value).encode(), congestion_control=zenoh.CongestionControl.BLOCK)
+
+
+async def take(numbers: Pump[int], count: int) -> list[int]:
+    async with asyncio.timeout(10):
+        return [await anext(numbers) for _ in range(count)]
+
+
+async def take_to_last(numbers: Pump[int]) -> list[int]:
+    taken = []
+    async with asyncio.timeout(10):
+        while (value := await anext(numbers)) != LAST:
+            taken.append(value)
+    return taken
+
+
+def feed_all(numbers: Pump[int], samples: list[zenoh.Sample]) -> None:
+    for sample in samples:
+        numbers.feed(sample)
+
+
+def pumps_running() -> list[str]:
+    return [thread.name for thread in threading.enumerate() if thread.name.startswith("pump ")]
+
+
+async def test_samples_come_in_their_order(here: zenoh.Session, there: zenoh.Session) -> None:
+    async with Pump(here, KEY, number) as numbers:
+        await until_heard(there, KEY)
+        put(there, *range(2000))
+
+        assert await take(numbers, 2000) == list(range(2000))
+        assert (numbers.received, numbers.dropped) == (2000, 0)
+
+
+async def test_what_the_conversion_turns_down_is_left_out(here: zenoh.Session, there: zenoh.Session) -> None:
+    def even(sample: zenoh.Sample) -> int | None:
+        return number(sample) if number(sample) % 2 == 0 else None
+
+    async with Pump(here, KEY, even) as numbers:
+        await until_heard(there, KEY)
+        put(there, *range(1000))
+
+        assert await take(numbers, 500) == list(range(0, 1000, 2))
+
+
+async def test_the_conversion_runs_beside_the_loop(here: zenoh.Session, there: zenoh.Session) -> None:
+    async with Pump(here, KEY, lambda _: threading.current_thread().name) as names:
+        await until_heard(there, KEY)
+        put(there, 1)
+
+        assert await anext(names) == f"pump {KEY}"
+
+
+async def test_a_slow_consumer_loses_the_oldest_and_each_one_is_counted(
+    here: zenoh.Session, there: zenoh.Session
+) -> None:
+    async with Pump(here, KEY, number, capacity=64) as numbers:
+        await until_heard(there, KEY)
+        await asyncio.to_thread(put, there, *range(5000))
+        put(there, LAST)
+        await until(lambda: numbers.received == 5001)
+        taken = await take_to_last(numbers)
+
+        assert taken == sorted(taken)
+        assert taken[-63:] == list(range(5000 - 63, 5000))
+        assert numbers.dropped > 0
+        assert numbers.received == len(taken) + 1 + numbers.dropped
+
+
+async def test_a_consumer_that_is_given_up_loses_nothing(here: zenoh.Session, there: zenoh.Session) -> None:
+    async with Pump(here, KEY, number) as numbers:
+        await until_heard(there, KEY)
+        waiting = asyncio.create_task(anext(numbers))
+        await asyncio.sleep(0)
+        waiting.cancel()
+        put(there, 1, 2, 3)
+
+        assert await take(numbers, 3) == [1, 2, 3]
+
+
+async def test_what_is_fed_comes_out_beside_the_live_samples(here: zenoh.Session, there: zenoh.Session) -> None:
+    samples = await some_samples(here, there, 3)
+
+    async with Pump(here, "test/elsewhere", number) as numbers:
+        for sample in samples:
+            numbers.feed(sample)
+
+        assert await take(numbers, 3) == [0, 1, 2]
+        assert numbers.received == 3
+
+
+async def test_feeding_never_waits_for_the_consumer_and_what_finds_no_room_is_counted(
+    here: zenoh.Session, there: zenoh.Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pump, "FED_CAPACITY", 1000)
+    (sample,) = await some_samples(here, there, 1)
+
+    async with Pump(here, "test/elsewhere", number) as numbers:
+        with at_most(5):
+            for _ in range(20_000):
+                numbers.feed(sample)
+
+        assert numbers.received == 20_000
+        assert numbers.dropped > 15_000
+        assert await take(numbers, 20_000 - numbers.dropped) == [0] * (20_000 - numbers.dropped)
+
+
+async def test_counts_are_exact_when_threads_feed_while_samples_arrive(
+    here: zenoh.Session, there: zenoh.Session
+) -> None:
+    samples = await some_samples(here, there, 500)
+
+    async with Pump(here, KEY, number, capacity=100_000) as numbers:
+        await until_heard(there, KEY)
+        with ThreadPoolExecutor(4) as threads:
+            for _ in range(3):
+                threads.submit(feed_all, numbers, samples)
+            threads.submit(put, there, *range(500))
+
+        assert sorted(await take(numbers, 2000)) == sorted([*range(500)] * 4)
+        assert (numbers.received, numbers.dropped) == (2000, 0)
+
+
+async def test_leaving_ends_the_iteration_of_whoever_waits(here: zenoh.Session) -> None:
+    async with Pump(here, KEY, number) as numbers:
+        consuming = asyncio.create_task(collect(numbers))
+        await asyncio.sleep(0)
+
+    with at_most(2):
+        assert await consuming == []
+    with pytest.raises(StopAsyncIteration):
+        await anext(numbers)
+
+
+@pytest.mark.parametrize("capacity", [64, 8192])
+async def test_leaving_does_not_wait_for_a_consumer_that_stands_still(
+    here: zenoh.Session, there: zenoh.Session, capacity: int
+) -> None:
+    numbers = await Pump(here, KEY, number, capacity=capacity).__aenter__()
+    await until_heard(there, KEY)
+    put(there, *range(3000))
+    await until(lambda: numbers.received == 3000)
+
+    with at_most(2):
+        await numbers.__aexit__(None, None, None)
+
+    assert not pumps_running()
+
+
+async def test_leaving_after_the_session_was_closed_does_not_hang(here: zenoh.Session) -> None:
+    with at_most(2):
+        async with Pump(here, KEY, number):
+            here.close()  # type: ignore[no-untyped-call]
+
+    assert not pumps_running()
+
+
+async def test_a_session_that_is_closed_ends_the_iteration_with_an_error(here: zenoh.Session) -> None:
+    async with Pump(here, KEY, number) as numbers:
+        consuming = asyncio.create_task(take(numbers, 1))
+        await asyncio.sleep(0)
+        here.close()  # type: ignore[no-untyped-call]
+
+        with at_most(2), pytest.raises(ClosedError, match="session of a subscription was closed"):
+            await consuming
+
+
+async def test_nothing_is_left_running_when_the_session_does_not_take_the_subscription(here: zenoh.Session) -> None:
+    here.close()  # type: ignore[no-untyped-call]
+
+    with pytest.raises(zenoh.ZError):
+        await Pump(here, KEY, number).__aenter__()
+
+    assert not pumps_running()
+
+
+async def test_what_the_conversion_raises_comes_out_after_what_came_before(
+    here: zenoh.Session, there: zenoh.Session
+) -> None:
+    async with Pump(here, KEY, number) as numbers:
+        await until_heard(there, KEY)
+        put(there, 1)
+        assert await take(numbers, 1) == [1]
+        there.put(KEY, b"no number")
+
+        for _ in range(2):
+            with pytest.raises(ValueError, match="no number"):
+                await take(numbers, 1)
+
+        for _ in range(10_000):
+            there.put(KEY, b"1")
+
+    assert not pumps_running()
+
+
+async def test_it_is_used_inside_async_with_and_once(here: zenoh.Session) -> None:
+    numbers = Pump(here, KEY, number)
+    with pytest.raises(ClosedError, match="not open"):
+        await anext(numbers)
+
+    async with numbers:
+        pass
+
+    with pytest.raises(ClosedError, match="used once"):
+        await numbers.__aenter__()
+
+
+async def collect(numbers: Pump[int]) -> list[int]:
+    return [value async for value in numbers]
+
+
+async def some_samples(here: zenoh.Session, there: zenoh.Session, count: int) -> list[zenoh.Sample]:
+    """Samples with the numbers from 0 on, as a subscriber gets them."""
+    samples: list[zenoh.Sample] = []
+    with here.declare_subscriber(KEY, samples.append):
+        await until_heard(there, KEY)
+        put(there, *range(count))
+        await until(lambda: len(samples) == count)
+    return samples

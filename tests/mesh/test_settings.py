@@ -1,0 +1,201 @@
+"""Settings: where they come from, who wins, and what is said of a mistake."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mesh.errors import ConfigurationError
+from mesh.settings import MEANING, NOT_OPTIONS, Settings, load
+
+NOTHING: dict[str, str] = {}
+
+
+def written(path: Path, text: str) -> Path:
+    file = path / "aira.toml"
+    file.write_text(text)
+    return file
+
+
+def test_without_anything_the_legacy_defaults_hold() -> None:
+    settings = load(environ=NOTHING)
+
+    assert settings == Settings()
+    assert settings.web3_http_provider == "http://127.0.0.1:8545"
+    assert settings.web3_ws_provider == "ws://127.0.0.1:8546"
+    assert settings.ipfs_http_provider == "http://127.0.0.1:5001"
+    assert settings.factory_contract == "factory.3.robonomics.eth"
+    assert settings.lighthouse_contract == "airalab.lighthouse.3.robonomics.eth"
+    assert settings.erc20_token == "xrt.3.robonomics.eth"
+    assert settings.enable_executor is True
+    assert settings.recording_topics == settings.ens_contract == ""
+
+
+def test_variables_win_over_the_file_and_flags_over_both(tmp_path: Path) -> None:
+    file = written(tmp_path, 'recording_topics = "file"\nens_contract = "file"\ndata_dir = "file"\n')
+
+    settings = load(path=file, environ={"AIRA_ENS_CONTRACT": "env", "AIRA_DATA_DIR": "env"}, flags={"data_dir": "flag"})
+
+    assert (settings.recording_topics, settings.ens_contract, settings.data_dir) == ("file", "env", "flag")
+
+
+def test_a_flag_that_was_not_given_overrides_nothing() -> None:
+    assert load(environ={"AIRA_DATA_DIR": "env"}, flags={"data_dir": None}).data_dir == "env"
+
+
+def test_the_process_environment_is_read_by_default(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AIRA_ERC20_TOKEN", "other.3.robonomics.eth")
+
+    assert load().erc20_token == "other.3.robonomics.eth"
+
+
+def test_variables_are_texts_and_become_what_the_option_is() -> None:
+    settings = load(
+        environ={
+            "AIRA_GENERATION": "5",
+            "AIRA_ENABLE_EXECUTOR": "false",
+            "AIRA_POLL_INTERVAL": "0.5",
+            "AIRA_OPEN_ORDERS_LIMIT": "7",
+            "AIRA_CONNECT": "tcp/a:1, tcp/b:2,",
+        }
+    )
+
+    assert settings.generation == 5
+    assert settings.enable_executor is False
+    assert settings.poll_interval == 0.5
+    assert settings.open_orders_limit == 7
+    assert settings.connect == ("tcp/a:1", "tcp/b:2")
+
+
+def test_a_file_has_typed_values(tmp_path: Path) -> None:
+    file = written(tmp_path, 'connect = ["tcp/a:1"]\ngeneration = 5\nenable_executor = false\nfetch_timeout = 3\n')
+
+    settings = load(path=file, environ=NOTHING)
+
+    assert (settings.connect, settings.generation, settings.enable_executor) == (("tcp/a:1",), 5, False)
+    assert settings.fetch_timeout == 3.0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "right"),
+    [
+        ("web3_http_providers", "web3_http_provider"),
+        ("keyfile_pasword_file", "keyfile_password_file"),
+        ("ens", "listen"),
+    ],
+)
+def test_an_unknown_option_in_the_file_names_the_nearest(tmp_path: Path, wrong: str, right: str) -> None:
+    file = written(tmp_path, f'{wrong} = "x"\n')
+
+    with pytest.raises(ConfigurationError, match=f"unknown option '{wrong}' in .*aira.toml") as error:
+        load(path=file, environ=NOTHING)
+
+    assert error.value.hint == f"did you mean {right!r}?"
+
+
+def test_an_unknown_variable_names_the_nearest_option() -> None:
+    with pytest.raises(ConfigurationError, match="unknown option 'keyfil' in the environment") as error:
+        load(environ={"AIRA_KEYFIL": "x"})
+
+    assert "'keyfile'" in error.value.hint
+
+
+def test_an_unknown_flag_names_the_nearest_option() -> None:
+    with pytest.raises(ConfigurationError, match="unknown option 'datadir' in the flags") as error:
+        load(environ=NOTHING, flags={"datadir": "x"})
+
+    assert "'data_dir'" in error.value.hint
+
+
+def test_variables_of_other_programs_and_of_the_tests_are_no_options() -> None:
+    others = dict.fromkeys(NOT_OPTIONS, "x") | {"PATH": "/bin", "XAIRA_FOO": "x"}
+
+    assert load(environ=others) == Settings()
+
+
+@pytest.mark.parametrize("where", ["file", "environment"])
+def test_a_retired_option_is_reported_and_not_obeyed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, where: str
+) -> None:
+    file = written(tmp_path, "master_check_interval = 1\n") if where == "file" else None
+    environ = {"AIRA_MASTER_CHECK_INTERVAL": "1"} if where == "environment" else {}
+
+    with caplog.at_level(logging.WARNING):
+        assert load(path=file, environ=environ) == Settings()
+
+    assert "master_check_interval" in caplog.text
+    assert "no ROS master" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("generation", 4),
+        ("generation", "three"),
+        ("enable_executor", "perhaps"),
+        ("poll_interval", 0),
+        ("poll_interval", float("nan")),
+        ("connect_timeout", -2),
+        ("connect_timeout", float("nan")),
+        ("open_orders_limit", 0),
+        ("objective_size_limit", -1),
+        ("playback", "backwards"),
+        ("fetch_timeout", -1),
+        ("connect", "tcp/a:1"),
+        ("connect", [1]),
+    ],
+)
+def test_a_value_that_can_not_be_names_its_option_and_what_it_means(option: str, value: Any) -> None:
+    with pytest.raises(ConfigurationError, match=f"^the setting {option} can't be used: [^\n]+$") as error:
+        load(environ=NOTHING, flags={option: value})
+
+    assert error.value.hint == f"{option}: {MEANING[option]}"
+
+
+def test_a_file_that_is_not_there_is_one_clear_line(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match=r"^can't read the settings .*none\.toml: No such file or directory$"):
+        load(path=tmp_path / "none.toml", environ=NOTHING)
+
+
+@pytest.mark.parametrize("content", [b"connect = [", b"\xff\xfe", b"a = 1\na = 2\n"])
+def test_a_file_that_is_not_toml_is_one_clear_line(tmp_path: Path, content: bytes) -> None:
+    file = tmp_path / "aira.toml"
+    file.write_bytes(content)
+
+    with pytest.raises(ConfigurationError, match=r"aira\.toml is not TOML: [^\n]+$"):
+        load(path=file, environ=NOTHING)
+
+
+def test_a_role_that_signs_needs_keyfile_and_password_file() -> None:
+    for settings in (Settings(), Settings(keyfile="k"), Settings(keyfile_password_file="p")):
+        with pytest.raises(ConfigurationError, match="keyfile or keyfile_password_file is not set") as error:
+            settings.keyfile_and_password()
+        assert "aira account new" in error.value.hint
+
+
+def test_keyfile_and_data_folder_may_be_in_the_home_folder() -> None:
+    settings = Settings(keyfile="~/key", keyfile_password_file="~/password", data_dir="~/aira")
+
+    assert settings.keyfile_and_password() == (Path.home() / "key", Path.home() / "password")
+    assert settings.state_directory == Path.home() / "aira"
+
+
+def test_without_a_data_folder_the_users_own_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", "/somewhere")
+    assert Settings().state_directory == Path("/somewhere/aira")
+
+    monkeypatch.delenv("XDG_DATA_HOME")
+    assert Settings().state_directory == Path.home() / ".local/share/aira"
+
+
+def test_another_lighthouse_changes_nothing_else() -> None:
+    settings = Settings(generation=5).with_lighthouse("mine.lighthouse.5.robonomics.eth")
+
+    assert settings == Settings(generation=5, lighthouse_contract="mine.lighthouse.5.robonomics.eth")
+
+
+def test_every_option_has_its_meaning_in_words() -> None:
+    assert set(MEANING) == set(Settings.__struct_fields__)

@@ -1,0 +1,148 @@
+"""A market for tests: founded once, on an embedded chain; each test has its own router, provider, agents and folders.
+
+Accounts and the chain are shared by all tests of a run, so tests compare balances before and after.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
+
+import msgspec
+import pytest
+
+from mesh.agent import Agent
+from mesh.background import Background
+from mesh.chain import Chain, EmbeddedChain, Timing
+from mesh.demo.market import Market, found_market
+from mesh.market.provider import Provider
+from mesh.network import Endpoints, Network
+from mesh.settings import Settings
+from schemas import cid_of_bytes
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterator
+    from pathlib import Path
+
+    from schemas import Demand, Verified
+    from tests.support.routers import EmbeddedRouter
+
+MODEL = cid_of_bytes(b"what the robots of the tests can do")
+QUICK = Timing(poll_interval=0.03, receipt_interval=0.01)
+
+
+@dataclass(frozen=True)
+class Founded:
+    """A chain in a thread of its own, which any event loop may use, and the market on it."""
+
+    node: EmbeddedChain
+    market: Market
+
+
+@pytest.fixture(scope="session")
+def founded() -> Iterator[Founded]:
+    """A market on an embedded chain, for the whole run."""
+    with asyncio.Runner() as runner:
+        stack = AsyncExitStack()
+        node = runner.run(stack.enter_async_context(EmbeddedChain()))
+        try:
+            yield Founded(node, runner.run(found_market(node.provider, node.funded_keys)))
+        finally:
+            runner.run(stack.aclose())
+
+
+class Place:
+    """Where a test's agents meet. `async with Place(founded, endpoint, folder) as place`."""
+
+    def __init__(self, founded: Founded, endpoint: str, folder: Path) -> None:
+        self.node = founded.node
+        self.market = founded.market
+        self.endpoint = endpoint
+        self.folder = folder
+        self.chains: dict[str, Chain] = {}
+        self._stack = AsyncExitStack()
+
+    async def __aenter__(self) -> Self:
+        for role in self.market.accounts:
+            self.chains[role] = await self._stack.enter_async_context(self.chain(role))
+        return self
+
+    async def __aexit__(self, *exc_info: object) -> None:
+        await self._stack.aclose()
+
+    def chain(self, role: str) -> Chain:
+        """The chain for an account, not yet open."""
+        return Chain(
+            self.node.provider, account=self.market.accounts[role], ens=self.market.deployment.ens, timing=QUICK
+        )
+
+    def address(self, role: str) -> str:
+        """A role's account."""
+        return self.market.accounts[role].address
+
+    async def balance(self, role: str) -> int:
+        """What a role has, wn."""
+        return await self.chains[role].balance_of(self.address(role))
+
+    def settings(self, role: str, **options: Any) -> Settings:
+        """Settings of an agent of that role, `options` changed. Objectives are played at once."""
+        settings = Settings(
+            connect=(self.endpoint,),
+            data_dir=str(self.folder / role),
+            lighthouse_contract=self.market.deployment.lighthouse_name,
+            ens_contract=self.market.deployment.ens,
+            poll_interval=QUICK.poll_interval,
+            playback="at-once",
+            fetch_timeout=5.0,
+        )
+        return msgspec.structs.replace(settings, **options)
+
+    def agent(self, role: str, model: str = MODEL, **options: Any) -> Agent:
+        """An agent of that role, not yet running; handlers can be added. Always with the same memory."""
+        settings = self.settings(role, **options)
+        return Agent(model, settings=settings, account=self.market.accounts[role], chain=self.chains[role])
+
+    @asynccontextmanager
+    async def provider(self) -> AsyncIterator[Provider]:
+        """The lighthouse's provider at work."""
+        async with (
+            Network(Endpoints(connect=(self.endpoint,))) as network,
+            Provider(network.session, self.chains["provider"], self.market.deployment.lighthouse_name) as provider,
+            Background() as tasks,
+        ):
+            tasks.start(provider.run(), "provider of the test")
+            yield provider
+
+    @asynccontextmanager
+    async def at_work(self, *agents: Agent) -> AsyncIterator[Agent]:
+        """The provider and these agents at work; gives a person's agent."""
+        async with AsyncExitStack() as stack:
+            await stack.enter_async_context(self.provider())
+            for agent in agents:
+                await stack.enter_async_context(agent)
+            yield await stack.enter_async_context(self.agent("person"))
+
+    def save(self, content: bytes, name: str = "objective.mcap") -> Path:
+        """A file of the person's."""
+        path = self.folder / name
+        path.write_bytes(content)
+        return path
+
+
+def obliging(robot: Agent) -> Agent:
+    """The same robot, which offers to do whatever is asked of it."""
+
+    @robot.on_demand
+    async def offer(demand: Verified[Demand]) -> None:
+        await robot.offer(demand)
+
+    return robot
+
+
+@pytest.fixture
+async def place(founded: Founded, router: EmbeddedRouter, tmp_path: Path) -> AsyncIterator[Place]:
+    """A market's place of this test's own."""
+    async with Place(founded, router.endpoint, tmp_path) as open_place:
+        yield open_place

@@ -1,0 +1,62 @@
+"""Signed messages of people who exist in tests only."""
+
+from __future__ import annotations
+
+from itertools import count
+from typing import Any, Final
+
+from schemas import ZERO_ADDRESS, Demand, Offer, Result, Signer, Verified, cid_of_bytes, verify_message
+
+MARKET: Final = "airalab.lighthouse.3.robonomics.eth"
+LIGHTHOUSE: Final = "0x19437Cb65760805A0e55339186F03B2d980eBBf9"
+TOKEN: Final = "0x27023154114b066515Ae678cb06E19417B8fcA73"
+MODEL: Final = cid_of_bytes(b"a model")
+OTHER_MODEL: Final = cid_of_bytes(b"another model")
+OBJECTIVE: Final = cid_of_bytes(b"an objective")
+RECORDING: Final = cid_of_bytes(b"a recording")
+
+PERSON: Final = Signer(b"\x01" * 32)
+ROBOT: Final = Signer(b"\x02" * 32)
+STRANGER: Final = Signer(b"\x03" * 32)
+
+_nonces = count(1)
+
+
+def terms(**changes: Any) -> dict[str, Any]:
+    """What a demand and an offer share, and a nonce of its own."""
+    return {
+        "model": MODEL,
+        "objective": OBJECTIVE,
+        "token": TOKEN,
+        "cost": 42,
+        "lighthouse": LIGHTHOUSE,
+        "validator": ZERO_ADDRESS,
+        "deadline": 1_000_000,
+        "nonce": f"{next(_nonces):064x}",
+    } | changes
+
+
+def demand(*, signer: Signer = PERSON, **changes: Any) -> Demand:
+    """A signed demand; of generation 5 where `sender` and an integer `nonce` are given."""
+    return signer.sign(Demand(**({"validator_fee": 0} | terms(**changes))))
+
+
+def offer(*, signer: Signer = ROBOT, **changes: Any) -> Offer:
+    """A signed offer, which agrees to the terms of a demand with the same changes."""
+    return signer.sign(Offer(**({"lighthouse_fee": 0} | terms(**changes))))
+
+
+def result(*, signer: Signer = ROBOT, **changes: Any) -> Result:
+    """A signed result, of a liability at some address unless it is given."""
+    fields: dict[str, Any] = {"liability": LIGHTHOUSE, "result": RECORDING, "success": True}
+    return signer.sign(Result(**(fields | changes)))
+
+
+def verified_demand(*, signer: Signer = PERSON, **changes: Any) -> Verified[Demand]:
+    """As `demand`, verified."""
+    return verify_message(demand(signer=signer, **changes))
+
+
+def verified_offer(*, signer: Signer = ROBOT, **changes: Any) -> Verified[Offer]:
+    """As `offer`, verified."""
+    return verify_message(offer(signer=signer, **changes))

@@ -1,0 +1,53 @@
+"""Waiting for what comes about elsewhere: asked again and again, and given up loudly."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterator
+
+    import zenoh
+
+SECONDS = 10.0
+PAUSE = 0.005
+
+
+async def until(condition: Callable[[], object], *, what: str = "", seconds: float = SECONDS) -> None:
+    """Return when `condition()` is true; fail the test if it isn't within `seconds`."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, f"{what or 'the condition'} did not come about within {seconds:g} s"
+        await asyncio.sleep(PAUSE)
+
+
+async def until_found(search: Callable[[], Awaitable[object]], *, what: str = "", seconds: float = SECONDS) -> None:
+    """As `until`, for a question that is itself waited for."""
+    deadline = time.monotonic() + seconds
+    while not await search():
+        assert time.monotonic() < deadline, f"{what or 'the condition'} did not come about within {seconds:g} s"
+        await asyncio.sleep(PAUSE)
+
+
+async def until_heard(session: zenoh.Session, key: str) -> None:
+    """Return when a put of `session` on `key` finds a subscriber: declarations take their time to get around."""
+    with session.declare_publisher(key) as publisher:
+        await until(lambda: publisher.matching_status.matching, what=f"a subscriber of {key}")  # type: ignore[attr-defined]
+
+
+async def until_answered(session: zenoh.Session, selector: str) -> None:
+    """Return when a query of `session` on `selector` finds a queryable."""
+    with session.declare_querier(selector) as querier:
+        await until(lambda: querier.matching_status.matching, what=f"a queryable on {selector}")  # type: ignore[attr-defined]
+
+
+@contextmanager
+def at_most(seconds: float) -> Iterator[None]:
+    """Fail if the body takes longer."""
+    started = time.monotonic()
+    yield
+    took = time.monotonic() - started
+    assert took < seconds, f"took {took:.2f} s, and {seconds:g} s are allowed"
