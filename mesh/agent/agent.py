@@ -5,12 +5,10 @@ from __future__ import annotations
 import asyncio
 import logging
 from contextlib import AsyncExitStack
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 
 from mesh.agent.hooks import Handler, HandlerPerformer, Hooks, call
 from mesh.agent.parts import chain_of, load_account, watching, working
-from mesh.agent.party import Worker
-from mesh.agent.trade import LIFETIME, Contract
 from mesh.background import Background
 from mesh.errors import ClosedError, ConfigurationError
 from mesh.settings import load
@@ -21,12 +19,17 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import TracebackType
 
+    from mesh.agent.contract import Contract
     from mesh.agent.parts import Parts
+    from mesh.agent.party import Worker
     from mesh.chain import Account, Chain
     from mesh.network import Channel
     from mesh.settings import Settings
 
 log = logging.getLogger(__name__)
+
+LIFETIME: Final = 1000
+"""Blocks for which an order is valid unless told otherwise."""
 
 H = TypeVar("H", bound=Handler)
 
@@ -54,6 +57,7 @@ class Agent:
         self._given_chain = chain
         self._hooks = Hooks()
         self._stack = AsyncExitStack()
+        self._running = False
         self._channel: Channel | None = None
         self._worker: Worker | None = None
 
@@ -100,9 +104,11 @@ class Agent:
         return register
 
     async def __aenter__(self) -> Self:
-        if self._channel is not None:
-            raise ClosedError("this agent is running already")
+        if self._running:
+            raise ClosedError("this agent is running already", hint="one process runs it once; make another Agent")
         async with AsyncExitStack() as stack:
+            self._running = True
+            stack.callback(self._ended)
             await self._open(stack)
             self._stack = stack.pop_all()
         return self
@@ -110,12 +116,11 @@ class Agent:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> bool | None:
-        self._channel = self._worker = None
         return await self._stack.__aexit__(kind, error, trace)
 
     def run(self) -> None:
         """Serve until Ctrl-C or SIGTERM. Errors that a person can mend are one line, and exit code 1 or 2."""
-        from mesh.cli.running import run_until_stopped
+        from mesh.running import run_until_stopped
 
         run_until_stopped(self.serve)
 
@@ -160,13 +165,12 @@ class Agent:
         """
         trader = self._working().trader
         if demand is not None:
-            order = demand.message if isinstance(demand, Verified) else demand
-            fields = await trader.mirrored(order)
+            terms = trader.mirrored(demand.message if isinstance(demand, Verified) else demand)
         else:
-            fields = await trader.terms(
+            terms = await trader.terms(
                 model=self.model, objective=objective, cost=cost, token=token, validator=validator, lifetime=lifetime
             )
-        return await trader.offer(Offer(**fields, lighthouse_fee=lighthouse_fee))
+        return await trader.offer(terms, lighthouse_fee=lighthouse_fee)
 
     async def demand(
         self,
@@ -184,17 +188,16 @@ class Agent:
         `objective` is a CID, or the path of a file, which is then served from here. The other terms are as for
         `offer`; the factory gets the allowance that they need. Raises `OrderExpired`, `OrderRejected`, `ShortOfFunds`.
         """
-        worker = self._working()
+        trader = self._working().trader
         cid = objective if isinstance(objective, str) else await asyncio.to_thread(self.parts.store.put_file, objective)
-        fields = await worker.trader.terms(
+        terms = await trader.terms(
             model=model or self.model, objective=cid, cost=cost, token=token, validator=validator, lifetime=lifetime
         )
-        return await worker.trader.demand(Demand(**fields, validator_fee=validator_fee))
+        return await trader.demand(terms, validator_fee=validator_fee)
 
     async def contract(self, address: str) -> Contract:
         """The contract at `address`, whoever made it, to be waited for. Raises `NotALiability`."""
-        worker = self._working()
-        return worker.trader.contract(await worker.parts.chain.liability(address))
+        return await self._working().trader.contract(address)
 
     async def finish(self, address: str, *, success: bool) -> str:
         """End the job of the liability at `address` now; returns the recording's CID."""
@@ -211,17 +214,28 @@ class Agent:
         else:
             await self._open_working(stack, account)
         assert self._channel is not None
-        tasks = await stack.enter_async_context(Background())
-        if self._worker is not None:
-            tasks.start(self._worker.run(), "worker")
+        subscriptions = []
         for kind, handlers in self._hooks.market.items():
             model = self.model if kind is not Result and self.model else "*"
             subscription = await stack.enter_async_context(self._channel.subscribe(kind, model=model))
-            tasks.start(self._hear(subscription, handlers), f"hear {kind.__name__}")
+            subscriptions.append((subscription, handlers))
+        # Last, and so ended first: until then, all that handlers and jobs use is open.
+        tasks = await stack.enter_async_context(Background())
+        if self._worker is not None:
+            tasks.start(self._worker.run(), "worker")
+        for subscription, handlers in subscriptions:
+            tasks.start(subscription.recall(), "recall")
+            tasks.start(_hear(subscription, handlers), "hear")
         for seconds, handler in self._hooks.periodic:
             tasks.start(_repeat(seconds, handler), f"every {seconds:g} s")
 
+    def _ended(self) -> None:
+        self._running = False
+        self._channel = self._worker = None
+
     async def _open_working(self, stack: AsyncExitStack, account: Account) -> None:
+        from mesh.agent.party import Worker  # loads web3, which an agent that watches does without
+
         chain = self._given_chain
         if chain is None:
             chain = await stack.enter_async_context(chain_of(self.settings, account))
@@ -236,12 +250,6 @@ class Agent:
         self._hooks.market.setdefault(kind, []).append(handler)
         return handler
 
-    async def _hear(self, subscription: Any, handlers: list[Handler]) -> None:
-        await subscription.recall()
-        async for message in subscription:
-            for handler in handlers:
-                await call(handler, message)
-
     def _working(self) -> Worker:
         self.channel  # raises when the agent is not running  # noqa: B018
         if self._worker is None:
@@ -250,6 +258,12 @@ class Agent:
                 hint="give it one: keyfile and keyfile_password_file in the settings",
             )
         return self._worker
+
+
+async def _hear(subscription: Any, handlers: list[Handler]) -> None:
+    async for message in subscription:
+        for handler in handlers:
+            await call(handler, message)
 
 
 async def _repeat(seconds: float, handler: Handler) -> None:

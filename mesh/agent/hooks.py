@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
+from mesh.agent.errors import JobFailed
 from mesh.errors import AiraError
 from schemas.values import decode_value
 
@@ -21,13 +23,8 @@ log = logging.getLogger(__name__)
 
 Handler = Callable[..., Awaitable[Any]]
 
-
 ANY_TOPIC: Final = "*"
 """The topic of the handler that takes what no other does."""
-
-
-class JobFailed(AiraError):
-    """Raised by a handler to end its job without success, which refunds the promisee; the text says why."""
 
 
 @dataclass
@@ -68,14 +65,17 @@ def _typed(message: Played, kind: type | None) -> Any:
         raise JobFailed(f"a message on {message.topic} is no {kind.__name__}: {error}") from None
 
 
-FAILED: Final = "a handler of %s failed; the agent goes on"
-
-
 async def call(handler: Handler, *arguments: Any) -> None:
     """Call a handler that no job depends on; its failure is logged, and the agent goes on."""
+    name = getattr(handler, "__name__", handler)
     try:
         await handler(*arguments)
     except AiraError as error:
-        log.warning("%s: %s", getattr(handler, "__name__", handler), error)
+        log.warning("%s: %s", name, error)
+    except asyncio.CancelledError:
+        task = asyncio.current_task()
+        if task is not None and task.cancelling():
+            raise
+        log.error("handler %s ended with the cancellation of what it waited for; the agent goes on", name)
     except Exception:
-        log.exception(FAILED, getattr(handler, "__name__", handler))
+        log.exception("handler %s failed; the agent goes on", name)

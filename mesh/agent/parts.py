@@ -45,6 +45,7 @@ class Parts:
     services: Services
     clock: Clock
     directory: Path
+    """Where what concerns this chain is kept: ledger and recordings."""
 
     def workshop(self) -> Workshop:
         """The parts that the executor works with."""
@@ -99,8 +100,12 @@ async def watching(settings: Settings) -> AsyncIterator[tuple[Network, Channel]]
 
 @asynccontextmanager
 async def working(settings: Settings, account: Account, chain: Chain) -> AsyncIterator[Parts]:
-    """The parts of an agent with an account, on `chain` (open). Its state is under the settings' folder, by address."""
-    directory = settings.state_directory / account.address
+    """The parts of an agent with an account, on `chain` (open).
+
+    Its state is in the settings' folder, by address; what concerns the chain, by chain.
+    """
+    home = settings.state_directory / account.address
+    directory = home / await _name_of(chain)
     clock = Clock()
     clock.head = await chain.block_number()
     async with AsyncExitStack() as stack:
@@ -116,7 +121,7 @@ async def working(settings: Settings, account: Account, chain: Chain) -> AsyncIt
             )
         )
         ledger = await stack.enter_async_context(Ledger(directory / "ledger.sqlite"))
-        store = await asyncio.to_thread(Store, directory / "content", limit=settings.objective_expanded_limit)
+        store = await asyncio.to_thread(Store, home / "content", limit=settings.objective_expanded_limit)
         stack.callback(store.close)
         yield Parts(
             settings=settings,
@@ -132,3 +137,10 @@ async def working(settings: Settings, account: Account, chain: Chain) -> AsyncIt
             clock=clock,
             directory=directory,
         )
+
+
+async def _name_of(chain: Chain) -> str:
+    """What tells this chain from all others: a development chain that is started anew has the number of the old one,
+    and the same addresses for other contracts."""
+    block = await chain.node.web3.eth.get_block(min(1, await chain.block_number()))
+    return f"{chain.chain_id}-{bytes(block['hash']).hex()[:8]}"

@@ -6,11 +6,13 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING, Final
 
+from mesh.agent.contract import Outcome
 from mesh.agent.hooks import call
-from mesh.agent.trade import Outcome, Trader
+from mesh.agent.trade import Trader
 from mesh.work.executor import Executor
 from mesh.work.lifecycle import Phase, WrongPhase
 from mesh.work.listener import Listener
+from schemas import parse_address
 from schemas.keys import EventKey, LiabilityEvent
 from schemas.rpc import Done, LiabilityRead, Nothing
 
@@ -47,11 +49,14 @@ class Worker:
     async def run(self) -> None:
         """Work until cancelled."""
         listener = Listener(self.parts.chain, self.parts.ledger, self.parts.signer.address, self)
-        async with asyncio.TaskGroup() as tasks:
-            if self.parts.settings.enable_executor:
-                tasks.create_task(self.executor.run(), name="executor")
-            tasks.create_task(self.parts.outbox.run(), name="outbox")
-            tasks.create_task(listener.run(), name="listener")
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                if self.parts.settings.enable_executor:
+                    tasks.create_task(self.executor.run(), name="executor")
+                tasks.create_task(self.parts.outbox.run(), name="outbox")
+                tasks.create_task(listener.run(), name="listener")
+        finally:
+            await self.trader.close()
 
     async def new_liability(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
         """A contract names us: trade it as a promisee, work for it as a promisor (an account may be both)."""
@@ -80,25 +85,26 @@ class Worker:
         services, executor = self.parts.services, self.executor
 
         async def start(request: StartLiability) -> Done:
-            return await _done(executor.start(request.address))
+            return await _done(executor.start(parse_address(request.address)))
 
         async def restart(request: RestartLiability) -> Done:
-            return await _done(executor.restart(request.address))
+            return await _done(executor.restart(parse_address(request.address)))
 
         async def resume(request: ResumeLiability) -> Done:
-            return await _done(executor.resume(request.address))
+            return await _done(executor.resume(parse_address(request.address)))
 
         async def finish(request: FinishLiability) -> Nothing:
-            await executor.finish(request.address, success=request.success)
+            await executor.finish(parse_address(request.address), success=request.success)
             return Nothing()
 
         async def read(request: ReadLiability) -> LiabilityRead:
             try:
-                return LiabilityRead(True, await executor.read(request.address))
+                return LiabilityRead(True, await executor.read(parse_address(request.address)))
             except WrongPhase:
                 return LiabilityRead(False)
 
-        for handler in (start, restart, resume, finish, read):
+        working = (start, restart, resume, finish) if self.parts.settings.enable_executor else ()
+        for handler in (read, *working):
             services.offer(handler.__name__, handler)
 
 

@@ -5,17 +5,20 @@ from __future__ import annotations
 import asyncio
 import logging
 import secrets
-from typing import TYPE_CHECKING, Any, Final
+from collections import Counter
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, TypeVar
 
-import msgspec
-
-from mesh.errors import AiraError
+from mesh.agent.contract import Contract, Outcome
+from mesh.agent.errors import OrderExpired, OrderRejected
+from mesh.agent.purse import Purse
+from mesh.errors import ClosedError
+from mesh.network.crossing import call_in_loop
 from schemas import ZERO_ADDRESS, Demand, InvalidRecord, Offer, market_selector, message_hash
 from schemas.rejection import Rejection
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
+    from collections.abc import Iterator, Mapping
 
     import zenoh
 
@@ -23,101 +26,41 @@ if TYPE_CHECKING:
     from mesh.chain import Chain
     from schemas import Liability
 
+    Terms = Mapping[str, Any]
+
 log = logging.getLogger(__name__)
 
-LIFETIME: Final = 1000
-"""Blocks for which an order is valid unless told otherwise."""
-
-
-class OrderRejected(AiraError):
-    """A provider says that an order can't be used; `rejection` holds its machine-readable reason."""
-
-    def __init__(self, rejection: Rejection) -> None:
-        super().__init__(
-            f"provider {rejection.provider} rejects the order ({rejection.reason}): {rejection.detail}",
-            hint="mend what the reason names and post a new order",
-        )
-        self.rejection = rejection
-
-
-class OrderExpired(AiraError):
-    """An order's deadline has passed and nobody took it."""
-
-    def __init__(self, order: str, deadline: int) -> None:
-        super().__init__(
-            f"nobody took the order {order[:16]}… until block {deadline}",
-            hint="offer more, or give it a longer lifetime",
-        )
-        self.deadline = deadline
-
-
-class ShortOfFunds(AiraError):
-    """The account can't pay what it wants to promise: units of the token that it has, and that it needs."""
-
-    def __init__(self, account: str, token: str, *, balance: int, needed: int) -> None:
-        super().__init__(
-            f"account {account} has {balance} of token {token}, and {needed} are needed",
-            hint="send it the missing tokens, or lower the cost",
-        )
-        self.balance = balance
-        self.needed = needed
-
-
-class Outcome(msgspec.Struct, frozen=True, kw_only=True):
-    """How a contract ended: `success` means that the promisor was paid; `result` is the recording's CID, or empty."""
-
-    success: bool
-    result: str
-
-
-class Contract:
-    """A liability, from the side of one who waits for its end."""
-
-    def __init__(self, liability: Liability, ended: asyncio.Future[Outcome], parts: Parts) -> None:
-        self.liability = liability
-        self._ended = ended
-        self._parts = parts
-
-    @property
-    def address(self) -> str:
-        """The contract's address (EIP-55)."""
-        return self.liability.address
-
-    async def outcome(self) -> Outcome:
-        """Wait until the chain has finalized the contract. Cancelling the wait changes nothing."""
-        return await asyncio.shield(self._ended)
-
-    async def recording(self) -> Path:
-        """The result's file: waits for the outcome, fetches the recording by its CID and checks every block.
-
-        Raises a `ContentError` when nobody holds it.
-        """
-        outcome = await self.outcome()
-        settings = self._parts.settings
-        return await self._parts.exchange.fetch(
-            outcome.result, size_limit=settings.objective_expanded_limit, timeout=settings.fetch_timeout
-        )
+AnOrder = TypeVar("AnOrder", Demand, Offer)
 
 
 class Trader:
-    """Makes the orders of one account and waits for what comes of them."""
+    """Makes the orders of one account and waits for what comes of them, until `close`."""
 
     def __init__(self, parts: Parts, chain: Chain) -> None:
         self._parts = parts
         self._chain = chain
-        self._factory = chain.factory
+        self._address = parts.signer.address
+        self._purse = Purse(chain, self._address)
         self._matches: dict[str, asyncio.Future[Contract]] = {}
         self._deadlines: dict[str, int] = {}
+        self._counted: dict[str, tuple[Terms, int]] = {}
         self._endings: dict[str, asyncio.Future[Outcome]] = {}
-        self._reserved: dict[str, int] = {}
-        self._approving = asyncio.Lock()
+        self._closed = False
 
-    async def terms(
-        self, *, model: str, objective: str, cost: int, token: str, validator: str, lifetime: int
-    ) -> Mapping[str, Any]:
-        """The fields that a demand and an offer share, names looked up, with a fresh nonce and a deadline."""
+    async def close(self) -> None:
+        """Nothing is heard of any more: who waits for a contract, or for its end, gets `ClosedError`."""
+        self._closed = True
+        waiters: list[asyncio.Future[Any]] = [*self._matches.values(), *self._endings.values()]
+        for waiting in waiters:
+            if not waiting.done():
+                waiting.set_exception(ClosedError("the agent has ended", hint="run it again and ask for the contract"))
+                waiting.exception()  # taken note of: perhaps nobody waits for it
+        for identity in list(self._matches):
+            await self._parts.outbox.settle(identity)
+
+    async def terms(self, *, model: str, objective: str, cost: int, token: str, validator: str, lifetime: int) -> Terms:
+        """The fields that a demand and an offer share, names looked up, with a deadline."""
         settings, chain = self._parts.settings, self._chain
-        address = self._parts.signer.address
         return {
             "model": await chain.resolve_model(model),
             "objective": objective,
@@ -126,65 +69,70 @@ class Trader:
             "lighthouse": await chain.resolve(settings.lighthouse_contract),
             "validator": await chain.resolve(validator) if validator else ZERO_ADDRESS,
             "deadline": await chain.block_number() + lifetime,
-            "nonce": secrets.token_hex(32) if settings.generation == 3 else await chain.nonce_of(address),
-            "sender": None if settings.generation == 3 else address,
+            "sender": None if settings.generation == 3 else self._address,
         }
 
-    async def mirrored(self, order: Demand | Offer) -> Mapping[str, Any]:
-        """The fields of the counterpart of `order`, in its generation."""
-        address = self._parts.signer.address
+    def mirrored(self, order: Demand | Offer) -> Terms:
+        """The terms of the counterpart of `order`, in its generation."""
         kept = ("model", "objective", "token", "cost", "lighthouse", "validator", "deadline")
-        return {
-            **{field: getattr(order, field) for field in kept},
-            "nonce": secrets.token_hex(32) if order.generation == 3 else await self._chain.nonce_of(address),
-            "sender": None if order.generation == 3 else address,
-        }
+        terms = {field: getattr(order, field) for field in kept}
+        return {**terms, "sender": None if order.generation == 3 else self._address}
 
-    async def demand(self, demand: Demand) -> Contract:
+    async def demand(self, terms: Terms, *, validator_fee: int) -> Contract:
         """Sign and post a demand, and wait for the contract that it becomes.
 
         The factory is given the allowance that the demand needs. Raises `ShortOfFunds`, `OrderRejected`,
         `OrderExpired`. Cancelling stops the waiting and the resending; what was sent may still be matched.
         """
-        await self._allow(demand.token, demand.cost)
-        await self._allow(self._chain.xrt, demand.validator_fee)
-        signed = self._parts.signer.sign(demand)
-        identity = message_hash(signed).hex()
-        matched: asyncio.Future[Contract] = asyncio.get_running_loop().create_future()
-        self._matches[identity] = matched
-        self._deadlines[identity] = signed.deadline
-        listener = self._hear_rejections(identity)
-        try:
-            await self._parts.outbox.post(signed)
-            contract = await matched
-        finally:
-            listener.undeclare()
-            del self._matches[identity], self._deadlines[identity]
-            self._release(demand.token, demand.cost)
-            self._release(self._chain.xrt, demand.validator_fee)
-            await self._parts.outbox.settle(identity)
-        return contract
+        costs = Counter({terms["token"]: terms["cost"]})
+        costs[self._chain.xrt] += validator_fee
+        while True:
+            signed = await self._signed(Demand, terms, validator_fee=validator_fee)
+            try:
+                return await self._contract_of(signed, costs)
+            except OrderRejected:
+                if signed.generation == 3 or signed.nonce == await self._chain.nonce_of(self._address):
+                    raise
+                # Generation 5 counts an account's orders, and another one was taken before this one.
+                log.info("demand %s is signed anew: its nonce was used meanwhile", message_hash(signed).hex())
 
-    async def offer(self, offer: Offer) -> str:
-        """Sign and post an offer; returns its hash (hex). It is sent again until it is taken or its deadline passes."""
-        await self._allow(self._chain.xrt, offer.lighthouse_fee)
-        signed = self._parts.signer.sign(offer)
+    async def offer(self, terms: Terms, *, lighthouse_fee: int) -> str:
+        """Sign and post an offer; returns its hash (hex). It is sent again until it is taken or its deadline passes.
+
+        Raises `ShortOfFunds`.
+        """
+        signed = await self._signed(Offer, terms, lighthouse_fee=lighthouse_fee)
+        identity = message_hash(signed).hex()
+        await self._purse.promise(identity, {self._chain.xrt: lighthouse_fee})
+        self._deadlines[identity] = signed.deadline
+        if signed.generation == 5:
+            self._counted[identity] = terms, lighthouse_fee
         await self._parts.outbox.post(signed)
-        return message_hash(signed).hex()
+        return identity
 
     async def matched(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
         """A contract was made of these orders; they need not be sent again."""
-        await self._parts.outbox.settle(offer_hash.hex())
+        for identity in (demand_hash.hex(), offer_hash.hex()):
+            await self._withdraw(identity)
         matched = self._matches.get(demand_hash.hex())
         if matched is not None and not matched.done():
-            matched.set_result(self.contract(liability))
+            matched.set_result(self._contract(liability))
+        for identity, (terms, fee) in list(self._counted.items()):
+            # Generation 5 counts an account's orders: the one that was taken has made the others invalid.
+            await self._withdraw(identity)
+            await self.offer(terms, lighthouse_fee=fee)
 
-    def contract(self, liability: Liability) -> Contract:
-        """The contract of `liability`, to be waited for."""
-        ended = self._endings.setdefault(liability.address, asyncio.get_running_loop().create_future())
-        if liability.is_finalized and not ended.done():
-            ended.set_result(Outcome(success=liability.is_success, result=liability.result))
-        return Contract(liability, ended, self._parts)
+    async def contract(self, address: str) -> Contract:
+        """The contract at `address`, to be waited for. Raises `NotALiability`."""
+        address = await self._chain.resolve(address)
+        known = address in self._endings
+        self._ending(address)  # before it is read: it may end in between
+        try:
+            return self._contract(await self._chain.liability(address))
+        except BaseException:
+            if not known:
+                self._endings.pop(address, None)
+            raise
 
     def finalized(self, address: str, outcome: Outcome) -> None:
         """The contract at `address` has ended."""
@@ -193,34 +141,59 @@ class Trader:
             ended.set_result(outcome)
 
     def passed(self, block: int) -> None:
-        """Block `block` is there: demands whose deadline it reaches have expired."""
-        for identity, deadline in self._deadlines.items():
-            matched = self._matches[identity]
-            if deadline <= block and not matched.done():
-                matched.set_exception(OrderExpired(identity, deadline))
+        """Block `block` is there: orders whose deadline it reaches have expired."""
+        for identity, deadline in list(self._deadlines.items()):
+            if deadline <= block:
+                self._forget(identity)
+                matched = self._matches.get(identity)
+                if matched is not None and not matched.done():
+                    matched.set_exception(OrderExpired(identity, deadline))
 
-    async def _allow(self, token: str, amount: int) -> None:
-        """Let the factory take `amount` more of `token` than what open demands will already take."""
-        if not amount:
-            return
-        address = self._parts.signer.address
-        async with self._approving:
-            needed = self._reserved.get(token, 0) + amount
-            balance = await self._chain.balance_of(address, token=token)
-            if balance < needed:
-                raise ShortOfFunds(address, token, balance=balance, needed=needed)
-            if await self._chain.allowance(address, self._factory, token=token) < needed:
-                log.info("allowing the factory %d of token %s", needed, token)
-                await self._chain.approve(self._factory, needed, token=token)
-            self._reserved[token] = needed
+    async def _signed(self, kind: type[AnOrder], terms: Terms, **fee: Any) -> AnOrder:
+        counted = terms["sender"] is not None
+        nonce = await self._chain.nonce_of(self._address) if counted else secrets.token_hex(32)
+        return self._parts.signer.sign(kind(**terms, nonce=nonce, **fee))
 
-    def _release(self, token: str, amount: int) -> None:
-        if amount:
-            self._reserved[token] -= amount
+    async def _contract_of(self, signed: Demand, costs: Mapping[str, int]) -> Contract:
+        """Post a signed demand and wait for its contract."""
+        identity = message_hash(signed).hex()
+        matched: asyncio.Future[Contract] = asyncio.get_running_loop().create_future()
+        self._matches[identity] = matched
+        try:
+            with self._rejections_heard(identity):
+                await self._purse.promise(identity, costs)
+                self._deadlines[identity] = signed.deadline
+                await self._parts.outbox.post(signed)
+                return await matched
+        finally:
+            del self._matches[identity]
+            self._forget(identity)
+            if not self._closed:
+                await self._parts.outbox.settle(identity)
 
-    def _hear_rejections(self, identity: str) -> Any:
+    def _contract(self, liability: Liability) -> Contract:
+        ended = self._ending(liability.address)
+        if liability.is_finalized:
+            self.finalized(liability.address, Outcome(success=liability.is_success, result=liability.result))
+        return Contract(liability, ended, self._parts)
+
+    def _ending(self, address: str) -> asyncio.Future[Outcome]:
+        return self._endings.setdefault(address, asyncio.get_running_loop().create_future())
+
+    async def _withdraw(self, identity: str) -> None:
+        """The order is sent no more, and costs nothing any more."""
+        self._forget(identity)
+        await self._parts.outbox.settle(identity)
+
+    def _forget(self, identity: str) -> None:
+        self._purse.forget(identity)
+        self._deadlines.pop(identity, None)
+        self._counted.pop(identity, None)
+
+    @contextmanager
+    def _rejections_heard(self, identity: str) -> Iterator[None]:
         """Listen for providers that reject the order."""
-        loop = asyncio.get_running_loop()
+        loop, session = asyncio.get_running_loop(), self._parts.network.session
 
         def heard(sample: zenoh.Sample) -> None:
             try:
@@ -228,10 +201,15 @@ class Trader:
             except InvalidRecord as error:
                 log.info("an unreadable rejection: %s", error)
                 return
-            loop.call_soon_threadsafe(self._rejected, identity, rejection)
+            call_in_loop(loop, self._rejected, identity, rejection)
 
         selector = market_selector(self._parts.channel.lighthouse, "reject").replace("/*/*", f"/{identity}/*")
-        return self._parts.network.session.declare_subscriber(selector, heard)
+        subscriber: Any = session.declare_subscriber(selector, heard)
+        try:
+            yield
+        finally:
+            if not session.is_closed():
+                subscriber.undeclare()
 
     def _rejected(self, identity: str, rejection: Rejection) -> None:
         matched = self._matches.get(identity)

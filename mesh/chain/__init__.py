@@ -18,6 +18,7 @@ from mesh.chain.errors import (
     NoContracts,
     NodeUnreachable,
     NotALiability,
+    ReorganisedTooDeep,
     RequestRefused,
     Reverted,
     TransactionTimeout,
@@ -35,9 +36,10 @@ from mesh.chain.events import (
     Online,
     Transfer,
 )
+from mesh.chain.history import History
 from mesh.chain.names import namehash
 from mesh.chain.node import Node
-from mesh.chain.reader import BlockEvents
+from mesh.chain.reader import BlockEvents, Reorganised
 from mesh.chain.records import Created, LighthouseState, Settled
 from mesh.chain.recursion import restrain_recursion
 from mesh.chain.rpc_server import JsonRpcServer
@@ -60,6 +62,7 @@ __all__ = [
     "DeploymentPlan",
     "EmbeddedChain",
     "Finalized",
+    "History",
     "InsufficientFunds",
     "InvalidName",
     "JsonRpcServer",
@@ -75,6 +78,8 @@ __all__ = [
     "Offline",
     "Online",
     "Receipt",
+    "Reorganised",
+    "ReorganisedTooDeep",
     "RequestRefused",
     "Reverted",
     "Sender",

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from mesh.chain.accounts import Account
     from mesh.chain.events import NewLighthouse
+    from mesh.chain.history import History
     from mesh.chain.timing import Timing
     from schemas.liability import Liability
     from schemas.messages import Demand, Offer, Result
@@ -244,9 +245,15 @@ class Chain:
         """Take `value` wn off the stake, or all of it where less than the minimum would remain; the tx hash."""
         return (await self._send((await self._lighthouse(lighthouse)).functions.withdraw(value))).tx
 
-    def events(self, from_block: int, *, lighthouses: Iterable[str] = ()) -> AsyncGenerator[BlockEvents, None]:
-        """Events from a block on, for ever (see `read_blocks`); those of lighthouses only of the given addresses."""
-        return read_blocks(self.node, self._sources(lighthouses), from_block)
+    def events(
+        self, from_block: int, *, lighthouses: Iterable[str] = (), history: History | None = None
+    ) -> AsyncGenerator[BlockEvents, None]:
+        """Events from a block on, for ever (see `read_blocks`); those of lighthouses only of the given addresses.
+
+        Blocks that the chain replaced are told as `Reorganised`, also from before where the `history` is given that
+        an earlier iterator filled.
+        """
+        return read_blocks(self.node, self._sources(lighthouses), from_block, history=history)
 
     def _sources(self, lighthouses: Iterable[str]) -> Sources:
         return Sources(

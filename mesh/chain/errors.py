@@ -107,6 +107,22 @@ class ChainWentBack(ChainError):
         self.head = head
 
 
+class ReorganisedTooDeep(ChainWentBack):
+    """None of the blocks that are remembered of the chain is on it any more: it is another chain, or started afresh.
+
+    `cursor` is the oldest block that is remembered.
+    """
+
+    def __init__(self, cursor: int, head: int) -> None:
+        ChainError.__init__(
+            self,
+            f"the chain has no block {cursor} as it was read, nor any read after it; it ends at block {head}",
+            hint="check which chain the node is on; if it was started afresh, start with a fresh data_dir too",
+        )
+        self.cursor = cursor
+        self.head = head
+
+
 class NoAccount(ConfigurationError):
     """Something was to be signed and no account was given."""
 

@@ -105,6 +105,8 @@ class Evm:
 
     def block(self, identifier: int | bytes, *, transactions: str) -> dict[str, Any] | None:
         """A block by number or hash, None if there is none; its `transactions` as `"hashes"` or as `"objects"`."""
+        if isinstance(identifier, int) and identifier > self.head:
+            return None
         get = self._backend.get_block_by_hash if isinstance(identifier, bytes) else self._backend.get_block_by_number
         try:
             raw = get(identifier, full_transaction=False)
@@ -134,6 +136,15 @@ class Evm:
         for _ in range(blocks):
             self._set_clock()
             self._backend.mine_blocks(1)
+
+    def rewind(self, height: int) -> None:
+        """Take the chain back to a block, as if nothing had come after it. Raises `RpcError` if there is none."""
+        block = self._backend.get_block_by_number(self.height(height), full_transaction=False)
+        self._backend.revert_to_snapshot(bytes(block["hash"]))
+        gone = [hash_ for hash_, receipt in self._receipts.items() if int(receipt["blockNumber"], 16) > height]
+        for hash_ in gone:
+            del self._receipts[hash_], self._transactions[hash_]
+        self._logs = {number: logs for number, logs in self._logs.items() if number <= height}
 
     def call(self, fields: Call, height: int) -> bytes:
         """What a call returns. Raises `RpcError` with the revert data when it fails."""

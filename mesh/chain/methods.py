@@ -57,6 +57,8 @@ class Methods:
             "eth_estimateGas": lambda call, block="latest": evm.estimate(_call(call), self._height(block)),
             "eth_sendRawTransaction": lambda raw: evm.send(parse_data(raw)),
             "evm_mine": self._mine,
+            "evm_snapshot": lambda: evm.head,
+            "evm_revert": self._revert,
         }
 
     def answer(self, method: str, params: Sequence[Any]) -> Any:
@@ -97,6 +99,10 @@ class Methods:
     def _mine(self, blocks: object = 1) -> str:
         self._evm.mine(parse_quantity(blocks))
         return "0x0"
+
+    def _revert(self, snapshot: object) -> bool:
+        self._evm.rewind(parse_quantity(snapshot))
+        return True
 
     def _logs(self, query: dict[str, Any]) -> list[dict[str, Any]]:
         if "blockHash" in query:

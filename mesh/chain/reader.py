@@ -1,7 +1,7 @@
 """Reading a chain's events block by block from a cursor.
 
 By `eth_getLogs` over ranges of blocks: no filters are kept by the node, so nothing is missed across its restarts or
-ours.
+ours. What was read last is remembered with its block hashes, so that blocks which the chain replaced are taken back.
 """
 
 from __future__ import annotations
@@ -10,21 +10,24 @@ import asyncio
 from contextlib import aclosing
 from dataclasses import dataclass
 from itertools import groupby
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
-from mesh.chain.errors import ChainWentBack, RequestRefused
+from web3.exceptions import BlockNotFound
+
+from mesh.chain.errors import ChainWentBack, NodeUnreachable, ReorganisedTooDeep, RequestRefused
 from mesh.chain.events import ChainEvent, NewLighthouse, decode_log, topics_of
+from mesh.chain.history import History, Remembered
 from schemas.address import parse_address
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Awaitable, Callable, Collection, Sequence
 
-    from web3.types import FilterParams
+    from web3.types import BlockIdentifier, FilterParams
 
     from mesh.chain.node import Node
 
 MAX_RANGE: Final = 2_000
-"""Blocks asked for at once; halved as often as a node refuses."""
+"""Blocks asked for at once; halved as often as a node refuses, and grown again by a quarter as often as it answers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +36,23 @@ class BlockEvents:
 
     block_number: int
     events: tuple[ChainEvent, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Reorganised(BlockEvents):
+    """The chain replaced what came after `block_number`: all events of `events_taken_back` did not happen.
+
+    They are those told of the blocks above, the newest first, which is the order to undo them in. `events` is empty;
+    the next cursor is `block_number + 1` as ever, and the blocks that are there instead come next. An event that
+    happened on both sides is taken back and told again.
+    """
+
+    events_taken_back: tuple[ChainEvent, ...] = ()
+
+    @property
+    def back_to(self) -> int:
+        """The last block that is as it was told."""
+        return self.block_number
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,62 +65,175 @@ class Sources:
     is_liability: Callable[[str], Awaitable[bool]]
 
 
-async def read_blocks(node: Node, sources: Sources, from_block: int) -> AsyncGenerator[BlockEvents, None]:
-    """Events from `from_block` on, for ever; block numbers only grow.
+class Head(NamedTuple):
+    """A block as the chain has it now."""
 
-    A block without events comes where nothing else would tell how far was read. Raises `ChainWentBack` at the start,
-    `NodeUnreachable`, `RequestRefused`; reading goes on from the cursor with a new iterator.
+    number: int
+    hash: bytes
+    parent: bytes
+
+
+class _ReplacedMeanwhile(Exception):
+    """The chain was reorganised between two questions: the answers don't belong together."""
+
+
+async def read_blocks(
+    node: Node, sources: Sources, from_block: int, *, history: History | None = None
+) -> AsyncGenerator[BlockEvents, None]:
+    """Events from `from_block` on, for ever; block numbers only grow, but for `Reorganised`.
+
+    A block without events comes where nothing else would tell how far was read. With the `history` of an earlier
+    reading, blocks that were replaced since then are taken back first. Raises `ChainWentBack` at the start,
+    `ReorganisedTooDeep`, `NodeUnreachable`, `RequestRefused`; reading goes on from the cursor with a new iterator.
     """
-    head = await node.block_number()
-    if from_block > head + 1:
-        raise ChainWentBack(from_block, head)
+    history = history or History(node.timing.reorg_depth)
+    ranges = _Ranges(node, sources)
+    head = await _head(node)
+    await _check_start(node, history, from_block=from_block, head=head)
     cursor = from_block
     while True:
-        async with aclosing(_read_to(node, sources, cursor, head)) as blocks:
-            async for block in blocks:
-                yield block
-        cursor = max(cursor, head + 1)
+        replaced = await _find_replaced(node, history, head)
+        if replaced is not None:
+            cursor = min(cursor, replaced.block_number + 1)
+            yield replaced
+        history.forget_above(cursor - 1)
+        await _remember_start(node, history, cursor, head)
+        try:
+            async with aclosing(ranges.read_to(cursor, head)) as blocks:
+                async for block in blocks:
+                    if block.block_hash:
+                        history.remember(block)
+                    cursor = block.block_number + 1
+                    yield BlockEvents(block.block_number, block.events)
+        except _ReplacedMeanwhile:
+            pass
         await asyncio.sleep(node.timing.poll_interval)
-        head = await node.block_number()
+        head = await _head(node)
 
 
 async def find_lighthouses(node: Node, sources: Sources, from_block: int) -> list[NewLighthouse]:
     """All lighthouses made from a block to the latest, in order. Raises `NodeUnreachable`, `RequestRefused`."""
-    blocks = _read_to(node, sources, from_block, await node.block_number())
+    blocks = _Ranges(node, sources).read_to(from_block, await _head(node))
     return [event async for block in blocks for event in block.events if isinstance(event, NewLighthouse)]
 
 
-async def _read_to(node: Node, sources: Sources, first: int, head: int) -> AsyncGenerator[BlockEvents, None]:
-    """The events from a block to another, in ranges as long as the node answers."""
-    span = MAX_RANGE
-    while first <= head:
-        last = min(head, first + span - 1)
-        try:
-            blocks = await read_range(node, sources, first=first, last=last)
-        except RequestRefused:
-            if span == 1:
-                raise
-            span = max(1, span // 2)
-            continue
-        for block in blocks:
-            yield block
-        first = last + 1
+class _Ranges:
+    """Reads ranges of blocks, as long as the node answers them."""
+
+    def __init__(self, node: Node, sources: Sources) -> None:
+        self._node = node
+        self._sources = sources
+        self._span = MAX_RANGE
+
+    async def read_to(self, first: int, head: Head) -> AsyncGenerator[Remembered, None]:
+        """The events from a block to the head; the hash of an eventless block is empty where nobody needs it."""
+        while first <= head.number:
+            last = min(head.number, first + self._span - 1)
+            try:
+                blocks = await read_range(self._node, self._sources, first=first, last=last)
+            except (RequestRefused, NodeUnreachable) as error:
+                if first == last:
+                    raise
+                if isinstance(error, NodeUnreachable):
+                    # A node may give up on a long range without a word; one that is gone raises again here.
+                    await self._node.block_number()
+                self._span = (last - first + 1) // 2
+                continue
+            for block in blocks:
+                yield _with_hash_of(block, head)
+            first = last + 1
+            self._span = min(MAX_RANGE, self._span + max(1, self._span // 4))
 
 
-async def read_range(node: Node, sources: Sources, *, first: int, last: int) -> list[BlockEvents]:
-    """The events of the blocks from `first` to `last`, both included; an empty one stands for an eventless last."""
+async def read_range(node: Node, sources: Sources, *, first: int, last: int) -> list[Remembered]:
+    """The events of the blocks from `first` to `last`, both included; an empty one stands for an eventless last.
+
+    Raises `_ReplacedMeanwhile` when a block's logs are of two different blocks.
+    """
     addresses = [sources.factory, sources.xrt, *sources.lighthouses]
     ours = await _logs(node, first, last, addresses=addresses, topics=topics_of("Factory", "XRT", "Lighthouse"))
     finals = await _logs(node, first, last, addresses=(), topics=topics_of("Liability"))
     finals = [log for log in finals if await sources.is_liability(parse_address(log["address"]))]
     logs = sorted((*ours, *finals), key=lambda log: (log["blockNumber"], log["logIndex"]))
     blocks = []
-    for number, of_block in groupby(logs, key=lambda log: int(log["blockNumber"])):
+    for number, group in groupby(logs, key=lambda log: int(log["blockNumber"])):
+        of_block = list(group)
+        hashes = {bytes(log["blockHash"]) for log in of_block}
+        if len(hashes) > 1:
+            raise _ReplacedMeanwhile
         events = tuple(event for log in of_block if (event := decode_log(log)) is not None)
-        blocks.append(BlockEvents(number, events))
+        blocks.append(Remembered(number, hashes.pop(), events))
     if not blocks or blocks[-1].block_number != last:
-        blocks.append(BlockEvents(last, ()))
+        blocks.append(Remembered(last, b"", ()))
     return blocks
+
+
+async def _check_start(node: Node, history: History, *, from_block: int, head: Head) -> None:
+    """Raise `ChainWentBack` if the cursor is past the head, but for a node that is a few blocks behind another."""
+    if from_block <= head.number + 1:
+        return
+    if from_block - 1 - head.number <= history.depth:
+        for block in reversed(history.blocks):
+            if block.block_number <= head.number and await _is_there(node, block, head):
+                return
+    raise ChainWentBack(from_block, head.number)
+
+
+async def _find_replaced(node: Node, history: History, head: Head) -> Reorganised | None:
+    """What was told of blocks that the chain has replaced; None as long as it only grew.
+
+    A chain that is shorter than what is remembered has not replaced anything yet: the node may only be behind.
+    """
+    known = [block for block in history.blocks if block.block_number <= head.number]
+    for block in reversed(known):
+        if await _is_there(node, block, head):
+            if block is known[-1]:
+                return None
+            return Reorganised(block.block_number, (), history.forget_above(block.block_number))
+    if known:
+        raise ReorganisedTooDeep(known[0].block_number, head.number)
+    return None
+
+
+async def _remember_start(node: Node, history: History, cursor: int, head: Head) -> None:
+    """Remember the block before the first one that is read, as what a reorganisation can go back to."""
+    if not history.blocks and 0 < cursor <= head.number + 1:
+        before = await _block(node, cursor - 1)
+        if before is not None:
+            history.remember(Remembered(before.number, before.hash, ()))
+
+
+async def _is_there(node: Node, block: Remembered, head: Head) -> bool:
+    """Whether the chain that ends at `head` has the block."""
+    if block.block_number == head.number:
+        return block.block_hash == head.hash
+    if block.block_number == head.number - 1:
+        return block.block_hash == head.parent
+    now = await _block(node, block.block_number)
+    return now is not None and now.hash == block.block_hash
+
+
+def _with_hash_of(block: Remembered, head: Head) -> Remembered:
+    if block.block_number != head.number or block.block_hash == head.hash:
+        return block
+    if block.block_hash:
+        raise _ReplacedMeanwhile
+    return Remembered(block.block_number, head.hash, block.events)
+
+
+async def _head(node: Node) -> Head:
+    head = await _block(node, "latest")
+    if head is None:
+        raise NodeUnreachable(node.endpoint, "it has no blocks")
+    return head
+
+
+async def _block(node: Node, identifier: BlockIdentifier) -> Head | None:
+    try:
+        block = await node.web3.eth.get_block(identifier)
+    except BlockNotFound:
+        return None
+    return Head(int(block["number"]), bytes(block["hash"]), bytes(block["parentHash"]))
 
 
 async def _logs(node: Node, first: int, last: int, *, addresses: Collection[str], topics: Sequence[str]) -> list[Any]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from mesh.chain.history import DEPTH
 from mesh.errors import ConfigurationError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timing:
-    """Waiting times, all in seconds."""
+    """Waiting times, in seconds where nothing else is said."""
 
     poll_interval: float = 1.0
     """Between two looks for a new block."""
@@ -28,6 +29,9 @@ class Timing:
 
     retry_delay: float = 0.25
     """Before the second attempt; doubled before each further one."""
+
+    reorg_depth: int = DEPTH
+    """Blocks, not seconds: how far behind the head a reader of events notices that blocks were replaced."""
 
     def __post_init__(self) -> None:
         if self.attempts < 1 or self.request_timeout <= 0 or min(self.poll_interval, self.receipt_interval) <= 0:

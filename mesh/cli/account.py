@@ -7,8 +7,8 @@ from pathlib import Path
 
 import click
 
-from mesh.cli.running import fail
 from mesh.errors import AiraError, ConfigurationError
+from mesh.running import fail
 
 
 @click.group("account")
@@ -29,7 +29,7 @@ def new(keyfile: Path, password_file: Path) -> None:
     from mesh.chain import new_private_key, write_keyfile
 
     try:
-        click.echo(write_keyfile(keyfile, new_private_key(), _password(password_file)))
+        click.echo(write_keyfile(_free(keyfile), new_private_key(), _password(password_file)))
     except AiraError as error:
         fail(error)
 
@@ -41,13 +41,27 @@ def show(keyfile: Path) -> None:
     from mesh.chain import keyfile_address
 
     try:
-        click.echo(keyfile_address(keyfile))
+        address = keyfile_address(keyfile)
+        if address is None:
+            raise ConfigurationError(f"{keyfile} does not say its address", hint="some keyfiles keep it to themselves")
     except AiraError as error:
         fail(error)
+    click.echo(address)
+
+
+def _free(keyfile: Path) -> Path:
+    """The same path, its folder made. A name that is taken is found before a password is made for it."""
+    if keyfile.exists():
+        raise ConfigurationError(f"{keyfile} exists already", hint="no keyfile is overwritten; choose another name")
+    try:
+        keyfile.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigurationError(f"can't make the folder of {keyfile}: {error.strerror}") from None
+    return keyfile
 
 
 def _password(path: Path) -> str:
-    """The password in a file, which is made, readable by its owner only, when it is missing."""
+    """The password in a file, its first line; the file is made, readable by its owner only, when it is missing."""
     import secrets
 
     try:
@@ -55,6 +69,9 @@ def _password(path: Path) -> str:
             path.parent.mkdir(parents=True, exist_ok=True)
             with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
                 file.write(secrets.token_urlsafe(24) + "\n")
-        return path.read_text(encoding="utf-8").rstrip("\r\n")
+        password = path.read_text(encoding="utf-8").split("\n", 1)[0].rstrip("\r")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"can't use the password file {path}: {error}") from None
+    if not password:
+        raise ConfigurationError(f"the password file {path} is empty", hint="write one line with the password into it")
+    return password

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from mesh.cli.options import with_settings
-from mesh.cli.running import run_until_stopped
+from mesh.running import run_until_stopped
 
 if TYPE_CHECKING:
     from mesh.settings import Settings

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import click
 
-from mesh.cli.running import fail
 from mesh.errors import InputError
+from mesh.running import fail
 from schemas import cid_of_file, cid_of_stream
 
 

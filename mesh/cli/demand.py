@@ -11,7 +11,9 @@ import click
 import msgspec
 
 from mesh.cli.options import with_settings
-from mesh.cli.running import run_to_end
+from mesh.errors import ConfigurationError, InputError
+from mesh.running import run_to_end
+from schemas import InvalidCid, parse_cid
 
 if TYPE_CHECKING:
     from mesh.settings import Settings
@@ -49,9 +51,12 @@ async def _demand(
 
     say = (lambda text: None) if as_json else click.echo
     settings.keyfile_and_password()
+    source = await asyncio.to_thread(_source, objective)
+    if out is not None:
+        await asyncio.to_thread(_check_writable, out)
     async with Agent(model, settings=settings) as agent:
         say(f"demand by {agent.address} for {model}")
-        contract = await agent.demand(await asyncio.to_thread(_source, objective), cost=cost, lifetime=lifetime)
+        contract = await agent.demand(source, cost=cost, lifetime=lifetime)
         say(f"contract {contract.address} with {contract.liability.promisor}")
         outcome = await contract.outcome()
         say(f"{'paid' if outcome.success else 'refunded'}, result {outcome.result or 'none'}")
@@ -67,4 +72,20 @@ async def _demand(
 def _source(objective: str) -> str | Path:
     """A file where there is one of that name, else a CID."""
     path = Path(objective)
-    return path if path.is_file() else objective
+    if path.is_file():
+        return path
+    try:
+        parse_cid(objective)
+    except InvalidCid:
+        raise InputError(f"the objective {objective!r} is neither a file nor a CID") from None
+    return objective
+
+
+def _check_writable(out: Path) -> None:
+    """Before anything is paid for, not after."""
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with out.open("ab"):
+            pass
+    except OSError as error:
+        raise ConfigurationError(f"can't write the recording to {out}: {error.strerror}") from None

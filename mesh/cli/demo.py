@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from mesh.cli.running import run_to_end
+from mesh.running import run_to_end
 
 
 @click.command("demo")

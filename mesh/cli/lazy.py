@@ -1,12 +1,15 @@
-"""A click group whose commands are imported when they are called."""
+"""A click group whose commands are imported when they are called, and which Ctrl-C ends at any moment."""
 
 from __future__ import annotations
 
 import difflib
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import click
+
+from mesh.running import INTERRUPTED
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -38,6 +41,13 @@ class LazyGroup(click.Group):
             near = difflib.get_close_matches(args[0], self._lazy, n=1)
             ctx.fail(f"no such command {args[0]!r}" + (f"; did you mean {near[0]!r}?" if near else ""))
         return super().resolve_command(ctx, args)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Import the command and run it. Ctrl-C meanwhile is exit code 130, as it is once the command runs."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            sys.exit(INTERRUPTED)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """The list of commands, without importing any."""

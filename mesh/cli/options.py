@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mesh.cli.running import fail
 from mesh.errors import AiraError
+from mesh.running import fail
 from mesh.settings import MEANING, Settings, load
 
 if TYPE_CHECKING:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 from contextlib import AsyncExitStack
 from typing import TYPE_CHECKING
 
 import click
 
 from mesh.cli.options import with_settings
-from mesh.cli.running import run_until_stopped
+from mesh.running import run_until_stopped
 
 if TYPE_CHECKING:
     from mesh.settings import Settings
@@ -42,4 +41,4 @@ async def _serve(settings: Settings, port: int, block_time: float) -> None:
             Provider(network.session, chain, served.market.deployment.lighthouse_name)
         )
         click.echo(f"router      {', '.join(settings.listen)}\n{served.describe()}\nprovider    {provider.address}")
-        await asyncio.gather(provider.run())
+        await provider.run()

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Final
 from mesh.agent import Agent, Phase
 from mesh.background import Background
 from mesh.chain import XRT, EmbeddedChain
-from mesh.demo.device import Lamp
+from mesh.demo.device import BLINK, Lamp
 from mesh.demo.market import ROLES, Market, found_market
 from mesh.demo.objective import write_objective
-from mesh.errors import InputError
+from mesh.errors import ConfigurationError, InputError, RemoteError
 from mesh.market.provider import Provider
 from mesh.network import Endpoints, Network, free_endpoint
 from mesh.recording import open_objective
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from mesh.agent import Contract, Outcome
     from mesh.demo.story import JsonStory, SpokenStory
     from mesh.market.book import Match
+    from mesh.recording import Objective
     from schemas import Liability
 
 COST: Final = 42 * XRT
@@ -37,7 +38,7 @@ COST: Final = 42 * XRT
 MODEL: Final = cid_of_bytes(b"aira-mesh demo: a lamp that blinks for each message\n")
 """The behaviour model of the demo's robot: any content has a name."""
 PATIENCE: Final = 30.0
-"""Seconds until a demand that nobody takes is given up, beyond the time that the objective itself takes."""
+"""Seconds until a demand that nobody takes is given up; for the job, beyond the time that its objective takes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,21 +55,28 @@ class Demo:
         started = time.monotonic()
         with tempfile.TemporaryDirectory(prefix="aira-demo-") as temporary:
             scene = Path(temporary)
-            objective = await asyncio.to_thread(self._prepare_objective, scene)
-            async with AsyncExitStack() as stack:
-                stage = await _Stage.set_up(self, stack, scene)
-                await stage.play(objective, started)
+            objective = await asyncio.to_thread(self._prepare, scene)
+            try:
+                async with AsyncExitStack() as stack:
+                    stage = await _Stage.set_up(self, stack, scene)
+                    await stage.play(objective, started)
+            except TimeoutError:
+                raise RemoteError("the demo stands still", hint="is this machine very busy? try again") from None
 
-    def _prepare_objective(self, scene: Path) -> Path:
-        """The objective's file, examined; raises `InputError` for what is no recording."""
+    def _prepare(self, scene: Path) -> Objective:
+        """The objective, examined, and a place for what is kept. Raises `InputError`, `ConfigurationError`."""
+        if self.out is not None:
+            try:
+                self.out.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise ConfigurationError(f"can't keep files in {self.out}: {error.strerror}") from None
         path = self.objective
         if path is None:
             path = scene / "blink.mcap"
             write_objective(path)
         elif not path.is_file():
             raise InputError(f"there is no file {path}", hint="give an MCAP file or a ROS 1 bag")
-        open_objective(path)
-        return path
+        return open_objective(path)
 
 
 class _Stage:
@@ -101,25 +109,22 @@ class _Stage:
     _robot: Agent
     _person: Agent
 
-    async def play(self, objective: Path, started: float) -> None:
+    async def play(self, objective: Objective, started: float) -> None:
         """The job, from the demand to the payment."""
-        story, person = self._story, self._person
+        story, person, path = self._story, self._person, objective.path
         before = await self._balances()
         story.chapter("A person wants work done")
-        cid = await asyncio.to_thread(cid_of_file, objective)
-        seconds = open_objective(objective).duration_ns / 1e9
-        story.tell(
-            "person", "objective", f"holds the objective {objective.name}\n{cid}", objective=cid, file=str(objective)
-        )
+        cid = await asyncio.to_thread(cid_of_file, path)
+        story.tell("person", "objective", f"holds the objective {path.name}\n{cid}", objective=cid, file=str(path))
         story.tell("person", "asking", f"will pay {_xrt(COST)} for it, and publishes a Demand", model=MODEL, cost=COST)
         async with asyncio.timeout(PATIENCE):
-            contract = await person.demand(objective, cost=COST)
-        async with asyncio.timeout(PATIENCE + seconds):
+            contract = await person.demand(path, cost=COST)
+        async with asyncio.timeout(PATIENCE + objective.duration_ns / 1e9 + objective.count * BLINK):
             outcome = await contract.outcome()
             await self._finalized.wait()
         recording = await contract.recording()
         self._tell_payment(before, await self._balances())
-        kept = await asyncio.to_thread(self._keep, recording, outcome.result, objective, cid)
+        kept = await asyncio.to_thread(self._keep, recording, outcome.result, path, cid)
         story.tell(
             "person", "recording", f"has the recording {kept}\n{outcome.result}", result=outcome.result, path=kept
         )
@@ -272,10 +277,14 @@ class _Stage:
         out = self._demo.out
         if out is None:
             return f"{result}.mcap (keep it with --out DIR)"
-        out.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(objective, out / f"{cid}{objective.suffix}")
         kept = out / f"{result}.mcap"
-        shutil.copyfile(recording, kept)
+        for source, target in ((objective, out / f"{cid}{objective.suffix}"), (recording, kept)):
+            try:
+                shutil.copyfile(source, target)
+            except shutil.SameFileError:
+                continue  # what an earlier demo kept is played again
+            except OSError as error:
+                raise ConfigurationError(f"can't keep {target}: {error.strerror}") from None
         return str(kept)
 
 

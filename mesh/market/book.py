@@ -1,9 +1,10 @@
 """The order book: open demands and offers of one lighthouse, matched first come, first served. Pure: no I/O.
 
-A demand and an offer agree when model, objective, token, cost, lighthouse and validator are equal; the book is of one
-lighthouse. Orders wait in a queue for each set of the other terms. Adding, matching and removing cost the same at a
-thousand open orders and at a million, and an order costs little more than its text. What is due at a block is a list
-of keys; an order that leaves earlier stays listed until then, by its key only.
+A demand and an offer agree when model, objective, token, cost, lighthouse, validator and generation are equal; the
+book is of one lighthouse. Orders wait in a queue for each set of the other terms. Adding, matching and removing cost
+the same at a thousand open orders and at a million, and an order costs little more than its text. What is due at a
+block is a list of keys; an order that leaves earlier stays listed, by its key only, until then or until the lists are
+made anew because most of what they hold has left.
 """
 
 from __future__ import annotations
@@ -16,14 +17,16 @@ from mesh.market.queues import Link, Queues
 from schemas import Demand, address_bytes
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from schemas import Offer, Verified
 
     Order = Demand | Offer
-    Terms = tuple[str, str, str, int, str]
+    Terms = tuple[str, str, str, int, str, int]
 
 HASH_SIZE: Final = 32
+STALE: Final = 4096
+"""Keys of orders that have left which may stay listed, beside as many as are open."""
 LIMIT: Final = 1_000_000
 """Open orders that a book holds unless told otherwise."""
 
@@ -74,6 +77,7 @@ class OrderBook:
         self._demands: Queues[Terms, Verified[Order]] = Queues()
         self._offers: Queues[Terms, Verified[Order]] = Queues()
         self._due: dict[int, list[bytes]] = {}
+        self._listed = 0
 
     def __len__(self) -> int:
         return len(self._links)
@@ -119,12 +123,15 @@ class OrderBook:
 
         A lower `head` than before (a reorganised chain) takes nothing out and brings nothing back.
         """
-        passed = range(self._head + 1, head + 1)
-        self._head = max(self._head, head)
-        reached = passed if len(passed) < len(self._due) else sorted(block for block in self._due if block <= head)
+        before, self._head = self._head, max(self._head, head)
+        reached: Iterable[int] = range(before + 1, head + 1)
+        if head - before > len(self._due):
+            reached = sorted(block for block in self._due if block <= head)
         expired: list[Verified[Order]] = []
         for block in reached:
-            for key in self._due.pop(block, ()):
+            keys = self._due.pop(block, [])
+            self._listed -= len(keys)
+            for key in keys:
                 link = self._links.get(key)  # None, or another order, where the one due has left the book
                 if link is not None and link.item.message.deadline == block:
                     self.remove(order_id(link.item))
@@ -140,7 +147,23 @@ class OrderBook:
         key = order.hash if order.hash not in self._links else order_id(order)
         link = self._links[key] = Link(order)
         self._side(message).append(_terms(message), link)
-        self._due.setdefault(message.deadline, []).append(key)
+        self._list(key, message.deadline)
+        if self._listed > STALE + 2 * len(self._links):
+            self._list_anew()
+
+    def _list(self, key: bytes, deadline: int) -> None:
+        self._due.setdefault(deadline, []).append(key)
+        self._listed += 1
+
+    def _list_anew(self) -> None:
+        """Forget the keys of those that have left: whoever posts orders chooses their deadlines, as late as he likes.
+
+        O(open orders), but so many orders come between two times that it costs each of them little.
+        """
+        self._due.clear()
+        self._listed = 0
+        for key, link in self._links.items():
+            self._list(key, link.item.message.deadline)
 
     def _key(self, identity: bytes) -> bytes:
         """Under what the order of this identity is or would be found.
@@ -156,7 +179,7 @@ class OrderBook:
 
 
 def _terms(order: Order) -> Terms:
-    return (order.model, order.objective, order.token, order.cost, order.validator)
+    return (order.model, order.objective, order.token, order.cost, order.validator, order.generation)
 
 
 def _match(order: Verified[Order], other: Verified[Order]) -> Match:

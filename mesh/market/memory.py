@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 import zenoh
 
-from mesh.network.channel import verified_key
+from mesh.network import verified_key
 from mesh.network.crossing import call_in_loop
 from schemas import encode, lighthouse_selector
 

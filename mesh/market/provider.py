@@ -177,13 +177,13 @@ class Provider:
         for order in match:
             if order in gone:
                 self._reject(order, _reason(error), str(error))
-            elif not await self._sending.send(partial(self._is_used, order.message)):
+            elif not await self._sending.send(partial(self._is_used, order)):
                 self._add(order)
 
-    async def _is_used(self, order: Order) -> bool:
-        if order.sender is None:
-            return await self._chain.is_order_used(message_hash(order))
-        return await self._chain.nonce_of(order.sender) > int(order.nonce)
+    async def _is_used(self, order: Verified[Order]) -> bool:
+        if order.message.generation == 3:
+            return await self._chain.is_order_used(order.hash)
+        return await self._chain.nonce_of(order.signer) > int(order.message.nonce)
 
     async def _take_results(self) -> None:
         async for result in self._results:

@@ -89,15 +89,22 @@ class Ledger:
             self._database = await aiosqlite.connect(self._path, isolation_level=None)
             await self._prepare()
         except (OSError, aiosqlite.Error) as error:
-            await self.__aexit__(None, None, None)
+            await self._close()
             raise ConfigurationError(
                 f"can't use the ledger {self._path}: {error}", hint="give another folder with --data-dir"
             ) from None
+        except BaseException:
+            await self._close()
+            raise
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        await self._close()
+
+    async def _close(self) -> None:
+        """A connection that is left open keeps its thread, and with it the interpreter, alive."""
         database, self._database = self._database, None
         if database is not None:
             await database.close()
@@ -128,21 +135,26 @@ class Ledger:
             (phase, position, time.time(), liability),
         )
 
+    async def set_position(self, liability: str, position: int) -> None:
+        """Write down how many messages the job at `liability` (address) has played; its phase stays."""
+        await self._run("UPDATE jobs SET position = ? WHERE liability = ?", (position, liability))
+
     async def complete(self, liability: str, *, success: bool, result: str, note: str, outgoing: Outgoing) -> None:
-        """Write down the job's end and the signed Result that tells of it, both or neither."""
+        """Write down the job's end and the signed Result that tells of it, both or neither (when cancelled, too)."""
         database = self._open()
         async with self._writing:
-            await database.execute("BEGIN IMMEDIATE")
             try:
+                await database.execute("BEGIN IMMEDIATE")
                 await database.execute(
                     "UPDATE jobs SET phase = ?, success = ?, result = ?, note = ?, changed = ? WHERE liability = ?",
                     (Phase.COMPLETE, success, result, note, time.time(), liability),
                 )
                 await database.execute(POST, _posted(outgoing))
+                await database.commit()
             except BaseException:
-                await database.execute("ROLLBACK")
+                # What was cancelled is executed all the same, in the ledger's thread: nothing may stay open behind it.
+                await database.rollback()
                 raise
-            await database.execute("COMMIT")
 
     async def job(self, liability: str) -> Job | None:
         """The job at `liability` (EIP-55 address), if it is ours."""

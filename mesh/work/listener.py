@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
-from mesh.chain.events import Finalized, NewLiability
+from mesh.chain import Finalized, NewLiability, NodeUnreachable, RequestRefused
 
 if TYPE_CHECKING:
     from mesh.chain import Chain
@@ -13,6 +14,9 @@ if TYPE_CHECKING:
     from schemas import Liability
 
 log = logging.getLogger(__name__)
+
+RETRY: Final = 1.0
+"""Seconds before a node is asked again that was lost, or that refused to answer."""
 
 
 class Party(Protocol):
@@ -42,14 +46,29 @@ class Listener:
         self._ledger = ledger
         self._account = account
         self._party = party
+        self._lost = False
 
     async def run(self) -> None:
-        """Read until cancelled. A node that can't be reached is waited for."""
+        """Read until cancelled. A node that can't be reached is waited for. Raises `ChainWentBack`."""
+        while True:
+            try:
+                await self._read()
+            except (NodeUnreachable, RequestRefused) as error:
+                if not self._lost:
+                    log.warning("the chain can't be read, trying again: %s", error)
+                self._lost = True
+                await asyncio.sleep(RETRY)
+
+    async def _read(self) -> None:
+        """Read from the ledger's cursor on."""
         cursor = await self._ledger.cursor(self.NAME)
         if cursor is None:
             cursor = await self._chain.block_number()
             await self._ledger.set_cursor(self.NAME, cursor)
         async for block in self._chain.events(cursor + 1):
+            if self._lost:
+                log.info("the chain can be read again, from block %d", block.block_number)
+            self._lost = False
             for event in block.events:
                 match event:
                     case NewLiability():

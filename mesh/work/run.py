@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import secrets
 import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import zenoh
 
-from mesh.errors import ClosedError
+from mesh.errors import AiraError, ClosedError
 from mesh.recording import Recorder, Unrecordable, play
 from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey, parse_key, topic_selector
 from schemas.payloads import STRING, PayloadType, String, payload_type
@@ -31,6 +32,10 @@ NOTE_TOPIC: Final = "/aira/note"
 """Topic of the recording on which the agent says why a job failed."""
 FLUSH: Final = "aira/flush"
 """Encoding of the mark that a run sends to itself when it has heard enough."""
+
+
+class HandlerCancelled(AiraError):
+    """A handler ended with the cancellation of something that it waited for, and so without having done its work."""
 
 
 class Performer(Protocol):
@@ -68,7 +73,11 @@ class Run:
         self._plan = plan
         self._recorder = recorder
         self._subscriber: Any = None
+        self._mark = secrets.token_bytes(16)
         self._flushed = threading.Event()
+        self._waiting: asyncio.Queue[Played | None] = asyncio.Queue(AHEAD)
+        self._player: asyncio.Task[None] | None = None
+        self._closing = False
         self.position = plan.position
         """How many of the objective's messages have been done with."""
         self.playing: Played | None = None
@@ -102,27 +111,34 @@ class Run:
         """Play the objective from its position to its end, each message at its time; returns when all is done.
 
         Every message goes to the mesh, into the recording and, where there is a `performer`, to it: in order, one
-        after the other. `progress` is told the position after each. Raises what the performer raises.
+        after the other. `progress` is told the position after each. Raises what the performer raises. When the run is
+        closed meanwhile, which the performer itself may do, it returns after the message that the performer is at.
         """
-        waiting: asyncio.Queue[Played | None] = asyncio.Queue(AHEAD)
+        failed: BaseException | None = None
         try:
             async with asyncio.TaskGroup() as tasks:
-                tasks.create_task(self._play(waiting), name=f"player {self.liability.address}")
-                tasks.create_task(
-                    self._perform(waiting, performer, progress), name=f"performer {self.liability.address}"
-                )
+                if not self._closing:
+                    self._player = tasks.create_task(self._play(), name=f"player {self.liability.address}")
+                tasks.create_task(self._perform(performer, progress), name=f"performer {self.liability.address}")
         except ExceptionGroup as group:
-            raise group.exceptions[0] from None
+            failed = group.exceptions[0]
+        if failed is not None:
+            raise failed
 
     async def close(self, note: str = "") -> RecordingSummary:
         """Close the recording; everything heard before this call is in it. `note` is written at its end."""
+        self._closing = True
+        if self._player is not None:
+            self._player.cancel()
+        with contextlib.suppress(asyncio.QueueFull):  # then the performer has something to wake up for
+            self._waiting.put_nowait(None)
         if self._subscriber is not None:
             await asyncio.to_thread(self._stop_listening)
         if note:
             self._recorder.record(NOTE_TOPIC, String(note).encode(), STRING, role="agent")
         return await asyncio.to_thread(self._recorder.close)
 
-    async def _play(self, waiting: asyncio.Queue[Played | None]) -> None:
+    async def _play(self) -> None:
         plan = self._plan
         assert plan.objective is not None, "a run without an objective only records"
         async for step in play(plan.objective, pace=plan.pace, start_index=plan.position):
@@ -131,21 +147,26 @@ class Run:
                 self._recorder.record(message.topic, message.payload, message.type, role="objective")
             key = str(ObjectiveTopicKey(self._agent, self.liability.address, message.topic))
             self._put(key, message.payload, message.type)
-            await waiting.put(message)
-        await waiting.put(None)
+            await self._waiting.put(message)
+        await self._waiting.put(None)
 
-    async def _perform(
-        self,
-        waiting: asyncio.Queue[Played | None],
-        performer: Performer | None,
-        progress: Callable[[int], Awaitable[None]],
-    ) -> None:
-        while (message := await waiting.get()) is not None:
+    async def _perform(self, performer: Performer | None, progress: Callable[[int], Awaitable[None]]) -> None:
+        while (message := await self._waiting.get()) is not None and not self._closing:
             if performer is not None:
                 self.playing = message
-                await performer.perform(self, message)
+                await self._perform_one(performer, message)
             self.position += 1
             await progress(self.position)
+
+    async def _perform_one(self, performer: Performer, message: Played) -> None:
+        try:
+            await performer.perform(self, message)
+        except asyncio.CancelledError:
+            task = asyncio.current_task()
+            if task is not None and task.cancelling():
+                raise
+            # A task group takes a task that ends so for one that it has cancelled itself, and the job for done.
+            raise HandlerCancelled(f"the handler of {message.topic} was cancelled") from None
 
     def _put(self, key: str, payload: bytes, kind: PayloadType) -> None:
         self._session.put(
@@ -155,7 +176,7 @@ class Run:
     def _hear(self, sample: zenoh.Sample) -> None:
         """Zenoh's callback: a message on the job's topics, or our own mark that all before it has been heard."""
         encoding = str(sample.encoding)
-        if encoding == FLUSH:
+        if encoding == FLUSH and sample.payload.to_bytes() == self._mark:
             self._flushed.set()
             return
         try:
@@ -176,6 +197,6 @@ class Run:
         subscriber, self._subscriber = self._subscriber, None
         with contextlib.suppress(zenoh.ZError):  # a session that broke has nothing more to say
             mark = LiabilityTopicKey(self._agent, self.liability.address, NOTE_TOPIC)
-            self._session.put(str(mark), b"", encoding=FLUSH, allowed_destination=zenoh.Locality.SESSION_LOCAL)
+            self._session.put(str(mark), self._mark, encoding=FLUSH, allowed_destination=zenoh.Locality.SESSION_LOCAL)
             self._flushed.wait(timeout=5)
             subscriber.undeclare()

@@ -83,7 +83,7 @@ class Workshop:
             leftover.unlink(missing_ok=True)
 
     def _new_recorder(self, liability: Liability) -> Recorder:
-        finished, partial = self._recording_files(liability.address)
+        finished, partial, _ = self._recording_files(liability.address)
         if finished.exists():  # closed, but a crash came before the Result was written down
             finished.replace(partial)
         about = RecordingAbout(
@@ -95,7 +95,7 @@ class Workshop:
         )
         return Recorder(finished, about)
 
-    def _recording_files(self, address: str) -> tuple[Path, Path]:
-        """Where the recording is when it is whole, and while it is being made."""
+    def _recording_files(self, address: str) -> tuple[Path, Path, Path]:
+        """Where the recording is when it is whole, while it is being made, and while it is gone on with."""
         finished = self.recordings / f"{address}.mcap"
-        return finished, finished.with_name(f"{finished.name}.part")
+        return finished, finished.with_name(f"{finished.name}.part"), finished.with_name(f"{finished.name}.cut")

@@ -1,8 +1,7 @@
-"""How a command runs and ends: signals, errors as one line, exit codes, the log."""
+"""How a program of the mesh runs and ends: signals, errors as one line, exit codes, the log."""
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import signal
 import sys
@@ -18,7 +17,7 @@ INTERRUPTED: Final = 130
 
 
 def run_to_end(main: Callable[[], Coroutine[Any, Any, object]]) -> None:
-    """Run a command that has an end; Ctrl-C and SIGTERM break it off with exit code 130. Exits 1 or 2 on errors."""
+    """Run what has an end; Ctrl-C and SIGTERM break it off with exit code 130. Exits 1 or 2 on errors."""
     if not _run(main):
         sys.exit(INTERRUPTED)
 
@@ -44,8 +43,12 @@ def fail(error: AiraError) -> NoReturn:
 
 def _run(main: Callable[[], Coroutine[Any, Any, object]]) -> bool:
     """Whether `main` came to its end (false: a signal stopped it)."""
+    import asyncio  # here, as the small commands need nothing of it but `fail`
+
     try:
         return asyncio.run(_until_signal(main))
+    except KeyboardInterrupt:  # before the loop listens to signals, or the second Ctrl-C
+        return False
     except AiraError as error:
         fail(error)
     except BaseExceptionGroup as group:
@@ -57,6 +60,8 @@ def _run(main: Callable[[], Coroutine[Any, Any, object]]) -> bool:
 
 async def _until_signal(main: Callable[[], Coroutine[Any, Any, object]]) -> bool:
     """Run `main` as a task; the first signal cancels it, a second one has its usual effect."""
+    import asyncio
+
     loop = asyncio.get_running_loop()
     work = loop.create_task(main(), name="main")
     stopped = False

@@ -1,0 +1,52 @@
+"""What can go wrong in trading and in doing a job, beyond what the parts raise."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from mesh.errors import AiraError
+
+if TYPE_CHECKING:
+    from schemas.rejection import Rejection
+
+
+class JobFailed(AiraError):
+    """Raised by a handler to end its job without success, which refunds the promisee; the text says why."""
+
+
+class OrderRejected(AiraError):
+    """A provider says that an order can't be used; `rejection` holds its machine-readable reason."""
+
+    def __init__(self, rejection: Rejection) -> None:
+        super().__init__(
+            f"provider {rejection.provider} rejects the order ({rejection.reason}): {rejection.detail}",
+            hint="mend what the reason names and post a new order",
+        )
+        self.rejection = rejection
+
+
+class OrderExpired(AiraError):
+    """An order's deadline has passed and nobody took it."""
+
+    def __init__(self, order: str, deadline: int) -> None:
+        super().__init__(
+            f"nobody took the order {order[:16]}… until block {deadline}",
+            hint="offer more, or give it a longer lifetime",
+        )
+        self.order = order
+        self.deadline = deadline
+
+
+class ShortOfFunds(AiraError):
+    """The account can't pay what it wants to promise: units of the token that it has, and that it needs."""
+
+    def __init__(self, account: str, token: str, *, balance: int, needed: int) -> None:
+        super().__init__(
+            f"account {account} has {balance} of token {token}, and {needed} are needed",
+            hint="send it the missing tokens, or lower the cost",
+        )
+        self.balance = balance
+        self.needed = needed
+
+
+__all__ = ["JobFailed", "OrderExpired", "OrderRejected", "ShortOfFunds"]

@@ -1,0 +1,289 @@
+"""Blocks that the chain replaces after they were read."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import aclosing, asynccontextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.chain import (
+    Account,
+    Approval,
+    BlockEvents,
+    Chain,
+    ChainWentBack,
+    EmbeddedChain,
+    History,
+    Node,
+    NodeUnreachable,
+    Reorganised,
+    ReorganisedTooDeep,
+    deploy,
+)
+from mesh.chain.history import Remembered
+from mesh.errors import ConfigurationError, InputError
+from tests.mesh.chain.conftest import QUICK
+from tests.support.nodes import Anvil
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator, AsyncIterator, Callable
+    from pathlib import Path
+
+    from mesh.chain import ChainEvent
+
+
+class Fork:
+    """A chain whose last blocks can be replaced, with contracts and one account that approves things."""
+
+    def __init__(self, chain: Chain, friend: str) -> None:
+        self.chain = chain
+        self.friend = friend
+
+    async def approve(self, value: int) -> int:
+        """Make one event, in a block of its own; the block's number."""
+        await self.chain.approve(self.friend, value)
+        return await self.chain.block_number()
+
+    async def replace_last(self, blocks: int) -> None:
+        """Forget that many blocks, and make one eventless block more than that."""
+        head = await self.chain.block_number()
+        if self.is_embedded:
+            await self.request("evm_revert", hex(head - blocks))
+            await self.request("evm_mine", blocks + 1)
+        else:
+            await self.request("anvil_reorg", blocks, [])
+            await self.request("evm_mine")
+
+    @property
+    def is_embedded(self) -> bool:
+        return "embedded" in self.chain.node.endpoint
+
+    async def request(self, method: str, *params: object) -> None:
+        await self.chain.node.web3.provider.make_request(method, list(params))
+
+
+@pytest.fixture(params=["embedded", "anvil"])
+async def fork(request: pytest.FixtureRequest) -> AsyncIterator[Fork]:
+    if request.param == "embedded":
+        async with EmbeddedChain() as node:
+            account, friend = (Account.from_key(key) for key in node.funded_keys[:2])
+            await deploy(node.provider, account)
+            async with Chain(node.provider, account=account, timing=QUICK) as chain:
+                yield Fork(chain, friend.address)
+    else:
+        async with Anvil() as anvil:
+            account, friend = (Account.from_key(key) for key in anvil.private_keys[:2])
+            await deploy(anvil.url, account)
+            async with Chain(anvil.url, account=account, timing=QUICK) as chain:
+                yield Fork(chain, friend.address)
+
+
+async def _until(
+    events: AsyncGenerator[BlockEvents, None], is_last: Callable[[BlockEvents], bool]
+) -> list[BlockEvents]:
+    """What is told up to and including the first item that `is_last` likes."""
+    told: list[BlockEvents] = []
+    async with asyncio.timeout(10):
+        async for block in events:
+            told.append(block)
+            if is_last(block):
+                return told
+    raise AssertionError("the events ended")
+
+
+def _reaches(number: int) -> Callable[[BlockEvents], bool]:
+    return lambda block: block.block_number >= number
+
+
+def _is_reorganised(block: BlockEvents) -> bool:
+    return isinstance(block, Reorganised)
+
+
+def _values(events: tuple[ChainEvent, ...]) -> list[int]:
+    return [event.value for event in events if isinstance(event, Approval)]
+
+
+async def test_events_of_replaced_blocks_are_taken_back_newest_first_before_the_new_ones(fork: Fork) -> None:
+    chain = fork.chain
+    start = await fork.approve(1)
+    async with aclosing(chain.events(start)) as events:
+        first = await _until(events, _reaches(start))
+        for value in (2, 3):
+            head = await fork.approve(value)
+        await _until(events, _reaches(head))
+        await fork.replace_last(2)
+        *_, back = await _until(events, _is_reorganised)
+        assert isinstance(back, Reorganised)
+        assert (back.back_to, back.block_number, back.events) == (start, start, ())
+        assert _values(back.events_taken_back) == [3, 2]
+        head = await fork.approve(4)
+        new = await _until(events, _reaches(head))
+    assert [_values(block.events) for block in first] == [[1]]
+    assert [value for block in new for value in _values(block.events)] == [4]
+    assert min(block.block_number for block in new) > back.back_to
+
+
+async def test_a_reorganisation_while_nobody_read_is_told_first_with_the_history_that_was_kept(fork: Fork) -> None:
+    chain, history = fork.chain, History()
+    start = await fork.approve(1)
+    async with aclosing(chain.events(start, history=history)) as events:
+        await _until(events, _reaches(start))
+        head = await fork.approve(2)
+        await _until(events, _reaches(head))
+    await fork.replace_last(1)
+    kept = History.decode(history.encode())
+    async with aclosing(chain.events(head + 1, history=kept)) as events:
+        back = await anext(events)
+        assert isinstance(back, Reorganised)
+        assert (back.back_to, _values(back.events_taken_back)) == (start, [2])
+        assert await anext(events) == BlockEvents(head + 1, ())
+
+
+async def test_without_a_history_a_new_iterator_only_looks_forward(fork: Fork) -> None:
+    head = await fork.approve(1)
+    await fork.replace_last(1)
+    async with aclosing(fork.chain.events(head + 1)) as events:
+        assert await anext(events) == BlockEvents(head + 1, ())
+
+
+async def test_a_reorganisation_of_eventless_blocks_takes_nothing_back(fork: Fork) -> None:
+    start = await fork.approve(1)
+    async with aclosing(fork.chain.events(start)) as events:
+        await _until(events, _reaches(start))
+        await fork.request("evm_mine")
+        await _until(events, _reaches(start + 1))
+        await fork.replace_last(1)
+        *_, back = await _until(events, _is_reorganised)
+    assert back == Reorganised(start, (), ())
+
+
+async def test_a_reorganisation_of_the_whole_depth_is_unwound_and_a_deeper_one_is_an_error(fork: Fork) -> None:
+    chain, history = fork.chain, History(depth=3)
+    start = await fork.approve(1)
+    async with aclosing(chain.events(start, history=history)) as events:
+        await _until(events, _reaches(start))
+        for value in (2, 3, 4):
+            head = await fork.approve(value)
+            await _until(events, _reaches(head))
+        await fork.replace_last(3)
+        *_, back = await _until(events, _is_reorganised)
+        assert isinstance(back, Reorganised)
+        assert (back.back_to, _values(back.events_taken_back)) == (start, [4, 3, 2])
+        for value in (5, 6, 7, 8):
+            head = await fork.approve(value)
+            await _until(events, _reaches(head))
+        await fork.replace_last(4)
+        with pytest.raises(ReorganisedTooDeep) as caught:
+            await _until(events, _reaches(head + 10))
+    assert isinstance(caught.value, ChainWentBack)
+    assert (caught.value.cursor, caught.value.head) == (head - 3, head + 1)
+
+
+async def test_a_block_that_was_handled_in_part_is_told_again_or_taken_back(fork: Fork) -> None:
+    """The cursor of a reader that fell over in the middle of a block is behind the history."""
+    chain, history = fork.chain, History()
+    start = await fork.approve(1)
+    for wanted in ([1], [1]):
+        async with aclosing(chain.events(start, history=history)) as events:
+            assert _values((await anext(events)).events) == wanted
+    await fork.replace_last(1)
+    async with aclosing(chain.events(start, history=history)) as events:
+        back = await anext(events)
+    assert isinstance(back, Reorganised)
+    assert (back.back_to, _values(back.events_taken_back)) == (start - 1, [1])
+
+
+async def test_a_node_that_is_behind_is_waited_for_by_who_read_further(fork: Fork) -> None:
+    """After one of several nodes fell out, the next may not know the last blocks yet."""
+    chain, history = fork.chain, History()
+    for value in (1, 2, 3):
+        head = await fork.approve(value)
+    async with aclosing(chain.events(head - 2, history=history)) as events:
+        await _until(events, _reaches(head))
+    history.remember(Remembered(head + 2, bytes(32), ()))
+    with pytest.raises(ChainWentBack):
+        await anext(chain.events(head + 3))
+    async with aclosing(chain.events(head + 3, history=history)) as events:
+        waiting = asyncio.create_task(anext(events))
+        await asyncio.sleep(10 * QUICK.poll_interval)
+        assert not waiting.done()
+        await fork.request("evm_mine")
+        await fork.request("evm_mine")
+        back = await waiting
+    assert isinstance(back, Reorganised)
+    assert back.back_to == head
+
+
+@asynccontextmanager
+async def _anvil_with_state(folder: Path) -> AsyncIterator[Anvil]:
+    """An anvil that keeps its chain in a file, a second at most behind, and takes it up when it is started again."""
+    arguments = ("--state", str(folder / "state.json"), "--state-interval", "1", "--preserve-historical-states")
+    async with Anvil(arguments=arguments) as anvil:
+        yield anvil
+
+
+async def test_a_node_that_is_killed_and_started_from_its_state_takes_back_what_it_lost(tmp_path: Path) -> None:
+    state = tmp_path / "state.json"
+    async with _anvil_with_state(tmp_path) as anvil:
+        account, friend = (Account.from_key(key) for key in anvil.private_keys[:2])
+        await deploy(anvil.url, account)
+        history = History()
+        async with Chain(anvil.url, account=account, timing=replace(QUICK, attempts=1)) as chain:
+            fork = Fork(chain, friend.address)
+            kept = await fork.approve(1)
+            async with aclosing(chain.events(kept, history=history)) as events:
+                await _until(events, _reaches(kept))
+                # The file is written once a second: two writings later it holds the block.
+                for _ in range(2):
+                    written = state.stat().st_mtime_ns if state.exists() else 0
+                    while not state.exists() or state.stat().st_mtime_ns == written:
+                        await asyncio.sleep(0.02)
+                lost = await fork.approve(2)
+                await _until(events, _reaches(lost))
+                await asyncio.to_thread(anvil.kill)
+                with pytest.raises(NodeUnreachable):
+                    await anext(events)
+            await asyncio.to_thread(anvil.start)
+            assert await chain.block_number() == kept
+            await fork.approve(3)
+            async with aclosing(chain.events(lost + 1, history=history)) as events:
+                back, new = await anext(events), await anext(events)
+    assert isinstance(back, Reorganised)
+    assert (back.back_to, _values(back.events_taken_back)) == (kept, [2])
+    assert (new.block_number, _values(new.events)) == (lost, [3])
+
+
+async def test_a_chain_started_afresh_is_not_taken_for_the_one_that_was_read() -> None:
+    history = History()
+    async with Anvil() as anvil, Node(anvil.url, timing=QUICK) as node:
+        account = Account.from_key(anvil.private_keys[0])
+        await deploy(node, account)
+        async with Chain(node) as chain, aclosing(chain.events(5, history=history)) as events:
+            await _until(events, _reaches(await chain.block_number()))
+            head = await chain.block_number()
+        await asyncio.to_thread(anvil.stop)
+        await asyncio.to_thread(anvil.start)
+        # Started within the same second, it would come to the same blocks again.
+        await node.web3.provider.make_request("evm_mine", [])
+        await deploy(node, account)
+        async with Chain(node) as chain:
+            with pytest.raises(ReorganisedTooDeep, match="no block 4") as caught:
+                await anext(chain.events(head + 1, history=history))
+    assert "fresh data_dir" in caught.value.hint
+
+
+def test_a_history_survives_as_bytes_and_what_is_none_is_refused() -> None:
+    history = History(depth=2)
+    for number in (5, 6, 9):
+        history.remember(Remembered(number, number.to_bytes(32, "big"), (Approval("a", "b", 2**256 - 1, "0x"),)))
+    again = History.decode(history.encode())
+    assert (again.depth, again.blocks) == (2, history.blocks)
+    assert [block.block_number for block in again.blocks] == [6, 9]
+    for data in (b"", b"[]", b'{"depth": 0, "blocks": []}', b'{"depth": 1, "blocks": [[1, "00", [["No", {}]]]]}'):
+        with pytest.raises(InputError):
+            History.decode(data)
+    with pytest.raises(ConfigurationError):
+        History(0)

@@ -1,0 +1,401 @@
+"""The order book: each rule by itself, and all of them against a book that is as simple as can be."""
+
+from __future__ import annotations
+
+import gc
+import tracemalloc
+import weakref
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+
+from mesh.market import Added, Match, OrderBook, Refusal, order_id
+from mesh.market.book import STALE
+from schemas import Demand, Offer, Verified, verify_message
+from tests.support.orders import (
+    LIGHTHOUSE,
+    OTHER_MODEL,
+    PERSON,
+    ROBOT,
+    STRANGER,
+    TOKEN,
+    terms,
+    verified_demand,
+    verified_offer,
+)
+
+if TYPE_CHECKING:
+    from mesh.market.book import Order
+
+FIFTH = {"sender": PERSON.address, "nonce": 1}
+
+
+def book(*orders: Verified[Any], limit: int = 100) -> OrderBook:
+    """A book with these orders open."""
+    filled = OrderBook(LIGHTHOUSE, limit=limit)
+    for order in orders:
+        assert filled.add(order) == Added(order)
+    return filled
+
+
+def test_a_demand_and_an_offer_that_agree_match_whichever_comes_first() -> None:
+    demand, offer = verified_demand(), verified_offer()
+
+    assert book(demand).add(offer) == Match(demand, offer)
+    assert book(offer).add(demand) == Match(demand, offer)
+
+
+def test_a_match_leaves_neither_open() -> None:
+    demand, offer = verified_demand(), verified_offer()
+    matched = book(demand)
+    matched.add(offer)
+
+    assert len(matched) == 0
+    assert order_id(demand) not in matched
+    assert order_id(offer) not in matched
+    assert list(matched.orders()) == []
+
+
+@pytest.mark.parametrize(
+    "difference",
+    [
+        {"model": OTHER_MODEL},
+        {"objective": OTHER_MODEL},
+        {"token": LIGHTHOUSE},
+        {"cost": 43},
+        {"validator": TOKEN},
+        {"sender": ROBOT.address, "nonce": 1},
+    ],
+    ids=lambda difference: next(iter(difference)),
+)
+def test_orders_that_differ_in_a_term_do_not_match(difference: dict[str, Any]) -> None:
+    offer = verified_offer(**difference)
+
+    assert book(verified_demand()).add(offer) == Added(offer)
+
+
+def test_fees_deadlines_and_nonces_need_not_agree() -> None:
+    demand, offer = verified_demand(validator_fee=1, deadline=5), verified_offer(lighthouse_fee=2, deadline=6)
+
+    assert book(demand).add(offer) == Match(demand, offer)
+
+
+def test_orders_of_generation_5_match_among_themselves() -> None:
+    demand = verified_demand(sender=PERSON.address, nonce=4)
+    offer = verified_offer(sender=ROBOT.address, nonce=9)
+
+    assert book(demand).add(offer) == Match(demand, offer)
+
+
+def test_who_came_first_is_matched_first() -> None:
+    offers = [verified_offer() for _ in range(3)]
+    waiting = book(*offers)
+
+    matched = [waiting.add(verified_demand()) for _ in range(3)]
+
+    assert [match.offer for match in matched if isinstance(match, Match)] == offers
+
+
+def test_one_who_left_the_middle_is_passed_over() -> None:
+    offers = [verified_offer() for _ in range(3)]
+    waiting = book(*offers)
+    assert waiting.remove(order_id(offers[1])) == offers[1]
+
+    matched = [waiting.add(verified_demand()) for _ in range(3)]
+
+    assert [match.offer for match in matched if isinstance(match, Match)] == [offers[0], offers[2]]
+    assert isinstance(matched[2], Added)
+
+
+def test_one_who_was_put_back_waits_at_the_end() -> None:
+    offers = [verified_offer() for _ in range(2)]
+    waiting = book(*offers)
+    waiting.remove(order_id(offers[0]))
+    waiting.add(offers[0])
+
+    match = waiting.add(verified_demand())
+
+    assert isinstance(match, Match)
+    assert match.offer == offers[1]
+
+
+def test_an_order_that_is_not_open_can_not_be_removed() -> None:
+    demand = verified_demand()
+    emptied = book(demand)
+
+    assert emptied.remove(order_id(demand)) == demand
+    assert emptied.remove(order_id(demand)) is None
+    assert emptied.remove(order_id(verified_demand())) is None
+
+
+def test_an_order_of_another_lighthouse_is_refused() -> None:
+    assert book().add(verified_demand(lighthouse=TOKEN)) is Refusal.LIGHTHOUSE
+
+
+def test_an_order_whose_deadline_is_not_ahead_is_refused() -> None:
+    late = book()
+    late.expire(10)
+
+    assert late.add(verified_demand(deadline=10)) is Refusal.EXPIRED
+    assert isinstance(late.add(verified_demand(deadline=11)), Added)
+
+
+def test_an_open_order_is_refused_a_second_time() -> None:
+    demand = verified_demand()
+
+    assert book(demand).add(demand) is Refusal.DUPLICATE
+
+
+def test_an_order_that_left_may_come_again() -> None:
+    demand = verified_demand()
+    again = book(demand)
+    again.remove(order_id(demand))
+
+    assert again.add(demand) == Added(demand)
+
+
+def test_a_full_book_refuses_but_goes_on_matching() -> None:
+    demand, offer = verified_demand(), verified_offer()
+    full = book(demand, limit=1)
+
+    assert full.add(verified_demand()) is Refusal.FULL
+    assert full.add(offer) == Match(demand, offer)
+    assert isinstance(full.add(verified_demand()), Added)
+
+
+def test_equal_terms_signed_by_two_people_are_two_orders() -> None:
+    same = terms()
+    first, second = (verify_message(signer.sign(Demand(**same, validator_fee=0))) for signer in (PERSON, STRANGER))
+    assert first.hash == second.hash
+    both = book(first, second)
+
+    assert both.remove(order_id(first)) == first
+    assert (order_id(first) in both, order_id(second) in both) == (False, True)
+    assert both.add(first) == Added(first)
+    assert list(both.orders()) == [second, first]
+    assert both.remove(order_id(second)) == second
+    assert list(both.orders()) == [first]
+
+
+def test_two_people_s_equal_orders_expire_both() -> None:
+    same = terms(deadline=5)
+    pair = [verify_message(signer.sign(Demand(**same, validator_fee=0))) for signer in (PERSON, STRANGER)]
+
+    assert book(*pair).expire(5) == pair
+
+
+def test_orders_expire_at_their_deadline_in_the_order_of_their_deadlines() -> None:
+    orders = [verified_demand(deadline=deadline) for deadline in (7, 5, 6, 5)]
+    aging = book(*orders)
+
+    assert aging.expire(4) == []
+    assert aging.expire(6) == [orders[1], orders[3], orders[2]]
+    assert (aging.head, len(aging), list(aging.orders())) == (6, 1, [orders[0]])
+
+
+def test_an_expired_order_is_not_matched() -> None:
+    aging = book(verified_offer(deadline=5))
+    aging.expire(5)
+
+    assert isinstance(aging.add(verified_demand()), Added)
+
+
+@pytest.mark.parametrize("head", [10**9, 2**256])
+def test_a_head_far_ahead_costs_no_more_than_what_is_due(head: int) -> None:
+    orders = [verified_demand(deadline=2**255), verified_demand(deadline=2**256 - 1), verified_demand(deadline=10**8)]
+
+    assert set(map(order_id, book(*orders).expire(head))) >= {order_id(orders[2])}
+
+
+def test_a_head_that_goes_back_brings_nothing_back_and_takes_nothing_out() -> None:
+    orders = [verified_demand(deadline=20), verified_demand(deadline=21)]
+    reorganised = book(*orders)
+    assert reorganised.expire(20) == [orders[0]]
+
+    assert reorganised.expire(3) == []
+    assert reorganised.head == 20
+    assert reorganised.add(verified_demand(deadline=20)) is Refusal.EXPIRED
+    assert reorganised.expire(20) == []
+    assert reorganised.expire(21) == [orders[1]]
+
+
+def test_one_who_left_before_his_deadline_does_not_expire() -> None:
+    demand = verified_demand(deadline=5)
+    aging = book(demand, verified_demand(deadline=5))
+    aging.remove(order_id(demand))
+
+    assert demand not in aging.expire(5)
+
+
+def test_one_who_left_and_came_again_expires_once() -> None:
+    demand = verified_demand(deadline=5)
+    aging = book(demand)
+    aging.remove(order_id(demand))
+    aging.add(demand)
+
+    assert aging.expire(5) == [demand]
+    assert len(aging) == 0
+
+
+def test_nothing_holds_an_order_that_left() -> None:
+    class Watched(Verified[Any], frozen=True, weakref=True):
+        """A verified order that a weak reference can watch."""
+
+    kept, gone = book(verified_demand()), verified_demand()
+    watched = Watched(gone.message, gone.hash, gone.signer)
+    reference = weakref.ref(watched)
+    kept.add(watched)
+    kept.remove(order_id(gone))
+    del watched
+    gc.collect()
+
+    assert reference() is None
+
+
+def test_orders_that_come_and_go_leave_nothing_behind_whatever_their_deadlines() -> None:
+    pairs = [
+        (verified_demand(cost=number, deadline=2**256 - 1 - number), verified_offer(cost=number, deadline=2**255))
+        for number in range(500)
+    ]
+    through = book()
+
+    def all_through() -> None:
+        for demand, offer in pairs:
+            through.add(demand)
+            assert isinstance(through.add(offer), Match)
+
+    for _ in range(2 * STALE // len(pairs) + 1):
+        all_through()
+    tracemalloc.start()
+    try:
+        for _ in range(4 * STALE // len(pairs)):
+            all_through()
+        grown, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+
+    assert grown < 200 * STALE
+
+
+def test_the_lists_of_what_is_due_are_made_anew_without_losing_any() -> None:
+    stays = [verified_demand(cost=1, deadline=number) for number in range(10, 20)]
+    aging = book(*stays, limit=10_000)
+    comes_and_goes = verified_demand(cost=2, deadline=15)
+    for _ in range(3 * STALE):
+        aging.add(comes_and_goes)
+        aging.remove(order_id(comes_and_goes))
+
+    assert aging.expire(19) == stays
+
+
+class NaiveBook:
+    """The rules, in lists that are searched from end to end."""
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+        self.head = 0
+        self.open: list[Verified[Order]] = []
+
+    def add(self, order: Verified[Order]) -> Match | Added | Refusal:
+        if order.message.lighthouse != LIGHTHOUSE:
+            return Refusal.LIGHTHOUSE
+        if order.message.deadline <= self.head:
+            return Refusal.EXPIRED
+        if order in self.open:
+            return Refusal.DUPLICATE
+        for other in self.open:
+            if type(other.message) is not type(order.message) and agree(other.message, order.message):
+                self.open.remove(other)
+                pair = (order, other) if isinstance(order.message, Demand) else (other, order)
+                return Match(*pair)  # type: ignore[arg-type]
+        if len(self.open) >= self.limit:
+            return Refusal.FULL
+        self.open.append(order)
+        return Added(order)
+
+    def remove(self, order: Verified[Order]) -> Verified[Order] | None:
+        if order not in self.open:
+            return None
+        self.open.remove(order)
+        return order
+
+    def expire(self, head: int) -> list[Verified[Order]]:
+        self.head = max(self.head, head)
+        due = sorted((o for o in self.open if o.message.deadline <= head), key=lambda order: order.message.deadline)
+        self.open = [order for order in self.open if order not in due]
+        return due
+
+
+def agree(one: Order, other: Order) -> bool:
+    fields = ("model", "objective", "token", "cost", "lighthouse", "validator", "generation")
+    return all(getattr(one, field) == getattr(other, field) for field in fields)
+
+
+def pool() -> list[Verified[Any]]:
+    """Orders that often agree, expire together, are signed by two people, or belong elsewhere."""
+    orders: list[Verified[Any]] = []
+    for cost in (1, 2):
+        for deadline in (3, 4, 8, 9):
+            for twin in range(2):
+                same = terms(cost=cost, deadline=deadline, nonce=f"{twin:064x}")
+                for signer in (PERSON, ROBOT):
+                    orders.append(verify_message(signer.sign(Demand(**same, validator_fee=0))))
+                    orders.append(verify_message(signer.sign(Offer(**same, lighthouse_fee=0))))
+            fifth = {"cost": cost, "deadline": deadline, "nonce": 1}
+            orders.append(verified_demand(sender=PERSON.address, **fifth))
+            orders.append(verified_offer(sender=ROBOT.address, **fifth))
+    return [*orders, verified_demand(lighthouse=TOKEN)]
+
+
+POOL = pool()
+
+
+class BookAgainstNaiveBook(RuleBasedStateMachine):
+    """Whatever is done to a book, it says and holds what the naive one does."""
+
+    @initialize(limit=st.sampled_from([1, 3, 8, 100]))
+    def begin(self, limit: int) -> None:
+        self.book = OrderBook(LIGHTHOUSE, limit=limit)
+        self.naive = NaiveBook(limit)
+
+    @rule(order=st.sampled_from(POOL))
+    def add(self, order: Verified[Any]) -> None:
+        assert self.book.add(order) == self.naive.add(order)
+
+    @rule(order=st.sampled_from(POOL))
+    def remove(self, order: Verified[Any]) -> None:
+        assert self.book.remove(order_id(order)) == self.naive.remove(order)
+
+    @rule(head=st.integers(0, 10))
+    def expire(self, head: int) -> None:
+        assert by_deadline(self.book.expire(head)) == by_deadline(self.naive.expire(head))
+
+    @rule()
+    def make_lists_anew(self) -> None:
+        self.book._list_anew()
+
+    @invariant()
+    def holds_the_same(self) -> None:
+        assert list(self.book.orders()) == self.naive.open
+        assert len(self.book) == len(self.naive.open)
+        assert self.book.head == self.naive.head
+        assert [order for order in POOL if order_id(order) in self.book] == [
+            order for order in POOL if order in self.naive.open
+        ]
+
+
+def by_deadline(orders: list[Verified[Any]]) -> list[tuple[int, set[bytes]]]:
+    """Deadlines in the order in which they came, with what expired at each."""
+    deadlines = [order.message.deadline for order in orders]
+    assert deadlines == sorted(deadlines)
+    return [
+        (deadline, {order_id(order) for order in orders if order.message.deadline == deadline})
+        for deadline in dict.fromkeys(deadlines)
+    ]
+
+
+TestBookAgainstNaiveBook = BookAgainstNaiveBook.TestCase
+TestBookAgainstNaiveBook.settings = settings(max_examples=60, stateful_step_count=60, deadline=None)

@@ -1,0 +1,367 @@
+"""Jobs of an agent, from the demand to the money: the executor with everything around it real."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import pytest
+
+from mesh.agent import JobFailed, Phase
+from mesh.recording import open_objective
+from mesh.work.run import NOTE_TOPIC
+from schemas import Empty, String, cid_of_bytes, cid_of_file
+from tests.support.market import Place, obliging
+from tests.support.objectives import MILLISECOND, objective, timed
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from mesh.agent import Agent, Contract
+    from mesh.recording import Objective, Played
+    from mesh.work.run import Run
+    from schemas import Liability
+
+COST = 1000
+"""What a job pays here, wn."""
+
+
+class Speed(msgspec.Struct):
+    """What a handler asks for."""
+
+    wheel: int
+
+
+async def recorded(contract: Contract) -> Objective:
+    """The recording of an ended contract."""
+    return open_objective(await contract.recording())
+
+
+def heard(recording: Objective, topic: str) -> list[bytes]:
+    return [played.payload for played in recording.messages() if played.topic == topic]
+
+
+def notes(recording: Objective) -> list[str]:
+    return [String.decode(payload).data for payload in heard(recording, NOTE_TOPIC)]
+
+
+def doing_nothing(robot: Agent) -> Agent:
+    """The same robot with a handler for any topic."""
+
+    @robot.on("*")
+    async def nothing(job: Run, message: Any) -> None:
+        pass
+
+    return robot
+
+
+async def test_an_objective_is_played_in_order_to_the_handlers_and_the_robot_is_paid(place: Place) -> None:
+    robot = obliging(place.agent("robot"))
+    done: list[object] = []
+
+    @robot.on("/go")
+    async def go(job: Run, message: Any) -> None:
+        done.append(message)
+
+    @robot.on("*")
+    async def anything(job: Run, message: Any) -> None:
+        done.append((job.playing.topic if job.playing else "", message))
+
+    path = place.save(objective(("/go", Empty()), ("/say", "hi"), ("/go", {"speed": 2}), ("/raw", b"\x01\x02")))
+    async with place.at_work(robot) as person:
+        before = await place.balance("robot"), await place.balance("person")
+        contract = await person.demand(path, cost=COST)
+        outcome = await contract.outcome()
+        assert outcome.success
+        assert done == [Empty(), ("/say", String("hi")), {"speed": 2}, ("/raw", b"\x01\x02")]
+        assert await place.balance("robot") == before[0] + COST
+        assert await place.balance("person") == before[1] - COST
+        assert contract.liability.objective == cid_of_file(path)
+        assert cid_of_file(await contract.recording()) == outcome.result
+
+
+async def test_the_recording_holds_what_was_played_and_what_the_handler_published(place: Place) -> None:
+    robot = obliging(place.agent("robot"))
+
+    @robot.on("/go")
+    async def go(job: Run, message: String) -> None:
+        job.publish("/done", f"did {message.data}")
+
+    async with place.at_work(robot) as person:
+        contract = await person.demand(place.save(objective(("/go", "one"), ("/go", "two"))))
+        recording = await recorded(contract)
+    assert heard(recording, "/go") == [String("one").encode(), String("two").encode()]
+    assert heard(recording, "/done") == [String("did one").encode(), String("did two").encode()]
+    about = recording.metadata["aira"]
+    assert about["liability"] == contract.address
+    assert about["agent"] == place.address("robot")
+    assert about["objective"] == contract.liability.objective
+
+
+async def test_messages_come_at_their_recorded_times(place: Place) -> None:
+    robot = obliging(place.agent("robot", playback="recorded"))
+    times: list[float] = []
+
+    @robot.on("/tick")
+    async def tick(job: Run, message: Empty) -> None:
+        times.append(asyncio.get_running_loop().time())
+
+    path = place.save(timed([("/tick", Empty(), at * MILLISECOND) for at in (0, 150, 200)]))
+    async with place.at_work(robot) as person:
+        assert (await (await person.demand(path)).outcome()).success
+    assert times[1] - times[0] >= 0.1
+    assert times[2] - times[0] == pytest.approx(0.2, abs=0.1)
+
+
+async def test_at_once_means_without_waiting_for_recorded_times(place: Place) -> None:
+    robot = doing_nothing(obliging(place.agent("robot", playback="at-once")))
+    path = place.save(timed([("/tick", Empty(), hour * 3600 * 1000 * MILLISECOND) for hour in range(3)]))
+    async with place.at_work(robot) as person, asyncio.timeout(20):
+        assert (await (await person.demand(path)).outcome()).success
+
+
+async def refusal(place: Place, robot: Agent, content: bytes | str, **terms: Any) -> tuple[str, str]:
+    """Have a robot fail at an objective: its note in the ledger and in the recording. The money must come back."""
+    async with place.at_work(robot) as person:
+        before = await place.balance("robot"), await place.balance("person")
+        source = place.save(content) if isinstance(content, bytes) else content
+        contract = await person.demand(source, cost=COST, **terms)
+        outcome = await contract.outcome()
+        assert not outcome.success
+        assert (await place.balance("robot"), await place.balance("person")) == before
+        job = await robot.parts.ledger.job(contract.address)
+        assert job is not None
+        assert job.success is False
+        recording = await recorded(contract)
+    return job.note, "\n".join(notes(recording))
+
+
+@pytest.mark.parametrize("error", [JobFailed("the lamp is broken"), ValueError("the lamp is broken")], ids=repr)
+async def test_a_handler_that_raises_fails_its_job_and_the_promisee_is_refunded(place: Place, error: Exception) -> None:
+    robot = obliging(place.agent("robot"))
+    calls = 0
+
+    @robot.on("/go")
+    async def go(job: Run, message: Any) -> None:
+        nonlocal calls
+        calls += 1
+        raise error
+
+    note, recorded_note = await refusal(place, robot, objective(("/go", Empty()), ("/go", Empty())))
+    assert note == recorded_note == "the lamp is broken"
+    assert calls == 1
+
+
+async def test_a_handler_whose_inner_task_was_cancelled_has_not_done_its_job(place: Place) -> None:
+    robot = obliging(place.agent("robot"))
+
+    @robot.on("/go")
+    async def go(job: Run, message: Any) -> None:
+        inner = asyncio.create_task(asyncio.sleep(60))
+        inner.cancel()
+        await inner
+
+    note, _ = await refusal(place, robot, objective(("/go", Empty())))
+    assert note == "the handler of /go was cancelled"
+
+
+async def test_a_message_of_another_type_than_the_handlers_fails_the_job(place: Place) -> None:
+    robot = obliging(place.agent("robot"))
+    speeds: list[Speed] = []
+
+    @robot.on("/go", Speed)
+    async def go(job: Run, message: Speed) -> None:
+        speeds.append(message)
+
+    note, _ = await refusal(place, robot, objective(("/go", Speed(3)), ("/go", {"wheel": "fast"})))
+    assert note.startswith("a message on /go is no Speed")
+    assert speeds == [Speed(3)]
+
+
+async def test_a_topic_without_handler_is_refused_before_anything_is_played(place: Place) -> None:
+    robot = obliging(place.agent("robot"))
+    done: list[object] = []
+
+    @robot.on("/go")
+    async def go(job: Run, message: Any) -> None:
+        done.append(message)
+
+    note, _ = await refusal(place, robot, objective(("/go", Empty()), ("/fly", Empty())))
+    assert "unknown-topic" in note
+    assert "/fly" in note
+    assert done == []
+
+
+async def test_what_is_no_recording_is_refused(place: Place) -> None:
+    note, _ = await refusal(place, doing_nothing(obliging(place.agent("robot"))), b"please go to the kitchen\n")
+    assert "not-a-recording" in note
+
+
+async def test_an_objective_that_nobody_holds_is_given_up_and_refunded(place: Place) -> None:
+    robot = doing_nothing(obliging(place.agent("robot", fetch_timeout=0.2)))
+    note, _ = await refusal(place, robot, cid_of_bytes(b"held by nobody"))
+    assert "is not to be had" in note
+
+
+async def test_an_objective_over_the_size_limit_is_refused(place: Place) -> None:
+    robot = doing_nothing(obliging(place.agent("robot", objective_size_limit=2000)))
+    note, _ = await refusal(place, robot, objective(("/blob", os.urandom(4000))))
+    assert "2000 allowed" in note
+
+
+async def test_a_job_whose_objective_is_missing_does_not_hold_up_the_next(place: Place) -> None:
+    robot = doing_nothing(obliging(place.agent("robot", fetch_timeout=30.0)))
+    async with place.at_work(robot) as person, asyncio.timeout(25):
+        missing = await person.demand(cid_of_bytes(b"nobody has this"))
+        good = await person.demand(place.save(objective(("/go", Empty()))))
+        assert (await good.outcome()).success
+        job = await robot.parts.ledger.job(missing.address)
+        assert job is not None
+        assert job.phase is Phase.INCOMING
+
+
+async def test_jobs_are_done_one_after_the_other(place: Place) -> None:
+    robot = obliging(place.agent("robot"))
+    at_it: set[str] = set()
+    most = 0
+
+    @robot.on("/go")
+    async def go(job: Run, message: Any) -> None:
+        nonlocal most
+        at_it.add(job.liability.address)
+        most = max(most, len(at_it))
+        await asyncio.sleep(0.05)
+        at_it.discard(job.liability.address)
+
+    path = place.save(objective(("/go", Empty()), ("/go", Empty())))
+    async with place.at_work(robot) as person:
+        contracts = await asyncio.gather(*(person.demand(path, cost=cost) for cost in (1, 2, 3)))
+        outcomes = await asyncio.gather(*(contract.outcome() for contract in contracts))
+    assert [outcome.success for outcome in outcomes] == [True] * 3
+    assert most == 1
+
+
+async def test_witnesses_hear_every_phase_in_order_with_its_record(place: Place) -> None:
+    robot = doing_nothing(obliging(place.agent("robot")))
+    seen: list[tuple[Phase, Liability]] = []
+
+    @robot.on_liability
+    async def phase(phase: Phase, liability: Liability) -> None:
+        seen.append((phase, liability))
+
+    async with place.at_work(robot) as person:
+        contract = await person.demand(place.save(objective(("/go", Empty()))), cost=COST)
+        outcome = await contract.outcome()
+        await until(lambda: len(seen) == 5)
+    assert [phase for phase, _ in seen] == list(Phase)
+    assert {liability.address for _, liability in seen} == {contract.address}
+    complete, finalized = seen[3][1], seen[4][1]
+    assert (complete.result, complete.is_success, complete.is_finalized) == (outcome.result, True, False)
+    assert (finalized.result, finalized.is_success, finalized.is_finalized) == (outcome.result, True, True)
+
+
+async def test_a_handler_may_end_its_own_job(place: Place) -> None:
+    robot = obliging(place.agent("robot"))
+    done: list[str] = []
+
+    @robot.on("/go")
+    async def go(job: Run, message: String) -> None:
+        cid = await robot.finish(job.liability.address, success=False)
+        done.append(f"{message.data} {cid}")
+
+    async with place.at_work(robot) as person:
+        contract = await person.demand(place.save(objective(*(("/go", str(n)) for n in range(50)), step_ns=0)))
+        outcome = await contract.outcome()
+        assert not outcome.success
+        await until(lambda: done)
+        second = await person.demand(place.save(objective(("/go", "again")), "second.mcap"))
+        await second.outcome()
+    assert done[0] == f"0 {outcome.result}"
+    assert len(done) == 2, "nothing is played after the end"
+
+
+async def test_a_witness_may_end_the_job_that_has_just_begun(place: Place) -> None:
+    robot = doing_nothing(obliging(place.agent("robot")))
+
+    @robot.on_liability
+    async def phase(phase: Phase, liability: Liability) -> None:
+        if phase is Phase.RUNNING:
+            await robot.finish(liability.address, success=False)
+
+    async with place.at_work(robot) as person, asyncio.timeout(20):
+        contract = await person.demand(place.save(objective(("/go", Empty()))))
+        assert not (await contract.outcome()).success
+
+
+async def test_only_the_chosen_topics_are_recorded(place: Place) -> None:
+    robot = obliging(place.agent("robot", recording_topics="/go, /led"))
+
+    @robot.on("*")
+    async def anything(job: Run, message: Any) -> None:
+        job.publish("/led", "on")
+        job.publish("/camera", b"a picture")
+
+    async with place.at_work(robot) as person:
+        contract = await person.demand(place.save(objective(("/go", Empty()), ("/quietly", Empty()))))
+        recording = await recorded(contract)
+    assert {topic.name for topic in recording.topics} == {"/go", "/led"}
+
+
+async def test_an_agent_told_not_to_work_leaves_liabilities_alone(place: Place) -> None:
+    robot = doing_nothing(obliging(place.agent("robot", enable_executor=False)))
+    async with place.at_work(robot) as person:
+        contract = await person.demand(place.save(objective(("/go", Empty()))))
+        head = await place.chains["robot"].block_number()
+        await until(lambda: robot.parts.clock.head >= head)
+        assert await robot.parts.ledger.jobs() == []
+        assert not (await place.chains["person"].liability(contract.address)).is_finalized
+
+
+async def test_a_failure_that_was_meant_is_logged_without_a_traceback(
+    place: Place, caplog: pytest.LogCaptureFixture
+) -> None:
+    robot = obliging(place.agent("robot"))
+
+    @robot.on("/go")
+    async def go(job: Run, message: Any) -> None:
+        raise JobFailed("the battery is empty")
+
+    with caplog.at_level(logging.WARNING, "mesh.work"):
+        async with place.at_work(robot) as person:
+            await (await person.demand(place.save(objective(("/go", Empty()))))).outcome()
+    (line,) = [record for record in caplog.records if "the battery is empty" in record.message]
+    assert not line.exc_info
+
+
+async def test_played_messages_are_on_the_mesh(place: Place) -> None:
+    robot = doing_nothing(obliging(place.agent("robot")))
+    played: list[tuple[str, bytes, str]] = []
+    async with place.at_work(robot) as person:
+        listener: Any = person.parts.network.session.declare_subscriber(
+            f"aira/agent/{place.address('robot').lower()}/liability/*/objective/**",
+            lambda sample: played.append(
+                (str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding)),
+            ),
+        )
+        contract = await person.demand(place.save(objective(("/arm/left", "up"), ("/arm/left", "down"))))
+        await contract.outcome()
+        await until(lambda: len(played) == 2)
+        listener.undeclare()
+    key = f"aira/agent/{place.address('robot').lower()}/liability/{contract.address.lower()}/objective/arm/left"
+    assert played == [(key, String(word).encode(), "ros1;std_msgs/String") for word in ("up", "down")]
+
+
+async def test_a_late_device_message_of_a_played_topic_keeps_its_role(place: Place) -> None:
+    """What was played and what was said on the same topic can be told apart in the recording."""
+    robot = obliging(place.agent("robot"))
+
+    @robot.on("/go")
+    async def go(job: Run, message: Any) -> None:
+        job.publish("/go", "gone")
+
+    async with place.at_work(robot) as person:
+        contract = await person.demand(place.save(objective(("/go", "go"))))
+        messages: list[Played] = list((await recorded(contract)).messages())
+    assert [String.decode(message.payload).data for message in messages] == ["go", "gone"]

@@ -1,0 +1,45 @@
+"""The life of a job: where it may go from where."""
+
+from __future__ import annotations
+
+import pytest
+
+from mesh.work import Phase, WrongPhase
+from mesh.work.lifecycle import NEXT, UNFINISHED, advance
+
+LIABILITY = "0x" + "12" * 20
+
+
+@pytest.mark.parametrize("phase", [Phase.INCOMING, Phase.READY, Phase.RUNNING])
+def test_whatever_has_not_ended_can_fail(phase: Phase) -> None:
+    assert advance(LIABILITY, phase, Phase.COMPLETE) is Phase.COMPLETE
+
+
+@pytest.mark.parametrize("phase", UNFINISHED)
+def test_the_chain_can_end_a_job_in_any_phase(phase: Phase) -> None:
+    assert advance(LIABILITY, phase, Phase.FINALIZED) is Phase.FINALIZED
+
+
+@pytest.mark.parametrize(
+    ("phase", "to"),
+    [
+        (Phase.INCOMING, Phase.RUNNING),
+        (Phase.COMPLETE, Phase.RUNNING),
+        (Phase.COMPLETE, Phase.COMPLETE),
+        (Phase.FINALIZED, Phase.COMPLETE),
+    ],
+)
+def test_no_job_goes_back_or_skips_its_objective(phase: Phase, to: Phase) -> None:
+    with pytest.raises(WrongPhase, match=f"can't move to {to} {LIABILITY}: it is {phase}") as caught:
+        advance(LIABILITY, phase, to)
+    assert caught.value.phase is phase
+
+
+def test_every_phase_has_its_next_ones_and_only_the_last_has_none() -> None:
+    assert set(NEXT) == set(Phase)
+    assert [phase for phase in Phase if not NEXT[phase]] == [Phase.FINALIZED]
+
+
+def test_a_job_of_somebody_else_has_no_phase() -> None:
+    error = WrongPhase(LIABILITY, asked="start", phase=None)
+    assert str(error) == f"can't start {LIABILITY}: it is not a job of this agent"

@@ -1,0 +1,192 @@
+"""The listener: nothing on the chain that concerns an agent is missed."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.background import Background
+from mesh.chain import Chain, ChainWentBack, JsonRpcServer, Timing
+from mesh.work import Ledger
+from mesh.work import listener as listener_module
+from mesh.work.listener import Listener
+from schemas import Demand, Offer, Result, message_hash
+from tests.support.orders import RECORDING, terms
+from tests.support.waiting import until, until_found
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from schemas import Liability
+    from tests.support.market import Place
+
+
+QUICK_TO_GIVE_UP = Timing(poll_interval=0.03, attempts=1, request_timeout=2)
+
+
+class Diary:
+    """A party that writes down what it is told."""
+
+    def __init__(self) -> None:
+        self.liabilities: list[tuple[Liability, bytes, bytes]] = []
+        self.ends: list[tuple[str, bool, str]] = []
+        self.head = 0
+
+    async def new_liability(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
+        self.liabilities.append((liability, demand_hash, offer_hash))
+
+    async def finalized(self, address: str, *, success: bool, result: str) -> None:
+        self.ends.append((address, success, result))
+
+    async def new_head(self, block: int) -> None:
+        self.head = block
+
+
+@pytest.fixture
+async def ledger(tmp_path: Path) -> AsyncIterator[Ledger]:
+    async with Ledger(tmp_path / "ledger.sqlite") as opened:
+        yield opened
+
+
+@asynccontextmanager
+async def listening(
+    place: Place, ledger: Ledger, role: str = "robot", *, chain: Chain | None = None
+) -> AsyncIterator[Diary]:
+    diary = Diary()
+    listener = Listener(chain or place.chains[role], ledger, place.address(role), diary)
+    async with Background() as tasks:
+        tasks.start(listener.run(), "listener")
+        yield diary
+
+
+async def started(ledger: Ledger) -> None:
+    """Wait until a listener has chosen its first block."""
+
+    async def chosen() -> bool:
+        return await ledger.cursor(Listener.NAME) is not None
+
+    await until_found(chosen)
+
+
+async def contract(place: Place, *, promisor: str = "robot") -> tuple[str, Demand, Offer]:
+    """A liability between the person and the promisor, made by the provider."""
+    deployment = place.market.deployment
+    fields = terms(token=deployment.xrt, cost=0, lighthouse=deployment.lighthouse, nonce=secrets.token_hex(32))
+    demand = place.market.accounts["person"].signer.sign(Demand(**fields, validator_fee=0))
+    offer = place.market.accounts[promisor].signer.sign(Offer(**fields, lighthouse_fee=0))
+    created = await place.chains["provider"].create_liability(deployment.lighthouse_name, demand, offer)
+    return created.liability, demand, offer
+
+
+async def finalize(place: Place, address: str) -> None:
+    result = place.market.accounts["robot"].signer.sign(Result(liability=address, result=RECORDING, success=True))
+    await place.chains["provider"].finalize(place.market.deployment.lighthouse_name, result)
+
+
+async def test_a_contract_that_names_the_account_is_told_with_its_orders(place: Place, ledger: Ledger) -> None:
+    async with listening(place, ledger) as diary:
+        await started(ledger)
+        address, demand, offer = await contract(place)
+        await until(lambda: diary.liabilities)
+    ((liability, demand_hash, offer_hash),) = diary.liabilities
+    assert (liability.address, liability.promisor) == (address, place.address("robot"))
+    assert (demand_hash, offer_hash) == (message_hash(demand), message_hash(offer))
+
+
+async def test_contracts_of_others_are_left_out(place: Place, ledger: Ledger) -> None:
+    async with listening(place, ledger) as diary:
+        await started(ledger)
+        await contract(place, promisor="provider")
+        mine, *_ = await contract(place)
+        await until(lambda: diary.liabilities)
+    assert [liability.address for liability, *_ in diary.liabilities] == [mine]
+
+
+async def test_the_end_of_a_contract_is_told_with_its_result(place: Place, ledger: Ledger) -> None:
+    async with listening(place, ledger) as diary:
+        await started(ledger)
+        address, *_ = await contract(place)
+        await finalize(place, address)
+        await until(lambda: diary.ends)
+    assert diary.ends == [(address, True, RECORDING)]
+
+
+async def test_one_that_never_ran_begins_at_the_head(place: Place, ledger: Ledger) -> None:
+    await contract(place)
+    head = await place.chains["robot"].block_number()
+    async with listening(place, ledger) as diary:
+        await started(ledger)
+        assert await ledger.cursor(Listener.NAME) == head
+        later, *_ = await contract(place)
+        await until(lambda: diary.liabilities)
+    assert [liability.address for liability, *_ in diary.liabilities] == [later]
+
+
+async def test_what_happens_while_the_agent_is_down_is_read_when_it_is_back(place: Place, ledger: Ledger) -> None:
+    async with listening(place, ledger):
+        await started(ledger)
+    address, *_ = await contract(place)
+    await finalize(place, address)
+    async with listening(place, ledger) as diary:
+        await until(lambda: diary.ends)
+    assert [liability.address for liability, *_ in diary.liabilities] == [address]
+    assert diary.ends[0][0] == address
+
+
+async def test_a_block_that_was_not_handled_to_its_end_is_handled_again(place: Place, ledger: Ledger) -> None:
+    class Crashing(Diary):
+        async def new_liability(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
+            raise ZeroDivisionError
+
+    listener = Listener(place.chains["robot"], ledger, place.address("robot"), Crashing())
+    running = asyncio.create_task(listener.run())
+    await started(ledger)
+    address, *_ = await contract(place)
+    with pytest.raises(ZeroDivisionError):
+        await running
+    async with listening(place, ledger) as diary:
+        await until(lambda: diary.liabilities)
+    assert [liability.address for liability, *_ in diary.liabilities] == [address]
+
+
+async def test_the_head_is_told_as_the_chain_grows_and_kept(place: Place, ledger: Ledger) -> None:
+    async with listening(place, ledger) as diary:
+        await started(ledger)
+        await place.node.mine(3)
+        head = await place.chains["robot"].block_number()
+        await until(lambda: diary.head >= head)
+    assert await ledger.cursor(Listener.NAME) == diary.head
+
+
+async def test_a_lost_node_is_waited_for_and_said_once(
+    place: Place, ledger: Ledger, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(listener_module, "RETRY", 0.02)
+    caplog.set_level(logging.INFO, "mesh.work.listener")
+    async with JsonRpcServer(place.node.provider) as server:
+        port = int(server.url.rpartition(":")[2])
+        chain = Chain(server.url, ens=place.market.deployment.ens, timing=QUICK_TO_GIVE_UP)
+        async with chain, listening(place, ledger, chain=chain) as diary:
+            await started(ledger)
+            await server.__aexit__(None, None, None)
+            address, *_ = await contract(place)
+            await until(lambda: "can't be read" in caplog.text)
+            await asyncio.sleep(0.2)
+            async with JsonRpcServer(place.node.provider, port=port):
+                await until(lambda: diary.liabilities)
+                assert diary.liabilities[0][0].address == address
+    assert caplog.text.count("can't be read") == 1
+    assert caplog.text.count("can be read again") == 1
+
+
+async def test_a_chain_that_is_shorter_than_what_was_read_is_refused(place: Place, ledger: Ledger) -> None:
+    await ledger.set_cursor(Listener.NAME, 10**6)
+    listener = Listener(place.chains["robot"], ledger, place.address("robot"), Diary())
+    with pytest.raises(ChainWentBack):
+        await listener.run()

@@ -1,0 +1,280 @@
+"""An agent that is stopped in the middle of a job goes on with it, and is paid once."""
+
+from __future__ import annotations
+
+import asyncio
+import sqlite3
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from mesh.agent import Agent, Phase
+from mesh.recording import open_objective
+from mesh.work import outbox as outbox_module
+from mesh.work.executor import Executor
+from mesh.work.outbox import outgoing
+from schemas import String, cid_of_file
+from tests.mesh.work.samples import liability
+from tests.support.market import obliging
+from tests.support.objectives import objective
+from tests.support.orders import result
+from tests.support.waiting import until, until_found
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from mesh.agent import Contract
+    from mesh.work.run import Run
+    from schemas import Liability
+    from tests.support.market import Place
+
+COST = 1000
+WORDS = [str(number) for number in range(6)]
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outbox_module, "RESEND", 0.1)
+
+
+def words(place: Place) -> Path:
+    """An objective of six words."""
+    return place.save(objective(*(("/say", word) for word in WORDS)))
+
+
+def speaking(robot: Agent, said: list[str], *, stuck_at: str = "") -> Agent:
+    """The same robot, which takes note of what it plays and never gets over `stuck_at`."""
+
+    @robot.on("/say")
+    async def say(job: Run, message: String) -> None:
+        if message.data == stuck_at:
+            await asyncio.Event().wait()
+        said.append(message.data)
+        job.publish("/said", message.data)
+
+    return robot
+
+
+async def in_phase(robot: Agent, contract: Contract, phase: Phase) -> None:
+    async def reached() -> bool:
+        job = await robot.parts.ledger.job(contract.address)
+        return job is not None and job.phase is phase
+
+    await until_found(reached, what=phase)
+
+
+class Paying:
+    """Compares what a robot has with what it should have got."""
+
+    def __init__(self, place: Place, before: int) -> None:
+        self._place = place
+        self._before = before
+
+    async def once(self) -> bool:
+        return await self._place.balance("robot") == self._before + COST
+
+
+@pytest.fixture
+async def paid(place: Place) -> Paying:
+    return Paying(place, await place.balance("robot"))
+
+
+async def test_a_ready_job_is_done_after_a_restart(place: Place, paid: Paying) -> None:
+    said: list[str] = []
+    async with place.provider(), place.agent("person") as person:
+        async with obliging(place.agent("robot")) as robot:
+            contract = await person.demand(words(place), cost=COST)
+            await in_phase(robot, contract, Phase.READY)
+        async with speaking(place.agent("robot"), said) as robot:
+            assert (await contract.outcome()).success
+            await in_phase(robot, contract, Phase.FINALIZED)
+    assert said == WORDS
+    assert await paid.once()
+
+
+async def test_a_running_job_goes_on_where_it_was(place: Place, paid: Paying) -> None:
+    first: list[str] = []
+    second: list[str] = []
+    async with place.provider(), place.agent("person") as person:
+        async with speaking(obliging(place.agent("robot")), first, stuck_at="3"):
+            contract = await person.demand(words(place), cost=COST)
+            await until(lambda: len(first) == 3)
+        async with speaking(place.agent("robot"), second):
+            assert (await contract.outcome()).success
+            recording = open_objective(await contract.recording())
+    assert first + second == WORDS
+    assert await paid.once()
+    said = [String.decode(message.payload).data for message in recording.messages() if message.topic == "/said"]
+    assert said == WORDS, "what was recorded before the restart is not lost"
+
+
+async def test_a_running_job_can_be_stopped_again_and_again(place: Place, paid: Paying) -> None:
+    said: list[str] = []
+    async with place.provider(), place.agent("person") as person:
+        async with speaking(obliging(place.agent("robot")), said, stuck_at="0") as robot:
+            contract = await person.demand(words(place), cost=COST)
+            await in_phase(robot, contract, Phase.RUNNING)
+        for stop in ("2", "2", "4"):
+            async with speaking(place.agent("robot"), said, stuck_at=stop) as robot:
+                await until(lambda stop=stop: len(said) == int(stop))  # type: ignore[misc]
+        async with speaking(place.agent("robot"), said):
+            assert (await contract.outcome()).success
+    assert said == WORDS
+    assert await paid.once()
+
+
+async def test_a_job_that_awaits_its_finish_keeps_its_recording_over_a_restart(place: Place) -> None:
+    """Without handlers: what the device has said until the restart is in the Result."""
+    async with place.provider(), place.agent("person") as person:
+        async with obliging(place.agent("robot")) as robot:
+            contract = await person.demand(words(place))
+            await in_phase(robot, contract, Phase.READY)
+            executor = robot._working().executor
+            await executor.start(contract.address)
+            executor._runs[contract.address].publish("/said", "before")
+            await until(lambda: executor._runs[contract.address].position == len(WORDS))
+        async with place.agent("robot") as robot:
+            executor = robot._working().executor
+            await executor.resume(contract.address)
+            executor._runs[contract.address].publish("/said", "after")
+            await robot.finish(contract.address, success=True)
+            assert (await contract.outcome()).success
+            recording = open_objective(await contract.recording())
+    messages = [(message.topic, String.decode(message.payload).data) for message in recording.messages()]
+    assert [data for topic, data in messages if topic == "/said"] == ["before", "after"]
+    assert [data for topic, data in messages if topic == "/say"] == WORDS, "nothing is played twice"
+
+
+async def test_a_finished_job_is_paid_when_the_provider_comes_late(place: Place, paid: Paying) -> None:
+    said: list[str] = []
+    async with place.agent("person") as person, speaking(obliging(place.agent("robot")), said) as robot:
+        contract = await made_by_a_provider_that_goes(place, person)
+        await in_phase(robot, contract, Phase.COMPLETE)
+        assert not await paid.once()
+        async with place.provider():
+            assert (await contract.outcome()).success
+            await in_phase(robot, contract, Phase.FINALIZED)
+        assert await robot.parts.ledger.outbox(head=0) == []
+    assert await paid.once()
+
+
+async def test_a_finished_job_is_paid_after_a_restart(place: Place, paid: Paying) -> None:
+    said: list[str] = []
+    async with place.agent("person") as person:
+        async with speaking(obliging(place.agent("robot")), said) as robot:
+            contract = await made_by_a_provider_that_goes(place, person)
+            await in_phase(robot, contract, Phase.COMPLETE)
+        async with speaking(place.agent("robot"), said) as robot, place.provider():
+            outcome = await contract.outcome()
+            await in_phase(robot, contract, Phase.FINALIZED)
+            recording = await contract.recording()
+        assert cid_of_file(recording) == outcome.result
+    assert said == WORDS, "a finished job is not done again"
+    assert await paid.once()
+
+
+async def made_by_a_provider_that_goes(place: Place, person: Agent) -> Contract:
+    """A contract whose Result finds no provider."""
+    async with place.provider():
+        return await person.demand(words(place), cost=COST)
+
+
+async def test_a_job_that_the_chain_ended_meanwhile_is_not_done(place: Place) -> None:
+    said: list[str] = []
+    seen: list[Phase] = []
+    async with place.provider(), place.agent("person") as person:
+        async with obliging(place.agent("robot")) as robot:
+            await robot.parts.ledger.set_cursor("listener", 0)
+            contract = await person.demand(words(place))
+            await in_phase(robot, contract, Phase.READY)
+            failed = result(signer=robot.parts.signer, liability=contract.address, success=False)
+        await place.chains["provider"].finalize(place.market.deployment.lighthouse_name, failed)
+        robot = place.agent("robot")
+        robot.on_liability(take_note(seen))
+        async with robot:
+            await in_phase(robot, contract, Phase.FINALIZED)
+        async with speaking(place.agent("robot"), said) as robot:
+            await reading(robot)
+    assert Phase.FINALIZED in seen
+    assert said == []
+
+
+def take_note(seen: list[Phase]) -> Callable[[Phase, Liability], Any]:
+    async def phase(phase: Phase, liability: Liability) -> None:
+        seen.append(phase)
+
+    return phase
+
+
+async def reading(robot: Agent) -> None:
+    """Wait until an agent has read the chain to its end."""
+    head = await robot.parts.chain.block_number()
+    await until(lambda: robot.parts.clock.head >= head)
+
+
+async def test_a_liability_that_has_ended_before_the_agent_heard_of_it_is_no_job(place: Place) -> None:
+    said: list[str] = []
+    async with place.provider(), place.agent("person") as person:
+        async with obliging(place.agent("robot", enable_executor=False)) as robot:
+            await reading(robot)
+            contract = await person.demand(words(place))
+        failed = result(signer=place.market.accounts["robot"].signer, liability=contract.address, success=False)
+        await place.chains["provider"].finalize(place.market.deployment.lighthouse_name, failed)
+        # As if it had been down since before the contract was made.
+        async with place.agent("robot", enable_executor=False) as robot:
+            await robot.parts.ledger.set_cursor("listener", 1)
+        async with speaking(place.agent("robot"), said) as robot:
+            await reading(robot)
+            assert await robot.parts.ledger.job(contract.address) is None
+    assert said == []
+
+
+async def test_a_result_is_out_of_the_outbox_before_its_job_is_marked_as_finalized(place: Place) -> None:
+    """A crash between the two would else have it sent for ever: the block is handled again, the marked job skipped."""
+    ours = liability(promisor=place.address("robot"))
+    signed = result(liability=ours.address)
+
+    async def witness(phase: Phase, liability: Liability) -> None:
+        pass
+
+    async with place.agent("robot", enable_executor=False) as robot:
+        ledger = robot.parts.ledger
+        await ledger.add_job(ours)
+        await ledger.complete(ours.address, success=True, result=signed.result, note="", outgoing=outgoing(signed))
+        refuse_to_finalize(robot.parts.directory / "ledger.sqlite")
+        executor = Executor(robot.parts.workshop(), performer=None, witness=witness)
+        with pytest.raises(sqlite3.IntegrityError, match="crash"):
+            await executor.finalized(ours.address, success=True)
+        assert await ledger.outbox(head=0) == []
+        job = await ledger.job(ours.address)
+        assert job is not None
+        assert job.phase is Phase.COMPLETE
+
+
+def refuse_to_finalize(ledger: Path) -> None:
+    """Have SQLite fail when a job is marked, as a full disk or a crash would."""
+    database = sqlite3.connect(ledger)
+    database.execute(
+        "CREATE TRIGGER crash BEFORE UPDATE ON jobs WHEN NEW.phase = 'finalized'"
+        " BEGIN SELECT RAISE(ABORT, 'crash'); END"
+    )
+    database.close()
+
+
+async def test_a_chain_started_anew_is_another_memory(place: Place) -> None:
+    """A development chain gives the same addresses to other contracts: an old job there must not hide a new one."""
+    from mesh.chain import Chain, EmbeddedChain
+    from mesh.demo.market import found_market
+
+    async with place.agent("robot") as robot:
+        here = robot.parts.directory
+    async with EmbeddedChain() as node:
+        market = await found_market(node.provider, node.funded_keys)
+        await node.mine()
+        async with Chain(node.provider, account=market.accounts["robot"], ens=market.deployment.ens) as chain:
+            settings = place.settings("robot", ens_contract=market.deployment.ens)
+            async with Agent(settings=settings, account=market.accounts["robot"], chain=chain) as robot:
+                assert robot.parts.chain.chain_id == place.chains["robot"].chain_id
+                assert robot.parts.directory != here
+                assert robot.parts.directory.parent == here.parent
