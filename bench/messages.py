@@ -86,14 +86,15 @@ async def receive(endpoint: str, count: int, ready: Any) -> tuple[float, list[De
 
 def recover_bare(demands: list[Demand]) -> float:
     """Recoveries a second of the same signatures, with everything but coincurve done beforehand."""
-    signatures = [_compact(demand) for demand in demands]
+    signatures = [compact(demand) for demand in demands]
     started = time.perf_counter()
     for signature, digest in signatures:
         PublicKey.from_signature_and_message(signature, digest, hasher=None)
     return len(signatures) / (time.perf_counter() - started)
 
 
-def _compact(demand: Demand) -> tuple[bytes, bytes]:
+def compact(demand: Demand) -> tuple[bytes, bytes]:
+    """The signature as coincurve takes it, and the digest that was signed."""
     signature = bytes.fromhex(demand.signature)
     return signature[:64] + bytes([signature[64] - 27]), keccak256(PREFIX + message_hash(demand))
 

@@ -1,4 +1,5 @@
-// Compiles the contracts and writes one JSON artifact each; with --check it writes nothing and fails where one differs.
+// Compiles the contracts and writes one JSON artifact each; with --check it writes nothing and fails where one differs,
+// and with --input it only prints what the compiler is given of the suite.
 import { existsSync, mkdirSync, readFileSync, readdirSync, writeFileSync } from "node:fs";
 import { dirname, join } from "node:path";
 import { fileURLToPath } from "node:url";
@@ -16,6 +17,7 @@ const wanted = {
   "src/Factory.sol": { Factory: suite },
   "src/Lighthouse.sol": { Lighthouse: suite },
   "src/Liability.sol": { Liability: suite },
+  "src/Jury.sol": { Jury: suite },
   "fixtures/Tokens.sol": { FeeToken: tests, SilentToken: tests, RefusingToken: tests, HookedToken: tests },
   "fixtures/Validators.sol": { OneSigner: tests, BrokenValidator: tests },
 };
@@ -26,17 +28,21 @@ const settings = {
   optimizer: { enabled: true, runs: 1_000_000 },
   // Nothing in the bytecode that depends on comments or on where the sources lie.
   metadata: { appendCBOR: false, bytecodeHash: "none" },
-  outputSelection: { "*": { "*": ["abi", "evm.bytecode.object", "evm.deployedBytecode.object"] } },
 };
+const outputSelection = { "*": { "*": ["abi", "evm.bytecode.object", "evm.deployedBytecode.object"] } };
 
-function compile() {
-  const input = { language: "Solidity", settings, sources: {} };
-  for (const folder of ["src", "fixtures"]) {
+function input(folders, settings) {
+  const sources = {};
+  for (const folder of folders) {
     for (const name of readdirSync(join(here, folder)).sort()) {
-      input.sources[`${folder}/${name}`] = { content: readFileSync(join(here, folder, name), "utf8") };
+      sources[`${folder}/${name}`] = { content: readFileSync(join(here, folder, name), "utf8") };
     }
   }
-  const output = JSON.parse(solc.compile(JSON.stringify(input)));
+  return JSON.stringify({ language: "Solidity", settings, sources });
+}
+
+function compile() {
+  const output = JSON.parse(solc.compile(input(["src", "fixtures"], { ...settings, outputSelection })));
   const complaints = output.errors ?? [];
   for (const complaint of complaints) console.error(complaint.formattedMessage);
   if (complaints.length > 0) process.exit(1);
@@ -45,7 +51,6 @@ function compile() {
 
 function artifact(contractName, contract) {
   const compiler = { name: "solc", version: solc.version(), ...settings };
-  delete compiler.outputSelection;
   return `${JSON.stringify(
     {
       contractName,
@@ -59,6 +64,10 @@ function artifact(contractName, contract) {
   )}\n`;
 }
 
+if (process.argv.includes("--input")) {
+  console.log(input(["src"], settings));
+  process.exit(0);
+}
 const checking = process.argv.includes("--check");
 const contracts = compile();
 let stale = 0;

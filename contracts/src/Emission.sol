@@ -47,6 +47,7 @@ abstract contract Emission {
             terms.promisee != terms.promisor && provider != terms.promisee && provider != terms.promisor;
         if (!success || provider == address(0) || terms.token != address(xrt) || terms.cost == 0 || !strangers) return;
         uint256 wn = wnFromGas(gas);
+        // slither-disable-next-line unused-return (XRT returns true or reverts)
         xrt.mint(provider, wn < terms.cost ? wn : terms.cost);
     }
 

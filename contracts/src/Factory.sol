@@ -5,8 +5,8 @@ import {Clone} from "./Clone.sol";
 import {Emission} from "./Emission.sol";
 import {RobonomicsErrors} from "./Errors.sol";
 import {IENS} from "./IENS.sol";
-import {Liability} from "./Liability.sol";
-import {Lighthouse} from "./Lighthouse.sol";
+import {ILiabilityFactory, Liability} from "./Liability.sol";
+import {ILighthouseFactory, Lighthouse} from "./Lighthouse.sol";
 import {LighthouseNames} from "./LighthouseNames.sol";
 import {Order, Orders} from "./Orders.sol";
 import {Signatures} from "./Signatures.sol";
@@ -18,7 +18,7 @@ import {XRT} from "./XRT.sol";
 /// @notice It keeps no list of what it has made: a clone of its own is known by its code (see Clone). Money moves in
 /// before a liability exists and out after it has ended, so there is no state in between for a token's hook to come
 /// back to.
-contract Factory is RobonomicsErrors, LighthouseNames, Emission {
+contract Factory is RobonomicsErrors, LighthouseNames, Emission, ILighthouseFactory, ILiabilityFactory {
     using Orders for Order;
 
     /// Tell the two kinds of clones apart.
@@ -65,6 +65,7 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission {
         bytes memory arguments = abi.encodePacked(uint128(minimalStake), uint32(timeoutInBlocks), name);
         lighthouse = Clone.create(lighthouseCode, LIGHTHOUSE, arguments);
         _give(name, lighthouse);
+        // slither-disable-next-line reentrancy-events (the registry is chosen by who deploys)
         emit NewLighthouse(lighthouse, name);
     }
 
@@ -76,6 +77,7 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission {
         Terms memory terms = _agree(Orders.read(demand), Orders.read(offer));
         _collect(terms, _provider());
         address liability = Clone.create(liabilityCode, LIABILITY, TermsCode.pack(terms, address(xrt)));
+        // slither-disable-next-line reentrancy-events (nobody but the token was called, and it changes nothing here)
         emit NewLiability(liability);
     }
 
@@ -87,7 +89,7 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission {
         if (msg.sender != terms.lighthouse) revert WrongLighthouse(terms.lighthouse, msg.sender);
         (bytes32 digest, address signer) = _readResult(liability, result, success, signature);
         if (terms.validator == address(0)) {
-            if (signer != terms.promisor) revert WrongSigner(terms.promisor, signer);
+            _requireSigner(terms.promisor, signer);
         } else if (terms.generation == 3) {
             revert NotTheValidator(_provider());
         } else {
@@ -109,7 +111,7 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission {
         Terms memory terms = _termsOf(msg.sender);
         if (terms.generation != 3 || terms.validator != validator) revert NotTheValidator(validator);
         (bytes32 digest, address signer) = _readResult(msg.sender, result, success, signature);
-        if (signer != terms.promisor) revert WrongSigner(terms.promisor, signer);
+        _requireSigner(terms.promisor, signer);
         _end(msg.sender, terms, digest, success && agree);
         _credit(terms, success && agree, address(0));
     }
@@ -118,19 +120,29 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission {
     function refund(address liability) external {
         Terms memory terms = _termsOf(liability);
         if (block.number < terms.createdAt + refundDelay) revert RefundTooEarly(terms.createdAt + refundDelay);
-        Liability(liability).settle(0, false);
-        if (terms.cost > 0) Tokens.pay(terms.token, terms.promisee, terms.cost);
-        if (_hasValidatorFee(terms)) xrt.transfer(terms.promisee, terms.validatorFee);
-        _credit(terms, false, address(0));
+        _giveBack(liability, terms);
+    }
+
+    /// @notice Gives the promisee the money back at once, for both parties want it so; anybody may call.
+    /// @param promiseeSignature of keccak256 of the liability's address and the six letters "cancel", packed.
+    /// @param promisorSignature of the same.
+    function cancel(address liability, bytes calldata promiseeSignature, bytes calldata promisorSignature) external {
+        Terms memory terms = _termsOf(liability);
+        bytes32 hash = keccak256(abi.encodePacked(liability, "cancel"));
+        _requireSigner(terms.promisee, Signatures.recover(hash, promiseeSignature));
+        _requireSigner(terms.promisor, Signatures.recover(hash, promisorSignature));
+        _giveBack(liability, terms);
     }
 
     /// @notice Whether this factory made the lighthouse.
     function isLighthouse(address account) public view returns (bool isClone) {
+        // slither-disable-next-line unused-return (the clone's arguments are not asked for)
         (isClone,) = Clone.read(account, LIGHTHOUSE);
     }
 
     /// @notice Whether this factory made the liability.
     function isLiability(address account) public view returns (bool isClone) {
+        // slither-disable-next-line unused-return (the clone's arguments are not asked for)
         (isClone,) = Clone.read(account, LIABILITY);
     }
 
@@ -175,7 +187,7 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission {
             nonce = nonceOf[sender]++;
             hash = order.hashFifth(nonce);
             signer = order.recover(hash);
-            if (signer != sender) revert WrongSigner(sender, signer);
+            _requireSigner(sender, signer);
         } else {
             hash = order.hashThird();
             signer = order.recover(hash);
@@ -185,7 +197,9 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission {
         emit HashConsumed(hash);
     }
 
-    /// Takes what the liability costs into the factory and pays the provider's fee.
+    /// Takes what the liability costs into the factory and pays the provider's fee. Each gives what it has signed for,
+    /// and XRT returns true or reverts.
+    // slither-disable-start arbitrary-send-erc20,unchecked-transfer
     function _collect(Terms memory terms, address provider) private {
         if (terms.lighthouseFee > 0) xrt.transferFrom(terms.promisor, provider, terms.lighthouseFee);
         if (terms.cost > 0) {
@@ -194,12 +208,26 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission {
         }
         if (_hasValidatorFee(terms)) xrt.transferFrom(terms.promisee, address(this), terms.validatorFee);
     }
+    // slither-disable-end arbitrary-send-erc20,unchecked-transfer
 
     /// Ends the liability, then pays: the promisor for success, or the promisee; and the validator for judging.
     function _end(address liability, Terms memory terms, bytes32 digest, bool success) private {
         Liability(liability).settle(digest, success);
-        if (terms.cost > 0) Tokens.pay(terms.token, success ? terms.promisor : terms.promisee, terms.cost);
-        if (_hasValidatorFee(terms)) xrt.transfer(terms.validator, terms.validatorFee);
+        _payOut(terms, success ? terms.promisor : terms.promisee, terms.validator);
+    }
+
+    /// Ends the liability without a result; nobody has judged anything, so the promisee gets the validator's fee too.
+    function _giveBack(address liability, Terms memory terms) private {
+        Liability(liability).settle(0, false);
+        _payOut(terms, terms.promisee, terms.promisee);
+        _credit(terms, false, address(0));
+    }
+
+    /// Pays what `_collect` has taken into the factory; for a liability that has just ended, so it comes once.
+    function _payOut(Terms memory terms, address costTo, address feeTo) private {
+        if (terms.cost > 0) Tokens.pay(terms.token, costTo, terms.cost);
+        // slither-disable-next-line unchecked-transfer (XRT returns true or reverts)
+        if (_hasValidatorFee(terms)) xrt.transfer(feeTo, terms.validatorFee);
     }
 
     function _readResult(address liability, bytes calldata result, bool success, bytes calldata signature)
@@ -218,6 +246,10 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission {
         (bool isClone, uint256 arguments) = Clone.read(liability, LIABILITY);
         if (!isClone) revert NotALiability(liability);
         return TermsCode.unpack(arguments, address(xrt));
+    }
+
+    function _requireSigner(address expected, address signer) private pure {
+        if (signer != expected) revert WrongSigner(expected, signer);
     }
 
     function _hasValidatorFee(Terms memory terms) private pure returns (bool) {

@@ -15,13 +15,14 @@ interface IENS {
     /// @notice Seconds for which a record may be cached.
     function ttl(bytes32 node) external view returns (uint64);
     function recordExists(bytes32 node) external view returns (bool);
-    function setOwner(bytes32 node, address owner) external;
-    function setResolver(bytes32 node, address resolver) external;
-    function setTTL(bytes32 node, uint64 ttl) external;
+    function setOwner(bytes32 node, address newOwner) external;
+    function setResolver(bytes32 node, address newResolver) external;
+    function setTTL(bytes32 node, uint64 newTTL) external;
     /// @param label keccak256 of the subdomain's own label.
     /// @return The node of the subdomain.
-    function setSubnodeOwner(bytes32 node, bytes32 label, address owner) external returns (bytes32);
-    function setSubnodeRecord(bytes32 node, bytes32 label, address owner, address resolver, uint64 ttl) external;
+    function setSubnodeOwner(bytes32 node, bytes32 label, address newOwner) external returns (bytes32);
+    function setSubnodeRecord(bytes32 node, bytes32 label, address newOwner, address newResolver, uint64 newTTL)
+        external;
 }
 
 /// @title What the suite needs of a resolver.

@@ -23,7 +23,7 @@ interface ILiabilityFactory {
 /// @notice This is the implementation behind the clones. A clone's terms are its code, so they cannot change; the one
 /// thing it stores is its end. Money is held by the factory.
 contract Liability is RobonomicsErrors {
-    /// The mark of a refund where a failed result would be; no digest is that small.
+    /// The mark of an end without a result where a failed result would be; no digest is that small.
     bytes32 private constant REFUNDED = bytes32(uint256(1));
 
     /// @notice The factory that makes liabilities and holds what they cost.
@@ -37,12 +37,13 @@ contract Liability is RobonomicsErrors {
     bytes32 private _failed;
 
     /// @notice The end: with the promisor paid (`success`) or the promisee refunded. `result` is the multihash, empty
-    /// when the promisee was refunded for want of a result.
+    /// when there is none: after a refund or a cancellation.
     event Finalized(bool indexed success, bytes result);
 
     /// @dev Made by the factory's constructor.
     constructor(address xrt) {
         factory = msg.sender;
+        // slither-disable-next-line missing-zero-check (the factory's own)
         _xrt = xrt;
     }
 
@@ -63,7 +64,7 @@ contract Liability is RobonomicsErrors {
     }
 
     /// @notice Ends the liability, once; the factory pays.
-    /// @param digest sha2-256 of the result, zero for a refund.
+    /// @param digest sha2-256 of the result, zero when there is none.
     function settle(bytes32 digest, bool success) external onlyFactory {
         if (isFinalized()) revert AlreadyFinalized(address(this));
         if (success) _succeeded = digest;
@@ -86,7 +87,7 @@ contract Liability is RobonomicsErrors {
         return _multihash(_terms().objective);
     }
 
-    /// @notice Multihash of the result; empty before the end and after a refund.
+    /// @notice Multihash of the result; empty before the end, and after a refund or a cancellation.
     function result() public view returns (bytes memory) {
         bytes32 digest = isSuccess() ? _succeeded : _failed;
         return uint256(digest) <= uint256(REFUNDED) ? bytes("") : _multihash(digest);
@@ -186,7 +187,7 @@ contract Liability is RobonomicsErrors {
         return _succeeded != 0;
     }
 
-    /// @notice Whether it has ended, with a result or with a refund.
+    /// @notice Whether it has ended, with a result or without.
     function isFinalized() public view returns (bool) {
         return _succeeded != 0 || _failed != 0;
     }
@@ -201,7 +202,8 @@ contract Liability is RobonomicsErrors {
     }
 
     function _work(Terms memory terms) private pure returns (bytes memory) {
-        return abi.encodePacked(_multihash(terms.model), _multihash(terms.objective), terms.token, terms.cost);
+        uint16 head = uint16(Orders.MULTIHASH);
+        return abi.encodePacked(head, terms.model, head, terms.objective, terms.token, terms.cost);
     }
 
     function _multihash(bytes32 digest) private pure returns (bytes memory) {

@@ -15,6 +15,7 @@ interface ILighthouseFactory {
 
 /// @title A lighthouse: providers who stake XRT and in turn send the network's transactions.
 /// @notice This is the implementation behind the clones; a clone's minimal stake, timeout and name are in its code.
+// slither-disable-next-line missing-inheritance (its finalizeLiability is the network's, which returns a bool)
 contract Lighthouse is RobonomicsErrors, Turns {
     /// @notice The factory that made this lighthouse.
     address public immutable factory;
@@ -62,6 +63,7 @@ contract Lighthouse is RobonomicsErrors, Turns {
     /// @param value wn, approved for this lighthouse.
     function refill(uint256 value) external returns (bool) {
         _setStake(msg.sender, stakes[msg.sender] + value);
+        // slither-disable-next-line unchecked-transfer (XRT returns true or reverts)
         xrt.transferFrom(msg.sender, address(this), value);
         return true;
     }
@@ -79,6 +81,7 @@ contract Lighthouse is RobonomicsErrors, Turns {
         } else {
             _setStake(msg.sender, stake - value);
         }
+        // slither-disable-next-line unchecked-transfer (XRT returns true or reverts)
         xrt.transfer(msg.sender, value);
         return true;
     }

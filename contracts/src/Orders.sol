@@ -45,7 +45,9 @@ library Orders {
             order := data.offset
         }
         // Every bit that must not be set, and every bit in which a fixed word differs.
+        // slither-disable-next-line incorrect-exp (exclusive or is meant)
         uint256 wrong = (order.modelAt ^ 320) | (order.objectiveAt ^ 416) | (order.signatureAt ^ 512);
+        // slither-disable-next-line incorrect-exp (exclusive or is meant)
         wrong |= (order.modelLength ^ 34) | (order.objectiveLength ^ 34) | (order.signatureLength ^ 65);
         wrong |= (uint256(order.modelHead) >> 240 ^ MULTIHASH) | (uint256(order.objectiveHead) >> 240 ^ MULTIHASH);
         wrong |= (order.token | order.firstAccount | order.secondAccount) >> 160;

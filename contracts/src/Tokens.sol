@@ -29,6 +29,7 @@ library Tokens {
         take(token, from, address(this), value);
         uint256 afterwards = IERC20(token).balanceOf(address(this));
         uint256 received = afterwards > before ? afterwards - before : 0;
+        // slither-disable-next-line reentrancy-balance (whoever comes back makes the sums differ, and all is undone)
         if (received != value) revert OrderErrors.TokenAmountMismatch(token, value, received);
     }
 

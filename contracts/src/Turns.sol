@@ -123,8 +123,10 @@ abstract contract Turns is LighthouseErrors {
         delete stakes[provider];
         emit Offline(provider);
         Turn memory turn = _load();
+        // slither-disable-next-line incorrect-equality (places in a list)
         if (turn.marker == index) {
             _restart(index < last ? index : 1);
+        // slither-disable-next-line incorrect-equality (places in a list)
         } else if (turn.marker == last) {
             turn.marker = index;
             _store(turn);
@@ -148,7 +150,7 @@ abstract contract Turns is LighthouseErrors {
     /// Whether so many timeouts have passed in silence as there are turns before that of the provider at `index`.
     function _mayTake(Turn memory turn, uint256 index) private view returns (bool) {
         uint256 silence = block.number - turn.keepAliveBlock;
-        uint256 passed = silence == 0 ? 0 : (silence - 1) / timeoutInBlocks();
+        uint256 passed = silence > 0 ? (silence - 1) / timeoutInBlocks() : 0;
         uint256 count = _providers.length;
         return (index + count - turn.marker) % count <= passed;
     }
@@ -162,11 +164,13 @@ abstract contract Turns is LighthouseErrors {
     }
 
     function _restart(uint256 index) private {
-        Turn memory turn;
-        if (_providers.length > 0) {
-            _begin(turn, index);
-            turn.keepAliveBlock = block.number;
+        if (_providers.length == 0) {
+            _turn = 0;
+            return;
         }
+        Turn memory turn = _load();
+        _begin(turn, index);
+        turn.keepAliveBlock = block.number;
         _store(turn);
     }
 

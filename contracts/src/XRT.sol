@@ -44,6 +44,7 @@ contract XRT is TokenErrors {
     function setMinter(address account) external {
         if (msg.sender != _deployer) revert NotTheDeployer(msg.sender);
         if (minter != address(0)) revert MinterAlreadySet();
+        // slither-disable-next-line missing-zero-check (zero is nobody, and can be set again)
         minter = account;
     }
 
