@@ -11,6 +11,7 @@ from mesh.chain.deploy import XRT, Deployment, DeploymentPlan, deploy
 from mesh.chain.embedded import EmbeddedChain, ServedChain, serve_embedded
 from mesh.chain.errors import (
     ChainWentBack,
+    FeeTooHigh,
     InsufficientFunds,
     InvalidName,
     KeyfileError,
@@ -18,6 +19,7 @@ from mesh.chain.errors import (
     NoContracts,
     NodeUnreachable,
     NotALiability,
+    NotOffered,
     ReorganisedTooDeep,
     RequestRefused,
     Reverted,
@@ -36,6 +38,7 @@ from mesh.chain.events import (
     Online,
     Transfer,
 )
+from mesh.chain.fees import GWEI, FeePolicy
 from mesh.chain.history import History
 from mesh.chain.names import namehash
 from mesh.chain.node import Node
@@ -49,6 +52,7 @@ from mesh.chain.transactions import Receipt, Sender
 restrain_recursion()
 
 __all__ = [
+    "GWEI",
     "XRT",
     "Account",
     "Approval",
@@ -61,6 +65,8 @@ __all__ = [
     "Deployment",
     "DeploymentPlan",
     "EmbeddedChain",
+    "FeePolicy",
+    "FeeTooHigh",
     "Finalized",
     "History",
     "InsufficientFunds",
@@ -75,6 +81,7 @@ __all__ = [
     "Node",
     "NodeUnreachable",
     "NotALiability",
+    "NotOffered",
     "Offline",
     "Online",
     "Receipt",

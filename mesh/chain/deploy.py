@@ -15,9 +15,9 @@ from schemas.keccak import keccak256
 
 if TYPE_CHECKING:
     from web3.contract import AsyncContract
-    from web3.providers.async_base import AsyncBaseProvider
 
     from mesh.chain.accounts import Account
+    from mesh.chain.provider import Endpoint
 
 WN: Final = 1
 XRT: Final = 10**9 * WN
@@ -58,7 +58,7 @@ class Deployment:
 
 
 async def deploy(
-    endpoint: str | AsyncBaseProvider | Node,
+    endpoint: Endpoint | Node,
     account: Account,
     *,
     plan: DeploymentPlan | None = None,

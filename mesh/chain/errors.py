@@ -55,6 +55,18 @@ class NotALiability(ChainError):
         self.address = address
 
 
+class NotOffered(ChainError):
+    """The original contracts lack something that ours have."""
+
+    def __init__(self, what: str, generation: int) -> None:
+        super().__init__(
+            f"the original contracts of generation {generation} offer no {what}",
+            hint="only a deployment of this project's contracts does",
+        )
+        self.what = what
+        self.generation = generation
+
+
 class InsufficientFunds(ChainError):
     """The account can't pay for the transaction's gas (and value). Amounts are wei."""
 
@@ -66,6 +78,18 @@ class InsufficientFunds(ChainError):
         self.address = address
         self.balance = balance
         self.needed = needed
+
+
+class FeeTooHigh(ChainError):
+    """Gas costs more than the account is ready to pay; nothing was sent. Prices are wei for a unit of gas."""
+
+    def __init__(self, price: int, ceiling: int) -> None:
+        super().__init__(
+            f"gas costs {price / 10**9:g} gwei now, and the ceiling is {ceiling / 10**9:g} gwei",
+            hint="try again when the price has come down, or raise the ceiling",
+        )
+        self.price = price
+        self.ceiling = ceiling
 
 
 class Reverted(ChainError):
@@ -84,12 +108,12 @@ class Reverted(ChainError):
 
 
 class TransactionTimeout(ChainError):
-    """A sent transaction was not mined in time; it may still be."""
+    """A sent transaction was not mined in time; it may still be. Sending the same again waits on for this one."""
 
     def __init__(self, tx: str, seconds: float) -> None:
         super().__init__(
             f"the transaction {tx} was not mined within {seconds:g} s",
-            hint="it may still be mined: look for it before sending another",
+            hint="it may still be mined; sending the same again waits for it, and sends no second one",
         )
         self.tx = tx
         self.seconds = seconds

@@ -107,10 +107,16 @@ def decode_log(log: Any) -> ChainEvent | None:
         return None
     try:
         keys = [decode([kind], bytes(topic))[0] for kind, topic in zip(indexed, log["topics"][1:], strict=True)]
-        values = decode(plain, bytes(log["data"]))
+        data = bytes(log["data"])
+        values = decode(plain, _padded(data) if plain == ["string"] else data)
         return _event(name, _address(log["address"]), (*keys, *values), "0x" + bytes(log["transactionHash"]).hex())
     except (DecodingError, UnicodeDecodeError, InvalidCid):
         return None
+
+
+def _padded(data: bytes) -> bytes:
+    """The data of an event in whole words: the original factory of generation 3 cuts its string off at the end."""
+    return data + bytes(-len(data) % 32)
 
 
 def topics_of(*contracts: str) -> list[str]:

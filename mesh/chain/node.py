@@ -11,46 +11,58 @@ from web3.exceptions import BadFunctionCallOutput
 
 from mesh.chain.artifacts import load_artifact
 from mesh.chain.errors import NoContracts
+from mesh.chain.fees import FeePolicy
+from mesh.chain.journal import Journal
+from mesh.chain.outbox import Outbox
 from mesh.chain.provider import open_provider
 from mesh.chain.timing import Timing
 from mesh.errors import ClosedError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+    from pathlib import Path
     from types import TracebackType
     from typing import Self
 
     from eth_typing import ChecksumAddress
     from web3.contract import AsyncContract
     from web3.contract.async_contract import AsyncContractFunction
-    from web3.providers.async_base import AsyncBaseProvider
     from web3.types import BlockIdentifier
 
+    from mesh.chain.provider import Endpoint
+
 CONTRACTS_KEPT = 1024
-
-
-class Numbering:
-    """The transactions of one account that one node is being given: one at a time, by number."""
-
-    def __init__(self) -> None:
-        self.lock = asyncio.Lock()
-        self.in_flight: set[int] = set()
-        """Numbers of those that are sent and not yet mined."""
 
 
 class Node:
     """A node reached at `endpoint`: `http(s)://…`, `ws(s)://…` or a web3 provider object (which stays open).
 
+    Several endpoints (a sequence, or one text with commas) are nodes of one chain: when one does not answer, the next
+    is asked, and stays in use until it fails in its turn.
+
+    `fees` is what its accounts pay at most. In the folder `journal`, where given, is written what they send: several
+    processes of one account then never take the same number, and one that is started again takes up what it left.
+
     Used with `async with`, which connects: raises `NodeUnreachable` when nobody answers, `ConfigurationError` for a
     text that is no endpoint. Its methods raise `NodeUnreachable` when the node is lost, after bounded retries.
     """
 
-    def __init__(self, endpoint: str | AsyncBaseProvider, *, timing: Timing | None = None) -> None:
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        *,
+        timing: Timing | None = None,
+        fees: FeePolicy | None = None,
+        journal: Path | None = None,
+    ) -> None:
         self.timing = timing or Timing()
+        self.fees = fees or FeePolicy()
+        self._journal = journal
+        self._chain_folder: Path | None = None
         self._provider = open_provider(endpoint, self.timing)
         self._chain_id: int | None = None
         self.web3: AsyncWeb3[Any] = AsyncWeb3(self._provider, middleware=[])
-        self._numberings: dict[str, Numbering] = {}
+        self._outboxes: dict[str, Outbox] = {}
         self.contract = lru_cache(maxsize=CONTRACTS_KEPT)(self._contract)
 
     @property
@@ -69,6 +81,8 @@ class Node:
         self._provider.open()
         try:
             self._chain_id = await self.web3.eth.chain_id
+            if self._journal is not None:
+                self._chain_folder = self._journal / await self._chain_name()
         except BaseException:
             await self._provider.close()
             raise
@@ -104,9 +118,18 @@ class Node:
             raise failed.exceptions[0] from None
         return [task.result() for task in tasks]
 
-    def numbering(self, address: str) -> Numbering:
-        """What all senders of one account through this node share."""
-        return self._numberings.setdefault(address, Numbering())
+    def outbox(self, address: str) -> Outbox:
+        """What all senders of one account through this node share. Raises `ConfigurationError` for the journal."""
+        if address not in self._outboxes:
+            folder = self._chain_folder
+            journal = None if folder is None else Journal(folder / address.lower())
+            self._outboxes[address] = Outbox(journal)
+        return self._outboxes[address]
+
+    async def _chain_name(self) -> str:
+        """A name that another chain of the same number (a development chain started afresh) does not have."""
+        first = await self.web3.eth.get_block(0)
+        return f"{self.chain_id}-{bytes(first['hash']).hex()[:16]}"
 
     def _contract(self, name: str, address: str) -> AsyncContract:
         """The contract at an address, with the ABI of one of ours (`artifacts.NAMES`); kept for the next time."""

@@ -20,6 +20,8 @@ from mesh.chain.transports import HttpTransport, WebSocketTransport
 from mesh.errors import AiraError, ClosedError, ConfigurationError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from web3.types import RPCEndpoint, RPCResponse
 
     from mesh.chain.timing import Timing
@@ -30,27 +32,42 @@ CONNECTION_ERRORS: Final = (OSError, TimeoutError, ClientError, Web3Exception, V
 """What transports raise when there is no node, no connection any more, or no JSON in the answer."""
 
 Transport: TypeAlias = HttpTransport | WebSocketTransport
+Endpoint: TypeAlias = "str | Sequence[str] | AsyncBaseProvider"
 
 SEND: Final = "eth_sendRawTransaction"
 TRANSIENT_STATUS: Final = frozenset({429, 500, 502, 503, 504})
 
 
-class ReliableProvider(AsyncBaseProvider):
-    """A provider in front of another, with bounded retries.
+class NotJsonRpc(ValueError):
+    """What answers is no JSON-RPC server, or none of this chain."""
 
-    A request is repeated when the connection fails, `timing.attempts` times in all with a growing delay; only a
-    transaction goes out once, as its sender has to know whether an earlier attempt may have arrived. `owned` is the
-    transport that `close` closes.
+
+class Way:
+    """One of the nodes that requests can go to. `owned` is the transport that is closed with the provider."""
+
+    def __init__(self, provider: AsyncBaseProvider, *, endpoint: str, owned: Transport | None = None) -> None:
+        self.endpoint = endpoint
+        self.provider = provider
+        self.owned = owned
+        self.is_on_chain = False
+        """Whether it was seen to be on the chain of the others."""
+
+
+class ReliableProvider(AsyncBaseProvider):
+    """A provider in front of one or several others, with bounded retries.
+
+    A request goes to the node that answered last; when its connection fails, to the next, and so on around all of
+    them, `timing.attempts` times with a growing delay in between. Only a transaction goes to one node once, as its
+    sender has to know whether an earlier attempt may have arrived; the sender's next attempt goes to the next node.
+    A node that is on another chain than the first that answered is passed over.
     """
 
-    def __init__(
-        self, inner: AsyncBaseProvider, *, endpoint: str, timing: Timing, owned: Transport | None = None
-    ) -> None:
+    def __init__(self, ways: Sequence[Way], *, timing: Timing) -> None:
         super().__init__()
-        self.endpoint = endpoint
-        self._inner = inner
-        self._owned = owned
+        self.endpoint = ", ".join(way.endpoint for way in ways)
+        self._ways = tuple(ways)
         self._timing = timing
+        self._chain_id: object = None
         self._is_open = False
 
     def open(self) -> None:
@@ -67,67 +84,102 @@ class ReliableProvider(AsyncBaseProvider):
         attempts = 1 if method == SEND else self._timing.attempts
         delay = self._timing.retry_delay
         for attempt in range(1, attempts + 1):
-            try:
-                async with asyncio.timeout(self._timing.request_timeout):
-                    response = await self._inner.make_request(method, params)
+            failures: list[Exception] = []
+            for way in self._ways[:1] if method == SEND else self._ways:
+                try:
+                    return _checked(method, await self._ask(way, method, params))
+                except AiraError:
+                    raise
+                except CONNECTION_ERRORS as error:
+                    failures.append(error)
+                    self._turn_from(way)
+                    why = _why(error) if len(self._ways) == 1 else f"{way.endpoint}: {_why(error)}"
+            if attempt == attempts or not any(_is_transient(failure) for failure in failures):
                 break
-            except AiraError:
-                raise
-            except CONNECTION_ERRORS as error:
-                if attempt == attempts or not _is_transient(error):
-                    raise NodeUnreachable(self.endpoint, _why(error)) from error
-                log.debug("%s: %s failed (%s); trying again in %.2f s", self.endpoint, method, _why(error), delay)
+            log.debug("%s failed (%s); trying again in %.2f s", method, why, delay)
             await asyncio.sleep(delay)
             delay *= 2
-        return self._checked(method, response)
+        raise NodeUnreachable(self.endpoint, why) from failures[-1]
+
+    async def _ask(self, way: Way, method: RPCEndpoint, params: Any) -> dict[str, Any]:
+        """What a node answers. Raises `CONNECTION_ERRORS`."""
+        async with asyncio.timeout(self._timing.request_timeout):
+            if not way.is_on_chain and len(self._ways) > 1:
+                await self._check_chain(way)
+            response: Any = await way.provider.make_request(method, params)
+        if not isinstance(response, dict) or ("result" not in response and "error" not in response):
+            raise NotJsonRpc("what answers is not a JSON-RPC server")
+        return response
+
+    async def _check_chain(self, way: Way) -> None:
+        response: Any = await way.provider.make_request("eth_chainId", [])  # type: ignore[arg-type]
+        found = response.get("result") if isinstance(response, dict) else None
+        if self._chain_id is None:
+            self._chain_id = found
+        if found is None or found != self._chain_id:
+            raise NotJsonRpc(f"it is on the chain {found}, the others are on {self._chain_id}")
+        way.is_on_chain = True
+
+    def _turn_from(self, way: Way) -> None:
+        """Ask another node first from now on; the one that failed comes last."""
+        if len(self._ways) > 1 and self._ways[0] is way:
+            self._ways = (*self._ways[1:], way)
+            log.warning("the node %s does not answer; turning to %s", way.endpoint, self._ways[0].endpoint)
 
     async def is_connected(self, show_traceback: bool = False) -> bool:
-        """Whether the node answers."""
+        """Whether a node answers."""
         try:
-            await self._inner.make_request("web3_clientVersion", [])  # type: ignore[arg-type]
-        except (AiraError, *CONNECTION_ERRORS):
+            await self.make_request("web3_clientVersion", [])  # type: ignore[arg-type]
+        except AiraError:
             return False
         return True
 
     async def close(self) -> None:
-        """Close the connection, if this side opened it; further requests raise `ClosedError`."""
+        """Close the connections that this side opened; further requests raise `ClosedError`."""
         self._is_open = False
-        if self._owned is not None:
-            await self._owned.close()
-
-    def _checked(self, method: str, response: Any) -> RPCResponse:
-        """The response, unless it is an error or nothing that a node would say."""
-        if not isinstance(response, dict) or ("result" not in response and "error" not in response):
-            raise NodeUnreachable(self.endpoint, "what answers is not a JSON-RPC server")
-        error = response.get("error")
-        if error is None:
-            return response  # type: ignore[return-value]
-        if not isinstance(error, dict):
-            raise RequestRefused(method, 0, str(error))
-        reverted = decode_revert(error)
-        if reverted is not None:
-            raise reverted
-        raise RequestRefused(method, int(error.get("code", 0)), str(error.get("message", "")))
+        for way in self._ways:
+            if way.owned is not None:
+                await way.owned.close()
 
 
-def open_provider(endpoint: str | AsyncBaseProvider, timing: Timing) -> ReliableProvider:
-    """The provider of an endpoint: `http(s)://…`, `ws(s)://…`, or a provider object.
+def open_provider(endpoint: Endpoint, timing: Timing) -> ReliableProvider:
+    """The provider of an endpoint: `http(s)://…`, `ws(s)://…`, several of them, or a provider object.
 
-    Nothing is connected yet. Raises `ConfigurationError` for any other text.
+    Several are a sequence, or one text with commas. Nothing is connected yet. Raises `ConfigurationError` for any
+    other text.
     """
-    if not isinstance(endpoint, str):
-        return ReliableProvider(endpoint, endpoint=str(endpoint), timing=timing)
+    if isinstance(endpoint, AsyncBaseProvider):
+        return ReliableProvider([Way(endpoint, endpoint=str(endpoint))], timing=timing)
+    texts = [endpoint] if isinstance(endpoint, str) else endpoint
+    urls = [url.strip() for text in texts for url in text.split(",")] or [""]
+    return ReliableProvider([_way(url) for url in urls], timing=timing)
+
+
+def _way(url: str) -> Way:
     transport: Transport
-    if endpoint.startswith(("http://", "https://")):
-        transport = HttpTransport(endpoint)
-    elif endpoint.startswith(("ws://", "wss://")):
-        transport = WebSocketTransport(endpoint)
+    if url.startswith(("http://", "https://")):
+        transport = HttpTransport(url)
+    elif url.startswith(("ws://", "wss://")):
+        transport = WebSocketTransport(url)
     else:
         raise ConfigurationError(
-            f"{endpoint!r} is not the address of a node",
-            hint="an address begins with http://, https://, ws:// or wss://",
+            f"{url!r} is not the address of a node",
+            hint="an address begins with http://, https://, ws:// or wss://; several are separated by commas",
         )
-    return ReliableProvider(transport, endpoint=endpoint, timing=timing, owned=transport)
+    return Way(transport, endpoint=url, owned=transport)
+
+
+def _checked(method: str, response: dict[str, Any]) -> RPCResponse:
+    """The response, unless it is an error."""
+    error = response.get("error")
+    if error is None:
+        return response  # type: ignore[return-value]
+    if not isinstance(error, dict):
+        raise RequestRefused(method, 0, str(error))
+    reverted = decode_revert(error)
+    if reverted is not None:
+        raise reverted
+    raise RequestRefused(method, int(error.get("code", 0)), str(error.get("message", "")))
 
 
 def _is_transient(error: Exception) -> bool:
@@ -144,6 +196,6 @@ def _why(error: Exception) -> str:
             return "no answer in time"
         case OSError() if error.strerror:
             return error.strerror
-        case ValueError():
+        case ValueError() if not isinstance(error, NotJsonRpc):
             return "the answer is not JSON"
     return str(error) or type(error).__name__

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 from web3.exceptions import BlockNotFound
 
 from mesh.chain.errors import ChainWentBack, NodeUnreachable, ReorganisedTooDeep, RequestRefused
-from mesh.chain.events import ChainEvent, NewLighthouse, decode_log, topics_of
+from mesh.chain.events import ChainEvent, NewLiability, NewLighthouse, decode_log, topics_of
 from mesh.chain.history import History, Remembered
 from schemas.address import parse_address
 
@@ -63,6 +63,8 @@ class Sources:
     xrt: str
     lighthouses: tuple[str, ...] = ()
     is_liability: Callable[[str], Awaitable[bool]]
+    recognise: Callable[[str], None]
+    """Told of each liability that the factory's events name, before `is_liability` is asked of what comes with it."""
 
 
 class Head(NamedTuple):
@@ -152,6 +154,9 @@ async def read_range(node: Node, sources: Sources, *, first: int, last: int) -> 
     """
     addresses = [sources.factory, sources.xrt, *sources.lighthouses]
     ours = await _logs(node, first, last, addresses=addresses, topics=topics_of("Factory", "XRT", "Lighthouse"))
+    for log in ours:
+        if isinstance(event := decode_log(log), NewLiability) and parse_address(log["address"]) == sources.factory:
+            sources.recognise(event.liability)
     finals = await _logs(node, first, last, addresses=(), topics=topics_of("Liability"))
     finals = [log for log in finals if await sources.is_liability(parse_address(log["address"]))]
     logs = sorted((*ours, *finals), key=lambda log: (log["blockNumber"], log["logIndex"]))

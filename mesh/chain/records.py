@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from mesh.chain.errors import NotALiability
-from schemas.address import parse_address
+from schemas.address import ZERO_ADDRESS, parse_address
 from schemas.cid import format_cid
 from schemas.liability import Liability
 
 if TYPE_CHECKING:
     from mesh.chain.node import Node
+    from mesh.chain.suites import Members
 
 LIABILITY_GETTERS = (
     "model",
@@ -28,7 +28,6 @@ LIABILITY_GETTERS = (
     "isSuccess",
     "isFinalized",
 )
-LIGHTHOUSE_GETTERS = ("minimalStake", "timeoutInBlocks", "keepAliveBlock", "quota", "current")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,13 +67,8 @@ class Settled:
     gas_used: int
 
 
-async def read_liability(node: Node, factory: str, address: str) -> Liability:
-    """A liability's terms and outcome, as of one block.
-
-    Raises `NotALiability` unless the factory recognises it, `NodeUnreachable`.
-    """
-    if not await is_liability(node, factory, address):
-        raise NotALiability(address)
+async def read_liability(node: Node, address: str) -> Liability:
+    """The terms and the outcome of what is known to be a liability, as of one block. Raises `NodeUnreachable`."""
     block = await node.block_number()
     functions = node.contract("Liability", address).functions
     values = await node.read_all((functions[getter]() for getter in LIABILITY_GETTERS), block=block)
@@ -97,26 +91,27 @@ async def read_liability(node: Node, factory: str, address: str) -> Liability:
     )
 
 
-async def is_liability(node: Node, factory: str, address: str) -> bool:
-    """Whether the factory made the contract at `address`. Raises `NodeUnreachable`."""
-    return bool(await node.read(node.contract("Factory", factory).functions.isLiability(address)))
+async def lighthouse_state(node: Node, address: str, names: Members, *, current: str) -> LighthouseState:
+    """The state of a lighthouse, as of one block. Raises `NoContracts` if there is none, `NodeUnreachable`.
 
-
-async def read_lighthouse(node: Node, address: str) -> LighthouseState:
-    """The state of a lighthouse, as of one block. Raises `NoContracts` if there is none, `NodeUnreachable`."""
+    `current` is the getter of whose turn it is: of the provider's address, or of its place (`marker`).
+    """
     block = await node.block_number()
     functions = node.contract("Lighthouse", address).functions
-    count = await node.read(functions.providersLength(), block=block)
-    found = await node.read_all((functions.providers(index) for index in range(count)), block=block)
-    stakes = await node.read_all((functions.stakes(provider) for provider in found), block=block)
-    values = await node.read_all((functions[getter]() for getter in LIGHTHOUSE_GETTERS), block=block)
-    minimal_stake, timeout_blocks, keep_alive_block, quota, current = values
+    count = await node.read(functions[names.length](), block=block)
+    found = await node.read_all((functions[names.at](index) for index in range(count)), block=block)
+    stakes = await node.read_all((functions[names.stake](provider) for provider in found), block=block)
+    getters = (names.minimal_stake, names.timeout_blocks, names.keep_alive_block, "quota", current)
+    values = await node.read_all((functions[getter]() for getter in getters), block=block)
+    minimal_stake, timeout_blocks, keep_alive_block, quota, whose = values
+    if current == "marker":
+        whose = found[(whose - names.first) % count] if count else ZERO_ADDRESS
     return LighthouseState(
         address=address,
         minimal_stake=minimal_stake,
         timeout_blocks=timeout_blocks,
         keep_alive_block=keep_alive_block,
         quota=quota,
-        current=parse_address(current),
+        current=parse_address(whose),
         stakes={parse_address(provider): stake for provider, stake in zip(found, stakes, strict=True)},
     )

@@ -21,6 +21,15 @@ class Timing:
     receipt_timeout: float = 180.0
     """Until a sent transaction is given up as not mined."""
 
+    confirmations: int = 1
+    """Blocks, not seconds: how many a transaction needs, its own included, to count as mined."""
+
+    replace_after: float = 30.0
+    """Until a transaction that is not mined is sent again with higher fees; and again after as long."""
+
+    repeat_within: float = 600.0
+    """How long after a transaction whose outcome was not learned sending the same again means that one, if mined."""
+
     request_timeout: float = 15.0
     """For one answer of the node."""
 
@@ -34,5 +43,6 @@ class Timing:
     """Blocks, not seconds: how far behind the head a reader of events notices that blocks were replaced."""
 
     def __post_init__(self) -> None:
-        if self.attempts < 1 or self.request_timeout <= 0 or min(self.poll_interval, self.receipt_interval) <= 0:
-            raise ConfigurationError("intervals and timeouts are above zero, and a request is made at least once")
+        intervals = (self.poll_interval, self.receipt_interval, self.replace_after, self.request_timeout)
+        if min(self.attempts, self.confirmations, self.reorg_depth) < 1 or min(intervals) <= 0:
+            raise ConfigurationError("intervals and timeouts are above zero, and attempts and blocks one at least")

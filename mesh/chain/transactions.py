@@ -6,21 +6,27 @@ the simulation, and raises `Reverted`.
 
 from __future__ import annotations
 
-import asyncio
+import itertools
 import logging
-from contextlib import asynccontextmanager
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from web3.exceptions import TransactionNotFound
-
-from mesh.chain.errors import InsufficientFunds, NodeUnreachable, RequestRefused, Reverted, TransactionTimeout
+from mesh.chain.errors import InsufficientFunds, NodeUnreachable, RequestRefused, Reverted
+from mesh.chain.outbox import Outbox, Pending, effect_of
+from mesh.chain.submission import (
+    count_all,
+    count_mined,
+    find_receipt,
+    is_known,
+    is_number_taken,
+    is_waiting_elsewhere,
+    submit,
+)
+from mesh.chain.watching import NumberLost, Watch
 from schemas.address import parse_address
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from hexbytes import HexBytes
     from web3.contract.async_contract import AsyncContractFunction
     from web3.types import TxParams, TxReceipt
 
@@ -35,18 +41,6 @@ GAS_MARGIN_PERCENT: Final = 20
 NONCE_ATTEMPTS: Final = 25
 """How often a number that another client took meanwhile is replaced."""
 
-NUMBER_TAKEN: Final = (
-    "nonce too low",
-    "nonce too high",
-    "underpriced",
-    "already known",
-    "known transaction",
-    "already imported",
-    "alreadyknown",
-    "oldnonce",
-)
-"""Words of geth, anvil, nethermind, erigon and the embedded chain for a number that is another transaction's."""
-
 
 @dataclass(frozen=True, slots=True)
 class Receipt:
@@ -59,32 +53,22 @@ class Receipt:
     logs: tuple[Any, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Fees:
-    """Prices of a unit of gas, in wei (EIP-1559), or the one price of a chain without a base fee."""
-
-    maximum: int
-    priority: int | None
-
-    def fields(self) -> dict[str, int]:
-        """The transaction's fields."""
-        if self.priority is None:
-            return {"gasPrice": self.maximum}
-        return {"type": 2, "maxFeePerGas": self.maximum, "maxPriorityFeePerGas": self.priority}
-
-
 class Sender:
     """Sends transactions of one account; safe to use from many tasks of one event loop at once.
 
-    Transactions of one account through one node are numbered one after another under a lock. Other clients of the
-    same account get in each other's way, but not lost on a node that refuses a number twice. Cancelling `send` after
-    the transaction went out does not take it back.
+    Transactions of one account through one node are numbered one after another under a lock; with the node's journal,
+    so are those of all processes that share it. Without, other clients of the account get in each other's way, but
+    not lost.
+
+    A transaction whose outcome was not learned - its sender lost the node, gave up waiting or was cancelled, or its
+    process ended, where there is a journal - is kept. Sending the same again (to the same, with the same data and
+    value) takes it up instead of making a second one, as long as it is not mined, or not for longer than
+    `Timing.repeat_within`. One that the node has forgotten meanwhile gives its number to the next.
     """
 
     def __init__(self, node: Node, account: Account) -> None:
         self.account = account
         self._node = node
-        self._numbering = node.numbering(account.address)
 
     async def call(self, function: AsyncContractFunction) -> Receipt:
         """Send a call of a contract's function, and wait until it is mined. Raises as `send` does."""
@@ -93,102 +77,106 @@ class Sender:
     async def send(self, *, to: str | None, data: bytes, value: int = 0) -> Receipt:
         """Send `data` and `value` (wei) to an address, or deploy `data` where `to` is None; wait until it is mined.
 
-        Raises `Reverted` (before anything is sent, or once it is mined and failed), `InsufficientFunds`,
-        `TransactionTimeout`, `NodeUnreachable`, `RequestRefused`.
+        Raises `Reverted` (before anything is sent, or once it is mined and failed), `InsufficientFunds`, `FeeTooHigh`
+        (nothing was sent), `TransactionTimeout`, `NodeUnreachable`, `RequestRefused`.
         """
-        fields: dict[str, Any] = {"from": self.account.address, "data": "0x" + data.hex(), "value": value}
-        if to is not None:
-            fields["to"] = to
+        outbox = self._node.outbox(self.account.address)
+        fields: dict[str, Any] = {"to": to or b"", "data": "0x" + data.hex(), "value": value}
+        while True:
+            entry = await self._taken_up(outbox, fields) or await self._sent(outbox, fields)
+            try:
+                signed, receipt = await Watch(self._node, self.account, outbox, entry).mined()
+                await outbox.forget(entry)
+            except NumberLost:
+                log.info("the number %d was another transaction's; sending with the next", entry.nonce)
+                await outbox.forget(entry)
+                continue
+            finally:
+                outbox.abandon(entry)
+            if receipt["status"] != 1:
+                raise await self._why_failed(entry.fields, receipt)
+            return _receipt(signed, receipt)
+
+    async def _taken_up(self, outbox: Outbox, fields: dict[str, Any]) -> Pending | None:
+        """The transaction that was sent before to the same effect, and that nobody watches; None if there is none."""
+        async with outbox.lock:
+            await outbox.refresh()
+            if not outbox.abandoned:
+                return None
+            mined = await count_mined(self._node, self.account.address)
+            for entry in outbox.abandoned:
+                if entry.nonce < mined and entry.sent_at + self._node.timing.repeat_within < time.time():
+                    await outbox.forget(entry)
+                elif entry.effect == effect_of(fields) and await self._is_alive(entry) and await outbox.take_up(entry):
+                    log.info("the transaction %s was sent before; waiting for it", entry.versions[-1].hash)
+                    return entry
+        return None
+
+    async def _is_alive(self, entry: Pending) -> bool:
+        """Whether a transaction is mined or can be, once the node has it (again)."""
+        if await find_receipt(self._node, reversed(entry.versions)) is not None:
+            return True
+        try:
+            await submit(self._node, entry.versions[-1])
+        except RequestRefused:
+            return await is_known(self._node, entry.versions)
+        return True
+
+    async def _sent(self, outbox: Outbox, fields: dict[str, Any]) -> Pending:
+        """The transaction, simulated, priced and sent."""
         gas = await self._estimate(fields)
         limit = gas + gas * GAS_MARGIN_PERCENT // 100
-        fees = await self._fees()
-        async with self._sent(fields | fees.fields() | {"gas": limit, "chainId": self._node.chain_id}) as signed:
-            receipt = await self._mined(signed)
-        if receipt["status"] != 1:
-            raise await self._why_failed(fields, receipt, limit)
-        return _receipt(signed, receipt)
+        fees = await self._node.fees.fees(self._node)
+        complete = fields | fees.fields() | {"gas": limit, "chainId": self._node.chain_id}
+        async with outbox.lock:
+            return await self._send_numbered(outbox, complete)
 
     async def _estimate(self, fields: dict[str, Any]) -> int:
         """Gas in the state that the account's own pending transactions leave."""
         try:
-            return int(await self._node.web3.eth.estimate_gas(cast("TxParams", fields), "pending"))
+            return int(await self._node.web3.eth.estimate_gas(self._call(fields), "pending"))
         except RequestRefused as refused:
             await self._raise_if_poor(fields, refused)
             raise
 
-    async def _fees(self) -> Fees:
-        eth = self._node.web3.eth
-        base = (await eth.get_block("latest")).get("baseFeePerGas")
-        if base is None:
-            return Fees(maximum=int(await eth.gas_price), priority=None)
-        priority = int(await eth.max_priority_fee)
-        return Fees(maximum=2 * int(base) + priority, priority=priority)
-
-    @asynccontextmanager
-    async def _sent(self, fields: dict[str, Any]) -> AsyncIterator[SignedTransaction]:
-        """The transaction, sent; its number counts as taken inside the block."""
-        async with self._numbering.lock:
-            nonce, signed = await self._send_numbered({**fields, "to": fields.get("to", b"")})
-            self._numbering.in_flight.add(nonce)
-        try:
-            yield signed
-        finally:
-            self._numbering.in_flight.discard(nonce)
-
-    async def _send_numbered(self, fields: dict[str, Any]) -> tuple[int, SignedTransaction]:
+    async def _send_numbered(self, outbox: Outbox, fields: dict[str, Any]) -> Pending:
         """Sign with the next number and send; again where another client was faster."""
-        unsigned = {name: value for name, value in fields.items() if name != "from"}
-        attempt = 1
-        while True:
-            nonce = await self._next_nonce()
-            signed = self.account.sign_transaction(unsigned | {"nonce": nonce})
+        refused_numbers: set[int] = set()
+        for attempt in range(1, NONCE_ATTEMPTS + 1):
+            nonce = await self._next_nonce(outbox, refused_numbers)
+            signed = self.account.sign_transaction(fields | {"nonce": nonce})
+            entry = Pending(nonce=nonce, fields=fields, versions=[signed])
+            if not await outbox.add(entry):
+                continue
             try:
-                await self._submit(signed)
+                await submit(self._node, signed)
             except RequestRefused as refused:
+                await outbox.forget(entry)
                 await self._raise_if_poor(fields, refused)
-                if attempt == NONCE_ATTEMPTS or not any(word in refused.detail.lower() for word in NUMBER_TAKEN):
+                if attempt == NONCE_ATTEMPTS or not is_number_taken(refused):
                     raise
+                if is_waiting_elsewhere(refused):
+                    refused_numbers.add(nonce)
                 log.debug("%s: the number %d was taken; trying the next", self.account.address, nonce)
-                attempt += 1
-            else:
-                return nonce, signed
-
-    async def _submit(self, signed: SignedTransaction) -> None:
-        """Give the transaction to the node, again where the connection fails.
-
-        Once an attempt may have arrived, a refusal of the next can mean just that.
-        """
-        timing = self._node.timing
-        delay, may_have_arrived = timing.retry_delay, False
-        for attempt in range(1, timing.attempts + 1):
-            try:
-                await self._node.web3.eth.send_raw_transaction(signed.raw)
-            except NodeUnreachable:
-                if attempt == timing.attempts:
-                    raise
-                may_have_arrived = True
-                await asyncio.sleep(delay)
-                delay *= 2
-            except RequestRefused:
-                if may_have_arrived and await self._is_known(signed):
-                    return
+            except BaseException:
+                # It may have arrived.
+                outbox.abandon(entry)
                 raise
             else:
-                return
+                return entry
+        raise NodeUnreachable(self._node.endpoint, "other clients of the account take all its numbers")
 
-    async def _next_nonce(self) -> int:
-        address = self._node.checksum(self.account.address)
-        counted = int(await self._node.web3.eth.get_transaction_count(address, "pending"))
+    async def _next_nonce(self, outbox: Outbox, refused: set[int]) -> int:
+        """The first number that no transaction has, of those that the node knows and of those sent by us."""
+        await outbox.refresh()
+        counted = await count_all(self._node, self.account.address)
         # A node behind a balancer may not have heard of what was just sent through another.
-        return max(counted, 0, *(nonce + 1 for nonce in self._numbering.in_flight))
+        left = [entry.nonce for entry in outbox.abandoned if await self._is_waiting(entry, counted)]
+        taken = {*outbox.taken, *left, *refused}
+        return next(number for number in itertools.count(counted) if number not in taken)
 
-    async def _is_known(self, signed: SignedTransaction) -> bool:
-        """Whether the node has the transaction after all: its first answer was lost, and this was another attempt."""
-        try:
-            await self._node.web3.eth.get_transaction(_hash(signed))
-        except (TransactionNotFound, RequestRefused):
-            return False
-        return True
+    async def _is_waiting(self, entry: Pending, counted: int) -> bool:
+        return entry.nonce >= counted and await is_known(self._node, entry.versions)
 
     async def _raise_if_poor(self, fields: dict[str, Any], refused: RequestRefused) -> None:
         balance = await self._node.eth_balance(self.account.address)
@@ -196,34 +184,20 @@ class Sender:
         if balance < needed:
             raise InsufficientFunds(self.account.address, balance=balance, needed=needed) from refused
 
-    async def _mined(self, signed: SignedTransaction) -> TxReceipt:
-        """The receipt, looked for until it is there."""
-        timing = self._node.timing
-        pause = min(timing.receipt_interval, timing.poll_interval)
-        try:
-            async with asyncio.timeout(timing.receipt_timeout):
-                while True:
-                    try:
-                        return await self._node.web3.eth.get_transaction_receipt(_hash(signed))
-                    except TransactionNotFound:
-                        await asyncio.sleep(pause)
-                        pause = min(pause * 1.5, timing.poll_interval)
-        except TimeoutError:
-            raise TransactionTimeout(signed.hash, timing.receipt_timeout) from None
-
-    async def _why_failed(self, fields: dict[str, Any], receipt: TxReceipt, limit: int) -> Reverted:
+    async def _why_failed(self, fields: dict[str, Any], receipt: TxReceipt) -> Reverted:
         """Why a mined transaction failed though its simulation went through: asked of the state after its block."""
         try:
-            await self._node.web3.eth.call(cast("TxParams", fields), receipt["blockNumber"])
+            await self._node.web3.eth.call(self._call(fields), receipt["blockNumber"])
         except Reverted as reverted:
             return reverted
         except RequestRefused as refused:
             return Reverted(refused.detail)
-        return Reverted("OutOfGas" if receipt["gasUsed"] >= limit else "")
+        return Reverted("OutOfGas" if receipt["gasUsed"] >= fields["gas"] else "")
 
-
-def _hash(signed: SignedTransaction) -> HexBytes:
-    return cast("HexBytes", signed.hash)
+    def _call(self, fields: dict[str, Any]) -> TxParams:
+        """The same as a call, without prices: a simulation is not paid for."""
+        call = {"from": self.account.address, "data": fields["data"], "value": fields["value"]}
+        return cast("TxParams", call | ({"to": fields["to"]} if fields["to"] else {}))
 
 
 def _receipt(signed: SignedTransaction, receipt: TxReceipt) -> Receipt:

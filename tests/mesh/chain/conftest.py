@@ -5,6 +5,8 @@ One chain serves all tests of a module; tests make orders of their own and compa
 
 from __future__ import annotations
 
+import asyncio
+from contextlib import aclosing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -18,10 +20,12 @@ from schemas.messages import Demand, Offer, Result
 from tests.support.nodes import Anvil
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Iterable
 
     import pytest
     from web3.providers.async_base import AsyncBaseProvider
+
+    from mesh.chain import BlockEvents, ChainEvent
 
 QUICK = Timing(poll_interval=0.02, receipt_interval=0.01, attempts=2, retry_delay=0.01, receipt_timeout=30)
 PLAN = DeploymentPlan(refund_delay=10, timeout_blocks=5)
@@ -102,6 +106,21 @@ async def prepare(endpoint: str | AsyncBaseProvider, keys: tuple[bytes, ...]) ->
         async with Chain(node, account=provider) as chain:
             await chain.refill(market.deployment.lighthouse, 500 * XRT)
     return market
+
+
+async def read_to(chain: Chain, first: int, last: int, *, lighthouses: Iterable[str] = ()) -> list[BlockEvents]:
+    """What is told of the blocks from `first` to `last`."""
+    blocks: list[BlockEvents] = []
+    async with asyncio.timeout(10), aclosing(chain.events(first, lighthouses=lighthouses)) as events:
+        async for block in events:
+            blocks.append(block)
+            if block.block_number >= last:
+                break
+    return blocks
+
+
+def events_of(blocks: list[BlockEvents]) -> list[ChainEvent]:
+    return [event for block in blocks for event in block.events]
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module", params=["embedded", "anvil"])

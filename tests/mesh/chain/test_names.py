@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from mesh.chain import Account, Chain, EmbeddedChain, InvalidName, Sender, UnknownName, deploy, namehash
@@ -62,7 +64,7 @@ async def test_a_model_is_a_cid_or_a_name_of_one() -> None:
     async with EmbeddedChain() as node:
         account = Account.from_key(node.funded_keys[0])
         deployment = await deploy(node.provider, account)
-        places = {"factory": deployment.factory, "xrt": deployment.xrt}
+        places: dict[str, Any] = {"factory": deployment.factory, "xrt": deployment.xrt}
         async with Chain(node.provider, account=account, timing=QUICK, **places) as chain:
             assert await chain.resolve_model(cid(1)) == cid(1)
             with pytest.raises(InvalidCid):

@@ -182,3 +182,56 @@ async def test_a_closed_embedded_chain_is_told_as_closed() -> None:
         await chain.__aexit__(None, None, None)
         with pytest.raises(ClosedError, match="embedded"):
             await node.block_number()
+
+
+@pytest.mark.parametrize("scheme", ["http", "ws"])
+async def test_of_several_nodes_the_next_is_asked_when_one_goes(scheme: str) -> None:
+    async with Anvil() as first, Anvil() as second:
+        urls = [anvil.url if scheme == "http" else anvil.ws_url for anvil in (first, second)]
+        async with Node(urls, timing=replace(QUICK, attempts=1)) as node:
+            await node.web3.provider.make_request("evm_mine", [])
+            assert await node.block_number() == 1
+            await asyncio.to_thread(first.kill)
+            assert await asyncio.gather(*(node.block_number() for _ in range(5))) == [0] * 5
+            await asyncio.to_thread(first.start)
+            await asyncio.to_thread(second.kill)
+            assert await node.block_number() == 0
+            await asyncio.to_thread(first.kill)
+            with pytest.raises(NodeUnreachable) as caught:
+                await node.block_number()
+    assert caught.value.endpoint == ", ".join(urls)
+
+
+async def test_a_frozen_node_is_passed_over_once_and_not_asked_first_again() -> None:
+    async with Anvil() as frozen, Anvil() as other:
+        timing = replace(QUICK, request_timeout=1)
+        async with Node(f"{frozen.url}, {other.url}", timing=timing) as node:
+            await asyncio.to_thread(frozen.pause)
+            # The signal may take a moment, and the first request still be answered.
+            started = time.monotonic()
+            for _ in range(5):
+                await node.block_number()
+            assert timing.request_timeout <= time.monotonic() - started < 2 * timing.request_timeout
+            await asyncio.to_thread(frozen.resume)
+
+
+async def test_a_node_that_is_not_there_at_the_start_is_passed_over() -> None:
+    async with Anvil() as anvil, Node(f"http://127.0.0.1:{free_port()},{anvil.url}", timing=QUICK) as node:
+        assert node.chain_id == 31337
+
+
+async def test_a_node_of_another_chain_is_not_taken_for_one_of_this() -> None:
+    async with (
+        Anvil() as anvil,
+        Anvil(arguments=("--chain-id", "4")) as other,
+        Node((anvil.url, other.url), timing=replace(QUICK, attempts=1)) as node,
+    ):
+        await asyncio.to_thread(anvil.kill)
+        with pytest.raises(NodeUnreachable, match=f"{other.url}: it is on the chain 0x4, the others are on 0x7a69"):
+            await node.block_number()
+
+
+@pytest.mark.parametrize("endpoint", [(), "http://127.0.0.1:1,", ["http://127.0.0.1:1", "ftp://x"]])
+def test_every_one_of_several_endpoints_is_an_address(endpoint: Any) -> None:
+    with pytest.raises(ConfigurationError, match="not the address of a node"):
+        Node(endpoint)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import aclosing
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -29,32 +28,14 @@ from mesh.chain.embedded import EmbeddedProvider
 from mesh.chain.errors import RequestRefused
 from mesh.chain.jsonrpc import RpcError
 from schemas.address import ZERO_ADDRESS
-from tests.mesh.chain.conftest import QUICK
+from tests.mesh.chain.conftest import QUICK, events_of, read_to
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from web3.types import RPCEndpoint, RPCResponse
 
-    from mesh.chain import ChainEvent
     from tests.mesh.chain.conftest import Market
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
-
-
-async def _read(chain: Chain, first: int, last: int, *, lighthouses: Iterable[str] = ()) -> list[BlockEvents]:
-    """What is told of the blocks from `first` to `last`."""
-    blocks: list[BlockEvents] = []
-    async with asyncio.timeout(10), aclosing(chain.events(first, lighthouses=lighthouses)) as events:
-        async for block in events:
-            blocks.append(block)
-            if block.block_number >= last:
-                break
-    return blocks
-
-
-def _events(blocks: list[BlockEvents]) -> list[ChainEvent]:
-    return [event for block in blocks for event in block.events]
 
 
 async def test_a_job_is_told_from_the_liability_to_the_payment(market: Market) -> None:
@@ -65,7 +46,7 @@ async def test_a_job_is_told_from_the_liability_to_the_payment(market: Market) -
         result = market.result(created.liability)
         settled = await chain.finalize("airalab", result)
         head = await chain.block_number()
-        events = _events(await _read(chain, start + 1, head))
+        events = events_of(await read_to(chain, start + 1, head))
     factory = market.deployment.factory
     assert NewLiability(created.liability, created.tx) in events
     assert Finalized(created.liability, True, result.result, settled.tx) in events
@@ -78,8 +59,8 @@ async def test_a_job_is_told_from_the_liability_to_the_payment(market: Market) -
 async def test_lighthouses_are_told_and_those_asked_for_tell_their_turns(market: Market) -> None:
     async with market.chain() as chain:
         head = await chain.block_number()
-        everything = _events(await _read(chain, 0, head, lighthouses=[market.deployment.lighthouse]))
-        without = _events(await _read(chain, 0, head))
+        everything = events_of(await read_to(chain, 0, head, lighthouses=[market.deployment.lighthouse]))
+        without = events_of(await read_to(chain, 0, head))
     lighthouse, provider = market.deployment.lighthouse, market.provider.address
     assert next(event.name for event in everything if isinstance(event, NewLighthouse)) == "airalab"
     assert [event.provider for event in everything if isinstance(event, Online)] == [provider]
@@ -92,7 +73,7 @@ async def test_an_approval_is_told(market: Market) -> None:
     async with market.chain(market.promisee) as chain:
         tx = await chain.approve(market.stranger.address, 17)
         head = await chain.block_number()
-        assert _events(await _read(chain, head, head)) == [
+        assert events_of(await read_to(chain, head, head)) == [
             Approval(market.promisee.address, market.stranger.address, 17, tx)
         ]
 
@@ -104,15 +85,15 @@ async def test_a_refund_is_told_without_a_result(market: Market) -> None:
             await chain.approve(market.stranger.address, 0)
         settled = await chain.refund(created.liability)
         head = await chain.block_number()
-        events = _events(await _read(chain, head, head))
+        events = events_of(await read_to(chain, head, head))
     assert Finalized(created.liability, False, "", settled.tx) in events
 
 
-async def test_block_numbers_grow_and_the_head_is_told_without_events(market: Market) -> None:
+async def test_block_numbers_grow_and_the_head_is_told_withoutevents_of(market: Market) -> None:
     async with market.chain(market.promisee) as chain:
         await chain.send_eth(market.stranger.address, 1)
         head = await chain.block_number()
-        blocks = await _read(chain, 0, head)
+        blocks = await read_to(chain, 0, head)
     numbers = [block.block_number for block in blocks]
     assert numbers == sorted(set(numbers))
     assert blocks[-1] == BlockEvents(head, ())
@@ -121,21 +102,21 @@ async def test_block_numbers_grow_and_the_head_is_told_without_events(market: Ma
 async def test_reading_goes_on_with_new_blocks_and_a_cursor_takes_it_up(market: Market) -> None:
     async with market.chain(market.promisee) as chain:
         cursor = await chain.block_number() + 1
-        reading = asyncio.create_task(_read(chain, cursor, cursor + 1))
+        reading = asyncio.create_task(read_to(chain, cursor, cursor + 1))
         await chain.approve(market.stranger.address, 1)
         await chain.approve(market.stranger.address, 2)
         live = await reading
-        again = await _read(chain, cursor, cursor + 1)
-        rest = await _read(chain, cursor + 1, cursor + 1)
-    assert _events(live) == _events(again)
-    assert _events(rest) == _events(again)[1:]
+        again = await read_to(chain, cursor, cursor + 1)
+        rest = await read_to(chain, cursor + 1, cursor + 1)
+    assert events_of(live) == events_of(again)
+    assert events_of(rest) == events_of(again)[1:]
 
 
 async def test_a_cursor_past_the_head_means_that_the_chain_went_back(market: Market) -> None:
     async with market.chain() as chain:
         head = await chain.block_number()
         with pytest.raises(ChainWentBack) as caught:
-            await _read(chain, head + 2, head + 2)
+            await read_to(chain, head + 2, head + 2)
     assert (caught.value.cursor, caught.value.head) == (head + 2, head)
 
 
@@ -154,8 +135,8 @@ async def test_a_finalized_event_of_somebody_elses_contract_is_not_told(market: 
         created = await theirs.create_liability(other.lighthouse, market.demand(**elsewhere), market.offer(**elsewhere))
         await theirs.finalize(other.lighthouse, market.result(created.liability))
         head = await theirs.block_number()
-        assert [type(event) for event in _events(await _read(theirs, start + 1, head))][-1] is Finalized
-        assert _events(await _read(ours, start + 1, head)) == []
+        assert [type(event) for event in events_of(await read_to(theirs, start + 1, head))][-1] is Finalized
+        assert events_of(await read_to(ours, start + 1, head)) == []
 
 
 class _Choosy(EmbeddedProvider):
@@ -182,19 +163,19 @@ async def test_a_node_that_refuses_long_ranges_is_asked_for_shorter_ones() -> No
         async with Chain(node.provider, account=deployer, timing=QUICK) as chain:
             for value in range(25):
                 await chain.approve(deployer.address, value)
-            everything = _events(await _read(chain, 0, await chain.block_number()))
+            everything = events_of(await read_to(chain, 0, await chain.block_number()))
         choosy = _Choosy(node, limit=10)
         async with Chain(choosy, timing=QUICK) as chain:
             head = await chain.block_number()
-            blocks = await _read(chain, 0, head)
-        assert _events(blocks) == everything
+            blocks = await read_to(chain, 0, head)
+        assert events_of(blocks) == everything
         assert blocks[-1].block_number == head
         assert min(choosy.ranges) >= 3
 
         choosy.limit = 0
         async with Chain(choosy, timing=QUICK) as chain:
             with pytest.raises(RequestRefused, match="10000 results"):
-                await _read(chain, 0, head)
+                await read_to(chain, 0, head)
 
 
 async def _prepare_lonely(node: EmbeddedChain) -> Account:
@@ -217,7 +198,7 @@ async def test_a_lost_node_ends_the_reading_and_the_cursor_takes_it_up() -> None
                 await waiting
             flaky.is_lost = False
             await node.mine(1)
-            assert (await _read(chain, head + 1, head + 1))[-1] == BlockEvents(head + 1, ())
+            assert (await read_to(chain, head + 1, head + 1))[-1] == BlockEvents(head + 1, ())
 
 
 class _Flaky(EmbeddedProvider):

@@ -1,0 +1,150 @@
+"""Sent transactions on disk: a file for each number of an account, held by the process that waits for it.
+
+A file's name is the number; making it is what reserves the number among all processes of the account. It is locked
+(flock) as long as its process lives and waits, so that what a process left behind can be told from what another one
+is busy with. Each line is one version of the transaction, written before it is sent.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import tempfile
+import time
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Final
+
+from mesh.chain.accounts import SignedTransaction
+from mesh.chain.outbox import Pending
+from mesh.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+    from pathlib import Path
+
+SUFFIX: Final = ".jsonl"
+UNFINISHED: Final = ".new"
+LOCK_ATTEMPTS: Final = 5
+LOCK_PAUSE: Final = 0.01
+"""Seconds between two attempts to lock an entry."""
+
+
+class Hold:
+    """One entry that this process has locked. All of it blocks for the time of a disk write."""
+
+    def __init__(self, path: Path, descriptor: int) -> None:
+        self._path = path
+        self._descriptor = descriptor
+
+    def append(self, entry: Pending) -> None:
+        """Add the entry's newest version."""
+        os.write(self._descriptor, _line(entry))
+        os.fsync(self._descriptor)
+
+    def release(self) -> None:
+        """Leave the entry to whoever takes it up."""
+        os.close(self._descriptor)
+
+    def remove(self) -> None:
+        """End the entry."""
+        self._path.unlink(missing_ok=True)
+        os.close(self._descriptor)
+
+
+class Journal:
+    """The folder of an account's entries on one chain. Raises `ConfigurationError` where it can't be written.
+
+    Not for network file systems, whose locks may not be seen by others.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        try:
+            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        except OSError as error:
+            raise ConfigurationError(f"can't keep sent transactions in {folder}: {error.strerror}") from None
+
+    def add(self, entry: Pending) -> Hold | None:
+        """Make the entry of a number and hold it; None if the number has one."""
+        path = self._path(entry.nonce)
+        descriptor, unfinished = tempfile.mkstemp(suffix=UNFINISHED, dir=self._folder)
+        hold = Hold(path, descriptor)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            hold.append(entry)
+            # The entry is whole and locked before others can see it.
+            os.link(unfinished, path)
+        except FileExistsError:
+            hold.release()
+            return None
+        except BaseException:
+            hold.release()
+            raise
+        finally:
+            os.unlink(unfinished)
+        return hold
+
+    def hold(self, entry: Pending) -> Hold | None:
+        """Hold the entry that a number has; None if there is none, or another process holds it."""
+        path = self._path(entry.nonce)
+        for attempt in range(LOCK_ATTEMPTS):
+            descriptor = _locked(path, fcntl.LOCK_EX)
+            if descriptor is not None:
+                return Hold(path, descriptor)
+            if attempt and not path.exists():
+                break
+            # A reader has it for a moment only.
+            time.sleep(LOCK_PAUSE)
+        return None
+
+    def read(self, mine: Collection[int]) -> tuple[list[Pending], frozenset[int]]:
+        """What nobody holds, and the numbers that other processes hold; `mine` are this one's, and left out."""
+        left, elsewhere = [], set()
+        for path in sorted(self._folder.glob(f"*{SUFFIX}")):
+            nonce = int(path.stem)
+            if nonce in mine:
+                continue
+            descriptor = _locked(path, fcntl.LOCK_SH)
+            if descriptor is not None:
+                left.append(_parse(nonce, path))
+                os.close(descriptor)
+            elif path.exists():
+                elsewhere.add(nonce)
+        return left, frozenset(elsewhere)
+
+    def _path(self, nonce: int) -> Path:
+        return self._folder / f"{nonce:012}{SUFFIX}"
+
+
+def _line(entry: Pending) -> bytes:
+    signed = entry.versions[-1]
+    fields = entry.fields | {"to": entry.fields["to"] or ""}
+    held = {"sentAt": entry.sent_at, "hash": signed.hash, "raw": signed.raw.hex(), "fields": fields}
+    return json.dumps(held).encode() + b"\n"
+
+
+def _parse(nonce: int, path: Path) -> Pending:
+    """The entry in a file. A last line that was cut off was not sent yet; the first one never is."""
+    lines: list[dict[str, Any]] = []
+    with suppress(ValueError):
+        for line in path.read_text(encoding="utf-8").splitlines():
+            lines.append(json.loads(line))
+    fields = lines[-1]["fields"] | {"to": lines[-1]["fields"]["to"] or b""}
+    versions = [SignedTransaction(raw=bytes.fromhex(line["raw"]), hash=line["hash"]) for line in lines]
+    return Pending(nonce=nonce, fields=fields, versions=versions, sent_at=lines[0]["sentAt"], is_watched=False)
+
+
+def _locked(path: Path, how: int) -> int | None:
+    """The opened and locked file; None if there is none, or somebody has it."""
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_APPEND)
+    except FileNotFoundError:
+        return None
+    with suppress(BlockingIOError, FileNotFoundError):
+        fcntl.flock(descriptor, how | fcntl.LOCK_NB)
+        # It may have been ended, and made again, between the opening and the lock.
+        if os.stat(path).st_ino == os.fstat(descriptor).st_ino:
+            return descriptor
+    os.close(descriptor)
+    return None

@@ -1,0 +1,171 @@
+"""Which contracts are on the chain: ours, which serve both generations at once, or the originals of one generation.
+
+They share most functions. Where they differ (how a result is brought, what lighthouses call their members, how a
+liability is recognised), each suite has its own way; the differences are those of the design page "Chain". The
+originals themselves were not at hand: their suites are tested against our contracts, which have both sets of names.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
+
+from mesh.chain.errors import NotOffered
+from mesh.chain.records import LighthouseState, lighthouse_state
+from mesh.errors import ConfigurationError, InvalidMessage
+from schemas.cid import parse_cid
+
+if TYPE_CHECKING:
+    from web3.contract.async_contract import AsyncContractFunction, AsyncContractFunctions
+
+    from mesh.chain.node import Node
+    from schemas.messages import Order, Result
+
+Kind = Literal["mesh", "original"]
+"""Ours, or what was there before."""
+
+AGREE: Final = True
+"""A provider has no opinion of a result: only a validator, who finalizes himself, can disagree."""
+
+
+class Members(NamedTuple):
+    """What a lighthouse calls things, and how its turns are counted."""
+
+    length: str
+    at: str
+    stake: str
+    minimal_stake: str
+    timeout_blocks: str
+    keep_alive_block: str
+    first: int
+    """The marker of the first member."""
+
+
+NAMES: Final = {
+    3: Members("membersLength", "members", "balances", "minimalFreeze", "timeoutBlocks", "keepaliveBlock", first=0),
+    5: Members("providersLength", "providers", "stakes", "minimalStake", "timeoutInBlocks", "keepAliveBlock", first=1),
+}
+GAS_OF: Final = {3: "gasUtilizing", 5: "gasConsumedOf"}
+
+
+class Suite:
+    """Our own contracts. `factory` is the address of the factory; `generation` names the root of its names."""
+
+    def __init__(self, node: Node, factory: str, generation: int) -> None:
+        self.generation = generation
+        self._node = node
+        self._factory = node.contract("Factory", factory).functions
+        self._liabilities: set[str] = set()
+
+    def check_order(self, order: Order) -> None:
+        """Raise `InvalidMessage` for an order that the contracts can't read."""
+
+    def finalization(self, lighthouse: AsyncContractFunctions, result: Result) -> AsyncContractFunction:
+        """The call by which a provider brings a result."""
+        return lighthouse.finalizeLiability(result.liability, *result_arguments(result))
+
+    def validation(self, result: Result, *, agree: bool) -> AsyncContractFunction:
+        """The call by which a generation-3 validator finalizes. Raises `NotOffered`."""
+        call: AsyncContractFunction = self._liability(result.liability).finalize(*result_arguments(result), agree)
+        return call
+
+    def refund(self, liability: str) -> AsyncContractFunction:
+        """The call that pays a promisee back. Raises `NotOffered`."""
+        return self._factory.refund(liability)
+
+    async def refundable_from(self, liability: str) -> int:
+        """The block from which that can be had. Raises `NotOffered`."""
+        return int(await self._node.read(self._liability(liability).refundableFrom()))
+
+    async def nonce_of(self, address: str) -> int:
+        """The nonce of an account's next generation-5 order. Raises `NotOffered`."""
+        return int(await self._node.read(self._factory.nonceOf(address)))
+
+    def recognise(self, liability: str) -> None:
+        """Take an address for a liability: the factory said so in an event."""
+        self._liabilities.add(liability)
+
+    async def is_liability(self, address: str) -> bool:
+        """Whether the factory made the contract at an address."""
+        if address not in self._liabilities and await self._asked_is_liability(address):
+            self._liabilities.add(address)
+        return address in self._liabilities
+
+    async def state(self, lighthouse: str) -> LighthouseState:
+        """The state of a lighthouse, as of one block. Raises `NoContracts` if there is none."""
+        return await lighthouse_state(self._node, lighthouse, NAMES[5], current="current")
+
+    async def is_turn(self, lighthouse: str, provider: str) -> bool:
+        """Whether a provider may send in the next block."""
+        functions = self._node.contract("Lighthouse", lighthouse).functions
+        return bool(await self._node.read(functions.isTurnOf(provider), block="pending"))
+
+    async def _asked_is_liability(self, address: str) -> bool:
+        return bool(await self._node.read(self._factory.isLiability(address)))
+
+    def _liability(self, address: str) -> Any:
+        return self._node.contract("Liability", address).functions
+
+
+class OriginalSuite(Suite):
+    """The original contracts of one generation, which understand the orders of that generation only.
+
+    They give no reasons when they refuse, pay nobody back, and don't say whose liability a contract is: recognised
+    are those that an event of the factory told of, and those whose gas the factory has counted.
+    """
+
+    def check_order(self, order: Order) -> None:
+        if order.generation != self.generation:
+            raise InvalidMessage(
+                reason="generation",
+                detail=f"the contracts are of generation {self.generation}, the order of {order.generation}",
+            )
+
+    def finalization(self, lighthouse: AsyncContractFunctions, result: Result) -> AsyncContractFunction:
+        if self.generation == 5:
+            return super().finalization(lighthouse, result)
+        call = super().validation(result, agree=AGREE)
+        return lighthouse.to(result.liability, bytes.fromhex(call._encode_transaction_data()[2:]))
+
+    def validation(self, result: Result, *, agree: bool) -> AsyncContractFunction:
+        if self.generation == 5:
+            raise NotOffered("finalization by a validator's own account", self.generation)
+        return super().validation(result, agree=agree)
+
+    def refund(self, liability: str) -> AsyncContractFunction:
+        raise NotOffered("refund", self.generation)
+
+    async def refundable_from(self, liability: str) -> int:
+        raise NotOffered("refund", self.generation)
+
+    async def nonce_of(self, address: str) -> int:
+        if self.generation == 3:
+            raise NotOffered("nonceOf", self.generation)
+        return await super().nonce_of(address)
+
+    async def state(self, lighthouse: str) -> LighthouseState:
+        return await lighthouse_state(self._node, lighthouse, NAMES[self.generation], current="marker")
+
+    async def is_turn(self, lighthouse: str, provider: str) -> bool:
+        """By the rule of the originals: who the marker is at, and anybody after a timeout of silence."""
+        state = await self.state(lighthouse)
+        silence = await self._node.block_number() + 1 - state.keep_alive_block
+        return provider in state.stakes and (provider == state.current or silence > state.timeout_blocks)
+
+    async def _asked_is_liability(self, address: str) -> bool:
+        gas_of = self._factory[GAS_OF[self.generation]]
+        return int(await self._node.read(gas_of(address))) > 0
+
+
+def open_suite(kind: Kind, node: Node, factory: str, generation: int) -> Suite:
+    """The suite of a kind. Raises `ConfigurationError`."""
+    if generation not in NAMES or kind not in ("mesh", "original"):
+        raise ConfigurationError(
+            f"there are no {kind} contracts of generation {generation}",
+            hint='contracts are "mesh" or "original", generations 3 or 5',
+        )
+    return (OriginalSuite if kind == "original" else Suite)(node, factory, generation)
+
+
+def result_arguments(result: Result) -> tuple[bytes, bool, bytes]:
+    """A signed result as the contracts take it."""
+    return parse_cid(result.result), result.success, bytes.fromhex(result.signature)

@@ -1,0 +1,42 @@
+"""Logs as contracts write them."""
+
+from __future__ import annotations
+
+import pytest
+
+from mesh.chain import NewLighthouse
+from mesh.chain.events import decode_log
+from schemas.address import address_bytes
+from schemas.keccak import keccak256
+
+LIGHTHOUSE = "0x5FbDB2315678afecb367f032d93F642f64180aa3"
+FACTORY = "0x" + "12" * 20
+NAME = b"airalab"
+
+
+def _log(name: bytes, *, announced: int) -> dict[str, object]:
+    """A factory's NewLighthouse, with a name that is said to have `announced` bytes."""
+    return {
+        "address": FACTORY,
+        "topics": [keccak256(b"NewLighthouse(address,string)"), address_bytes(LIGHTHOUSE).rjust(32, b"\0")],
+        "data": (32).to_bytes(32, "big") + announced.to_bytes(32, "big") + name,
+        "transactionHash": bytes(32),
+    }
+
+
+@pytest.mark.parametrize("padding", [0, 32 - len(NAME), 5])
+def test_the_name_of_a_new_lighthouse_is_read_whether_it_is_padded_or_not(padding: int) -> None:
+    """The original factory of generation 3 cuts the event's data off where the name ends."""
+    log = _log(NAME + bytes(padding), announced=len(NAME))
+    assert decode_log(log) == NewLighthouse(LIGHTHOUSE, "airalab", "0x" + "00" * 32)
+
+
+def test_a_name_of_whole_words_is_read() -> None:
+    event = decode_log(_log(b"a" * 64, announced=64))
+    assert isinstance(event, NewLighthouse)
+    assert event.name == "a" * 64
+
+
+@pytest.mark.parametrize("name", [b"", NAME, b"\xff" * 70])
+def test_a_name_that_is_not_there_or_is_no_text_is_no_event(name: bytes) -> None:
+    assert decode_log(_log(name, announced=70)) is None

@@ -1,0 +1,91 @@
+"""What gas may cost."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from mesh.chain import GWEI, Account, FeePolicy, FeeTooHigh, Node, Sender, new_private_key
+from mesh.chain.fees import Fees
+from mesh.errors import ConfigurationError
+from tests.mesh.chain.conftest import QUICK
+from tests.support.nodes import Anvil
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+
+@pytest.fixture
+async def anvil() -> AsyncIterator[Anvil]:
+    async with Anvil() as anvil:
+        yield anvil
+
+
+def _sender(node: Node, anvil: Anvil) -> Sender:
+    return Sender(node, Account.from_key(anvil.private_keys[0]))
+
+
+def _stranger() -> str:
+    return Account.from_key(new_private_key()).address
+
+
+async def _ask(node: Node, method: str, *params: Any) -> Any:
+    return (await node.web3.provider.make_request(method, list(params)))["result"]
+
+
+async def _next_base_fee(node: Node, wei: int) -> None:
+    await _ask(node, "anvil_setNextBlockBaseFeePerGas", hex(wei))
+    await _ask(node, "evm_mine")
+
+
+async def test_above_the_ceiling_nothing_is_sent(anvil: Anvil) -> None:
+    async with Node(anvil.url, timing=QUICK, fees=FeePolicy(ceiling=20 * GWEI)) as node:
+        sender, friend = _sender(node, anvil), _stranger()
+        await _next_base_fee(node, 30 * GWEI)
+        with pytest.raises(FeeTooHigh, match=r"31 gwei now, and the ceiling is 20 gwei") as caught:
+            await sender.send(to=friend, data=b"", value=1)
+        assert (caught.value.price, caught.value.ceiling) == (31 * GWEI, 20 * GWEI)
+        assert caught.value.hint
+        assert await node.web3.eth.get_transaction_count(node.checksum(sender.account.address), "pending") == 0
+
+
+async def test_with_patience_a_transaction_waits_for_the_price_to_come_down(anvil: Anvil) -> None:
+    async with Node(anvil.url, timing=QUICK, fees=FeePolicy(ceiling=20 * GWEI, patience=20)) as node:
+        friend = _stranger()
+        await _next_base_fee(node, 30 * GWEI)
+        sending = asyncio.create_task(_sender(node, anvil).send(to=friend, data=b"", value=1))
+        await asyncio.sleep(5 * QUICK.poll_interval)
+        assert not sending.done()
+        await _next_base_fee(node, 3 * GWEI)
+        await sending
+        assert await node.eth_balance(friend) == 1
+
+
+async def test_never_more_than_the_ceiling_is_offered(anvil: Anvil) -> None:
+    async with Node(anvil.url, timing=QUICK, fees=FeePolicy(ceiling=25 * GWEI)) as node:
+        await _next_base_fee(node, 20 * GWEI)
+        receipt = await _sender(node, anvil).send(to=_stranger(), data=b"", value=1)
+        sent = await _ask(node, "eth_getTransactionByHash", receipt.tx)
+    assert int(sent["maxFeePerGas"], 16) == 25 * GWEI
+    assert int(sent["type"], 16) == 2
+
+
+async def test_a_replacement_is_dearer_by_what_nodes_want_or_there_is_none(anvil: Anvil) -> None:
+    async with Node(anvil.url, timing=QUICK) as node:
+        policy = FeePolicy(ceiling=100 * GWEI)
+        bumped = await policy.bumped(node, Fees(50 * GWEI, 7))
+        assert bumped == Fees(575 * GWEI // 10, GWEI), "the priority fee goes to the market's price at least"
+        assert await policy.bumped(node, Fees(90 * GWEI, 2 * GWEI)) == Fees(100 * GWEI, 23 * GWEI // 10)
+        assert await policy.bumped(node, Fees(91 * GWEI, 2 * GWEI)) is None
+        assert await policy.bumped(node, Fees(10 * GWEI, None)) == Fees(115 * GWEI // 10, None)
+        cheap = await replace(policy, ceiling=GWEI // 2).bumped(node, Fees(1, 1))
+        assert cheap == Fees(GWEI // 2, GWEI // 2), "the priority fee is never above the whole"
+
+
+@pytest.mark.parametrize("wrong", [{"ceiling": 0}, {"patience": -1}, {"bump_percent": 9}])
+def test_a_policy_that_can_not_be_is_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ConfigurationError, match="ceiling above zero"):
+        FeePolicy(**wrong)

@@ -1,0 +1,73 @@
+"""Entries on disk, as several processes see them: locks belong to an open file, so two journals stand for two."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.chain.accounts import SignedTransaction
+from mesh.chain.journal import Journal
+from mesh.chain.outbox import Pending
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.fixture
+def one(tmp_path: Path) -> Journal:
+    return Journal(tmp_path)
+
+
+@pytest.fixture
+def other(tmp_path: Path) -> Journal:
+    return Journal(tmp_path)
+
+
+def _entry(nonce: int) -> Pending:
+    fields = {"to": "0x" + "12" * 20, "data": "0x", "value": 2**255, "gas": 21_000, "gasPrice": 1}
+    return Pending(nonce=nonce, fields=fields, versions=[SignedTransaction(b"\x01", "0x01")])
+
+
+def test_an_entry_is_anothers_while_it_is_held_and_anyones_afterwards(one: Journal, other: Journal) -> None:
+    entry = _entry(7)
+    hold = one.add(entry)
+    assert hold is not None
+    assert other.read(()) == ([], frozenset({7}))
+    assert other.hold(entry) is None
+    assert other.add(_entry(7)) is None, "the number is taken"
+
+    hold.release()
+    (left,), elsewhere = other.read(())
+    assert elsewhere == frozenset()
+    assert (left.nonce, left.fields, left.versions, left.is_watched) == (7, entry.fields, entry.versions, False)
+    assert other.hold(entry) is not None
+    assert one.hold(entry) is None
+
+
+def test_an_entry_that_is_removed_is_gone_for_all(one: Journal, other: Journal, tmp_path: Path) -> None:
+    hold = one.add(_entry(7))
+    assert hold is not None
+    hold.remove()
+    assert other.read(()) == ([], frozenset())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_all_versions_are_kept_and_a_line_that_was_cut_off_is_not_read(one: Journal, tmp_path: Path) -> None:
+    entry = _entry(7)
+    hold = one.add(entry)
+    assert hold is not None
+    entry.fields = entry.fields | {"gasPrice": 2}
+    entry.versions.append(SignedTransaction(b"\x02", "0x02"))
+    hold.append(entry)
+    hold.release()
+    (path,) = tmp_path.iterdir()
+    path.write_bytes(path.read_bytes() + b'{"hash": "0x0')
+    (left,), _ = one.read(())
+    assert [signed.hash for signed in left.versions] == ["0x01", "0x02"]
+    assert left.fields["gasPrice"] == 2
+
+
+def test_what_is_ones_own_is_left_out(one: Journal) -> None:
+    assert one.add(_entry(7)) is not None
+    assert one.read({7}) == ([], frozenset())

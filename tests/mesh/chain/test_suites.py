@@ -1,0 +1,114 @@
+"""The calls that the original contracts want, made to ours, which have the functions of both generations.
+
+What only the originals do (their markers, their gas counts at creation, their silence about reasons) is not tested:
+their code was not at hand.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from mesh.chain import XRT, Finalized, NotALiability, NotOffered
+from mesh.errors import ConfigurationError, InvalidMessage
+from tests.mesh.chain.conftest import cid, events_of, read_to
+
+if TYPE_CHECKING:
+    from tests.mesh.chain.conftest import Market
+
+pytestmark = pytest.mark.asyncio(loop_scope="module")
+
+FINALIZE_BY = {3: "af0bdb38", 5: "563e52d5"}
+"""Selectors of to(address,bytes) and finalizeLiability(address,bytes,bool,bytes)."""
+
+
+async def _orders(market: Market, generation: int, **fields: Any) -> tuple[Any, Any]:
+    if generation == 3:
+        return market.demand(**fields), market.offer(**fields)
+    async with market.chain() as chain:
+        nonces = [await chain.nonce_of(who.address) for who in (market.promisee, market.promisor)]
+    demand = market.demand(**fields, sender=market.promisee.address, nonce=nonces[0])
+    return demand, market.offer(**fields, sender=market.promisor.address, nonce=nonces[1])
+
+
+@pytest.mark.parametrize("generation", [3, 5])
+async def test_a_job_is_done_by_the_calls_of_the_generation(market: Market, generation: int) -> None:
+    options: dict[str, Any] = {"contracts": "original", "generation": generation}
+    async with market.chain(market.provider, **options) as chain:
+        start = await chain.block_number()
+        created = await chain.create_liability("airalab", *await _orders(market, generation, cost=XRT))
+        settled = await chain.finalize("airalab", market.result(created.liability))
+        sent = await chain.node.web3.eth.get_transaction(settled.tx)  # type: ignore[arg-type]
+        record = await chain.liability(created.liability)
+        events = events_of(await read_to(chain, start + 1, await chain.block_number()))
+    assert bytes(sent["input"])[:4].hex() == FINALIZE_BY[generation]
+    assert (record.is_finalized, record.is_success, record.result) == (True, True, cid(3))
+    assert Finalized(created.liability, True, cid(3), settled.tx) in events
+
+
+async def test_generation_3s_result_of_a_failed_job_pays_the_promisee_back(market: Market) -> None:
+    async with market.chain(market.provider, contracts="original", generation=3) as chain:
+        before = await chain.balance_of(market.promisee.address)
+        created = await chain.create_liability("airalab", *await _orders(market, 3, cost=XRT))
+        await chain.finalize("airalab", market.result(created.liability, success=False))
+        assert await chain.balance_of(market.promisee.address) == before
+
+
+@pytest.mark.parametrize("generation", [3, 5])
+async def test_a_liability_is_known_by_the_factorys_event_or_by_its_gas(market: Market, generation: int) -> None:
+    options: dict[str, Any] = {"contracts": "original", "generation": generation}
+    async with market.chain(market.provider) as chain:
+        start = await chain.block_number()
+        created = await chain.create_liability("airalab", market.demand(cost=1), market.offer(cost=1))
+        head = await chain.block_number()
+        async with market.chain(**options) as reader:
+            with pytest.raises(NotALiability):
+                await reader.liability(created.liability)
+            await read_to(reader, start + 1, head)
+            assert (await reader.liability(created.liability)).cost == 1
+        await chain.finalize("airalab", market.result(created.liability))
+        async with market.chain(**options) as reader:
+            assert await reader.is_liability(created.liability)
+            assert not await reader.is_liability(market.deployment.xrt)
+
+
+@pytest.mark.parametrize("generation", [3, 5])
+async def test_a_lighthouse_is_read_by_the_names_of_the_generation(market: Market, generation: int) -> None:
+    options: dict[str, Any] = {"contracts": "original", "generation": generation}
+    async with market.chain(market.provider) as ours, market.chain(market.provider, **options) as chain:
+        assert await chain.lighthouse("airalab") == await ours.lighthouse("airalab")
+        assert await chain.is_turn("airalab")
+        assert not await chain.is_turn("airalab", market.stranger.address)
+
+
+async def test_names_are_those_of_the_generations_root(market: Market) -> None:
+    async with market.chain(generation=5) as chain:
+        assert (chain.factory, chain.xrt) == (market.deployment.factory, market.deployment.xrt)
+        assert await chain.lighthouse_address("airalab") == await chain.resolve("airalab.lighthouse.5.robonomics.eth")
+
+
+async def test_what_the_originals_lack_is_told(market: Market) -> None:
+    result = market.result(market.stranger.address)
+    async with market.chain(market.provider, contracts="original", generation=3) as chain:
+        with pytest.raises(NotOffered, match="generation 3 offer no nonceOf") as caught:
+            await chain.nonce_of()
+        assert caught.value.hint
+        with pytest.raises(NotOffered, match="refund"):
+            await chain.refund(market.stranger.address)
+        with pytest.raises(InvalidMessage, match="generation 3, the order of 5"):
+            await chain.create_liability("airalab", *await _orders(market, 5))
+    async with market.chain(market.provider, contracts="original", generation=5) as chain:
+        with pytest.raises(NotOffered, match="validator"):
+            await chain.validate(result, agree=True)
+        with pytest.raises(NotOffered, match="refund"):
+            await chain.refundable_from(market.stranger.address)
+        with pytest.raises(InvalidMessage, match="generation 5, the order of 3"):
+            await chain.create_liability("airalab", *await _orders(market, 3))
+
+
+async def test_contracts_that_never_were_are_refused(market: Market) -> None:
+    for options in ({"contracts": "original", "generation": 4}, {"contracts": "other"}):
+        with pytest.raises(ConfigurationError, match="there are no"):
+            async with market.chain(factory=market.deployment.factory, xrt=market.deployment.xrt, **options):
+                pass
