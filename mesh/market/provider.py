@@ -15,13 +15,22 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 import msgspec
 
-from mesh.chain import NodeUnreachable, NotALiability, RequestRefused, Reverted
+from mesh.chain import (
+    History,
+    NoContracts,
+    NodeUnreachable,
+    NotALiability,
+    Reorganised,
+    RequestRefused,
+    Reverted,
+)
 from mesh.chain.events import Finalized, NewLiability
-from mesh.errors import ClosedError
+from mesh.errors import AiraError, ClosedError, InputError
 from mesh.market.blame import at_fault
 from mesh.market.book import LIMIT, Match, OrderBook, Refusal
 from mesh.market.memory import Memory
 from mesh.market.sending import RETRY, Sending
+from mesh.market.used import Used
 from mesh.network.channel import Channel
 from schemas import ZERO_ADDRESS, Demand, Offer, RejectKey, Result, Verified, address_bytes
 from schemas.rejection import Rejection
@@ -79,7 +88,9 @@ class Provider:
         self._matched = matched
         self._head = 0
         self._stack: AsyncExitStack | None = None
+        self._history = History()
         self._liabilities: dict[str, Liability] = {}
+        self._used = Used()
         self._rejected: Counter[str] = Counter()
         self._created = self._finalized = self._gas = self._fees = 0
 
@@ -164,31 +175,35 @@ class Provider:
             )
         except Reverted as error:
             await self._part(match, gone=at_fault(match, error.reason, error.arguments), error=error)
-        except RequestRefused as error:
+        except (NodeUnreachable, RequestRefused, InputError) as error:
             await self._part(match, gone=match, error=error)
         else:
             self._created += 1
             self._gas += created.gas_used
             self._fees += offer.message.lighthouse_fee
+            self._used.add(created.liability, demand, offer)
             log.info("%s: created, gas %d", created.liability, created.gas_used)
 
-    async def _part(self, match: Match, *, gone: tuple[Verified[Order], ...], error: Reverted | RequestRefused) -> None:
+    async def _part(self, match: Match, *, gone: tuple[Verified[Order], ...], error: AiraError) -> None:
         """Reject the orders that are to blame, and put back the other one, unless it was used meanwhile."""
         for order in match:
             if order in gone:
                 self._reject(order, _reason(error), str(error))
-            elif not await self._sending.send(partial(self._is_used, order)):
+            elif not await self._sending.ask(partial(self._is_used, order)):
                 self._add(order)
 
     async def _is_used(self, order: Verified[Order]) -> bool:
-        if order.message.generation == 3:
-            return await self._chain.is_order_used(order.hash)
-        return await self._chain.nonce_of(order.signer) > int(order.message.nonce)
+        try:
+            if order.message.generation == 3:
+                return await self._chain.is_order_used(order.hash)
+            return await self._chain.nonce_of(order.signer) > int(order.message.nonce)
+        except RequestRefused:
+            return False  # the contracts will say so when it is matched
 
     async def _take_results(self) -> None:
         async for result in self._results:
             await self._sending.room()
-            liability = await self._sending.send(partial(self._liability, result.message.liability))
+            liability = await self._sending.ask(partial(self._liability, result.message.liability))
             if liability is None:
                 # An answer without a contract; or the node has not heard of the contract yet.
                 self._results.forget(result)
@@ -201,29 +216,35 @@ class Provider:
         """The record of a liability; None for another address."""
         try:
             return self._liabilities.get(address) or await self._chain.liability(address)
-        except NotALiability:
+        except (NotALiability, RequestRefused) as error:
+            log.info("a Result waits to be sent again: %s", error)
             return None
 
     async def _finalize(self, result: Verified[Result]) -> None:
         message = result.message
         try:
             settled = await self._sending.send(lambda: self._chain.finalize(self._market, message))
-        except (Reverted, RequestRefused) as error:
+        except (NodeUnreachable, RequestRefused, Reverted) as error:
             if _reason(error) != "AlreadyFinalized":
                 self._reject(result, _reason(error), str(error))
         else:
             self._finalized += 1
             self._gas += settled.gas_used
+            self._used.add(message.liability, result)
             log.info("%s: finalized, success %s, gas %d", message.liability, message.success, settled.gas_used)
 
     async def _follow_chain(self) -> None:
         """Orders that others made into contracts, and those whose time has passed, leave the book."""
         while True:
             try:
-                async with aclosing(self._chain.events(self._head + 1)) as blocks:
+                async with aclosing(self._chain.events(self._head + 1, history=self._history)) as blocks:
                     async for block in blocks:
-                        await self._take_block(block)
-            except (NodeUnreachable, RequestRefused) as error:
+                        if isinstance(block, Reorganised):
+                            self._take_back(block)
+                        else:
+                            await self._take_block(block)
+            except (NodeUnreachable, RequestRefused, NotALiability, NoContracts) as error:
+                # The latter two of a contract in a block that the chain has replaced meanwhile: that is told next.
                 log.warning("the chain can't be read on from block %d: %s", self._head + 1, error)
                 await asyncio.sleep(RETRY)
 
@@ -237,13 +258,28 @@ class Provider:
         for order in self.book.expire(self._head):
             log.info("expired order %s of %s", order.hash.hex(), order.signer)
 
+    def _take_back(self, block: Reorganised) -> None:
+        """What the chain has undone is done again, unless it comes again by itself: then the contracts say so."""
+        self._head = block.back_to
+        created = [event.liability for event in block.events_taken_back if isinstance(event, NewLiability)]
+        finalized = [event.liability for event in block.events_taken_back if isinstance(event, Finalized)]
+        log.warning("the chain took back %d contracts and %d endings", len(created), len(finalized))
+        for address in created:
+            self._liabilities.pop(address, None)
+            for order in self._used.pop(address, Demand, Offer):
+                self._add(order)
+        for address in finalized:
+            for result in self._used.pop(address, Result):
+                self._sending.put(partial(self._finalize, result))
+
     async def _forget_orders(self, address: str) -> None:
         liability = await self._chain.liability(address)
         if liability.lighthouse != self._market:
             return
         demand_hash, offer_hash = await self._chain.order_hashes(address)
-        self.book.remove(demand_hash + address_bytes(liability.promisee))
-        self.book.remove(offer_hash + address_bytes(liability.promisor))
+        demand = self.book.remove(demand_hash + address_bytes(liability.promisee))
+        offer = self.book.remove(offer_hash + address_bytes(liability.promisor))
+        self._used.add(address, demand, offer)
         if not liability.is_finalized:
             self._liabilities[address] = liability
 
@@ -257,7 +293,7 @@ class Provider:
             self.channel.put(str(RejectKey(self._lighthouse, order, self.address)), rejection.encode())
 
 
-def _reason(error: Reverted | RequestRefused) -> str:
+def _reason(error: AiraError) -> str:
     """A machine-readable word: the contracts' error, but never a text of a stranger's contract."""
     name = error.reason if isinstance(error, Reverted) else type(error).__name__
     return name if name.isidentifier() else NAMELESS

@@ -12,14 +12,17 @@ T = TypeVar("T")
 
 
 class Link(Generic[T]):
-    """A place in a queue, and what stands there. The queues are rings: the last link's `after` is the first."""
+    """A place in a queue, and what stands there. The queues are rings: the last link's `after` is the first.
+
+    Outside a queue it has no neighbours, not even itself: a cycle would keep the item until the garbage collector came.
+    """
 
     __slots__ = ("after", "before", "item")
 
     def __init__(self, item: T) -> None:
         self.item = item
-        self.before: Link[T] = self
-        self.after: Link[T] = self
+        self.before: Link[T]
+        self.after: Link[T]
 
 
 class Queues(Generic[K, T]):
@@ -41,8 +44,10 @@ class Queues(Generic[K, T]):
 
     def append(self, key: K, link: Link[T]) -> None:
         """Put a link, which stands in no queue, at the end of the one at `key`."""
-        first = self._first.setdefault(key, link)
-        if first is not link:
+        first = self._first.get(key)
+        if first is None:
+            self._first[key] = link.before = link.after = link
+        else:
             last = first.before
             last.after = first.before = link
             link.before, link.after = last, first
@@ -55,4 +60,4 @@ class Queues(Generic[K, T]):
             link.before.after, link.after.before = link.after, link.before
             if self._first[key] is link:
                 self._first[key] = link.after
-        link.before = link.after = link
+        del link.before, link.after

@@ -24,7 +24,10 @@ WAITING: Final = 1024
 OUT_OF_TURN: Final = frozenset({"NotYourTurn", "NotAProvider"})
 """What the lighthouse says to a provider, whatever the transaction is."""
 DOUBTS: Final = 3
-"""How often it may say so though it is the provider's turn: a token can revert with the same words."""
+"""How often that, or the node's silence, is believed though the node says that it is the provider's turn.
+
+A token can revert with the same words, or keep the node busy for longer than anybody waits.
+"""
 
 
 class Sending:
@@ -66,21 +69,31 @@ class Sending:
     async def send(self, transaction: Callable[[], Awaitable[T]]) -> T:
         """What `transaction` returns; again and again while the node is away and while it is not our turn.
 
-        Raises `Reverted` for what the contracts refuse for another reason, and what else `transaction` raises.
+        Raises `Reverted` for what the contracts refuse for another reason, and what else `transaction` raises;
+        `NodeUnreachable` when the node is there for everything but this.
         """
         doubts = 0
         while True:
             try:
                 return await transaction()
-            except (NodeUnreachable, TransactionTimeout) as error:
+            except TransactionTimeout as error:
                 log.warning("a transaction waits: %s", error)
-            except Reverted as error:
-                if error.reason not in OUT_OF_TURN:
+            except (NodeUnreachable, Reverted) as error:
+                if isinstance(error, Reverted) and error.reason not in OUT_OF_TURN:
                     raise
                 doubts += await self._is_our_turn()
                 if doubts == DOUBTS:
                     raise
-                log.info("a transaction waits: %s", error)
+                log.warning("a transaction waits: %s", error)
+            await asyncio.sleep(RETRY)
+
+    async def ask(self, question: Callable[[], Awaitable[T]]) -> T:
+        """What `question`, which only reads, returns; again and again while the node is away."""
+        while True:
+            try:
+                return await question()
+            except NodeUnreachable as error:
+                log.warning("a question waits: %s", error)
             await asyncio.sleep(RETRY)
 
     async def _is_our_turn(self) -> bool:

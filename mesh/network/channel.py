@@ -100,9 +100,7 @@ class Channel:
         self._check_open()
         if "*" in key:
             raise InvalidKey(key, "it has a wildcard")
-        self._session.put(
-            key, payload, encoding="application/json", congestion_control=zenoh.CongestionControl.DROP, express=True
-        )
+        self._session.put(key, payload, encoding="application/json", congestion_control=zenoh.CongestionControl.DROP)
 
     def subscribe(self, kind: type[M], *, model: str = "*", liability: str = "*") -> Subscription[M]:
         """The verified messages of `kind` (`Demand`, `Offer` or `Result`) from now on.

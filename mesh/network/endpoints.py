@@ -16,6 +16,8 @@ RETRY: Final = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_fa
 """Pauses between attempts to reach a router again: short, so that an agent is back within a second."""
 ATTEMPT: Final = 3.0
 """Seconds that an endpoint has to answer in one attempt."""
+QUEUED: Final = 16
+"""Batches of 64 kB that wait for a link before messages are dropped; Zenoh's own two lose some of a hundred puts."""
 LOCATOR: Final = re.compile(
     r"(?:tcp|udp|tls|quic|ws)/(?:\[[0-9A-Fa-f:.%]+\]|[^\s:/?#\[\]]+):(?P<port>[0-9]{1,5})(?:[?#]\S*)?"
     r"|(?:unixsock-stream|unixpipe|serial|vsock)/\S+"
@@ -52,6 +54,7 @@ class Endpoints:
             "connect/timeout_ms": 0,
             "transport/unicast/open_timeout": max(1, int(answer_within * 1000)),
             "connect/retry": RETRY,
+            "transport/link/tx/queue/size/data": QUEUED,
             "scouting/multicast/enabled": False,
             # For others that would be found by scouting a router waits half a second.
             "scouting/delay": 0,

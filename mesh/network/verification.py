@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 M = TypeVar("M", bound=SignedMessage)
 
+AMBIGUOUS_NONCE: Final = "00" * 12
+"""How no nonce of generation 3 may begin."""
 REMEMBERED: Final = 65_536
 """Messages of which the door remembers that they passed."""
 
@@ -118,6 +120,8 @@ class Door(Generic[M]):
     def _check_order(self, order: SignedMessage) -> None:
         if isinstance(order, Result):
             return
+        if order.generation == 3 and str(order.nonce).startswith(AMBIGUOUS_NONCE):
+            raise InvalidMessage("nonce", "the contracts would take it for the sender of a generation-5 order")
         if order.deadline <= self._head():
             raise InvalidMessage("deadline", f"block {order.deadline} has passed")
         if self._address is not None and order.lighthouse != self._address:

@@ -106,8 +106,9 @@ class Place:
 
     @asynccontextmanager
     async def provider(self) -> AsyncIterator[Provider]:
-        """The lighthouse's provider at work."""
+        """The lighthouse's provider at work, for a minute at most: no test may hang."""
         async with (
+            asyncio.timeout(60),
             Network(Endpoints(connect=(self.endpoint,))) as network,
             Provider(network.session, self.chains["provider"], self.market.deployment.lighthouse_name) as provider,
             Background() as tasks,
@@ -123,6 +124,12 @@ class Place:
             for agent in agents:
                 await stack.enter_async_context(agent)
             yield await stack.enter_async_context(self.agent("person"))
+
+    async def forget_blocks(self, count: int) -> None:
+        """Reorganise the chain: its last blocks, and what happened in them, make room for one more of empty ones."""
+        head = await self.chains["provider"].block_number()
+        await self.node.request("evm_revert", [hex(head - count)])
+        await self.node.mine(count + 1)
 
     def save(self, content: bytes, name: str = "objective.mcap") -> Path:
         """A file of the person's."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hashlib import sha256
 from itertools import count
 from typing import Any, Final
 
@@ -32,7 +33,7 @@ def terms(**changes: Any) -> dict[str, Any]:
         "lighthouse": LIGHTHOUSE,
         "validator": ZERO_ADDRESS,
         "deadline": 1_000_000,
-        "nonce": f"{next(_nonces):064x}",
+        "nonce": sha256(next(_nonces).to_bytes(8, "big")).hexdigest(),
     } | changes
 
 

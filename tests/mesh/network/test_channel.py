@@ -11,7 +11,7 @@ import pytest
 import zenoh
 
 from mesh.errors import ClosedError, InputError, InvalidKey, RemoteError
-from mesh.network import Channel, Endpoints, Network, Statistics, message_key, pump, subscription
+from mesh.network import Channel, Endpoints, Network, Statistics, free_endpoint, message_key, pump, subscription
 from schemas import Demand, Offer, PresenceKey, Result, SignedMessage, Verified, encode, message_hash
 from tests.support.orders import (
     LIGHTHOUSE,
@@ -80,6 +80,21 @@ async def test_each_kind_of_message_arrives_verified(kind_of_router: str, reques
             ):
                 assert await take(arriving, 1) == [Verified(message, message_hash(message), signer.address)]
                 assert key == message_key(MARKET, message)
+
+
+async def test_a_burst_arrives_whole() -> None:
+    endpoint = free_endpoint()
+    burst = [demand() for _ in range(1000)]
+    async with (
+        Network(Endpoints(mode="router", listen=(endpoint,))),
+        Network(Endpoints(connect=(endpoint,))) as mine,
+        Network(Endpoints(connect=(endpoint,))) as yours,
+        listening(mine.session, yours.session) as (demands, theirs),
+    ):
+        for message in burst:
+            theirs.publish(message)
+
+        assert contents(await take(demands, len(burst))) == burst
 
 
 async def test_an_agent_hears_itself_too(here: zenoh.Session) -> None:
@@ -354,6 +369,28 @@ async def test_recall_does_not_wait_for_a_consumer_that_is_not_there_yet(
         assert {one.hash for one in await take(demands, len(many))} == {message_hash(message) for message in many}
 
 
+async def test_recall_hears_the_memory_on_its_own_session(here: zenoh.Session, there: zenoh.Session) -> None:
+    many = [demand() for _ in range(1000)]
+    async with listening(here, there) as (demands, _), remembering(here, *many):
+        await demands.recall()
+
+        assert {one.hash for one in await take(demands, len(many))} == {message_hash(message) for message in many}
+
+
+async def test_no_answer_to_a_recall_is_lost(here: zenoh.Session, there: zenoh.Session) -> None:
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            for _ in range(10_000):
+                query.reply(KEY, b"-")
+
+    async with listening(here, there) as (demands, _):
+        with there.declare_queryable(f"aira/{MARKET}/**", answer, complete=True):
+            await until_answered(here, demands._selector)
+            await demands.recall()
+
+        assert demands.statistics().invalid == {"not-json": 10_000}
+
+
 async def test_recall_refuses_what_is_wrong_like_any_other_message(here: zenoh.Session, there: zenoh.Session) -> None:
     def answer(query: zenoh.Query) -> None:
         with query:
@@ -410,7 +447,7 @@ async def test_leaving_a_subscription_ends_its_iteration(here: zenoh.Session, th
         theirs.publish(demand())
         await until(lambda: taken)
 
-    with at_most(2):
+    async with asyncio.timeout(2):
         await consuming
     assert len(taken) == 1
 

@@ -218,7 +218,7 @@ async def test_leaving_breaks_off_what_is_not_answered(here: zenoh.Session, ther
             ended.append("handler")
         raise AssertionError
 
-    async with offering(there, here, start=start):
+    async with asyncio.timeout(5), offering(there, here, start=start):
         asking = asyncio.create_task(call(here, ADDRESS, "start", REQUEST))
         await begun.wait()
 
@@ -252,7 +252,7 @@ async def test_leaving_after_the_session_was_closed_does_not_hang(there: zenoh.S
         await asyncio.Event().wait()
         raise AssertionError
 
-    with at_most(3):
+    async with asyncio.timeout(3):
         async with offering(there, here, start=start):
             asking = asyncio.create_task(call(here, ADDRESS, "start", REQUEST))
             await begun.wait()

@@ -58,6 +58,7 @@ def test_a_generation_5_order_passes_too() -> None:
 
 
 WRONG_ORDERS: dict[str, Demand | Offer] = {
+    "nonce": demand(nonce="00" * 12 + "ff" * 20),
     "deadline": demand(deadline=HEAD),
     "lighthouse": demand(lighthouse=STRANGER.address),
     "kind": offer(),
@@ -139,6 +140,10 @@ def test_a_result_belongs_on_the_key_of_its_liability() -> None:
 
     assert pass_through(checked, message, other) is None
     assert counted(checked) == {"key": 1}
+
+
+def test_eleven_zero_bytes_of_a_nonce_are_none_too_many() -> None:
+    assert pass_through(door(), demand(nonce="00" * 11 + "ff" * 21)) is not None
 
 
 def test_an_order_is_valid_until_the_block_before_its_deadline() -> None:

@@ -1,0 +1,195 @@
+"""Where a test's traders and providers meet: a router, a founded market, and people with accounts on its chain."""
+
+from __future__ import annotations
+
+from contextlib import AsyncExitStack, asynccontextmanager
+from itertools import count
+from typing import TYPE_CHECKING, Any, Self
+
+from web3.types import RPCEndpoint
+
+from mesh.background import Background
+from mesh.chain import XRT, Account, Chain, Timing
+from mesh.chain.events import NewLiability
+from mesh.market.provider import Provider
+from mesh.network import Channel, Endpoints, Network
+from schemas import Demand, Offer, RejectKey, Result, market_selector, message_hash, parse_key
+from schemas.rejection import Rejection
+from tests.support.orders import RECORDING, terms
+from tests.support.waiting import until, until_found, until_heard
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Sequence
+
+    import zenoh
+    from web3.providers.async_base import AsyncBaseProvider
+
+    from mesh.demo.market import Market
+    from schemas import Liability, SignedMessage
+
+QUICK = Timing(poll_interval=0.02, receipt_interval=0.01, attempts=1, retry_delay=0.01, request_timeout=2)
+STAKE = XRT
+
+_names = count(1)
+
+
+class Floor:
+    """`async with Floor(market, endpoint, node=…, keys=…) as floor`: where the chain's node and the router are.
+
+    The person and the robot of the market trade; `rival` and `poor` are further accounts, which have ETH and no XRT.
+    """
+
+    def __init__(self, market: Market, endpoint: str, *, node: str | AsyncBaseProvider, keys: Sequence[bytes]) -> None:
+        self.node = node
+        self.deployment = market.deployment
+        self.accounts = market.accounts | {
+            "rival": Account.from_key(keys[5]),
+            "poor": Account.from_key(keys[6]),
+        }
+        self.endpoint = endpoint
+        self.lighthouse = self.deployment.lighthouse
+        self.market = self.deployment.lighthouse_name
+        self.rejections: list[Rejection] = []
+        self._stack = AsyncExitStack()
+
+    async def __aenter__(self) -> Self:
+        self.chain = await self._stack.enter_async_context(self.chain_of("person"))
+        self.started = await self.chain.block_number()
+        self.session = await self.new_session()
+        await self.trade_at(self.lighthouse, self.market)
+        return self
+
+    async def __aexit__(self, *exc_info: object) -> None:
+        await self._stack.aclose()
+
+    async def new_session(self) -> zenoh.Session:
+        """A session of its own on the floor's router."""
+        network = await self._stack.enter_async_context(Network(Endpoints(connect=(self.endpoint,))))
+        return network.session
+
+    async def trade_at(self, lighthouse: str, market: str) -> None:
+        """Post messages, and hear rejections, at this lighthouse (address and name) from now on."""
+        self.lighthouse, self.market = lighthouse, market
+        self.channel = await self._stack.enter_async_context(Channel(self.session, market))
+        selector = market_selector(market, "reject")
+        self._stack.enter_context(self.session.declare_subscriber(selector, self._rejected))
+
+    async def found_lighthouse(self, *, timeout_blocks: int, **stakes: int) -> None:
+        """Make a lighthouse where the named accounts stake so many transactions a turn, and trade there."""
+        async with self.chain_of("provider") as chain:
+            made = await chain.create_lighthouse(
+                minimal_stake=STAKE,
+                timeout_blocks=timeout_blocks,
+                name=f"test-{next(_names)}",
+            )
+            for role, turns in stakes.items():
+                await chain.transfer(self.address(role), turns * STAKE)
+        for role, turns in stakes.items():
+            await self.stake(role, made.lighthouse, turns)
+        await self.trade_at(made.lighthouse, f"{made.name}.lighthouse.3.robonomics.eth")
+
+    async def stake(self, role: str, lighthouse: str, turns: int) -> None:
+        """Stake so many transactions a turn, which the account must have."""
+        async with self.chain_of(role) as chain:
+            await chain.approve(lighthouse, turns * STAKE)
+            await chain.refill(lighthouse, turns * STAKE)
+
+    def address(self, role: str) -> str:
+        """An account's address."""
+        return self.accounts[role].address
+
+    def chain_of(self, role: str, endpoint: str | AsyncBaseProvider | None = None, **options: Any) -> Chain:
+        """The chain for an account, not yet open."""
+        return Chain(
+            endpoint or self.node,
+            account=self.accounts[role],
+            ens=self.deployment.ens,
+            **({"timing": QUICK} | options),
+        )
+
+    async def request(self, method: str, *params: Any) -> Any:
+        """The node's answer to a JSON-RPC method."""
+        return (await self.chain.node.web3.provider.make_request(RPCEndpoint(method), list(params)))["result"]
+
+    async def mine(self, blocks: int) -> None:
+        """Mine empty blocks."""
+        await self.request("evm_mine", blocks)
+
+    @asynccontextmanager
+    async def provider(
+        self,
+        role: str = "provider",
+        *,
+        endpoint: str | None = None,
+        timing: Timing = QUICK,
+        **options: Any,
+    ) -> AsyncIterator[Provider]:
+        """A provider at work, whom the traders reach."""
+        session = await self.new_session()
+        async with (
+            self.chain_of(role, endpoint, timing=timing) as chain,
+            Provider(session, chain, self.market, **options) as provider,
+            Background() as tasks,
+        ):
+            tasks.start(provider.run(), f"{role} at work")
+            for kind in ("demand", "offer", "result"):
+                await until_heard(self.session, f"aira/{self.market}/{kind}/x/x")
+            yield provider
+
+    def demand(self, role: str = "person", **changes: Any) -> Demand:
+        """A signed demand for XRT at this lighthouse, which costs nothing unless told otherwise."""
+        return self.accounts[role].signer.sign(Demand(**({"validator_fee": 0} | self._terms(changes))))
+
+    def offer(self, role: str = "robot", **changes: Any) -> Offer:
+        """A signed offer that agrees to a demand with the same changes."""
+        return self.accounts[role].signer.sign(Offer(**({"lighthouse_fee": 0} | self._terms(changes))))
+
+    def result(self, liability: str, role: str = "robot", **changes: Any) -> Result:
+        """A signed result."""
+        fields: dict[str, Any] = {"liability": liability, "result": RECORDING, "success": True}
+        return self.accounts[role].signer.sign(Result(**(fields | changes)))
+
+    def publish(self, *messages: SignedMessage) -> None:
+        """Post messages, as their signers would."""
+        for message in messages:
+            self.channel.publish(message)
+
+    async def liability_of(self, order: Demand | Offer) -> Liability:
+        """The liability that an order becomes."""
+        found: list[Liability] = []
+
+        async def search() -> bool:
+            found.extend(await self.liabilities_of(order))
+            return bool(found)
+
+        await until_found(search, what="the contract")
+        return found[0]
+
+    async def liabilities_of(self, order: Demand | Offer) -> list[Liability]:
+        """The liabilities that an order has become on this floor: at most one, if all is well."""
+        digest = message_hash(order)
+        made = []
+        async for block in self.chain.events(self.started):
+            for event in block.events:
+                if isinstance(event, NewLiability) and digest in await self.chain.order_hashes(event.liability):
+                    made.append(await self.chain.liability(event.liability))
+            if block.block_number >= await self.chain.block_number():
+                return made
+        raise AssertionError
+
+    async def rejection_of(self, message: SignedMessage) -> Rejection:
+        """Why a message was rejected, once it is."""
+        await until(lambda: self._rejections_of(message), what=f"a rejection of the {type(message).__name__}")
+        return self._rejections_of(message)[0]
+
+    def _rejections_of(self, message: SignedMessage) -> list[Rejection]:
+        return [one for one in self.rejections if one.order == message_hash(message).hex()]
+
+    def _rejected(self, sample: zenoh.Sample) -> None:
+        rejection = Rejection.decode(sample.payload.to_bytes())
+        assert parse_key(str(sample.key_expr)) == RejectKey(self.market, rejection.order, rejection.provider)
+        self.rejections.append(rejection)
+
+    def _terms(self, changes: dict[str, Any]) -> dict[str, Any]:
+        ours = {"token": self.deployment.xrt, "lighthouse": self.lighthouse, "cost": 0}
+        return terms(**(ours | changes))

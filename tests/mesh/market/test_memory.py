@@ -1,0 +1,98 @@
+"""The market's memory by itself: what it tells, and how it ends."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+from mesh.market import OrderBook
+from mesh.market.memory import Memory
+from mesh.network import Endpoints, Network, message_key
+from tests.support.orders import LIGHTHOUSE, MARKET, MODEL, OTHER_MODEL, verified_demand, verified_offer
+from tests.support.waiting import at_most, until, until_answered
+
+if TYPE_CHECKING:
+    import zenoh
+
+    from schemas import Verified
+    from tests.support.routers import EmbeddedRouter
+
+
+def network(router: EmbeddedRouter) -> Network:
+    return Network(Endpoints(connect=(router.endpoint,)))
+
+
+def holding(*orders: Verified[object]) -> OrderBook:  # type: ignore[type-var]
+    book = OrderBook(LIGHTHOUSE)
+    for order in orders:
+        book.add(order)  # type: ignore[arg-type]
+    return book
+
+
+def ask(session: zenoh.Session, selector: str) -> list[str]:
+    """The keys of the answers."""
+    return [str(reply.ok.key_expr) for reply in session.get(selector, timeout=5) if reply.ok is not None]
+
+
+async def test_it_tells_what_is_asked_for(router: EmbeddedRouter) -> None:
+    mine, other, offer = verified_demand(model=MODEL), verified_demand(model=OTHER_MODEL), verified_offer(cost=1)
+    keys = {name: message_key(MARKET, order.message) for name, order in (("d", mine), ("e", other), ("o", offer))}
+    async with network(router) as one, network(router) as two, Memory(one.session, MARKET, holding(mine, other, offer)):
+        await until_answered(two.session, f"aira/{MARKET}/**")
+
+        for selector, expected in (
+            (f"aira/{MARKET}/**", {keys["d"], keys["e"], keys["o"]}),
+            (f"aira/{MARKET}/demand/*/*", {keys["d"], keys["e"]}),
+            (f"aira/{MARKET}/demand/{MODEL}/*", {keys["d"]}),
+            (keys["o"], {keys["o"]}),
+            (f"aira/{MARKET}/result/*/*", set()),
+            (f"aira/{MARKET}/demand/{MODEL}/{'0' * 64}", set()),
+        ):
+            assert set(await asyncio.to_thread(ask, two.session, selector)) == expected
+
+
+async def test_it_tells_the_book_as_it_is_when_asked(router: EmbeddedRouter) -> None:
+    book = holding(verified_demand())
+    async with network(router) as one, network(router) as two, Memory(one.session, MARKET, book):
+        await until_answered(two.session, f"aira/{MARKET}/**")
+        book.add(verified_offer())
+
+        assert await asyncio.to_thread(ask, two.session, f"aira/{MARKET}/**") == []
+
+
+async def test_leaving_breaks_off_long_answers_and_those_not_begun(router: EmbeddedRouter) -> None:
+    book = holding(*(verified_demand() for _ in range(3000)))
+    async with network(router) as one, network(router) as two:
+        memory = await Memory(one.session, MARKET, book).__aenter__()
+        await until_answered(two.session, f"aira/{MARKET}/**")
+        asking = [asyncio.create_task(asyncio.to_thread(ask, two.session, f"aira/{MARKET}/**")) for _ in range(5)]
+        await until(lambda: memory._threads._work_queue.qsize() > 0)
+
+        with at_most(3):
+            await memory.__aexit__(None, None, None)
+            answers = await asyncio.gather(*asking)
+
+        assert min(len(answer) for answer in answers) < 3000
+
+
+async def test_a_question_that_comes_while_leaving_is_turned_down(router: EmbeddedRouter) -> None:
+    asked: list[zenoh.Query] = []
+    async with network(router) as one, network(router) as two:
+        async with Memory(one.session, MARKET, holding()) as memory:
+            pass
+        with one.session.declare_queryable("test", asked.append):
+            await until_answered(two.session, "test")
+            asking = asyncio.create_task(asyncio.to_thread(ask, two.session, "test"))
+            await until(lambda: asked)
+
+            memory._answer_soon(asked.pop())
+
+            with at_most(2):
+                assert await asking == []
+
+
+async def test_leaving_after_the_session_was_closed_does_not_hang(router: EmbeddedRouter) -> None:
+    async with network(router) as one:
+        with at_most(2):
+            async with Memory(one.session, MARKET, holding()):
+                one.session.close()  # type: ignore[no-untyped-call]

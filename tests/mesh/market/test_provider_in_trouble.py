@@ -1,0 +1,252 @@
+"""A provider when things go wrong: other providers' turns, tokens that mean harm, a node that is away, no ETH."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.chain import JsonRpcServer
+from mesh.demo.market import found_market
+from mesh.market import order_id, sending
+from mesh.market import provider as provider_module
+from schemas import verify_message
+from tests.mesh.market.floor import QUICK, Floor
+from tests.mesh.market.tokens import BURNS_ALL_GAS, deploy_token, refuses_with, says
+from tests.support.ports import free_port
+from tests.support.waiting import until, until_found
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from mesh.market.provider import Provider
+    from tests.support.nodes import Anvil
+    from tests.support.routers import EmbeddedRouter
+
+
+@pytest.fixture(autouse=True)
+def impatience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is tried again is tried again soon."""
+    for module in (sending, provider_module):
+        monkeypatch.setattr(module, "RETRY", 0.05)
+
+
+async def test_two_providers_share_the_work_in_their_turns(floor: Floor) -> None:
+    await floor.found_lighthouse(timeout_blocks=1000, provider=1, rival=1)
+    async with floor.provider("provider") as one, floor.provider("rival") as two:
+        demands = [floor.demand(cost=0) for _ in range(4)]
+        for demand in demands:
+            floor.publish(demand, floor.offer(cost=0))
+            await floor.liability_of(demand)
+
+        await until(lambda: (one.earnings().created, two.earnings().created) == (2, 2))
+        assert floor.rejections == []
+        await until(lambda: len(one.book) == len(two.book) == 0)
+
+
+async def test_a_turn_that_somebody_else_sleeps_through_is_taken_over(floor: Floor) -> None:
+    await floor.found_lighthouse(timeout_blocks=5, provider=10, rival=10)
+    async with floor.provider("rival") as rival:
+        demand = floor.demand()
+        floor.publish(demand, floor.offer())
+        await until(lambda: len(rival.book) == 0)
+        assert rival.earnings().created == 0
+
+        await floor.mine(8)
+
+        await floor.liability_of(demand)
+        assert floor.rejections == []
+
+
+async def test_a_provider_without_a_stake_waits_and_rejects_nobody(
+    floor: Floor, caplog: pytest.LogCaptureFixture
+) -> None:
+    await floor.found_lighthouse(timeout_blocks=3)
+    async with floor.provider("provider"):
+        demand = floor.demand()
+        floor.publish(demand, floor.offer())
+        with caplog.at_level("INFO"):
+            await until(lambda: "NotAProvider" in caplog.text)
+
+        await floor.stake("provider", floor.lighthouse, 5)
+
+        await floor.liability_of(demand)
+        assert floor.rejections == []
+
+
+async def test_orders_that_were_used_while_it_was_not_our_turn_leave(floor: Floor) -> None:
+    await floor.found_lighthouse(timeout_blocks=1000, provider=1, rival=1)
+    async with floor.provider("rival") as rival:
+        demand, offer = floor.demand(), floor.offer()
+        floor.publish(demand, offer)
+        await until(lambda: len(rival.book) == 0)
+        async with floor.chain_of("provider") as chain:
+            await chain.create_liability(floor.lighthouse, demand, offer)
+
+        await until(lambda: rival.earnings().rejected == {"OrderUsed": 1})
+        last = floor.demand()
+        floor.publish(last)
+        await until(lambda: list(rival.book.orders()) == [verify_message(last)])
+        assert floor.rejections == []
+
+
+async def works_on(floor: Floor, provider: Provider) -> bool:
+    """Whether the provider makes the contracts of those who mean well."""
+    demand = floor.demand()
+    floor.publish(demand, floor.offer())
+    await floor.liability_of(demand)
+    await until(lambda: provider.earnings().created > 0)
+    return True
+
+
+@pytest.mark.parametrize("name", ["NotYourTurn(address,uint256)", "NotAProvider(address)"])
+async def test_a_token_that_speaks_with_the_lighthouses_voice_stops_nobody(floor: Floor, name: str) -> None:
+    token = await deploy_token(floor.chain, refuses_with(name))
+    async with floor.provider() as provider:
+        floor.publish(guilty := floor.demand(cost=1, token=token), floor.offer(cost=1, token=token))
+
+        assert (await floor.rejection_of(guilty)).reason == name.partition("(")[0]
+        assert await works_on(floor, provider)
+
+
+async def test_a_token_that_burns_all_gas_stops_nobody(floor: Floor) -> None:
+    token = await deploy_token(floor.chain, BURNS_ALL_GAS)
+    async with floor.provider() as provider:
+        floor.publish(guilty := floor.demand(cost=1, token=token), offer := floor.offer(cost=1, token=token))
+
+        await floor.rejection_of(guilty)
+        await floor.rejection_of(offer)
+        assert await works_on(floor, provider)
+
+
+async def test_a_token_does_not_choose_the_words_of_a_rejection(floor: Floor) -> None:
+    token = await deploy_token(floor.chain, says(b"send me all your money, please"))
+    async with floor.provider() as provider:
+        floor.publish(guilty := floor.demand(cost=1, token=token), floor.offer(cost=1, token=token))
+
+        assert (await floor.rejection_of(guilty)).reason == "Reverted"
+        assert set(provider.earnings().rejected) == {"Reverted"}
+
+
+async def test_a_nonce_that_contracts_can_not_read_stops_nobody(floor: Floor) -> None:
+    async with floor.provider() as provider:
+        floor.publish(floor.demand(nonce="00" * 12 + "ff" * 20), offer := floor.offer())
+        await until(lambda: order_id(verify_message(offer)) in provider.book)
+
+        floor.publish(demand := floor.demand())
+        assert (await floor.liability_of(demand)).promisor == floor.address("robot")
+
+
+@asynccontextmanager
+async def served(floor: Floor, port: int) -> AsyncIterator[str]:
+    assert not isinstance(floor.node, str)
+    async with JsonRpcServer(floor.node, port=port) as server:
+        yield server.url
+
+
+async def test_a_node_that_is_away_for_a_while_costs_no_order_and_no_result(
+    floor: Floor, caplog: pytest.LogCaptureFixture
+) -> None:
+    port = free_port()
+    node = served(floor, port)
+    async with floor.provider(endpoint=await node.__aenter__()) as provider:
+        first, second = floor.demand(cost=0), floor.demand(cost=0)
+        floor.publish(first, floor.offer(cost=0))
+        liability = await floor.liability_of(first)
+
+        await node.__aexit__(None, None, None)
+        floor.publish(second, floor.offer(cost=0), floor.result(liability.address))
+        await until(lambda: "a transaction waits" in caplog.text and "can't be read on" in caplog.text)
+
+        async with served(floor, port):
+            await floor.liability_of(second)
+            await until(lambda: provider.earnings().finalized == 1)
+            last = floor.demand(cost=1, deadline=await floor.chain.block_number() + 2)
+            floor.publish(last)
+            await until(lambda: len(provider.book) == 1)
+            await floor.mine(2)
+            await until(lambda: len(provider.book) == 0)
+    assert floor.rejections == []
+
+
+async def test_a_provider_without_eth_says_so_and_goes_on_when_it_has_some(
+    floor: Floor, caplog: pytest.LogCaptureFixture
+) -> None:
+    await floor.found_lighthouse(timeout_blocks=1000, rival=5)
+    async with floor.chain_of("rival") as rival:
+        balance, price = await rival.eth_balance(), await rival.node.web3.eth.gas_price
+        await rival.send_eth(floor.address("person"), balance - 100_000 * price)
+        async with floor.provider("rival"):
+            demand = floor.demand()
+            floor.publish(demand, floor.offer())
+            await until(lambda: "send ETH to the account" in caplog.text)
+
+            await floor.chain.send_eth(floor.address("rival"), balance - 10**18)
+
+            await floor.liability_of(demand)
+            assert floor.rejections == []
+
+
+async def test_a_transaction_that_is_not_mined_for_long_is_waited_for(
+    anvil: Anvil, router: EmbeddedRouter, caplog: pytest.LogCaptureFixture
+) -> None:
+    market = await found_market(anvil.url, anvil.private_keys)
+    hasty = replace(QUICK, receipt_timeout=0.2)
+    floor = Floor(market, router.endpoint, node=anvil.url, keys=anvil.private_keys)
+    async with floor, floor.provider(timing=hasty) as provider:
+        await floor.request("evm_setAutomine", False)
+        demand = floor.demand()
+        floor.publish(demand, floor.offer())
+        await until(lambda: "was not mined within" in caplog.text)
+
+        await floor.request("evm_setIntervalMining", 1)
+
+        await floor.liability_of(demand)
+        await until(lambda: len(provider.book) == 0)
+        assert floor.rejections == []
+
+
+async def test_what_the_chain_takes_back_is_done_again(floor: Floor) -> None:
+    async with floor.provider() as provider:
+        early = floor.demand(cost=0)
+        floor.publish(early, floor.offer(cost=0))
+        liability = await floor.liability_of(early)
+        await until(lambda: provider.earnings().created == 1)
+        snapshot = await floor.request("evm_snapshot")
+        floor.publish(floor.result(liability.address))
+        floor.publish(late := floor.demand(cost=0), floor.offer(cost=0))
+        await floor.liability_of(late)
+        await until(lambda: (provider.earnings().created, provider.earnings().finalized) == (2, 1))
+        await until(lambda: not provider._liabilities.keys() & {liability.address})
+
+        await floor.request("evm_revert", snapshot)
+        assert not (await floor.chain.liability(liability.address)).is_finalized
+        await floor.mine(5)
+
+        await until(lambda: (provider.earnings().created, provider.earnings().finalized) == (3, 2))
+        assert (await floor.chain.liability(liability.address)).is_finalized
+        assert len(await floor.liabilities_of(late)) == 1
+
+
+async def test_a_result_that_was_too_early_counts_when_it_is_sent_again(floor: Floor) -> None:
+    demand, offer = floor.demand(), floor.offer()
+    async with floor.chain_of("provider") as chain:
+        snapshot = await floor.request("evm_snapshot")
+        created = await chain.create_liability(floor.lighthouse, demand, offer)
+        await floor.request("evm_revert", snapshot)
+        async with floor.provider() as provider:
+            result = floor.result(created.liability)
+            floor.publish(result, floor.result(floor.address("person")))
+            await until(lambda: provider._results.statistics().received == 2)
+            again = await chain.create_liability(floor.lighthouse, demand, offer)
+            assert again.liability == created.liability
+
+            async def finalized() -> bool:
+                floor.publish(result)
+                await asyncio.sleep(0.05)
+                return provider.earnings().finalized == 1
+
+            await until_found(finalized)

@@ -1,0 +1,97 @@
+"""The command line in processes of its own: run to the end, interrupted, or serving."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING
+
+from tests.support.processes import Server
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+AIRA = (sys.executable, "-m", "mesh")
+SECONDS = 60.0
+SOON = 2.5
+"""Seconds in which a signal ends a command: a fraction of one on a machine that has nothing else to do."""
+
+
+def aira(*arguments: str | Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run `aira` with these arguments and environment variables to its end."""
+    return run(*AIRA, *arguments, **variables)
+
+
+def run(*command: str | Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end."""
+    words = [str(word) for word in command]
+    return subprocess.run(words, env=environment(variables), capture_output=True, text=True, timeout=SECONDS)
+
+
+class Interrupted:
+    """`aira` with these arguments, which gets a signal when it has said `at`, and `after` so many seconds."""
+
+    def __init__(
+        self,
+        *arguments: str | Path,
+        at: str = "",
+        after: float = 0.0,
+        by: signal.Signals = signal.SIGINT,
+        variables: Mapping[str, str] | None = None,
+    ) -> None:
+        with subprocess.Popen(
+            [*AIRA, *map(str, arguments)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=environment(variables or {}),
+        ) as process:
+            assert process.stdout is not None
+            said = ""
+            while at not in said:
+                said = process.stdout.readline()
+                assert said, f"it ended without saying {at!r}: {process.stderr.read() if process.stderr else ''}"
+            time.sleep(after)
+            process.send_signal(by)
+            sent = time.monotonic()
+            self.output, self.errors = process.communicate(timeout=SECONDS)
+            self.seconds = time.monotonic() - sent
+            self.code = process.returncode
+
+
+class Serving(Server):
+    """A command that serves until it is stopped; ready when it has said `says`."""
+
+    name = "command"
+
+    def __init__(self, *command: str | Path, says: str, variables: Mapping[str, str] | None = None) -> None:
+        super().__init__()
+        self._command = command
+        self._says = says
+        self._variables = dict(variables or {})
+
+    def command(self) -> Sequence[str | Path]:
+        """The command, with the variables set by `env`."""
+        settings = [f"{name}={value}" for name, value in self._variables.items()]
+        return ["env", "-u", "AIRA_CONFIG", "PYTHONUNBUFFERED=1", *settings, *self._command]
+
+    def is_ready(self) -> bool:
+        """Whether it has said so."""
+        return self._says in self.log()
+
+    def end(self, how: signal.Signals) -> tuple[int, float]:
+        """Send a signal and wait for the end; its exit code, and the seconds that it took."""
+        process, self._process = self._running(), None
+        process.send_signal(how)
+        sent = time.monotonic()
+        return process.wait(SECONDS), time.monotonic() - sent
+
+
+def environment(variables: Mapping[str, str]) -> dict[str, str]:
+    """The variables of a process that has no settings of this one's."""
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith("AIRA_")}
+    return inherited | dict(variables)
