@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 from mesh.agent.contract import Outcome
 from mesh.agent.hooks import call
 from mesh.agent.trade import Trader
+from mesh.work.dealings import Dealings
 from mesh.work.executor import Executor
 from mesh.work.lifecycle import Phase, WrongPhase
 from mesh.work.listener import Listener
@@ -42,7 +43,9 @@ class Worker:
     def __init__(self, parts: Parts, *, performer: Performer | None, witnesses: Sequence[Handler]) -> None:
         self.parts = parts
         self.trader = Trader(parts, parts.chain)
-        self.executor = Executor(parts.workshop(), performer=performer, witness=self._phase)
+        workshop = parts.workshop()
+        self.executor = Executor(workshop, performer=performer, witness=self._phase)
+        self._dealings = Dealings(workshop, self.executor, witness=self._phase)
         self._witnesses = witnesses
         self._offer_services()
 
@@ -62,12 +65,20 @@ class Worker:
         """A contract names us: trade it as a promisee, work for it as a promisor (an account may be both)."""
         await self.trader.matched(liability, demand_hash=demand_hash, offer_hash=offer_hash)
         if liability.promisor == self.parts.signer.address and self.parts.settings.enable_executor:
-            await self.executor.accept(liability)
+            await self._dealings.accept(liability)
 
     async def finalized(self, address: str, *, success: bool, result: str) -> None:
         """A contract has ended, perhaps one of ours."""
-        await self.executor.finalized(address, success=success)
+        await self._dealings.finalized(address, success=success)
         self.trader.finalized(address, Outcome(success=success, result=result))
+
+    async def taken_back(self, address: str) -> None:
+        """The end of a contract, perhaps one of ours, did not happen after all."""
+        await self._dealings.taken_back(address)
+
+    async def unmade(self, address: str) -> None:
+        """A contract, perhaps one of ours, was not made after all."""
+        await self._dealings.unmade(address)
 
     async def new_head(self, block: int) -> None:
         """The chain has grown."""

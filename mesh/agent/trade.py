@@ -45,6 +45,7 @@ class Trader:
         self._deadlines: dict[str, int] = {}
         self._counted: dict[str, tuple[Terms, int]] = {}
         self._endings: dict[str, asyncio.Future[Outcome]] = {}
+        self._contracts: dict[str, Contract] = {}
         self._closed = False
 
     async def close(self) -> None:
@@ -114,9 +115,7 @@ class Trader:
         """A contract was made of these orders; they need not be sent again."""
         for identity in (demand_hash.hex(), offer_hash.hex()):
             await self._withdraw(identity)
-        matched = self._matches.get(demand_hash.hex())
-        if matched is not None and not matched.done():
-            matched.set_result(self._contract(liability))
+        self._made(demand_hash.hex(), liability)
         for identity, (terms, fee) in list(self._counted.items()):
             # Generation 5 counts an account's orders: the one that was taken has made the others invalid.
             await self._withdraw(identity)
@@ -137,6 +136,7 @@ class Trader:
     def finalized(self, address: str, outcome: Outcome) -> None:
         """The contract at `address` has ended."""
         ended = self._endings.pop(address, None)
+        self._contracts = {demand: made for demand, made in self._contracts.items() if made.address != address}
         if ended is not None and not ended.done():
             ended.set_result(outcome)
 
@@ -170,6 +170,16 @@ class Trader:
             self._forget(identity)
             if not self._closed:
                 await self._parts.outbox.settle(identity)
+
+    def _made(self, demand: str, liability: Liability) -> None:
+        """A demand has become a contract; perhaps once more, at another address, after a reorganisation."""
+        contract, matched = self._contracts.get(demand), self._matches.get(demand)
+        if contract is not None and contract.address in self._endings:
+            self._endings[liability.address] = self._endings.pop(contract.address)
+            contract.liability = liability
+        elif matched is not None and not matched.done():
+            self._contracts[demand] = self._contract(liability)
+            matched.set_result(self._contracts[demand])
 
     def _contract(self, liability: Liability) -> Contract:
         ended = self._ending(liability.address)

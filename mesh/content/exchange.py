@@ -117,6 +117,8 @@ class Exchange:
             except asyncio.CancelledError:
                 download.stop()
                 await asyncio.wait([running])
+                if not running.cancelled():
+                    running.exception()  # taken note of: that it was stopped is no news
                 raise
             finally:
                 del self._running[download]

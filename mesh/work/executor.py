@@ -9,29 +9,27 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from contextlib import asynccontextmanager
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
 from mesh.errors import AiraError, ClosedError, ContentError, InputError
 from mesh.work.lifecycle import Phase, WrongPhase, advance
-from mesh.work.outbox import outgoing, outgoing_identity
-from schemas import Result
+from mesh.work.objectives import Objectives
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable
+    from collections.abc import AsyncIterator, Awaitable
 
-    from mesh.recording import Objective
     from mesh.work.ledger import Job
+    from mesh.work.lifecycle import Witness
     from mesh.work.run import Performer, Run
     from mesh.work.workshop import Workshop
     from schemas import Liability
 
 log = logging.getLogger(__name__)
 
-FETCHES: Final = 4
-"""Objectives fetched and examined at once."""
 STARTED: Final = (Phase.READY, Phase.RUNNING)
 """Phases in which a job may be begun anew or gone on with."""
 PROGRESS: Final = 0.5
@@ -41,14 +39,8 @@ _playing: ContextVar[str] = ContextVar("playing", default="")
 """The job that the running code plays, or is a handler of."""
 
 
-class Witness(Protocol):
-    """Whoever is told that a job has come into a phase (after the ledger knows)."""
-
-    async def __call__(self, phase: Phase, liability: Liability) -> None: ...
-
-
 class Executor:
-    """Does the jobs of one agent: `run` in a task, `accept` each new liability.
+    """Does the jobs of one agent: `run` in a task, `prepare` each new one.
 
     With a `performer` a ready job starts and finishes by itself, in the order of arrival; without one it waits for
     `start` and `finish`.
@@ -57,12 +49,9 @@ class Executor:
     def __init__(self, workshop: Workshop, *, performer: Performer | None, witness: Witness) -> None:
         self._shop = workshop
         self._performer = performer
-        self._topics = None if performer is None else performer.topics
         self._witness = witness
-        self._fetching = asyncio.Semaphore(FETCHES)
+        self._objectives = Objectives(workshop, topics=None if performer is None else performer.topics)
         self._ready: asyncio.Queue[str] = asyncio.Queue()
-        self._preparing: dict[str, asyncio.Task[None]] = {}
-        self._objectives: dict[str, Objective] = {}
         self._runs: dict[str, Run] = {}
         self._plays: dict[str, asyncio.Task[None]] = {}
         self._tasks: asyncio.TaskGroup | None = None
@@ -75,36 +64,30 @@ class Executor:
         try:
             async with asyncio.TaskGroup() as self._tasks:
                 for job in left:
-                    self._prepare_soon(job.liability)
+                    self.prepare(job.liability)
                 self._opened.set()
                 await self._serve_ready()
         finally:
             self._tasks = None
             await self._suspend()
 
-    async def accept(self, liability: Liability) -> None:
-        """A new liability names us: write it down and prepare it. Known and ended ones are left as they are."""
+    async def opened(self) -> None:
+        """Return when `run` has taken up what the ledger holds."""
         await self._opened.wait()
-        if not liability.is_finalized and await self._shop.ledger.add_job(liability):
-            log.info("%s: incoming, model %s, objective %s", liability.address, liability.model, liability.objective)
-            await self._witness(Phase.INCOMING, liability)
-            self._prepare_soon(liability)
 
-    async def finalized(self, address: str, *, success: bool) -> None:
-        """The chain has finalized the liability at `address`; nothing more is owed. Unknown ones are ignored."""
+    def prepare(self, liability: Liability) -> None:
+        """Fetch and examine a job's objective in a task; then it is ready, or complete without success."""
+        self._objectives.prepare(liability.address, self._prepare(liability), self._begun())
+
+    @asynccontextmanager
+    async def halted(self, address: str) -> AsyncIterator[Job | None]:
+        """Stop whatever runs for a job, keeping its files, and let nothing change meanwhile; gives it if it is ours."""
         async with self._changing:
             job = await self._shop.ledger.job(address)
-            if job is None or job.phase is Phase.FINALIZED:
-                return
-            await self._abandon(address)
-            self._objectives.pop(address, None)
-            # In this order: after a crash between the two, the same block is handled again and finds the job unended.
-            if job.result is not None:
-                await self._shop.outbox.settle(outgoing_identity(_result(job)))
-            await self._shop.ledger.set_phase(address, advance(address, job.phase, Phase.FINALIZED))
-        log.info("%s: finalized, %s", address, "paid" if success else "refunded")
-        ended = msgspec.structs.replace(job.liability, is_finalized=True, is_success=success, result=job.result or "")
-        await self._witness(Phase.FINALIZED, ended)
+            if job is not None:
+                await self._abandon(address)
+                self._objectives.forget(address)
+            yield job
 
     async def start(self, address: str) -> None:
         """Play the objective of a ready job. Returns when the playback has begun. Raises `WrongPhase`."""
@@ -159,10 +142,9 @@ class Executor:
             run = self._runs.pop(address, None) or await self._shop.new_run(job.liability)
             summary = await run.close(note)
             cid = await asyncio.to_thread(self._shop.store.put_file, summary.path)
-            result = self._shop.signer.sign(Result(liability=address, result=cid, success=success))
-            await self._shop.ledger.complete(address, success=success, result=cid, note=note, outgoing=outgoing(result))
+            await self._shop.owe_result(address, success=success, result=cid, note=note)
             await asyncio.to_thread(summary.path.unlink, missing_ok=True)
-            self._objectives.pop(address, None)
+            self._objectives.forget(address)
         await self._shop.outbox.send()
         log.info("%s: complete, success %s, result %s, %d messages", address, success, cid, summary.messages)
         await self._witness(Phase.COMPLETE, await self.read(address))
@@ -182,23 +164,15 @@ class Executor:
 
     async def _objective_at_hand(self, address: str) -> None:
         """After a restart of the agent, a job that is ready is so before its objective has been examined again."""
-        await self._opened.wait()
-        preparing = self._preparing.get(address)
+        await self.opened()
         job = await self._shop.ledger.job(address)
-        if preparing is not None and job is not None and job.phase in STARTED and address not in self._objectives:
-            await asyncio.wait([preparing])
-
-    def _prepare_soon(self, liability: Liability) -> None:
-        address = liability.address
-        preparing = self._begun().create_task(self._prepare(liability), name=f"prepare {address}")
-        self._preparing[address] = preparing
-        preparing.add_done_callback(lambda task: self._preparing.pop(address))
+        if job is not None and job.phase in STARTED:
+            await self._objectives.wait(address)
 
     async def _prepare(self, liability: Liability) -> None:
         address = liability.address
         try:
-            async with self._fetching:
-                objective = await self._shop.examine(liability, topics=self._topics)
+            objective = await self._objectives.examine(liability)
         except (ContentError, InputError) as error:
             log.warning("%s: refused: %s", address, error)
             await self._unless_ended(self.finish(address, success=False, note=str(error)))
@@ -209,7 +183,7 @@ class Executor:
                 await self._shop.ledger.set_phase(address, Phase.READY)
             elif job.phase not in STARTED:
                 return
-            self._objectives[address] = objective
+            self._objectives.keep(address, objective)
         if job.phase is Phase.INCOMING:
             log.info("%s: ready, %d messages to play", address, objective.count)
             await self._witness(Phase.READY, liability)
@@ -270,20 +244,23 @@ class Executor:
 
     async def _suspend(self) -> None:
         """Leave the running jobs as another run of the agent can go on with them."""
-        runs, self._runs = self._runs, {}
-        for address, run in runs.items():
-            await self._shop.ledger.set_position(address, run.position)
+        for address in tuple(self._runs):
             try:
-                await run.close()
+                await self._put_away(address)
             except AiraError as error:
                 log.error("%s: %s", address, error)
 
     async def _abandon(self, address: str) -> None:
         """Stop whatever runs for a job, keeping its files."""
         await self._stop_playing(address)
-        run = self._runs.pop(address, None)
-        if run is not None:
-            await run.close()
+        if address in self._runs:
+            await self._put_away(address)
+
+    async def _put_away(self, address: str) -> None:
+        """Note how far a run has come and close it."""
+        run = self._runs.pop(address)
+        await self._shop.ledger.set_position(address, run.position)
+        await run.close()
 
     async def _stop_playing(self, address: str) -> None:
         """Cancel the playback of a job and wait for its end, unless it is the playback, or its handler, that asks."""
@@ -302,8 +279,3 @@ class Executor:
             await ending
         except WrongPhase as error:
             log.info("%s", error)
-
-
-def _result(job: Job) -> Result:
-    assert job.result is not None
-    return Result(liability=job.liability.address, result=job.result, success=bool(job.success))

@@ -32,6 +32,7 @@ CREATE TABLE IF NOT EXISTS jobs (
     result TEXT,
     position INTEGER NOT NULL DEFAULT 0,
     note TEXT NOT NULL DEFAULT '',
+    aside INTEGER NOT NULL DEFAULT 0,
     changed REAL NOT NULL
 );
 CREATE TABLE IF NOT EXISTS outbox (
@@ -41,7 +42,7 @@ CREATE TABLE IF NOT EXISTS outbox (
     deadline INTEGER,
     posted REAL NOT NULL
 );
-CREATE TABLE IF NOT EXISTS cursors (name TEXT PRIMARY KEY, block INTEGER NOT NULL);
+CREATE TABLE IF NOT EXISTS cursors (name TEXT PRIMARY KEY, block INTEGER NOT NULL, history BLOB NOT NULL DEFAULT x'');
 """
 POST: Final = "INSERT OR IGNORE INTO outbox (identity, kind, payload, deadline, posted) VALUES (?, ?, ?, ?, ?)"
 
@@ -122,11 +123,16 @@ class Ledger:
         await self._run(f"PRAGMA user_version = {VERSION}")
 
     async def add_job(self, liability: Liability) -> bool:
-        """Write down a new job as INCOMING; False when it was known."""
+        """Write down a new job as INCOMING, or take up one that was set aside; False when it was known."""
         return await self._run(
-            "INSERT OR IGNORE INTO jobs (liability, phase, record, changed) VALUES (?, ?, ?, ?)",
+            "INSERT INTO jobs (liability, phase, record, changed) VALUES (?, ?, ?, ?)"
+            " ON CONFLICT (liability) DO UPDATE SET aside = 0 WHERE aside",
             (liability.address, Phase.INCOMING, liability.encode(), time.time()),
         )
+
+    async def set_aside(self, liability: str) -> None:
+        """There is no such job, until `add_job` takes it up again with all that is known of it."""
+        await self._run("UPDATE jobs SET aside = 1 WHERE liability = ?", (liability,))
 
     async def set_phase(self, liability: str, phase: Phase, *, position: int | None = None) -> None:
         """Write down where the job at `liability` (address) stands, and how many messages it has played."""
@@ -158,14 +164,14 @@ class Ledger:
 
     async def job(self, liability: str) -> Job | None:
         """The job at `liability` (EIP-55 address), if it is ours."""
-        rows = await self._rows("SELECT * FROM jobs WHERE liability = ?", (liability,))
+        rows = await self._rows("SELECT * FROM jobs WHERE liability = ? AND NOT aside", (liability,))
         return _job(rows[0]) if rows else None
 
     async def jobs(self, phases: Iterable[Phase] = UNFINISHED) -> list[Job]:
         """The jobs in the given phases, oldest first."""
         wanted = tuple(phases)
         marks = ",".join("?" * len(wanted))
-        rows = await self._rows(f"SELECT * FROM jobs WHERE phase IN ({marks}) ORDER BY rowid", wanted)
+        rows = await self._rows(f"SELECT * FROM jobs WHERE phase IN ({marks}) AND NOT aside ORDER BY rowid", wanted)
         return [_job(row) for row in rows]
 
     async def post(self, outgoing: Outgoing) -> None:
@@ -187,9 +193,16 @@ class Ledger:
         rows = await self._rows("SELECT block FROM cursors WHERE name = ?", (name,))
         return int(rows[0][0]) if rows else None
 
-    async def set_cursor(self, name: str, block: int) -> None:
-        """All of `block` has been handled by `name`."""
-        await self._run("INSERT OR REPLACE INTO cursors (name, block) VALUES (?, ?)", (name, block))
+    async def history(self, name: str) -> bytes:
+        """What `name` remembered of the chain at its cursor; empty when it remembered nothing."""
+        rows = await self._rows("SELECT history FROM cursors WHERE name = ?", (name,))
+        return bytes(rows[0][0]) if rows else b""
+
+    async def set_cursor(self, name: str, block: int, *, history: bytes = b"") -> None:
+        """All of `block` has been handled by `name`, which remembers `history` of the chain."""
+        await self._run(
+            "INSERT OR REPLACE INTO cursors (name, block, history) VALUES (?, ?, ?)", (name, block, history)
+        )
 
     def _open(self) -> aiosqlite.Connection:
         if self._database is None:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 from mesh.errors import AiraError
+
+if TYPE_CHECKING:
+    from schemas import Liability
 
 
 class Phase(StrEnum):
@@ -43,6 +46,12 @@ class WrongPhase(AiraError):
         super().__init__(f"can't {asked} {liability}: it {where}")
         self.liability = liability
         self.phase = phase
+
+
+class Witness(Protocol):
+    """Whoever is told that a job has come into a phase (after the ledger knows)."""
+
+    async def __call__(self, phase: Phase, liability: Liability) -> None: ...
 
 
 def advance(liability: str, phase: Phase, to: Phase) -> Phase:

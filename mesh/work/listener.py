@@ -4,12 +4,23 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from contextlib import aclosing
 from typing import TYPE_CHECKING, Final, Protocol
 
-from mesh.chain import Finalized, NewLiability, NodeUnreachable, RequestRefused
+from mesh.chain import (
+    Finalized,
+    History,
+    NewLiability,
+    NodeUnreachable,
+    NotALiability,
+    Reorganised,
+    RequestRefused,
+)
 
 if TYPE_CHECKING:
-    from mesh.chain import Chain
+    from collections.abc import Iterable
+
+    from mesh.chain import Chain, ChainEvent
     from mesh.work.ledger import Ledger
     from schemas import Liability
 
@@ -28,8 +39,14 @@ class Party(Protocol):
     async def finalized(self, address: str, *, success: bool, result: str) -> None:
         """The contract at `address`, perhaps none of ours, has paid (`success`) or refunded; `result` is its CID."""
 
+    async def taken_back(self, address: str) -> None:
+        """The chain was reorganised: that the contract at `address` has ended did not happen, or not yet."""
+
+    async def unmade(self, address: str) -> None:
+        """The chain was reorganised: there is no contract at `address`, or not yet."""
+
     async def new_head(self, block: int) -> None:
-        """All of `block` has been handled."""
+        """All of `block` has been handled; after a reorganisation it may be lower than before."""
 
 
 class Listener:
@@ -61,25 +78,47 @@ class Listener:
 
     async def _read(self) -> None:
         """Read from the ledger's cursor on."""
-        cursor = await self._ledger.cursor(self.NAME)
+        cursor, history = await self._ledger.cursor(self.NAME), History()
         if cursor is None:
             cursor = await self._chain.block_number()
             await self._ledger.set_cursor(self.NAME, cursor)
-        async for block in self._chain.events(cursor + 1):
-            if self._lost:
-                log.info("the chain can be read again, from block %d", block.block_number)
-            self._lost = False
-            for event in block.events:
-                match event:
-                    case NewLiability():
-                        await self._new_liability(event)
-                    case Finalized():
-                        await self._party.finalized(event.liability, success=event.success, result=event.result)
-            await self._ledger.set_cursor(self.NAME, block.block_number)
-            await self._party.new_head(block.block_number)
+        elif remembered := await self._ledger.history(self.NAME):
+            history = History.decode(remembered)
+        async with aclosing(self._chain.events(cursor + 1, history=history)) as blocks:
+            async for block in blocks:
+                if self._lost:
+                    log.info("the chain can be read again, from block %d", block.block_number)
+                self._lost = False
+                if isinstance(block, Reorganised):
+                    await self._take_back(block)
+                await self._handle(block.events)
+                await self._ledger.set_cursor(self.NAME, block.block_number, history=history.encode())
+                await self._party.new_head(block.block_number)
+
+    async def _handle(self, events: Iterable[ChainEvent]) -> None:
+        for event in events:
+            match event:
+                case NewLiability():
+                    await self._new_liability(event)
+                case Finalized():
+                    await self._party.finalized(event.liability, success=event.success, result=event.result)
 
     async def _new_liability(self, event: NewLiability) -> None:
-        liability = await self._chain.liability(event.liability)
+        try:
+            liability = await self._chain.liability(event.liability)
+        except NotALiability as error:
+            log.warning("a reorganisation was quicker: %s", error)
+            return
         if self._account in (liability.promisor, liability.promisee):
             demand_hash, offer_hash = await self._chain.order_hashes(event.liability)
             await self._party.new_liability(liability, demand_hash=demand_hash, offer_hash=offer_hash)
+
+    async def _take_back(self, block: Reorganised) -> None:
+        """The chain replaced blocks: what was told of them did not happen, unless the new blocks say so again."""
+        log.warning("the chain replaced all after block %d", block.back_to)
+        for event in block.events_taken_back:
+            match event:
+                case NewLiability():
+                    await self._party.unmade(event.liability)
+                case Finalized():
+                    await self._party.taken_back(event.liability)

@@ -22,10 +22,15 @@ RESEND: Final = 3.0
 
 
 def outgoing_identity(message: Demand | Offer | Result) -> str:
-    """Under what a message waits: an order by its hash, a Result by its liability (there is one only)."""
+    """Under what a message waits: an order by its hash, a Result by its liability."""
     if isinstance(message, Result):
-        return f"result {message.liability}"
+        return result_identity(message.liability)
     return message_hash(message).hex()
+
+
+def result_identity(liability: str) -> str:
+    """Under what the Result of the liability at that address waits; there is one only."""
+    return f"result {liability}"
 
 
 def outgoing(message: Demand | Offer | Result) -> Outgoing:

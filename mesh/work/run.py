@@ -169,9 +169,7 @@ class Run:
             raise HandlerCancelled(f"the handler of {message.topic} was cancelled") from None
 
     def _put(self, key: str, payload: bytes, kind: PayloadType) -> None:
-        self._session.put(
-            key, payload, encoding=kind.zenoh_encoding, congestion_control=zenoh.CongestionControl.DROP, express=True
-        )
+        self._session.put(key, payload, encoding=kind.zenoh_encoding, congestion_control=zenoh.CongestionControl.DROP)
 
     def _hear(self, sample: zenoh.Sample) -> None:
         """Zenoh's callback: a message on the job's topics, or our own mark that all before it has been heard."""

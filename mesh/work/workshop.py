@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 import mesh
 from mesh.errors import InputError
 from mesh.recording import AtOnce, Limits, RecordedTimes, Recorder, RecordingAbout, preflight
+from mesh.work.outbox import outgoing
 from mesh.work.run import Plan, Run
+from schemas import Result
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -76,6 +78,11 @@ class Workshop:
         plan = Plan(liability=liability, objective=objective, pace=pace, position=position, topics=chosen or None)
         recorder = await asyncio.to_thread(self._new_recorder, liability)
         return Run(self.session, self.signer.address, plan, recorder)
+
+    async def owe_result(self, address: str, *, success: bool, result: str, note: str) -> None:
+        """Write down how the job at `address` has ended, and its signed Result, to be sent until the chain has it."""
+        signed = self.signer.sign(Result(liability=address, result=result, success=success))
+        await self.ledger.complete(address, success=success, result=result, note=note, outgoing=outgoing(signed))
 
     def discard_recording(self, address: str) -> None:
         """Forget what an earlier run of the liability at `address` has recorded. Blocks on the disk."""

@@ -13,7 +13,7 @@ from mesh.agent import Phase
 from mesh.network import Endpoints, Network, ServiceFailed, call
 from mesh.recording import open_objective
 from schemas import ZERO_ADDRESS, Liability, String, cid_of_bytes
-from schemas.keys import EventKey, LiabilityTopicKey, ObjectiveTopicKey
+from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey
 from schemas.rpc import (
     Done,
     FinishLiability,
@@ -295,10 +295,8 @@ async def test_events_are_on_the_agents_keys_with_the_record(place: Place, contr
     outcome = await contract.outcome()
     await until(lambda: len(told) == 4)
     subscriber.undeclare()
-    expected = ("incoming", "ready", "complete", "finalized")
-    assert [key for key, _ in told] == [
-        str(EventKey(control.robot.address, contract.address, event)) for event in expected
-    ]
+    events = f"aira/agent/{control.robot.address.lower()}/liability/{contract.address.lower()}"
+    assert [key for key, _ in told] == [f"{events}/{event}" for event in ("incoming", "ready", "complete", "finalized")]
     assert [record.address for _, record in told] == [contract.address] * 4
     assert [record.result for _, record in told] == ["", "", outcome.result, outcome.result]
     assert [record.is_finalized for _, record in told] == [False, False, False, True]

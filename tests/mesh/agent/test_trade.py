@@ -59,6 +59,11 @@ async def posted(agent: Agent) -> None:
     await until_found(lambda: waiting(agent), what="a posted order")
 
 
+async def known(robot: Agent, address: str) -> None:
+    """Wait until a robot has heard of its job: it reads the chain by itself."""
+    await until_found(lambda: robot.parts.ledger.job(address), what="a job")
+
+
 async def allowance(place: Place, role: str) -> int:
     chain = place.chains[role]
     return await chain.allowance(place.address(role), chain.factory)
@@ -87,6 +92,20 @@ async def test_concurrent_demands_become_a_contract_each(place: Place, generatio
         assert [contract.liability.cost for contract in contracts] == [10, 200, 3000]
         assert [outcome.success for outcome in outcomes] == [True] * 3
     assert await place.balance("robot") == before + 3210
+
+
+async def test_offers_that_were_overtaken_in_generation_5_are_signed_anew(place: Place) -> None:
+    """Both of the robot's offers bear the same nonce, since neither was taken when they were made."""
+    robot = working(place.agent("robot"))
+    people = [place.agent(role, generation=5) for role in ("person", "provider")]
+    async with robot, people[0], people[1], asyncio.timeout(30):
+        demands = [
+            asyncio.create_task(one.demand(job(place), cost=cost)) for one, cost in zip(people, (6, 7), strict=True)
+        ]
+        await until_found(lambda: all_posted(robot, 2))
+        async with place.provider():
+            contracts = [await demand for demand in demands]
+            assert [(await contract.outcome()).success for contract in contracts] == [True, True]
 
 
 async def test_the_factory_is_allowed_what_all_open_demands_may_cost(place: Place) -> None:
@@ -140,7 +159,7 @@ async def test_rejections_of_other_orders_and_rubbish_are_not_believed(place: Pl
         stranger.session.put(key, other.encode())
         arrived: list[object] = []
         with person.parts.network.session.declare_subscriber("last", arrived.append):
-            await until(lambda: stranger.session.put("last", b"") or arrived)  # type: ignore[func-returns-value]
+            await until(lambda: stranger.session.put("last", b"") or arrived)
         assert not demand.done()
         ours = Rejection(order=identity, reason="full", detail="come later", provider=place.address("provider"))
         stranger.session.put(key, ours.encode())
@@ -198,7 +217,7 @@ async def test_the_end_of_the_agent_is_told_to_who_waits_for_a_contract(place: P
         demand = asyncio.create_task(person.demand(OBJECTIVE))
         await posted(person)
     with pytest.raises(ClosedError, match="the agent has ended"):
-        await demand
+        await asyncio.wait_for(demand, 10)
     async with place.agent("person") as person:
         assert await waiting(person) == [], "nobody waits for it any more"
 
@@ -209,9 +228,9 @@ async def test_the_end_of_the_agent_is_told_to_who_waits_for_an_outcome(place: P
         async with place.agent("person") as person:
             contract = await person.demand(job(place))
             outcome = asyncio.create_task(contract.outcome())
-            await asyncio.sleep(0)
+            await known(robot, contract.address)
         with pytest.raises(ClosedError, match="the agent has ended"):
-            await outcome
+            await asyncio.wait_for(outcome, 10)
         await robot.finish(contract.address, success=False)
 
 
@@ -294,6 +313,7 @@ async def test_a_contract_of_others_can_be_waited_for(place: Place) -> None:
     robot = obliging(place.agent("robot"))
     async with place.provider(), robot, place.agent("person") as person, place.agent("provider") as stranger:
         address = (await person.demand(job(place))).address
+        await known(robot, address)
         contract = await stranger.contract(address.lower())
         outcome = asyncio.create_task(contract.outcome())
         result = await robot.finish(address, success=True)
@@ -304,7 +324,7 @@ async def test_a_contract_that_has_ended_has_its_outcome_at_once(place: Place) -
     async with place.provider(), working(place.agent("robot")), place.agent("person") as person:
         address = (await person.demand(job(place))).address
         outcome = await (await person.contract(address)).outcome()
-    async with place.agent("provider") as later:
+    async with place.agent("provider") as later, asyncio.timeout(10):
         contract = await later.contract(address)
         assert await contract.outcome() == outcome
         assert later._working().trader._endings == {}
@@ -322,7 +342,7 @@ async def test_giving_up_to_wait_for_an_outcome_leaves_it_to_others(place: Place
     async with place.provider(), robot, place.agent("person") as person:
         contract = await person.demand(job(place))
         impatient, patient = (asyncio.create_task(contract.outcome()) for _ in range(2))
-        await asyncio.sleep(0)
+        await known(robot, contract.address)
         impatient.cancel()
         await asyncio.wait([impatient])
         await robot.finish(contract.address, success=True)
@@ -333,6 +353,7 @@ async def test_a_contract_refunded_without_a_result_has_no_recording(place: Plac
     robot = obliging(place.agent("robot"))
     async with place.provider(), robot, place.agent("person") as person:
         contract = await person.demand(job(place))
+        await known(robot, contract.address)
         person._working().trader.finalized(contract.address, Outcome(success=False, result=""))
         with pytest.raises(ContentUnavailable, match="was refunded without a result"):
             await contract.recording()

@@ -16,7 +16,7 @@ from mesh.work.run import NOTE_TOPIC
 from schemas import Empty, String, cid_of_bytes, cid_of_file
 from tests.support.market import Place, obliging
 from tests.support.objectives import MILLISECOND, objective, timed
-from tests.support.waiting import until
+from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
     from mesh.agent import Agent, Contract
@@ -224,23 +224,26 @@ async def test_a_job_whose_objective_is_missing_does_not_hold_up_the_next(place:
 
 async def test_jobs_are_done_one_after_the_other(place: Place) -> None:
     robot = obliging(place.agent("robot"))
-    at_it: set[str] = set()
-    most = 0
+    begun: list[str] = []
+    release = asyncio.Event()
 
     @robot.on("/go")
     async def go(job: Run, message: Any) -> None:
-        nonlocal most
-        at_it.add(job.liability.address)
-        most = max(most, len(at_it))
-        await asyncio.sleep(0.05)
-        at_it.discard(job.liability.address)
+        begun.append(job.liability.address)
+        await release.wait()
+
+    async def others_are_ready() -> bool:
+        return len(await robot.parts.ledger.jobs((Phase.READY,))) == 2
 
     path = place.save(objective(("/go", Empty()), ("/go", Empty())))
     async with place.at_work(robot) as person:
         contracts = await asyncio.gather(*(person.demand(path, cost=cost) for cost in (1, 2, 3)))
+        await until_found(others_are_ready)
+        assert len(begun) == 1
+        release.set()
         outcomes = await asyncio.gather(*(contract.outcome() for contract in contracts))
     assert [outcome.success for outcome in outcomes] == [True] * 3
-    assert most == 1
+    assert begun[0::2] == begun[1::2], "both messages of a job before any of the next"
 
 
 async def test_witnesses_hear_every_phase_in_order_with_its_record(place: Place) -> None:
@@ -271,7 +274,7 @@ async def test_a_handler_may_end_its_own_job(place: Place) -> None:
         cid = await robot.finish(job.liability.address, success=False)
         done.append(f"{message.data} {cid}")
 
-    async with place.at_work(robot) as person:
+    async with place.at_work(robot) as person, asyncio.timeout(20):
         contract = await person.demand(place.save(objective(*(("/go", str(n)) for n in range(50)), step_ns=0)))
         outcome = await contract.outcome()
         assert not outcome.success
@@ -351,6 +354,22 @@ async def test_played_messages_are_on_the_mesh(place: Place) -> None:
         listener.undeclare()
     key = f"aira/agent/{place.address('robot').lower()}/liability/{contract.address.lower()}/objective/arm/left"
     assert played == [(key, String(word).encode(), "ros1;std_msgs/String") for word in ("up", "down")]
+
+
+async def test_a_burst_of_played_messages_arrives_whole(place: Place) -> None:
+    robot = doing_nothing(obliging(place.agent("robot")))
+    heard: list[bytes] = []
+    words = [str(number) for number in range(500)]
+    async with place.at_work(robot) as person:
+        listener: Any = person.parts.network.session.declare_subscriber(
+            f"aira/agent/{place.address('robot').lower()}/liability/*/objective/say",
+            lambda sample: heard.append(sample.payload.to_bytes()),
+        )
+        contract = await person.demand(place.save(objective(*(("/say", word) for word in words), step_ns=0)))
+        await contract.outcome()
+        await until(lambda: len(heard) >= len(words))
+        listener.undeclare()
+    assert heard == [String(word).encode() for word in words]
 
 
 async def test_a_late_device_message_of_a_played_topic_keeps_its_role(place: Place) -> None:

@@ -81,6 +81,19 @@ async def test_a_position_keeps_the_phase(ledger: Ledger) -> None:
     assert (job.phase, job.position) == (Phase.COMPLETE, 3)
 
 
+async def test_a_job_set_aside_is_unknown_until_it_is_added_again_with_all_that_was(ledger: Ledger) -> None:
+    await ledger.add_job(liability())
+    await ledger.set_phase(liability().address, Phase.RUNNING, position=7)
+    await ledger.set_aside(liability().address)
+    assert await ledger.job(liability().address) is None
+    assert await ledger.jobs() == []
+    assert await ledger.add_job(liability())
+    assert not await ledger.add_job(liability())
+    job = await ledger.job(liability().address)
+    assert job is not None
+    assert (job.phase, job.position) == (Phase.RUNNING, 7)
+
+
 async def test_jobs_are_listed_by_phase_oldest_first(ledger: Ledger) -> None:
     for name in ("c", "a", "b", "done"):
         await ledger.add_job(liability(name))
@@ -178,6 +191,14 @@ async def test_cursors_are_kept_by_name(ledger: Ledger) -> None:
     await ledger.set_cursor("listener", 42)
     await ledger.set_cursor("other", 1)
     assert await ledger.cursor("listener") == 42
+
+
+async def test_what_is_remembered_of_the_chain_is_kept_with_the_cursor(ledger: Ledger) -> None:
+    assert await ledger.history("listener") == b""
+    await ledger.set_cursor("listener", 41)
+    assert await ledger.history("listener") == b""
+    await ledger.set_cursor("listener", 42, history=b"blocks")
+    assert (await ledger.cursor("listener"), await ledger.history("listener")) == (42, b"blocks")
 
 
 async def test_everything_survives_reopening(path: Path) -> None:

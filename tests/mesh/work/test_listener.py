@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.background import Background
-from mesh.chain import Chain, ChainWentBack, JsonRpcServer, Timing
+from mesh.chain import Chain, ChainWentBack, JsonRpcServer, NewLiability, Timing
 from mesh.work import Ledger
 from mesh.work import listener as listener_module
 from mesh.work.listener import Listener
@@ -36,6 +36,8 @@ class Diary:
     def __init__(self) -> None:
         self.liabilities: list[tuple[Liability, bytes, bytes]] = []
         self.ends: list[tuple[str, bool, str]] = []
+        self.taken_back_ends: list[str] = []
+        self.taken_back_contracts: list[str] = []
         self.head = 0
 
     async def new_liability(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
@@ -43,6 +45,12 @@ class Diary:
 
     async def finalized(self, address: str, *, success: bool, result: str) -> None:
         self.ends.append((address, success, result))
+
+    async def taken_back(self, address: str) -> None:
+        self.taken_back_ends.append(address)
+
+    async def unmade(self, address: str) -> None:
+        self.taken_back_contracts.append(address)
 
     async def new_head(self, block: int) -> None:
         self.head = block
@@ -190,3 +198,57 @@ async def test_a_chain_that_is_shorter_than_what_was_read_is_refused(place: Plac
     listener = Listener(place.chains["robot"], ledger, place.address("robot"), Diary())
     with pytest.raises(ChainWentBack):
         await listener.run()
+
+
+async def test_an_end_that_the_chain_took_back_is_told(place: Place, ledger: Ledger) -> None:
+    async with listening(place, ledger) as diary:
+        await started(ledger)
+        address, *_ = await contract(place)
+        await finalize(place, address)
+        await until(lambda: diary.ends)
+        await place.forget_blocks(1)
+        await until(lambda: diary.taken_back_ends)
+        await finalize(place, address)
+        await until(lambda: len(diary.ends) == 2)
+    assert diary.taken_back_ends == [address]
+    assert diary.ends[0][0] == diary.ends[1][0] == address
+    assert len(diary.liabilities) == 1, "what came before is as it was"
+
+
+async def test_an_end_that_was_taken_back_while_the_agent_was_down_is_told(place: Place, ledger: Ledger) -> None:
+    async with listening(place, ledger) as diary:
+        await started(ledger)
+        address, *_ = await contract(place)
+        await finalize(place, address)
+        head = await place.chains["robot"].block_number()
+        await until(lambda: diary.head >= head)
+    await place.forget_blocks(1)
+    async with listening(place, ledger) as diary:
+        await until(lambda: diary.taken_back_ends)
+    assert diary.taken_back_ends == [address]
+
+
+async def test_a_contract_that_the_chain_took_back_is_told_and_told_again_when_it_is_made(
+    place: Place, ledger: Ledger
+) -> None:
+    async with listening(place, ledger) as diary:
+        await started(ledger)
+        first, demand, offer = await contract(place)
+        await until(lambda: diary.liabilities)
+        await place.forget_blocks(1)
+        await until(lambda: diary.taken_back_contracts)
+        lighthouse = place.market.deployment.lighthouse_name
+        again = await place.chains["provider"].create_liability(lighthouse, demand, offer)
+        await until(lambda: len(diary.liabilities) == 2)
+    assert diary.taken_back_contracts == [first]
+    assert [liability.address for liability, *_ in diary.liabilities] == [first, again.liability]
+    assert diary.taken_back_ends == []
+
+
+async def test_a_contract_that_a_reorganisation_took_before_it_was_read_is_left_out(
+    place: Place, ledger: Ledger
+) -> None:
+    diary = Diary()
+    listener = Listener(place.chains["robot"], ledger, place.address("robot"), diary)
+    await listener._new_liability(NewLiability(place.address("robot"), "0x"))
+    assert diary.liabilities == []

@@ -10,8 +10,8 @@ import pytest
 
 from mesh.agent import Agent, Phase
 from mesh.recording import open_objective
+from mesh.work import Ledger
 from mesh.work import outbox as outbox_module
-from mesh.work.executor import Executor
 from mesh.work.outbox import outgoing
 from schemas import String, cid_of_file
 from tests.mesh.work.samples import liability
@@ -185,7 +185,6 @@ async def test_a_job_that_the_chain_ended_meanwhile_is_not_done(place: Place) ->
     seen: list[Phase] = []
     async with place.provider(), place.agent("person") as person:
         async with obliging(place.agent("robot")) as robot:
-            await robot.parts.ledger.set_cursor("listener", 0)
             contract = await person.demand(words(place))
             await in_phase(robot, contract, Phase.READY)
             failed = result(signer=robot.parts.signer, liability=contract.address, success=False)
@@ -193,10 +192,9 @@ async def test_a_job_that_the_chain_ended_meanwhile_is_not_done(place: Place) ->
         robot = place.agent("robot")
         robot.on_liability(take_note(seen))
         async with robot:
-            await in_phase(robot, contract, Phase.FINALIZED)
+            await until(lambda: Phase.FINALIZED in seen)
         async with speaking(place.agent("robot"), said) as robot:
             await reading(robot)
-    assert Phase.FINALIZED in seen
     assert said == []
 
 
@@ -210,7 +208,11 @@ def take_note(seen: list[Phase]) -> Callable[[Phase, Liability], Any]:
 async def reading(robot: Agent) -> None:
     """Wait until an agent has read the chain to its end."""
     head = await robot.parts.chain.block_number()
-    await until(lambda: robot.parts.clock.head >= head)
+
+    async def read() -> bool:
+        return (await robot.parts.ledger.cursor("listener") or 0) >= head
+
+    await until_found(read, what=f"block {head}")
 
 
 async def test_a_liability_that_has_ended_before_the_agent_heard_of_it_is_no_job(place: Place) -> None:
@@ -218,12 +220,13 @@ async def test_a_liability_that_has_ended_before_the_agent_heard_of_it_is_no_job
     async with place.provider(), place.agent("person") as person:
         async with obliging(place.agent("robot", enable_executor=False)) as robot:
             await reading(robot)
+            head, robot_memory = robot.parts.clock.head, robot.parts.directory
             contract = await person.demand(words(place))
         failed = result(signer=place.market.accounts["robot"].signer, liability=contract.address, success=False)
         await place.chains["provider"].finalize(place.market.deployment.lighthouse_name, failed)
         # As if it had been down since before the contract was made.
-        async with place.agent("robot", enable_executor=False) as robot:
-            await robot.parts.ledger.set_cursor("listener", 1)
+        async with Ledger(robot_memory / "ledger.sqlite") as ledger:
+            await ledger.set_cursor("listener", head)
         async with speaking(place.agent("robot"), said) as robot:
             await reading(robot)
             assert await robot.parts.ledger.job(contract.address) is None
@@ -235,21 +238,110 @@ async def test_a_result_is_out_of_the_outbox_before_its_job_is_marked_as_finaliz
     ours = liability(promisor=place.address("robot"))
     signed = result(liability=ours.address)
 
-    async def witness(phase: Phase, liability: Liability) -> None:
-        pass
-
     async with place.agent("robot", enable_executor=False) as robot:
         ledger = robot.parts.ledger
         await ledger.add_job(ours)
         await ledger.complete(ours.address, success=True, result=signed.result, note="", outgoing=outgoing(signed))
         refuse_to_finalize(robot.parts.directory / "ledger.sqlite")
-        executor = Executor(robot.parts.workshop(), performer=None, witness=witness)
         with pytest.raises(sqlite3.IntegrityError, match="crash"):
-            await executor.finalized(ours.address, success=True)
+            await robot._working().finalized(ours.address, success=True, result=signed.result)
         assert await ledger.outbox(head=0) == []
         job = await ledger.job(ours.address)
         assert job is not None
         assert job.phase is Phase.COMPLETE
+
+
+async def test_a_payment_that_the_chain_took_back_is_asked_for_again(place: Place, paid: Paying) -> None:
+    said: list[str] = []
+    async with place.agent("person") as person, speaking(obliging(place.agent("robot")), said) as robot:
+        async with place.provider():
+            contract = await person.demand(words(place), cost=COST)
+            await in_phase(robot, contract, Phase.FINALIZED)
+            assert await paid.once()
+        await place.forget_blocks(1)
+        assert not await paid.once()
+        await in_phase(robot, contract, Phase.COMPLETE)
+        async with place.provider():
+            await in_phase(robot, contract, Phase.FINALIZED)
+        assert await robot.parts.ledger.outbox(head=0) == []
+    assert await paid.once()
+    assert said == WORDS
+
+
+async def test_an_end_without_a_result_of_ours_is_not_taken_back(place: Place) -> None:
+    ours = liability(promisor=place.address("robot"))
+    async with place.agent("robot") as robot:
+        await robot.parts.ledger.add_job(ours)
+        await robot.parts.ledger.set_phase(ours.address, Phase.FINALIZED)
+        await robot._working().taken_back(ours.address)
+        await robot._working().taken_back(liability("of somebody else").address)
+        assert [job.phase for job in await robot.parts.ledger.jobs(Phase)] == [Phase.FINALIZED]
+        assert await robot.parts.ledger.outbox(head=0) == []
+
+
+async def test_a_contract_that_is_made_again_elsewhere_is_one_job_and_paid_once(place: Place, paid: Paying) -> None:
+    """A reorganisation took the contract; the provider makes it again of the same orders, at another address."""
+    said: list[str] = []
+    async with place.agent("person") as person, place.provider():
+        async with obliging(place.agent("robot")) as robot:
+            contract = await person.demand(words(place), cost=COST)
+            first = contract.address
+            await in_phase(robot, contract, Phase.READY)
+            await place.forget_blocks(1)
+            await until(lambda: contract.address != first)
+            assert await robot.parts.ledger.job(first) is None
+            await in_phase(robot, contract, Phase.READY)
+        async with speaking(place.agent("robot"), said) as robot:
+            assert (await contract.outcome()).success
+            await in_phase(robot, contract, Phase.FINALIZED)
+    assert said == WORDS
+    assert await paid.once()
+
+
+async def told_again(robot: Agent, contract: Contract) -> None:
+    """Have the chain take a contract back and tell it again, as when another block holds the same transaction."""
+    hashes = await robot.parts.chain.order_hashes(contract.address)
+    await robot._working().unmade(contract.address)
+    assert await robot.parts.ledger.job(contract.address) is None
+    assert await robot.parts.ledger.outbox(head=0) == []
+    await robot._working().new_liability(contract.liability, demand_hash=hashes[0], offer_hash=hashes[1])
+
+
+async def test_a_job_that_rested_goes_on_where_it_was(place: Place, paid: Paying) -> None:
+    said: list[str] = []
+    released = asyncio.Event()
+    robot = obliging(place.agent("robot"))
+
+    @robot.on("/say")
+    async def say(job: Run, message: String) -> None:
+        if message.data == "3":
+            await released.wait()
+        said.append(message.data)
+        job.publish("/said", message.data)
+
+    async with place.provider(), robot, place.agent("person") as person:
+        contract = await person.demand(words(place), cost=COST)
+        await until(lambda: len(said) == 3)
+        await told_again(robot, contract)
+        released.set()
+        assert (await contract.outcome()).success
+        recording = open_objective(await contract.recording())
+    assert said == WORDS
+    heard = [String.decode(message.payload).data for message in recording.messages() if message.topic == "/said"]
+    assert heard == WORDS
+    assert await paid.once()
+
+
+async def test_a_finished_job_that_rested_sends_its_result_again(place: Place, paid: Paying) -> None:
+    said: list[str] = []
+    async with place.agent("person") as person, speaking(obliging(place.agent("robot")), said) as robot:
+        contract = await made_by_a_provider_that_goes(place, person)
+        await in_phase(robot, contract, Phase.COMPLETE)
+        await told_again(robot, contract)
+        async with place.provider():
+            assert (await contract.outcome()).success
+    assert said == WORDS
+    assert await paid.once()
 
 
 def refuse_to_finalize(ledger: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -29,7 +29,7 @@ async def shop(place: Place) -> AsyncIterator[Workshop]:
 
 
 @asynccontextmanager
-async def opened(place: Place, **settings: object) -> AsyncIterator[Workshop]:
+async def opened(place: Place, **settings: Any) -> AsyncIterator[Workshop]:
     async with place.agent("robot", enable_executor=False, **settings) as robot:
         yield robot.parts.workshop()
 
@@ -109,7 +109,7 @@ async def test_the_settings_choose_pace_and_topics(place: Place) -> None:
     async with opened(place, playback="recorded", recording_topics=" /a,/b/c ,") as shop:
         run = await shop.new_run(liability())
         assert run._plan.pace == RecordedTimes()
-        assert run._plan.topics == {"/a", "/b/c"}
+        assert run._plan.topics == frozenset({"/a", "/b/c"})
         await run.close()
     async with opened(place) as shop:
         run = await shop.new_run(liability())

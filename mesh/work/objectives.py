@@ -1,0 +1,57 @@
+"""The objectives of jobs that have not ended: fetched and examined several at once, and kept at hand."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine
+
+    from mesh.recording import Objective
+    from mesh.work.workshop import Workshop
+    from schemas import Liability
+
+FETCHES: Final = 4
+"""Objectives fetched and examined at once."""
+
+
+class Objectives:
+    """Objectives by the address of their liability. `topics` are those that the device understands (None: any)."""
+
+    def __init__(self, shop: Workshop, *, topics: frozenset[str] | None) -> None:
+        self._shop = shop
+        self._topics = topics
+        self._turns = asyncio.Semaphore(FETCHES)
+        self._preparing: dict[str, asyncio.Task[None]] = {}
+        self._at_hand: dict[str, Objective] = {}
+
+    def __contains__(self, address: str) -> bool:
+        return address in self._at_hand
+
+    def __getitem__(self, address: str) -> Objective:
+        return self._at_hand[address]
+
+    def prepare(self, address: str, work: Coroutine[None, None, None], tasks: asyncio.TaskGroup) -> None:
+        """Run `work`, which is to end with `keep` or with the job, as one of `tasks`."""
+        preparing = self._preparing[address] = tasks.create_task(work, name=f"prepare {address}")
+        preparing.add_done_callback(lambda task: self._preparing.pop(address))
+
+    async def examine(self, liability: Liability) -> Objective:
+        """The liability's objective, found fit to be played. Raises `UnfitObjective` or a `ContentError`."""
+        async with self._turns:
+            return await self._shop.examine(liability, topics=self._topics)
+
+    def keep(self, address: str, objective: Objective) -> None:
+        """Have it at hand until `forget`."""
+        self._at_hand[address] = objective
+
+    def forget(self, address: str) -> None:
+        """The job has ended. Unknown ones are ignored."""
+        self._at_hand.pop(address, None)
+
+    async def wait(self, address: str) -> None:
+        """Return when the objective is at hand, or nobody prepares it any more."""
+        preparing = self._preparing.get(address)
+        if preparing is not None and address not in self._at_hand:
+            await asyncio.wait([preparing])

@@ -1,0 +1,119 @@
+"""The purse: the factory may take what open orders cost, in a world that moves while it is allowed to."""
+
+from __future__ import annotations
+
+import secrets
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from web3.providers.async_base import AsyncBaseProvider
+
+from mesh.agent import ShortOfFunds
+from mesh.agent.purse import Purse
+from mesh.chain import Chain
+from schemas import Demand, Offer
+from tests.support.market import QUICK
+from tests.support.orders import terms
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Awaitable, Callable
+
+    from web3.types import RPCEndpoint, RPCResponse
+
+    from tests.support.market import Place
+
+
+class Overtaken(AsyncBaseProvider):
+    """The chain, on which something happens before each transaction of ours gets there."""
+
+    def __init__(self, chain: AsyncBaseProvider) -> None:
+        super().__init__()
+        self._chain = chain
+        self.meanwhile: Callable[[], Awaitable[object]] | None = None
+
+    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+        if method == "eth_sendRawTransaction" and self.meanwhile is not None:
+            meanwhile, self.meanwhile = self.meanwhile, None
+            await meanwhile()
+        return await self._chain.make_request(method, params)
+
+
+@pytest.fixture
+def road(place: Place) -> Overtaken:
+    return Overtaken(place.node.provider)
+
+
+@pytest.fixture
+async def chain(place: Place, road: Overtaken) -> AsyncIterator[Chain]:
+    """The chain as the person uses it, with no allowance given."""
+    async with Chain(
+        road, account=place.market.accounts["person"], ens=place.market.deployment.ens, timing=QUICK
+    ) as opened:
+        await opened.approve(opened.factory, 0)
+        yield opened
+
+
+@pytest.fixture
+def purse(place: Place, chain: Chain) -> Purse:
+    return Purse(chain, place.address("person"))
+
+
+async def allowance(chain: Chain) -> int:
+    assert chain.account is not None
+    return await chain.allowance(chain.account.address, chain.factory)
+
+
+async def spend(place: Place, cost: int) -> None:
+    """Have the factory take `cost` from the person, by a contract with the robot."""
+    deployment = place.market.deployment
+    fields = terms(token=deployment.xrt, cost=cost, lighthouse=deployment.lighthouse, nonce=secrets.token_hex(32))
+    demand = place.market.accounts["person"].signer.sign(Demand(**fields, validator_fee=0))
+    offer = place.market.accounts["robot"].signer.sign(Offer(**fields, lighthouse_fee=0))
+    await place.chains["provider"].create_liability(deployment.lighthouse_name, demand, offer)
+
+
+async def test_promises_add_up_and_are_allowed_together(chain: Chain, purse: Purse) -> None:
+    await purse.promise("one", {chain.xrt: 10})
+    await purse.promise("other", {chain.xrt: 5})
+    assert await allowance(chain) == 15
+
+
+async def test_what_is_allowed_already_costs_no_transaction(chain: Chain, purse: Purse) -> None:
+    await chain.approve(chain.factory, 100)
+    before = await chain.block_number()
+    await purse.promise("one", {chain.xrt: 100})
+    assert await chain.block_number() == before
+
+
+async def test_a_promise_of_nothing_asks_nothing(chain: Chain, purse: Purse) -> None:
+    before = await chain.block_number()
+    await purse.promise("one", {chain.xrt: 0})
+    assert await chain.block_number() == before
+
+
+async def test_a_forgotten_promise_makes_room(chain: Chain, purse: Purse) -> None:
+    balance = await chain.balance_of()
+    await purse.promise("one", {chain.xrt: balance})
+    with pytest.raises(ShortOfFunds) as caught:
+        await purse.promise("other", {chain.xrt: 1})
+    assert caught.value.needed == balance + 1
+    purse.forget("one")
+    purse.forget("never promised")
+    await purse.promise("other", {chain.xrt: balance})
+
+
+async def test_an_allowance_that_is_used_up_on_the_way_is_given_once_more(
+    place: Place, road: Overtaken, chain: Chain, purse: Purse
+) -> None:
+    """Gas is estimated for changing an allowance; to set one anew costs more."""
+    await chain.approve(chain.factory, 100)
+    spent: list[int] = []
+
+    async def spend_all() -> None:
+        await spend(place, 100)
+        spent.append(100)
+
+    road.meanwhile = spend_all
+    await purse.promise("one", {chain.xrt: 150})
+    assert spent == [100]
+    assert await allowance(chain) == 150
