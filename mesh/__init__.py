@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mesh.agent import Agent, Contract, JobFailed, Phase
     from mesh.settings import Settings
 
-try:
-    __version__ = version("aira-mesh")
-except PackageNotFoundError:  # run from a source tree that was never installed
-    __version__ = "0+unknown"
+    __version__: str
 
 _HOMES = {
     "Agent": "mesh.agent",
@@ -25,11 +21,22 @@ _HOMES = {
 
 def __getattr__(name: str) -> Any:
     """Load what is asked for: an edge agent must not pay for the parts that it does not use."""
+    if name == "__version__":
+        return _version()
     if name not in _HOMES:
         raise AttributeError(f"module 'mesh' has no attribute {name!r}")
     from importlib import import_module
 
     return getattr(import_module(_HOMES[name]), name)
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("aira-mesh")
+    except PackageNotFoundError:  # run from a source tree that was never installed
+        return "0+unknown"
 
 
 __all__ = ["Agent", "Contract", "JobFailed", "Phase", "Settings", "__version__"]

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 INTERRUPTED: Final = 130
 """Exit code of a command that Ctrl-C kept from its end."""
+STOPPING: Final = (signal.SIGINT, signal.SIGTERM)
+"""The signals that ask a program to end."""
 
 
 def run_to_end(main: Callable[[], Coroutine[Any, Any, object]]) -> None:
@@ -45,6 +47,7 @@ def _run(main: Callable[[], Coroutine[Any, Any, object]]) -> bool:
     """Whether `main` came to its end (false: a signal stopped it)."""
     import asyncio  # here, as the small commands need nothing of it but `fail`
 
+    before = {number: signal.getsignal(number) for number in STOPPING}
     try:
         return asyncio.run(_until_signal(main))
     except KeyboardInterrupt:  # before the loop listens to signals, or the second Ctrl-C
@@ -56,6 +59,10 @@ def _run(main: Callable[[], Coroutine[Any, Any, object]]) -> bool:
         if cause is None:
             raise
         fail(cause)
+    finally:
+        for number, handler in before.items():
+            if handler is not None:  # none was set by Python
+                signal.signal(number, handler)
 
 
 async def _until_signal(main: Callable[[], Coroutine[Any, Any, object]]) -> bool:
@@ -69,11 +76,11 @@ async def _until_signal(main: Callable[[], Coroutine[Any, Any, object]]) -> bool
     def stop() -> None:
         nonlocal stopped
         stopped = True
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in STOPPING:
             loop.remove_signal_handler(number)
         work.cancel()
 
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in STOPPING:
         loop.add_signal_handler(number, stop)
     try:
         await work

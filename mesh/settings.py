@@ -32,10 +32,13 @@ RETIRED: Final = {
 NOT_OPTIONS: Final = frozenset({"AIRA_CONFIG", "AIRA_REQUIRE_PEERS", "AIRA_KUBO", "AIRA_PEERS_CACHE"})
 """`AIRA_*` variables that belong to the command line or to the tests, not to the settings."""
 
+LONGEST: Final = 1e9
+"""Seconds that an option can be at most, some thirty years: infinity is no number that every file format has."""
+
 PositiveInt = Annotated[int, Meta(ge=1)]
-Seconds = Annotated[float, Meta(ge=0)]
-Interval = Annotated[float, Meta(gt=0)]
-SecondsOrEver = Annotated[float, Meta(ge=-1)]
+Seconds = Annotated[float, Meta(ge=0, le=LONGEST)]
+Interval = Annotated[float, Meta(gt=0, le=LONGEST)]
+SecondsOrEver = Annotated[float, Meta(ge=-1, le=LONGEST)]
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -119,15 +122,18 @@ MEANING: Final[Mapping[str, str]] = {
 def load(
     *, path: Path | None = None, environ: Mapping[str, str] | None = None, flags: Mapping[str, Any] | None = None
 ) -> Settings:
-    """The settings from the file at `path` (none: no file), the `AIRA_*` variables of `environ` and `flags`.
+    """The settings from the file at `path`, the `AIRA_*` variables of `environ` and `flags`.
 
-    A flag whose value is None was not given. Raises `ConfigurationError` for an unreadable file, an unknown option
-    or a value that can't be.
+    Without a path the file is the one that `AIRA_CONFIG` names, if it is set. A flag whose value is None was not given.
+    Raises `ConfigurationError` for an unreadable file, an unknown option or a value that can't be.
     """
+    variables = os.environ if environ is None else environ
+    if path is None and variables.get("AIRA_CONFIG"):
+        path = Path(variables["AIRA_CONFIG"])
     merged: dict[str, Any] = {}
     if path is not None:
         merged |= _checked(_read_toml(path), where=str(path))
-    merged |= _checked(_from_environment(os.environ if environ is None else environ), where="the environment")
+    merged |= _checked(_from_environment(variables), where="the environment")
     given = {name: value for name, value in (flags or {}).items() if value is not None}
     merged |= _checked(given, where="the flags")
     try:

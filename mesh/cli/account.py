@@ -70,8 +70,10 @@ def _password(path: Path) -> str:
             with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
                 file.write(secrets.token_urlsafe(24) + "\n")
         password = path.read_text(encoding="utf-8").split("\n", 1)[0].rstrip("\r")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"can't use the password file {path}: {error}") from None
+    except OSError as error:
+        raise ConfigurationError(f"can't use the password file {path}: {error.strerror}") from None
+    except UnicodeDecodeError:  # whose own text shows a part of the password
+        raise ConfigurationError(f"can't use the password file {path}: it is not UTF-8 text") from None
     if not password:
         raise ConfigurationError(f"the password file {path} is empty", hint="write one line with the password into it")
     return password

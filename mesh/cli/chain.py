@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from mesh.cli.options import with_settings
+from mesh.cli.options import BLOCK_TIME, PORT, with_settings
 from mesh.running import run_until_stopped
 
 if TYPE_CHECKING:
@@ -21,8 +21,8 @@ def command() -> None:
 
 @command.command("up")
 @click.option("--host", default="127.0.0.1", show_default=True, help="address to listen at")
-@click.option("--port", default=8545, show_default=True, help="port to listen at; 0 takes a free one")
-@click.option("--block-time", type=float, help="also mine an empty block every so many seconds")
+@click.option("--port", type=PORT, default=8545, show_default=True, help="port to listen at; 0 takes a free one")
+@click.option("--block-time", type=BLOCK_TIME, help="also mine an empty block every so many seconds")
 @with_settings("data_dir")
 def up(settings: Settings, host: str, port: int, block_time: float | None) -> None:
     """Serve an embedded chain with the contracts on it as JSON-RPC over HTTP. It is gone when this ends (Ctrl-C).

@@ -22,8 +22,20 @@ if TYPE_CHECKING:
 @click.command("demand")
 @click.option("--model", required=True, help="CID or ENS name of the behaviour that is wanted")
 @click.option("--objective", required=True, help="file to play, or its CID")
-@click.option("--cost", default=0, show_default=True, help="what it may cost, in the token's smallest unit (XRT: wn)")
-@click.option("--lifetime", default=1000, show_default=True, help="blocks for which the demand is valid")
+@click.option(
+    "--cost",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="what it may cost, in the token's smallest unit (XRT: wn)",
+)
+@click.option(
+    "--lifetime",
+    type=click.IntRange(min=1),
+    default=1000,
+    show_default=True,
+    help="blocks for which the demand is valid",
+)
 @click.option("--out", type=click.Path(path_type=Path), help="file to write the recording to")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object at the end")
 @with_settings(
@@ -82,10 +94,13 @@ def _source(objective: str) -> str | Path:
 
 
 def _check_writable(out: Path) -> None:
-    """Before anything is paid for, not after."""
+    """Before anything is paid for, not after; leaves nothing behind."""
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
+        there = out.exists()
         with out.open("ab"):
             pass
+        if not there:
+            out.unlink()
     except OSError as error:
         raise ConfigurationError(f"can't write the recording to {out}: {error.strerror}") from None

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 SEVERAL = frozenset({"connect", "listen"})
+PORT = click.IntRange(0, 65_535)
+BLOCK_TIME = click.FloatRange(0.01, 86_400)
+"""Seconds."""
 
 
 def with_settings(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -27,7 +30,7 @@ def with_settings(*names: str) -> Callable[[Callable[..., Any]], Callable[..., A
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(function)
         def command(config: Path | None, **options: Any) -> Any:
-            flags = {name: options.pop(name) or None for name in names}
+            flags = {name: _given(options.pop(name)) for name in names}
             try:
                 settings = load(path=config, flags=flags)
             except AiraError as error:
@@ -45,6 +48,12 @@ def with_settings(*names: str) -> Callable[[Callable[..., Any]], Callable[..., A
         )(decorated)
 
     return decorate
+
+
+def _given(value: str | tuple[str, ...] | None) -> str | tuple[str, ...] | None:
+    """A flag's value, None if it was not given: an empty text sets the option to nothing, an empty list can't be told
+    from no flag at all."""
+    return None if value == () else value
 
 
 def _flag(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

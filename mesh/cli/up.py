@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from mesh.cli.options import with_settings
+from mesh.cli.options import BLOCK_TIME, PORT, with_settings
 from mesh.running import run_until_stopped
 
 if TYPE_CHECKING:
@@ -15,8 +15,12 @@ if TYPE_CHECKING:
 
 
 @click.command("up")
-@click.option("--port", default=8545, show_default=True, help="port of the chain's JSON-RPC; 0 takes a free one")
-@click.option("--block-time", default=1.0, show_default=True, help="mine an empty block every so many seconds")
+@click.option(
+    "--port", type=PORT, default=8545, show_default=True, help="port of the chain's JSON-RPC; 0 takes a free one"
+)
+@click.option(
+    "--block-time", type=BLOCK_TIME, default=1.0, show_default=True, help="mine an empty block every so many seconds"
+)
 @with_settings("listen", "data_dir")
 def command(settings: Settings, port: int, block_time: float) -> None:
     """Run a market to develop on: a Zenoh router, a chain with the contracts, and a provider. Ctrl-C ends it.

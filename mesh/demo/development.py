@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from mesh.chain import serve_embedded, write_keyfile
 from mesh.demo.market import ROLES, Market, found_market
+from mesh.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -42,11 +43,19 @@ class DevelopmentChain:
 async def serve_chain(
     settings: Settings, *, host: str, port: int, block_time: float | None
 ) -> AsyncIterator[DevelopmentChain]:
-    """Serve an embedded chain with a market on it; `block_time` in seconds. Everything on it is gone at the end."""
+    """Serve an embedded chain with a market on it; `block_time` in seconds. Everything on it is gone at the end.
+
+    Raises `ConfigurationError` when the port is taken or the keyfiles can't be written.
+    """
     keys = settings.state_directory / "development"
     async with serve_embedded(host, port, block_time=block_time) as served:
         market = await found_market(served.node.provider, served.node.funded_keys)
-        await asyncio.to_thread(_write_keyfiles, keys, served.node.funded_keys)
+        try:
+            await asyncio.to_thread(_write_keyfiles, keys, served.node.funded_keys)
+        except OSError as error:
+            raise ConfigurationError(
+                f"can't write keyfiles to {keys}: {error.strerror}", hint="name another folder with --data-dir"
+            ) from None
         yield DevelopmentChain(url=served.url, market=market, keys=keys)
 
 

@@ -42,7 +42,9 @@ class Lamp:
 
 
 def _shown(message: Any) -> str:
+    """A message as people may see it: an objective is anybody's, and must not steer the terminal."""
     if isinstance(message, Empty):
         return "std_msgs/Empty"
     text = f"{len(message)} bytes" if isinstance(message, bytes) else str(getattr(message, "data", message))
-    return text if len(text) <= SHOWN else f"{text[:SHOWN]}…"
+    shown = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text[:SHOWN])
+    return shown if len(text) <= SHOWN else f"{shown}…"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import Any, Final, Protocol
 
@@ -37,21 +38,24 @@ class SpokenStory:
 
     def chapter(self, title: str) -> None:
         """What the following lines are about."""
-        self._console.print()
-        self._console.print(Text(title, style="bold"))
+        self._say(Text(), Text(title, style="bold"))
 
     def tell(self, who: str, event: str, words: str, **facts: Any) -> None:
         """Say it."""
         first, *rest = words.splitlines()
-        self._console.print(Text.assemble((f"  {who:<9}", COLOURS.get(who, "")), " ", first))
-        for line in rest:
-            self._console.print(Text(" " * 12 + line, style="dim"))
+        spoken = Text.assemble((f"  {who:<9}", COLOURS.get(who, "")), " ", first)
+        self._say(spoken, *(Text(" " * 12 + line, style="dim") for line in rest))
 
     def end(self, **facts: Any) -> None:
         """Say how it went."""
         paid = "paid" if facts["paid"] else "refunded"
-        self._console.print()
-        self._console.print(Text(f"Done in {facts['seconds']:.1f} s: the job was {paid}.", style="bold"))
+        self._say(Text(), Text(f"Done in {facts['seconds']:.1f} s: the job was {paid}.", style="bold"))
+
+    def _say(self, *lines: Text) -> None:
+        with self._console.capture() as rendered:
+            for line in lines:
+                self._console.print(line)
+        _write(rendered.get())
 
 
 class JsonStory:
@@ -70,4 +74,14 @@ class JsonStory:
 
     @staticmethod
     def _print(line: dict[str, Any]) -> None:
-        print(msgspec.json.encode(line).decode(), flush=True)
+        _write(msgspec.json.encode(line).decode() + "\n")
+
+
+def _write(text: str) -> None:
+    """Write to stdout. When its reader has left (`aira demo | head`), the demo goes on unheard."""
+    try:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        with open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), sys.stdout.fileno())

@@ -29,7 +29,7 @@ async def fail(error: Exception) -> None:
 async def test_leaving_ends_all_tasks() -> None:
     ended: list[str] = []
 
-    async with Background() as tasks:
+    async with asyncio.timeout(5), Background() as tasks:
         tasks.start(for_ever(ended, "a"), "a")
         tasks.start(for_ever(ended, "b"), "b")
         await asyncio.sleep(0)

@@ -111,7 +111,7 @@ def test_an_unknown_flag_names_the_nearest_option() -> None:
 
 
 def test_variables_of_other_programs_and_of_the_tests_are_no_options() -> None:
-    others = dict.fromkeys(NOT_OPTIONS, "x") | {"PATH": "/bin", "XAIRA_FOO": "x"}
+    others = dict.fromkeys(NOT_OPTIONS - {"AIRA_CONFIG"}, "x") | {"PATH": "/bin", "XAIRA_FOO": "x"}
 
     assert load(environ=others) == Settings()
 
@@ -199,3 +199,10 @@ def test_another_lighthouse_changes_nothing_else() -> None:
 
 def test_every_option_has_its_meaning_in_words() -> None:
     assert set(MEANING) == set(Settings.__struct_fields__)
+
+
+def test_the_file_that_aira_config_names_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "aira.toml"
+    path.write_text('lighthouse_contract = "named.lighthouse.3.robonomics.eth"\n')
+
+    assert load(environ={"AIRA_CONFIG": str(path)}).lighthouse_contract == "named.lighthouse.3.robonomics.eth"

@@ -1,0 +1,67 @@
+"""Flags: what an empty one means, and numbers that can't be."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+from click.testing import CliRunner
+
+from mesh.cli import main
+
+if TYPE_CHECKING:
+    from click.testing import Result
+
+CID = "QmTH8nmTYpLtoMXvrkG18CeKBcT926SBYLCTjiGmvtLE82"
+
+
+def aira(*arguments: str, **variables: str) -> Result:
+    return CliRunner().invoke(main, list(arguments), env=dict(variables))
+
+
+def test_an_empty_flag_wins_over_a_variable() -> None:
+    done = aira("settings", "--json", "--recording-topics", "", AIRA_RECORDING_TOPICS="/led")
+    assert json.loads(done.stdout)["recording_topics"] == ""
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("up", "--port", "65536"),
+        ("up", "--port", "-1"),
+        ("up", "--block-time", "0"),
+        ("up", "--block-time", "-1"),
+        ("chain", "up", "--port", "99999"),
+        ("chain", "up", "--block-time", "0"),
+        ("demand", "--model", CID, "--objective", CID, "--cost", "-1"),
+        ("demand", "--model", CID, "--objective", CID, "--lifetime", "0"),
+        ("demo", "--generation", "4"),
+    ],
+)
+def test_a_number_that_can_not_be_names_its_flag(arguments: tuple[str, ...]) -> None:
+    done = aira(*arguments)
+    assert done.exit_code == 2
+    assert f"Invalid value for '{arguments[-2]}'" in done.stderr
+
+
+@pytest.mark.parametrize("option", ["--connect-timeout", "--poll-interval", "--fetch-timeout"])
+@pytest.mark.parametrize("value", ["inf", "nan"])
+def test_seconds_are_finite(option: str, value: str) -> None:
+    done = aira("settings", option, value)
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert done.stderr.startswith(f"aira: the setting {option[2:].replace('-', '_')} can't be used: ")
+
+
+def test_an_unknown_flag_names_those_that_are_near() -> None:
+    done = aira("settings", "--fetch-timeot", "3")
+    assert done.exit_code == 2
+    assert "--fetch-timeout" in done.stderr
+
+
+@pytest.mark.parametrize("command", ["demand", "provider", "router", "settings", "up"])
+def test_a_mistaken_variable_is_one_clear_line_in_every_command_with_settings(command: str) -> None:
+    needed = ("--model", CID, "--objective", CID) if command == "demand" else ()
+    done = aira(command, *needed, AIRA_KEYFILL="x")
+    assert done.exit_code == 2
+    assert done.stderr.splitlines()[0] == "aira: unknown option 'keyfill' in the environment"

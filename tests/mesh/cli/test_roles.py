@@ -1,0 +1,153 @@
+"""The commands that serve and the one that asks, in this process: what they print, and what they leave behind."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from mesh.agent import Agent
+from mesh.agent.parts import load_account
+from mesh.cli.demand import _demand
+from mesh.cli.provider import _serve as serve_provider
+from mesh.cli.router import _serve as serve_router
+from mesh.cli.up import _serve as serve_up
+from mesh.errors import ConfigurationError, NetworkUnavailable
+from mesh.network import free_endpoint
+from mesh.settings import Settings
+from schemas import cid_of_bytes, cid_of_file
+from tests.support.market import obliging
+from tests.support.objectives import objective
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine
+    from pathlib import Path
+
+    from mesh.work.run import Run
+
+MODEL = cid_of_bytes(b"what is asked for on the command line")
+
+
+class Printed:
+    """What was printed so far."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
+        self._capsys = capsys
+        self.text = ""
+
+    def __contains__(self, words: str) -> bool:
+        self.text += self._capsys.readouterr().out
+        return words in self.text
+
+    def value(self, name: str) -> str:
+        """The word after `name` at the beginning of a line."""
+        return next(line.split()[1] for line in self.text.splitlines() if line.startswith(name))
+
+
+@pytest.fixture
+def printed(capsys: pytest.CaptureFixture[str]) -> Printed:
+    return Printed(capsys)
+
+
+async def stopped(serving: asyncio.Task[None]) -> None:
+    """End a server as a signal does."""
+    serving.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await serving
+
+
+async def said(serving: asyncio.Task[None], words: str, printed: Printed) -> None:
+    await until(lambda: serving.done() or words in printed, what=words, seconds=30)
+    if serving.done():
+        await serving
+
+
+def start(server: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+    return asyncio.create_task(server)
+
+
+async def test_a_job_from_up_to_the_recording(tmp_path: Path, printed: Printed) -> None:
+    endpoint = free_endpoint()
+    up = start(serve_up(Settings(listen=(endpoint,), data_dir=str(tmp_path)), port=0, block_time=0.1))
+    await said(up, "provider    0x", printed)
+    assert printed.value("router") == endpoint
+    person = settings_of("person", endpoint, printed.value("chain"), tmp_path)
+    robot = settings_of("robot", endpoint, printed.value("chain"), tmp_path)
+    path, out = tmp_path / "job.mcap", tmp_path / "new" / "result.mcap"
+    path.write_bytes(objective(("/go", "there")))
+    order: dict[str, Any] = {"model": MODEL, "cost": 7, "lifetime": 1000}
+    async with obliging(moving(Agent(MODEL, settings=robot, account=load_account(robot)))), asyncio.timeout(60):
+        await _demand(person, objective=str(path), out=out, as_json=False, **order)
+        assert f"paid, result {cid_of_file(out)}\nrecording {out}\n" in printed
+        assert f"demand by {load_account(person).address} for {MODEL}\ncontract 0x" in printed
+        printed.text = ""
+        await _demand(person, objective=cid_of_file(path), out=None, as_json=True, **order)
+    assert "}\n" in printed
+    assert set(json.loads(printed.text)) == {"liability", "success", "result"}
+    await stopped(up)
+
+
+def moving(robot: Agent) -> Agent:
+    @robot.on("/go")
+    async def go(job: Run, message: object) -> None:
+        job.publish("/gone", message)
+
+    return robot
+
+
+def settings_of(role: str, endpoint: str, url: str, folder: Path) -> Settings:
+    keys = folder / "development"
+    return Settings(
+        connect=(endpoint,),
+        connect_timeout=1.0,
+        web3_http_provider=url,
+        data_dir=str(folder / role),
+        poll_interval=0.05,
+        playback="at-once",
+        keyfile=str(keys / f"{role}.json"),
+        keyfile_password_file=str(keys / "password"),
+    )
+
+
+async def test_a_router_and_a_provider_apart(tmp_path: Path, printed: Printed) -> None:
+    endpoint = free_endpoint()
+    router = start(serve_router(Settings(listen=(endpoint,))))
+    await said(router, f"listens at {endpoint}\n", printed)
+    up = start(serve_up(Settings(listen=(free_endpoint(),), data_dir=str(tmp_path)), port=0, block_time=60))
+    await said(up, "provider    0x", printed)
+    url = printed.value("chain")
+    provider = start(serve_provider(settings_of("provider", endpoint, url, tmp_path)))
+    await said(provider, "serves airalab.lighthouse.3.robonomics.eth, Zenoh id ", printed)
+    for server in (provider, up, router):
+        await stopped(server)
+
+
+async def test_a_demand_that_comes_to_nothing_leaves_no_recording_behind(tmp_path: Path, printed: Printed) -> None:
+    up = start(serve_up(Settings(listen=(free_endpoint(),), data_dir=str(tmp_path)), port=0, block_time=60))
+    await said(up, "provider    0x", printed)
+    nowhere = settings_of("person", free_endpoint(), printed.value("chain"), tmp_path)
+    out, kept = tmp_path / "new.mcap", tmp_path / "old.mcap"
+    kept.write_bytes(b"an earlier one")
+    order: dict[str, Any] = {"model": MODEL, "objective": MODEL, "cost": 0, "lifetime": 10, "as_json": True}
+    for path in (out, kept):
+        with pytest.raises(NetworkUnavailable):
+            await _demand(nowhere, out=path, **order)
+    assert (out.exists(), kept.read_bytes()) == (False, b"an earlier one")
+    await stopped(up)
+
+
+async def test_what_can_not_listen_says_so_and_leaves_nothing_open(tmp_path: Path, printed: Printed) -> None:
+    endpoint = free_endpoint()
+    router = start(serve_router(Settings(listen=(endpoint,))))
+    await said(router, "listens at", printed)
+    for server in (
+        serve_router(Settings(listen=(endpoint,))),
+        serve_up(Settings(listen=(endpoint,), data_dir=str(tmp_path)), port=0, block_time=1.0),
+    ):
+        with pytest.raises(ConfigurationError, match=f"^can't listen at {endpoint}: "):
+            await server
+    assert not (tmp_path / "development").exists()
+    await stopped(router)

@@ -1,0 +1,282 @@
+"""Commands that serve, as processes of their own that talk to each other, and what they say when they can't."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import socket
+import sys
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.recording import open_objective
+from schemas import cid_of_file
+from tests.support.commands import AIRA, SOON, Interrupted, Serving, aira
+from tests.support.objectives import objective
+from tests.support.ports import free_port
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from subprocess import CompletedProcess
+
+EXAMPLES = Path(__file__).parents[3] / "examples" / "hello_mesh"
+
+ORDER = ("--model", "QmTH8nmTYpLtoMXvrkG18CeKBcT926SBYLCTjiGmvtLE82", "--objective")
+SOME_CID = "QmTH8nmTYpLtoMXvrkG18CeKBcT926SBYLCTjiGmvtLE82"
+
+ROBOT = """
+import asyncio, sys
+from mesh import Agent
+
+agent = Agent(sys.argv[1])
+
+@agent.on_demand
+async def offer(demand):
+    await agent.offer(demand)
+
+@agent.on("*")
+async def slowly(job, message):
+    await asyncio.sleep(0.2)
+    job.publish("/done", message.data)
+    print("did", message.data, flush=True)
+
+@agent.on_liability
+async def phase(phase, liability):
+    print("phase", phase, flush=True)
+
+agent.run()
+"""
+
+
+class Development:
+    """`aira up` and what other processes need to know of it."""
+
+    def __init__(self, folder: Path, *, block_time: str = "0.3") -> None:
+        self.folder = folder
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+        self.port = free_port()
+        self.url = f"http://127.0.0.1:{self.port}"
+        arguments = ("--listen", self.endpoint, "--port", str(self.port), "--data-dir", folder)
+        self.up = Serving(*AIRA, "up", *arguments, "--block-time", block_time, says="provider    0x")
+
+    def variables(self, role: str) -> dict[str, str]:
+        keys = self.folder / "development"
+        return {
+            "AIRA_CONNECT": self.endpoint,
+            "AIRA_WEB3_HTTP_PROVIDER": self.url,
+            "AIRA_DATA_DIR": str(self.folder / "state"),
+            "AIRA_KEYFILE": str(keys / f"{role}.json"),
+            "AIRA_KEYFILE_PASSWORD_FILE": str(keys / "password"),
+            "AIRA_POLL_INTERVAL": "0.1",
+        }
+
+    def demand(self, *arguments: str | Path) -> CompletedProcess[str]:
+        return aira("demand", *arguments, **self.variables("person"))
+
+    def agent(self, script: Path, *arguments: str, says: str) -> Serving:
+        return Serving(sys.executable, script, *arguments, says=says, variables=self.variables("robot"))
+
+
+@pytest.fixture(scope="module")
+def development(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Development]:
+    development = Development(tmp_path_factory.mktemp("up"))
+    with development.up:
+        yield development
+
+
+def test_a_job_is_done_and_paid_between_processes(development: Development, tmp_path: Path) -> None:
+    out = tmp_path / "new" / "result.mcap"
+    order = ("--model", cid_of_file(EXAMPLES / "model.md"), "--objective", EXAMPLES / "blink.mcap", "--cost", "1000")
+    watcher = Serving(
+        sys.executable,
+        EXAMPLES / "agent.py",
+        says="watching",
+        variables={"AIRA_CONNECT": development.endpoint},
+    )
+    with watcher, development.agent(EXAMPLES / "robot.py", says="account 0x") as robot:
+        done = development.demand(*order, "--out", out)
+        assert (done.returncode, done.stderr) == (0, "")
+        first, second, third, fourth = done.stdout.splitlines()
+        assert first.startswith("demand by 0x")
+        assert re.fullmatch(r"contract 0x\w{40} with 0x\w{40}", second)
+        assert third == f"paid, result {cid_of_file(out)}"
+        assert fourth == f"recording {out}"
+        assert robot.log().count("the lamp is on") == 3
+        assert "you would pay 1000 for" in watcher.log()
+        again = development.demand(*order, "--json")
+        summed = json.loads(again.stdout)
+        assert set(summed) == {"liability", "success", "result"}
+        assert summed["success"]
+        code, seconds = robot.end(signal.SIGINT)
+        assert code == 0
+        assert seconds < SOON
+        assert "Traceback" not in robot.log()
+
+
+def test_a_robot_that_is_killed_goes_on_where_it_was(development: Development, tmp_path: Path) -> None:
+    script, model, path = tmp_path / "robot.py", tmp_path / "model", tmp_path / "job.mcap"
+    script.write_text(ROBOT)
+    model.write_text("a slow robot")
+    words = [str(number) for number in range(12)]
+    path.write_bytes(objective(*(("/say", word) for word in words), step_ns=0))
+    with ExitStack() as stack:
+        robot = stack.enter_context(development.agent(script, cid_of_file(model), says="account 0x"))
+        person = stack.enter_context(
+            Serving(
+                *AIRA,
+                *("demand", "--model", cid_of_file(model), "--objective", path, "--out", tmp_path / "result.mcap"),
+                says="contract 0x",
+                variables=development.variables("person"),
+            )
+        )
+        until_said(robot, "did 7")
+        robot.kill()
+        killed = did(robot)
+        robot.start()
+        until_said(person, "recording ")
+        assert "paid, result" in person.log()
+        resumed = did(robot)
+    assert resumed[-1] == words[-1]
+    assert resumed[0] != "0", "the ledger knew how far it was"
+    assert int(resumed[0]) <= int(killed[-1]) + 1, "nothing is left out"
+    recording = open_objective(tmp_path / "result.mcap")
+    assert {message.topic for message in recording.messages()} == {"/say", "/done"}
+
+
+def did(robot: Serving) -> list[str]:
+    return re.findall(r"^did (\d+)$", robot.log(), re.MULTILINE)
+
+
+def until_said(server: Serving, words: str) -> None:
+    deadline = time.monotonic() + 30
+    while words not in server.log():
+        assert time.monotonic() < deadline, server.log()
+        time.sleep(0.01)
+
+
+def test_the_parts_run_apart_as_well(tmp_path: Path) -> None:
+    endpoint, port = f"tcp/127.0.0.1:{free_port()}", free_port()
+    router = Serving(*AIRA, "router", "--listen", endpoint, says="listens at")
+    chain = Serving(*AIRA, "chain", "up", "--port", str(port), "--data-dir", tmp_path, says="password ")
+    with router, chain:
+        assert f"chain       http://127.0.0.1:{port}" in chain.log()
+        keys = tmp_path / "development"
+        variables = {
+            "AIRA_CONNECT": endpoint,
+            "AIRA_WEB3_HTTP_PROVIDER": f"http://127.0.0.1:{port}",
+            "AIRA_KEYFILE": str(keys / "provider.json"),
+            "AIRA_KEYFILE_PASSWORD_FILE": str(keys / "password"),
+        }
+        with Serving(*AIRA, "provider", says="serves airalab", variables=variables) as provider:
+            for server in (provider, chain, router):
+                code, seconds = server.end(signal.SIGINT)
+                assert (code, seconds < SOON) == (0, True), server.log()
+                assert "Traceback" not in server.log()
+
+
+def test_up_ends_at_a_ctrl_c(tmp_path: Path) -> None:
+    development = Development(tmp_path, block_time="0.05")
+    with development.up as up:
+        code, seconds = up.end(signal.SIGINT)
+        assert (code, seconds < SOON) == (0, True), up.log()
+        assert "Traceback" not in up.log()
+
+
+def failed(done: CompletedProcess[str]) -> tuple[int, str]:
+    """Exit code and first line; there may be a hint, and nothing else."""
+    line, *hint = done.stderr.splitlines()
+    assert len(hint) <= 1, done.stderr
+    assert line.startswith("aira: ")
+    return done.returncode, line
+
+
+def test_ctrl_c_ends_the_waiting_for_a_contract(development: Development) -> None:
+    interrupted = Interrupted(
+        "demand", *ORDER, SOME_CID, at="demand by 0x", after=0.3, variables=development.variables("person")
+    )
+    assert (interrupted.code, interrupted.errors) == (130, "")
+    assert interrupted.seconds < SOON
+
+
+def test_a_demand_without_keyfile_is_one_clear_line() -> None:
+    code, line = failed(aira("demand", *ORDER, SOME_CID))
+    assert (code, "this needs an account" in line) == (2, True)
+
+
+def test_an_objective_that_is_neither_file_nor_cid_is_one_clear_line(development: Development) -> None:
+    code, line = failed(development.demand(*ORDER, "blnk.mcap"))
+    assert (code, line) == (2, "aira: the objective 'blnk.mcap' is neither a file nor a CID")
+
+
+def test_a_recording_that_can_not_be_written_is_found_before_anything_is_paid(
+    development: Development, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("")
+    code, line = failed(development.demand(*ORDER, SOME_CID, "--out", tmp_path / "file" / "result.mcap"))
+    assert (code, "can't write the recording to" in line) == (2, True)
+
+
+def test_a_model_that_is_no_cid_and_no_name_is_one_clear_line(development: Development) -> None:
+    code, line = failed(development.demand("--model", "blink", "--objective", SOME_CID))
+    assert (code, "'blink'" in line) == (2, True)
+
+
+def test_an_unknown_model_name_is_one_clear_line(development: Development) -> None:
+    code, line = failed(development.demand("--model", "no.model.3.robonomics.eth", "--objective", SOME_CID))
+    assert (code, "no.model.3.robonomics.eth" in line) == (1, True)
+
+
+def test_a_wrong_password_is_one_clear_line(development: Development, tmp_path: Path) -> None:
+    (tmp_path / "password").write_text("guessed\n")
+    variables = development.variables("person") | {"AIRA_KEYFILE_PASSWORD_FILE": str(tmp_path / "password")}
+    for command in (("demand", *ORDER, SOME_CID), ("provider",)):
+        code, line = failed(aira(*command, **variables))
+        assert (code, "does not open it" in line) == (2, True)
+
+
+def test_too_dear_a_demand_is_one_clear_line(development: Development) -> None:
+    code, line = failed(development.demand(*ORDER, SOME_CID, "--cost", str(10**30)))
+    assert (code, "are needed" in line) == (1, True)
+
+
+def test_no_router_is_one_clear_line(development: Development) -> None:
+    nowhere = f"tcp/127.0.0.1:{free_port()}"
+    variables = development.variables("person") | {"AIRA_CONNECT": nowhere, "AIRA_CONNECT_TIMEOUT": "0.2"}
+    code, line = failed(aira("demand", *ORDER, SOME_CID, **variables))
+    assert (code, line.startswith(f"aira: no Zenoh router at {nowhere}")) == (1, True), line
+
+
+def test_no_node_is_one_clear_line(development: Development) -> None:
+    nowhere = f"http://127.0.0.1:{free_port()}"
+    code, line = failed(aira("provider", **development.variables("person") | {"AIRA_WEB3_HTTP_PROVIDER": nowhere}))
+    assert (code, f"no Ethereum node answers at {nowhere}" in line) == (1, True)
+
+
+def test_a_taken_port_is_one_clear_line(development: Development, tmp_path: Path) -> None:
+    code, line = failed(aira("router", "--listen", development.endpoint))
+    assert (code, f"can't listen at {development.endpoint}" in line) == (2, True)
+    code, line = failed(aira("chain", "up", "--port", str(development.port), "--data-dir", tmp_path))
+    assert (code, f"can't listen on 127.0.0.1:{development.port}" in line) == (2, True)
+
+
+def test_what_is_no_endpoint_is_one_clear_line() -> None:
+    code, line = failed(aira("router", "--listen", "localhost:7447"))
+    assert (code, "is not a Zenoh endpoint" in line) == (2, True)
+
+
+def test_ctrl_c_while_a_router_is_waited_for_ends_the_waiting() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as unfriendly:
+        endpoint = f"tcp/127.0.0.1:{unfriendly.getsockname()[1]}"
+        variables = {"AIRA_CONNECT": endpoint, "AIRA_CONNECT_TIMEOUT": "-1"}
+        with Serving(sys.executable, EXAMPLES / "agent.py", says="", variables=variables) as waiting:
+            unfriendly.settimeout(30)
+            for _ in range(2):
+                unfriendly.accept()[0].close()
+            code, seconds = waiting.end(signal.SIGINT)
+            assert (code, seconds < SOON) == (0, True), waiting.log()
+            assert "Traceback" not in waiting.log()
