@@ -38,7 +38,7 @@ REQUEST = StartLiability(LIGHTHOUSE)
 @asynccontextmanager
 async def offering(there: zenoh.Session, here: zenoh.Session, **handlers: Any) -> AsyncIterator[Services]:
     """Services of the agent `there` that one `here` finds."""
-    async with Services(there, ADDRESS) as services:
+    async with asyncio.timeout(20), Services(there, ADDRESS) as services:
         for name, handler in handlers.items():
             services.offer(name.replace("__", "/"), handler)
             await until_answered(here, str(RpcKey(ADDRESS, name.replace("__", "/"))))
@@ -218,7 +218,7 @@ async def test_leaving_breaks_off_what_is_not_answered(here: zenoh.Session, ther
             ended.append("handler")
         raise AssertionError
 
-    async with asyncio.timeout(5), offering(there, here, start=start):
+    async with offering(there, here, start=start):
         asking = asyncio.create_task(call(here, ADDRESS, "start", REQUEST))
         await begun.wait()
 
