@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from schemas import address_bytes
 
@@ -11,6 +11,15 @@ if TYPE_CHECKING:
 
     from mesh.market.book import Match, Order
     from schemas import Verified
+
+
+NAMELESS: Final = "Reverted"
+"""What a refusal is called whose contract gave it no name."""
+
+
+def word_for(reason: str) -> str:
+    """A machine-readable word: the name of the contracts' error, but never a text of a stranger's contract."""
+    return reason if reason.isidentifier() else NAMELESS
 
 
 def at_fault(match: Match, reason: str, arguments: Sequence[Any]) -> tuple[Verified[Order], ...]:

@@ -11,7 +11,7 @@ import logging
 from collections import Counter
 from contextlib import AsyncExitStack, aclosing
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import msgspec
 
@@ -26,7 +26,7 @@ from mesh.chain import (
 )
 from mesh.chain.events import Finalized, NewLiability
 from mesh.errors import AiraError, ClosedError, InputError
-from mesh.market.blame import at_fault
+from mesh.market.blame import at_fault, word_for
 from mesh.market.book import LIMIT, Match, OrderBook, Refusal
 from mesh.market.memory import Memory
 from mesh.market.sending import RETRY, Sending
@@ -47,9 +47,6 @@ if TYPE_CHECKING:
     from schemas import Liability
 
 log = logging.getLogger(__name__)
-
-NAMELESS: Final = "Reverted"
-"""The reason of a rejection when the contract that refused gave none by name."""
 
 
 class Earnings(msgspec.Struct, frozen=True, kw_only=True):
@@ -294,6 +291,5 @@ class Provider:
 
 
 def _reason(error: AiraError) -> str:
-    """A machine-readable word: the contracts' error, but never a text of a stranger's contract."""
-    name = error.reason if isinstance(error, Reverted) else type(error).__name__
-    return name if name.isidentifier() else NAMELESS
+    """The machine-readable word for why something was refused."""
+    return word_for(error.reason if isinstance(error, Reverted) else type(error).__name__)

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from mesh.market import Match
-from mesh.market.blame import at_fault
+from mesh.market.blame import at_fault, word_for
 from tests.support.orders import LIGHTHOUSE, PERSON, ROBOT, STRANGER, verified_demand, verified_offer
 
 DEMAND = verified_demand(cost=10, validator_fee=20, deadline=50)
@@ -46,6 +46,13 @@ FACTORY = LIGHTHOUSE
 )
 def test_each_error_tells_of_its_order(reason: str, arguments: tuple[Any, ...], guilty: tuple[Any, ...]) -> None:
     assert at_fault(MATCH, reason, arguments) == tuple(guilty)
+
+
+@pytest.mark.parametrize(
+    ("reason", "word"), [("CostMismatch", "CostMismatch"), ("", "Reverted"), ("please pay\nme", "Reverted")]
+)
+def test_a_strangers_text_is_no_word(reason: str, word: str) -> None:
+    assert word_for(reason) == word
 
 
 @pytest.mark.parametrize("fees", [{"cost": 30}, {"validator_fee": 30}], ids=lambda fees: next(iter(fees)))

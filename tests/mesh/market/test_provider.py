@@ -169,6 +169,21 @@ async def test_of_a_pair_that_was_used_elsewhere_neither_stays(floor: Floor) -> 
         await until(lambda: list(provider.book.orders()) == [verify_message(last)])
 
 
+async def test_of_a_used_pair_of_generation_5_neither_stays(floor: Floor) -> None:
+    person, robot = floor.address("person"), floor.address("robot")
+    demand = floor.demand(sender=person, nonce=await floor.chain.nonce_of(person))
+    offer = floor.offer(sender=robot, nonce=await floor.chain.nonce_of(robot))
+    async with floor.chain_of("provider") as chain:
+        await chain.create_liability(floor.lighthouse, demand, offer)
+    async with floor.provider() as provider:
+        floor.publish(demand, offer)
+
+        await until(lambda: provider.earnings().rejected == {"WrongSigner": 1})
+        last = floor.demand(cost=1)
+        floor.publish(last)
+        await until(lambda: list(provider.book.orders()) == [verify_message(last)])
+
+
 async def test_late_comers_are_told_of_the_open_orders_only(floor: Floor) -> None:
     async with floor.provider() as provider:
         open_demand, open_offer, taken = floor.demand(cost=1), floor.offer(cost=2), floor.demand()
