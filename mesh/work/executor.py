@@ -104,9 +104,8 @@ class Executor:
         async with self._changing:
             job = await self._startable(address, asked="restart")
             await self._abandon(address)
-            await self._shop.ledger.set_position(
-                address, 0
-            )  # first: a crash may not leave a recording without its head
+            # In this order: a crash between the two may not leave a position past what the recording holds.
+            await self._shop.ledger.set_position(address, 0)
             await asyncio.to_thread(self._shop.discard_recording, address)
             await self._begin(job, 0)
 
@@ -145,9 +144,9 @@ class Executor:
             await self._shop.owe_result(address, success=success, result=cid, note=note)
             await asyncio.to_thread(summary.path.unlink, missing_ok=True)
             self._objectives.forget(address)
-        await self._shop.outbox.send()
         log.info("%s: complete, success %s, result %s, %d messages", address, success, cid, summary.messages)
-        await self._witness(Phase.COMPLETE, await self.read(address))
+        await self._witness(Phase.COMPLETE, msgspec.structs.replace(job.liability, result=cid, is_success=success))
+        await self._shop.outbox.send()
         return cid
 
     async def _job(self, address: str, *, asked: str) -> Job:
@@ -178,11 +177,11 @@ class Executor:
             await self._unless_ended(self.finish(address, success=False, note=str(error)))
             return
         async with self._changing:
-            job = await self._job(address, asked="prepare")
+            job = await self._shop.ledger.job(address)
+            if job is None or job.phase not in (Phase.INCOMING, *STARTED):
+                return
             if job.phase is Phase.INCOMING:
                 await self._shop.ledger.set_phase(address, Phase.READY)
-            elif job.phase not in STARTED:
-                return
             self._objectives.keep(address, objective)
         if job.phase is Phase.INCOMING:
             log.info("%s: ready, %d messages to play", address, objective.count)

@@ -35,7 +35,7 @@ class Objectives:
     def prepare(self, address: str, work: Coroutine[None, None, None], tasks: asyncio.TaskGroup) -> None:
         """Run `work`, which is to end with `keep` or with the job, as one of `tasks`."""
         preparing = self._preparing[address] = tasks.create_task(work, name=f"prepare {address}")
-        preparing.add_done_callback(lambda task: self._preparing.pop(address))
+        preparing.add_done_callback(lambda task: self._prepared(address, task))
 
     async def examine(self, liability: Liability) -> Objective:
         """The liability's objective, found fit to be played. Raises `UnfitObjective` or a `ContentError`."""
@@ -55,3 +55,7 @@ class Objectives:
         preparing = self._preparing.get(address)
         if preparing is not None and address not in self._at_hand:
             await asyncio.wait([preparing])
+
+    def _prepared(self, address: str, task: asyncio.Task[None]) -> None:
+        if self._preparing.get(address) is task:
+            del self._preparing[address]

@@ -332,6 +332,25 @@ async def test_a_job_that_rested_goes_on_where_it_was(place: Place, paid: Paying
     assert await paid.once()
 
 
+async def test_a_job_may_rest_while_its_objective_is_looked_for(place: Place) -> None:
+    robot = obliging(place.agent("robot", fetch_timeout=30.0))
+    said: list[str] = []
+    async with place.provider(), speaking(robot, said), place.agent("person") as person:
+        path = words(place)
+        contract = await person.demand(cid_of_file(path))
+        await in_phase(robot, contract, Phase.INCOMING)
+        await robot._working().unmade(contract.address)
+        await asyncio.to_thread(person.parts.store.put_file, path)
+        await until_found(lambda: held(robot, contract), what="the objective")
+        await told_again(robot, contract)
+        assert (await contract.outcome()).success
+    assert said == WORDS
+
+
+async def held(robot: Agent, contract: Contract) -> bool:
+    return robot.parts.store.has(contract.liability.objective)
+
+
 async def test_a_finished_job_that_rested_sends_its_result_again(place: Place, paid: Paying) -> None:
     said: list[str] = []
     async with place.agent("person") as person, speaking(obliging(place.agent("robot")), said) as robot:
