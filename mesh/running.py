@@ -16,6 +16,8 @@ INTERRUPTED: Final = 130
 """Exit code of a command that Ctrl-C kept from its end."""
 STOPPING: Final = (signal.SIGINT, signal.SIGTERM)
 """The signals that ask a program to end."""
+BEAT: Final = 0.1
+"""Seconds between two moments at which a program that is tidying up notices a second Ctrl-C."""
 
 
 def run_to_end(main: Callable[[], Coroutine[Any, Any, object]]) -> None:
@@ -79,6 +81,11 @@ async def _until_signal(main: Callable[[], Coroutine[Any, Any, object]]) -> bool
         for number in STOPPING:
             loop.remove_signal_handler(number)
         work.cancel()
+        beat()
+
+    def beat() -> None:
+        """A loop without handlers sleeps on when a signal comes to another thread, or just before it goes to sleep."""
+        loop.call_later(BEAT, beat)
 
     for number in STOPPING:
         loop.add_signal_handler(number, stop)

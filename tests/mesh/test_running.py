@@ -13,7 +13,7 @@ import pytest
 from tests.support.commands import environment, run
 
 PROGRAM: Final = """
-import asyncio, sys
+import asyncio, signal, sys, threading, time
 from mesh.errors import ConfigurationError, InputError, NetworkUnavailable, RemoteError
 from mesh.running import run_to_end, run_until_stopped
 
@@ -34,6 +34,11 @@ async def tidy_for_long():
     finally:
         print("tidying", flush=True)
         await asyncio.sleep(60)
+
+async def tidy_while_another_thread_gets_the_signals():
+    threading.Thread(target=time.sleep, args=(60,), daemon=True).start()
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    await tidy_for_long()
 
 async def fail(error):
     raise error
@@ -90,8 +95,9 @@ def test_a_signal_is_the_normal_end_of_a_server(number: signal.Signals) -> None:
     assert signalled("run_until_stopped(wait)", number) == (0, "waiting\ntidied up\nafter\n", "")
 
 
-def test_a_second_ctrl_c_does_not_wait_for_the_tidying() -> None:
-    code, output, errors = signalled("run_to_end(tidy_for_long)", signal.SIGINT, signal.SIGINT)
+@pytest.mark.parametrize("main", ["tidy_for_long", "tidy_while_another_thread_gets_the_signals"])
+def test_a_second_ctrl_c_does_not_wait_for_the_tidying(main: str) -> None:
+    code, output, errors = signalled(f"run_to_end({main})", signal.SIGINT, signal.SIGINT)
     assert (code, output, errors) == (130, "waiting\ntidying\n", "")
 
 
