@@ -2,83 +2,189 @@
 
 from __future__ import annotations
 
-from schemas.address import (
-    ZERO_ADDRESS,
-    address_bytes,
-    checksum_address,
-    is_ens_name,
-    parse_address,
-    parse_address_or_name,
-)
-from schemas.cid import cid_of_digest, format_cid, parse_cid
-from schemas.errors import (
-    AiraError,
-    InputError,
-    InvalidAddress,
-    InvalidCid,
-    InvalidKey,
-    InvalidMessage,
-    InvalidPayload,
-    InvalidRecord,
-)
-from schemas.keccak import keccak256
-from schemas.keys import (
-    AgentKey,
-    CidKey,
-    DemandKey,
-    DeviceTopicKey,
-    EthEventKey,
-    EventKey,
-    FeedbackKey,
-    Key,
-    LiabilityTopicKey,
-    MarketKey,
-    ObjectiveTopicKey,
-    OfferKey,
-    PendingKey,
-    PresenceKey,
-    RejectKey,
-    ResultKey,
-    RpcKey,
-    device_selector,
-    event_selector,
-    lighthouse_selector,
-    market_selector,
-    objective_selector,
-    parse_key,
-    presence_selector,
-    topic_selector,
-)
-from schemas.liability import Liability
-from schemas.messages import (
-    MAX_UINT256,
-    Demand,
-    Message,
-    Offer,
-    Order,
-    OrderFeedback,
-    Result,
-    SignedMessage,
-    TransactionFeedback,
-)
-from schemas.names import names_in, resolve_names
-from schemas.packing import message_hash, order_abi
-from schemas.payloads import EMPTY, JSON, RAW, STRING, Empty, PayloadType, String, payload_type
-from schemas.records import Record, UInt256
-from schemas.signing import Signer, Verified, recover, verify, verify_hashed, verify_message
-from schemas.unixfs import (
-    CHUNK_SIZE,
-    MAX_LINKS,
-    Block,
-    Link,
-    Node,
-    blocks_of_stream,
-    cid_of_bytes,
-    cid_of_file,
-    cid_of_stream,
-    parse_block,
-)
-from schemas.wire import MAX_MESSAGE_SIZE, decode, encode
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from schemas.address import (
+        ZERO_ADDRESS,
+        address_bytes,
+        checksum_address,
+        is_ens_name,
+        parse_address,
+        parse_address_or_name,
+    )
+    from schemas.cid import cid_of_digest, format_cid, parse_cid
+    from schemas.errors import (
+        AiraError,
+        InputError,
+        InvalidAddress,
+        InvalidCid,
+        InvalidKey,
+        InvalidMessage,
+        InvalidPayload,
+        InvalidRecord,
+    )
+    from schemas.keccak import keccak256
+    from schemas.keys import (
+        AgentKey,
+        CidKey,
+        DemandKey,
+        DeviceTopicKey,
+        EthEventKey,
+        EventKey,
+        FeedbackKey,
+        Key,
+        LiabilityTopicKey,
+        MarketKey,
+        ObjectiveTopicKey,
+        OfferKey,
+        PendingKey,
+        PresenceKey,
+        RejectKey,
+        ResultKey,
+        RpcKey,
+        device_selector,
+        event_selector,
+        lighthouse_selector,
+        market_selector,
+        objective_selector,
+        parse_key,
+        presence_selector,
+        topic_selector,
+    )
+    from schemas.liability import Liability
+    from schemas.messages import (
+        MAX_UINT256,
+        Demand,
+        Message,
+        Offer,
+        Order,
+        OrderFeedback,
+        Result,
+        SignedMessage,
+        TransactionFeedback,
+    )
+    from schemas.names import names_in, resolve_names
+    from schemas.packing import cancellation_hash, message_hash, order_abi
+    from schemas.payloads import EMPTY, JSON, RAW, STRING, Empty, PayloadType, String, payload_type
+    from schemas.records import Record, UInt256
+    from schemas.signing import Signer, Verified, recover, verify, verify_hashed, verify_message
+    from schemas.unixfs import (
+        CHUNK_SIZE,
+        MAX_LINKS,
+        Block,
+        Link,
+        Node,
+        blocks_of_stream,
+        cid_of_bytes,
+        cid_of_file,
+        cid_of_stream,
+        parse_block,
+    )
+    from schemas.wire import MAX_MESSAGE_SIZE, decode, encode
+
+_HOMES: Final = {
+    "AgentKey": "schemas.keys",
+    "AiraError": "schemas.errors",
+    "Block": "schemas.unixfs",
+    "CHUNK_SIZE": "schemas.unixfs",
+    "CidKey": "schemas.keys",
+    "Demand": "schemas.messages",
+    "DemandKey": "schemas.keys",
+    "DeviceTopicKey": "schemas.keys",
+    "EMPTY": "schemas.payloads",
+    "Empty": "schemas.payloads",
+    "EthEventKey": "schemas.keys",
+    "EventKey": "schemas.keys",
+    "FeedbackKey": "schemas.keys",
+    "InputError": "schemas.errors",
+    "InvalidAddress": "schemas.errors",
+    "InvalidCid": "schemas.errors",
+    "InvalidKey": "schemas.errors",
+    "InvalidMessage": "schemas.errors",
+    "InvalidPayload": "schemas.errors",
+    "InvalidRecord": "schemas.errors",
+    "JSON": "schemas.payloads",
+    "Key": "schemas.keys",
+    "Liability": "schemas.liability",
+    "LiabilityTopicKey": "schemas.keys",
+    "Link": "schemas.unixfs",
+    "MAX_LINKS": "schemas.unixfs",
+    "MAX_MESSAGE_SIZE": "schemas.wire",
+    "MAX_UINT256": "schemas.messages",
+    "MarketKey": "schemas.keys",
+    "Message": "schemas.messages",
+    "Node": "schemas.unixfs",
+    "ObjectiveTopicKey": "schemas.keys",
+    "Offer": "schemas.messages",
+    "OfferKey": "schemas.keys",
+    "Order": "schemas.messages",
+    "OrderFeedback": "schemas.messages",
+    "PayloadType": "schemas.payloads",
+    "PendingKey": "schemas.keys",
+    "PresenceKey": "schemas.keys",
+    "RAW": "schemas.payloads",
+    "Record": "schemas.records",
+    "RejectKey": "schemas.keys",
+    "Result": "schemas.messages",
+    "ResultKey": "schemas.keys",
+    "RpcKey": "schemas.keys",
+    "STRING": "schemas.payloads",
+    "SignedMessage": "schemas.messages",
+    "Signer": "schemas.signing",
+    "String": "schemas.payloads",
+    "TransactionFeedback": "schemas.messages",
+    "UInt256": "schemas.records",
+    "Verified": "schemas.signing",
+    "ZERO_ADDRESS": "schemas.address",
+    "address_bytes": "schemas.address",
+    "blocks_of_stream": "schemas.unixfs",
+    "cancellation_hash": "schemas.packing",
+    "checksum_address": "schemas.address",
+    "cid_of_bytes": "schemas.unixfs",
+    "cid_of_digest": "schemas.cid",
+    "cid_of_file": "schemas.unixfs",
+    "cid_of_stream": "schemas.unixfs",
+    "decode": "schemas.wire",
+    "device_selector": "schemas.keys",
+    "encode": "schemas.wire",
+    "event_selector": "schemas.keys",
+    "format_cid": "schemas.cid",
+    "is_ens_name": "schemas.address",
+    "keccak256": "schemas.keccak",
+    "lighthouse_selector": "schemas.keys",
+    "market_selector": "schemas.keys",
+    "message_hash": "schemas.packing",
+    "names_in": "schemas.names",
+    "objective_selector": "schemas.keys",
+    "order_abi": "schemas.packing",
+    "parse_address": "schemas.address",
+    "parse_address_or_name": "schemas.address",
+    "parse_block": "schemas.unixfs",
+    "parse_cid": "schemas.cid",
+    "parse_key": "schemas.keys",
+    "payload_type": "schemas.payloads",
+    "presence_selector": "schemas.keys",
+    "recover": "schemas.signing",
+    "resolve_names": "schemas.names",
+    "topic_selector": "schemas.keys",
+    "verify": "schemas.signing",
+    "verify_hashed": "schemas.signing",
+    "verify_message": "schemas.signing",
+}
+"""The module of each name, which is loaded when the name is asked for."""
+
+
+def __getattr__(name: str) -> Any:
+    """Load what is asked for: a device's agent speaks of keys and payloads, and must not pay for signatures."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'schemas' has no attribute {name!r}")
+    from importlib import import_module
+
+    value = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value
+
 
 __all__ = [
     "CHUNK_SIZE",
@@ -136,6 +242,7 @@ __all__ = [
     "Verified",
     "address_bytes",
     "blocks_of_stream",
+    "cancellation_hash",
     "checksum_address",
     "cid_of_bytes",
     "cid_of_digest",
