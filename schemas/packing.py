@@ -25,6 +25,15 @@ def message_hash(message: Message) -> bytes:
         raise _unresolved(error) from None
 
 
+def cancellation_hash(liability: str) -> bytes:
+    """The 32-byte hash that both parties sign to call off the liability at this address, each with `Signer.sign_hash`.
+
+    It is the keccak256 of the address and the six letters `cancel`: 26 bytes, a length that no message has. Raises
+    `InvalidAddress`.
+    """
+    return keccak256(address_bytes(liability) + b"cancel")
+
+
 def order_abi(order: Order) -> bytes:
     """The plain `abi.encode` of a signed order's fields: what `createLiability` takes for a demand or an offer.
 

@@ -21,7 +21,12 @@ def write_number(field: int, value: int) -> bytes:
 
 def write_bytes(field: int, value: bytes) -> bytes:
     """A field that holds a byte string."""
-    return _varint(field << 3 | _BYTES) + _varint(len(value)) + value
+    return write_length(field, len(value)) + value
+
+
+def write_length(field: int, length: int) -> bytes:
+    """What comes before a byte string of that length."""
+    return _varint(field << 3 | _BYTES) + _varint(length)
 
 
 def read_fields(data: bytes) -> Iterator[tuple[int, int | bytes]]:

@@ -1,6 +1,7 @@
 """The services of an agent, queryables under `aira/agent/{address}/rpc/`: what is asked and what is answered.
 
-The fields bear the names they had in the legacy stack's ROS services. Amounts are in wei (`eth_balance`) or wn (XRT).
+The fields bear the names they had in the legacy stack's ROS services. Amounts are in wei (`eth_balance`) or in the
+smallest unit of the agent's token, which is XRT (wn) unless its settings name another.
 `SERVICES` says which request and reply belong to a service; an error is Zenoh's error reply with one line of text.
 """
 
@@ -10,6 +11,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from schemas.liability import Liability  # msgspec reads the annotations
+from schemas.posting import Published, SendDemand, SendOffer, SendResult, SignDemand, SignOffer, SignResult
 from schemas.records import Record, UInt256
 
 if TYPE_CHECKING:
@@ -63,46 +65,6 @@ class LiabilityRead(Record, frozen=True):
 
     read: bool
     liability: Liability | None = None
-
-
-class SignDemand(Record, frozen=True, kw_only=True, rename="camel"):
-    """Sign and publish a Demand; the agent adds nonce, sender (generation 5) and signature."""
-
-    model: str
-    objective: str
-    token: str
-    cost: UInt256
-    lighthouse: str
-    validator: str
-    validator_fee: UInt256
-    deadline: UInt256
-
-
-class SignOffer(Record, frozen=True, kw_only=True, rename="camel"):
-    """Sign and publish an Offer; the agent adds nonce, sender (generation 5) and signature."""
-
-    model: str
-    objective: str
-    token: str
-    cost: UInt256
-    lighthouse: str
-    validator: str
-    lighthouse_fee: UInt256
-    deadline: UInt256
-
-
-class SignResult(Record, frozen=True, kw_only=True):
-    """Sign and publish a Result."""
-
-    liability: str
-    result: str
-    success: bool
-
-
-class Published(Record, frozen=True):
-    """The message went out; `hash` is its hash, 64 hexadecimal digits."""
-
-    hash: str
 
 
 class AccountBalance(Record, frozen=True):
@@ -171,7 +133,7 @@ class Transaction(Record, frozen=True):
 
 
 class TransferEvent(Record, frozen=True):
-    """A transfer of XRT from or to the agent's account."""
+    """A transfer of the token from or to the agent's account."""
 
     args_from: str
     args_to: str
@@ -179,7 +141,7 @@ class TransferEvent(Record, frozen=True):
 
 
 class ApprovalEvent(Record, frozen=True):
-    """An approval of XRT by or for the agent's account."""
+    """An approval of the token by or for the agent's account."""
 
     args_owner: str
     args_spender: str
@@ -203,6 +165,9 @@ SERVICES: Final[Mapping[str, Service]] = MappingProxyType(
         "sign/demand": Service(SignDemand, Published),
         "sign/offer": Service(SignOffer, Published),
         "sign/result": Service(SignResult, Published),
+        "send/demand": Service(SendDemand, Published),
+        "send/offer": Service(SendOffer, Published),
+        "send/result": Service(SendResult, Published),
         "eth/accounts": Service(Nothing, Accounts),
         "eth/account_eth_balance": Service(AccountBalance, Balance),
         "eth/eth_balance": Service(Nothing, Balance),
@@ -217,3 +182,50 @@ SERVICES: Final[Mapping[str, Service]] = MappingProxyType(
     }
 )
 """Every service by the part of its key after `rpc/`."""
+
+SPENDING: Final = frozenset({"eth/transfer", "eth/transfer_from", "eth/approve"})
+"""The services that send transactions, and so take as long as one takes to be mined."""
+
+GUARDED: Final = SPENDING | {
+    "sign/demand",
+    "sign/offer",
+    "sign/result",
+    "send/demand",
+    "send/offer",
+    "send/result",
+}
+"""The services that sign, spend or speak in an agent's name: offered to others only where its settings say so."""
+
+__all__ = [
+    "GUARDED",
+    "SERVICES",
+    "SPENDING",
+    "AccountBalance",
+    "AccountToAddressAllowance",
+    "Accounts",
+    "Allowance",
+    "ApprovalEvent",
+    "Approve",
+    "Balance",
+    "BlockNumber",
+    "Done",
+    "FinishLiability",
+    "LiabilityRead",
+    "Nothing",
+    "Published",
+    "ReadLiability",
+    "RestartLiability",
+    "ResumeLiability",
+    "SendDemand",
+    "SendOffer",
+    "SendResult",
+    "Service",
+    "SignDemand",
+    "SignOffer",
+    "SignResult",
+    "StartLiability",
+    "Transaction",
+    "Transfer",
+    "TransferEvent",
+    "TransferFrom",
+]

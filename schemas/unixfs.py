@@ -15,10 +15,10 @@ from msgspec import Struct
 
 from schemas.cid import MULTIHASH_PREFIX, cid_of_digest, format_cid
 from schemas.errors import InputError
-from schemas.protobuf import read_fields, write_bytes, write_number
+from schemas.protobuf import read_fields, write_bytes, write_length, write_number
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from os import PathLike
 
 CHUNK_SIZE: Final = 262_144
@@ -68,25 +68,13 @@ def blocks_of_stream(stream: BinaryIO) -> Iterator[Block]:
     Reads a chunk at a time (short reads are made up) and keeps no more than a chunk and the open nodes of the tree, so
     the memory does not grow with the file. Errors of the stream pass through.
     """
-    levels: list[list[_Child]] = [[]]
-    chunk = _read_chunk(stream)
-    while True:
-        yield from _make_room(levels)
-        block, child = _leaf(chunk)
-        levels[0].append(child)
-        yield block
-        if len(chunk) < CHUNK_SIZE:
-            break
-        chunk = _read_chunk(stream)
-        if not chunk:
-            break
-    yield from _close_tree(levels)
+    return _blocks(stream, _leaf)
 
 
 def cid_of_stream(stream: BinaryIO) -> str:
     """The CIDv0 of the file that `stream` holds, from its current position to its end."""
     cid = ""
-    for block in blocks_of_stream(stream):
+    for block in _blocks(stream, _named_leaf):
         cid = block.cid
     return cid
 
@@ -124,6 +112,22 @@ def parse_block(data: bytes) -> Node:
     return _node(names, unixfs)
 
 
+def _blocks(stream: BinaryIO, leaf: Callable[[bytes], tuple[Block, _Child]]) -> Iterator[Block]:
+    levels: list[list[_Child]] = [[]]
+    chunk = _read_chunk(stream)
+    while True:
+        yield from _make_room(levels)
+        block, child = leaf(chunk)
+        levels[0].append(child)
+        yield block
+        if len(chunk) < CHUNK_SIZE:
+            break
+        chunk = _read_chunk(stream)
+        if not chunk:
+            break
+    yield from _close_tree(levels)
+
+
 def _read_chunk(stream: BinaryIO) -> bytes:
     parts = []
     missing = CHUNK_SIZE
@@ -134,11 +138,27 @@ def _read_chunk(stream: BinaryIO) -> bytes:
 
 
 def _leaf(chunk: bytes) -> tuple[Block, _Child]:
-    content = write_bytes(_UNIXFS_DATA, chunk) if chunk else b""
-    unixfs = write_number(_UNIXFS_TYPE, _FILE) + content + write_number(_UNIXFS_FILE_SIZE, len(chunk))
-    data = write_bytes(_NODE_DATA, unixfs)
+    head, tail = _leaf_framing(len(chunk))
+    data = b"".join((head, chunk, tail))
     digest = sha256(data).digest()
     return Block(cid_of_digest(digest), data), _Child(digest, len(chunk), len(data))
+
+
+def _named_leaf(chunk: bytes) -> tuple[Block, _Child]:
+    """The same without the block's bytes: to make these takes half as long as to hash them."""
+    head, tail = _leaf_framing(len(chunk))
+    hashed = sha256(head)
+    hashed.update(chunk)
+    hashed.update(tail)
+    digest = hashed.digest()
+    return Block(cid_of_digest(digest), b""), _Child(digest, len(chunk), len(head) + len(chunk) + len(tail))
+
+
+def _leaf_framing(size: int) -> tuple[bytes, bytes]:
+    """What a leaf has before and after its `size` bytes of the file."""
+    head = write_number(_UNIXFS_TYPE, _FILE) + (write_length(_UNIXFS_DATA, size) if size else b"")
+    tail = write_number(_UNIXFS_FILE_SIZE, size)
+    return write_length(_NODE_DATA, len(head) + size + len(tail)) + head, tail
 
 
 def _parent(children: list[_Child]) -> tuple[Block, _Child]:

@@ -5,17 +5,34 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 import schemas
 
 HEAVY = ("web3", "eth_account", "eth_abi", "eth_utils", "zenoh", "mcap", "asyncio", "mesh")
 
 
+def loaded_by(imports: str, names: tuple[str, ...]) -> str:
+    """Which of these modules a fresh interpreter has loaded after the imports."""
+    script = f"import sys; {imports}; print([name for name in {names} if name in sys.modules])"
+    return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.strip()
+
+
 def test_importing_it_loads_nothing_heavy() -> None:
-    script = f"import sys, schemas, schemas.rpc; print([name for name in {HEAVY} if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    everything = "from schemas import *; import schemas.rpc"
+    assert loaded_by(everything, HEAVY) == "[]"
+
+
+def test_keys_and_payloads_are_had_without_signatures() -> None:
+    keys = "from schemas import DeviceTopicKey, Empty, String; import schemas.keys, schemas.payloads, schemas.values"
+    assert loaded_by(keys, ("coincurve", "schemas.signing", "schemas.messages")) == "[]"
 
 
 def test_everything_it_names_is_there() -> None:
     assert len(set(schemas.__all__)) == len(schemas.__all__)
     assert all(hasattr(schemas, name) for name in schemas.__all__)
+
+
+def test_what_it_does_not_have_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'Offre'"):
+        _ = schemas.Offre

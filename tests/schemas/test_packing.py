@@ -12,6 +12,7 @@ from hypothesis import given
 
 from schemas import (
     Demand,
+    InvalidAddress,
     InvalidMessage,
     Offer,
     Order,
@@ -19,6 +20,7 @@ from schemas import (
     Result,
     TransactionFeedback,
     address_bytes,
+    cancellation_hash,
     keccak256,
     message_hash,
     order_abi,
@@ -120,3 +122,13 @@ def test_nonce_that_looks_like_a_sender_has_no_contract_bytes() -> None:
         order_abi(msgspec.structs.replace(DEMAND, nonce="00" * 12 + "11" * 20))
     assert caught.value.reason == "nonce"
     assert order_abi(msgspec.structs.replace(DEMAND, nonce="00" * 11 + "11" * 21))
+
+
+@given(addresses)
+def test_what_calls_a_liability_off_is_its_address_and_the_word(address: str) -> None:
+    assert cancellation_hash(address) == keccak256(encode_packed(["address", "string"], [address, "cancel"]))
+
+
+def test_only_an_address_can_be_called_off() -> None:
+    with pytest.raises(InvalidAddress):
+        cancellation_hash(LIGHTHOUSE_NAME)
