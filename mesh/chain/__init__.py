@@ -5,7 +5,14 @@ Importing this package loads web3, which takes a second: what also runs without 
 
 from __future__ import annotations
 
-from mesh.chain.accounts import Account, SignedTransaction, keyfile_address, new_private_key, write_keyfile
+from mesh.chain.accounts import (
+    Account,
+    SignedTransaction,
+    copy_keyfile,
+    keyfile_address,
+    new_private_key,
+    write_keyfile,
+)
 from mesh.chain.client import Chain
 from mesh.chain.deploy import XRT, Deployment, DeploymentPlan, deploy
 from mesh.chain.embedded import EmbeddedChain, ServedChain, serve_embedded
@@ -13,6 +20,7 @@ from mesh.chain.errors import (
     ChainWentBack,
     FeeTooHigh,
     InsufficientFunds,
+    InsufficientTokens,
     InvalidName,
     KeyfileError,
     NoAccount,
@@ -23,8 +31,10 @@ from mesh.chain.errors import (
     ReorganisedTooDeep,
     RequestRefused,
     Reverted,
+    StakeTooSmall,
     TransactionTimeout,
     UnknownName,
+    WrongChain,
     WrongPassword,
 )
 from mesh.chain.events import (
@@ -43,10 +53,11 @@ from mesh.chain.history import History
 from mesh.chain.names import namehash
 from mesh.chain.node import Node
 from mesh.chain.reader import BlockEvents, Reorganised
-from mesh.chain.records import Created, LighthouseState, Settled
+from mesh.chain.records import Created, LighthouseState, RefundState, Settled
 from mesh.chain.recursion import restrain_recursion
 from mesh.chain.rpc_server import JsonRpcServer
 from mesh.chain.timing import Timing
+from mesh.chain.tokens import Token
 from mesh.chain.transactions import Receipt, Sender
 
 restrain_recursion()
@@ -70,6 +81,7 @@ __all__ = [
     "Finalized",
     "History",
     "InsufficientFunds",
+    "InsufficientTokens",
     "InvalidName",
     "JsonRpcServer",
     "KeyfileError",
@@ -85,6 +97,7 @@ __all__ = [
     "Offline",
     "Online",
     "Receipt",
+    "RefundState",
     "Reorganised",
     "ReorganisedTooDeep",
     "RequestRefused",
@@ -93,11 +106,15 @@ __all__ = [
     "ServedChain",
     "Settled",
     "SignedTransaction",
+    "StakeTooSmall",
     "Timing",
+    "Token",
     "TransactionTimeout",
     "Transfer",
     "UnknownName",
+    "WrongChain",
     "WrongPassword",
+    "copy_keyfile",
     "deploy",
     "keyfile_address",
     "namehash",

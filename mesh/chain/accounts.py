@@ -51,18 +51,7 @@ class Account:
 
         Takes most of a second, as keyfiles are made to. Raises `KeyfileError`, `WrongPassword`.
         """
-        content = _read_keyfile(Path(keyfile))
-        password = _read_password(Path(password_file))
-        try:
-            return cls(decode_keyfile_json(content, password))
-        except InputError:
-            raise KeyfileError(keyfile, "holds no private key") from None
-        except ValueError as error:
-            if "MAC" in str(error):
-                raise WrongPassword(keyfile, password_file) from None
-            raise KeyfileError(keyfile, f"is not a keyfile: {error}") from None
-        except (KeyError, TypeError, AttributeError, NotImplementedError) as error:
-            raise KeyfileError(keyfile, f"is not a keyfile that can be read here ({error})") from None
+        return cls(_open_keyfile(Path(keyfile), _read_password(Path(password_file)), password_from=password_file))
 
     def sign_transaction(self, fields: Mapping[str, Any]) -> SignedTransaction:
         """Sign a transaction's fields, named as in JSON-RPC with ints for quantities, all of them given."""
@@ -102,10 +91,37 @@ def write_keyfile(path: Path | str, private_key: bytes, password: str) -> str:
     return address
 
 
+def copy_keyfile(source: Path | str, path: Path | str, *, opened_by: str, password: str, password_from: object) -> str:
+    """Write the key of a keyfile, which `opened_by` opens, to a new one under another password; the account's address.
+
+    `password_from` says where `opened_by` is from, for the error. Takes some seconds. Raises as `Account.from_keyfile`
+    and `write_keyfile` do.
+    """
+    key = _open_keyfile(Path(source), opened_by.encode(), password_from=password_from)
+    return write_keyfile(path, key, password)
+
+
 def keyfile_address(keyfile: Path | str) -> str | None:
     """The address that a keyfile claims, without its password; None if it does not say. Raises `KeyfileError`."""
     claimed = _read_keyfile(Path(keyfile)).get("address")
     return parse_address("0x" + claimed.removeprefix("0x").lower()) if isinstance(claimed, str) else None
+
+
+def _open_keyfile(keyfile: Path, password: bytes, *, password_from: object) -> bytes:
+    """The private key in a keyfile. Raises `KeyfileError`, `WrongPassword`."""
+    content = _read_keyfile(keyfile)
+    try:
+        key = decode_keyfile_json(content, password)
+        Signer(key)
+    except InputError:
+        raise KeyfileError(keyfile, "holds no private key") from None
+    except ValueError as error:
+        if "MAC" in str(error):
+            raise WrongPassword(keyfile, password_from) from None
+        raise KeyfileError(keyfile, f"is not a keyfile: {error}") from None
+    except (KeyError, TypeError, AttributeError, NotImplementedError) as error:
+        raise KeyfileError(keyfile, f"is not a keyfile that can be read here ({error})") from None
+    return bytes(key)
 
 
 def _read_keyfile(path: Path) -> dict[str, Any]:

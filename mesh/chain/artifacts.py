@@ -13,11 +13,12 @@ NAMES: Final = ("ENSRegistry", "Resolver", "XRT", "Factory", "Lighthouse", "Liab
 
 @dataclass(frozen=True, slots=True)
 class Artifact:
-    """A built contract: its ABI, and the code that deploys it."""
+    """A built contract: its ABI, the code that deploys it, and the code that is deployed, its immutables zero."""
 
     name: str
     abi: tuple[dict[str, Any], ...]
     bytecode: bytes
+    runtime: bytes
 
 
 @cache
@@ -26,7 +27,8 @@ def load_artifact(name: str) -> Artifact:
     text = resources.files("mesh.chain").joinpath("artifacts", f"{name}.json").read_text(encoding="utf-8")
     content = json.loads(text)
     bytecode = bytes.fromhex(content["bytecode"].removeprefix("0x"))
-    return Artifact(name=name, abi=tuple(content["abi"]), bytecode=bytecode)
+    runtime = bytes.fromhex(content["deployedBytecode"].removeprefix("0x"))
+    return Artifact(name=name, abi=tuple(content["abi"]), bytecode=bytecode, runtime=runtime)
 
 
 def signature_of(entry: dict[str, Any]) -> str:

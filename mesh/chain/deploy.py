@@ -15,9 +15,11 @@ from schemas.keccak import keccak256
 
 if TYPE_CHECKING:
     from web3.contract import AsyncContract
+    from web3.contract.async_contract import AsyncContractFunction
 
     from mesh.chain.accounts import Account
     from mesh.chain.provider import Endpoint
+    from mesh.chain.transactions import Receipt
 
 WN: Final = 1
 XRT: Final = 10**9 * WN
@@ -46,7 +48,7 @@ class DeploymentPlan:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Deployment:
-    """Addresses of what was deployed, EIP-55, and the number of the last block that it took."""
+    """Addresses of what was deployed, EIP-55, the number of the last block that it took, and its gas altogether."""
 
     ens: str
     resolver: str
@@ -55,6 +57,7 @@ class Deployment:
     lighthouse: str
     lighthouse_name: str
     block_number: int
+    gas_used: int
 
 
 async def deploy(
@@ -80,6 +83,7 @@ class _Deployer:
         self._sender = Sender(node, account)
         self._owner = account.address
         self._plan = plan
+        self._gas_used = 0
 
     async def run(self) -> Deployment:
         plan = self._plan
@@ -87,10 +91,10 @@ class _Deployer:
         resolver = await self._create("Resolver", ens)
         xrt = await self._create("XRT", plan.initial_supply)
         factory = await self._create("Factory", ens, xrt, plan.refund_delay)
-        await self._sender.call(self._node.contract("XRT", xrt).functions.setMinter(factory))
+        await self._call(self._node.contract("XRT", xrt).functions.setMinter(factory))
         await self._name(self._node.contract("ENSRegistry", ens), resolver, xrt=xrt, factory=factory)
         create = self._node.contract("Factory", factory).functions.createLighthouse
-        receipt = await self._sender.call(create(plan.minimal_stake, plan.timeout_blocks, plan.lighthouse))
+        receipt = await self._call(create(plan.minimal_stake, plan.timeout_blocks, plan.lighthouse))
         return Deployment(
             ens=ens,
             resolver=resolver,
@@ -99,6 +103,7 @@ class _Deployer:
             lighthouse=lighthouse_created(receipt.logs).lighthouse,
             lighthouse_name=f"{plan.lighthouse}.lighthouse.{GENERATIONS[0]}.robonomics.eth",
             block_number=receipt.block_number,
+            gas_used=self._gas_used,
         )
 
     async def _create(self, name: str, *arguments: Any) -> str:
@@ -107,7 +112,13 @@ class _Deployer:
         data = contract.constructor(*arguments).data_in_transaction
         receipt = await self._sender.send(to=None, data=bytes.fromhex(data[2:]))
         assert receipt.contract is not None
+        self._gas_used += receipt.gas_used
         return receipt.contract
+
+    async def _call(self, function: AsyncContractFunction) -> Receipt:
+        receipt = await self._sender.call(function)
+        self._gas_used += receipt.gas_used
+        return receipt
 
     async def _name(self, registry: AsyncContract, resolver: str, *, xrt: str, factory: str) -> None:
         """Both generations' roots lead to the same contracts; lighthouses are named by the factory."""
@@ -115,7 +126,7 @@ class _Deployer:
         set_address = self._node.contract("Resolver", resolver).functions.setAddr
 
         async def own(parent: str, label: str, owner: str) -> None:
-            await self._sender.call(set_record(namehash(parent), keccak256(label.encode()), owner, resolver, 0))
+            await self._call(set_record(namehash(parent), keccak256(label.encode()), owner, resolver, 0))
 
         await own("", "eth", self._owner)
         await own("eth", "robonomics", self._owner)
@@ -126,4 +137,4 @@ class _Deployer:
             await own(root, "model", self._owner)
             for label, address in (("xrt", xrt), ("factory", factory)):
                 await own(root, label, self._owner)
-                await self._sender.call(set_address(namehash(f"{label}.{root}"), address))
+                await self._call(set_address(namehash(f"{label}.{root}"), address))

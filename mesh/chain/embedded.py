@@ -139,6 +139,11 @@ class ServedChain:
         """Where other processes reach it, e.g. `http://127.0.0.1:8545`."""
         return self.server.url
 
+    @property
+    def ws_url(self) -> str:
+        """The same for clients that subscribe, e.g. `ws://127.0.0.1:8545`."""
+        return self.server.ws_url
+
 
 @asynccontextmanager
 async def serve_embedded(

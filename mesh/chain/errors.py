@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from mesh.chain.refusals import HINTS
 from mesh.errors import ChainError, ConfigurationError, InputError
 
 
@@ -11,10 +12,23 @@ class NodeUnreachable(ChainError):
     def __init__(self, endpoint: str, why: str) -> None:
         super().__init__(
             f"no Ethereum node answers at {endpoint} ({why})",
-            hint="start a node there, or name another with web3_http_provider",
+            hint="start a node there (`aira chain up` runs one to develop on), or name another with web3_http_provider",
         )
         self.endpoint = endpoint
         self.why = why
+
+
+class WrongChain(ConfigurationError):
+    """Of several nodes one is on another chain than the rest; `found` and `expected` are EIP-155 numbers."""
+
+    def __init__(self, endpoint: str, *, found: int, expected: int) -> None:
+        super().__init__(
+            f"the node {endpoint} is on the chain {found}, the others are on the chain {expected}",
+            hint="name nodes of one chain only",
+        )
+        self.endpoint = endpoint
+        self.found = found
+        self.expected = expected
 
 
 class RequestRefused(ChainError):
@@ -72,12 +86,38 @@ class InsufficientFunds(ChainError):
 
     def __init__(self, address: str, *, balance: int, needed: int) -> None:
         super().__init__(
-            f"{address} has {balance} wei, and the transaction may need {needed} wei",
+            f"{address} has {_ether(balance)}, and the transaction may need {_ether(needed)}",
             hint="send ETH to the account; gas is paid in it",
         )
         self.address = address
         self.balance = balance
         self.needed = needed
+
+
+class InsufficientTokens(ChainError):
+    """The account holds less of a token than it is to give. Amounts are the token's smallest unit (wn for XRT)."""
+
+    def __init__(self, account: str, token: str, *, balance: int, needed: int) -> None:
+        super().__init__(
+            f"{account} has {balance} of the token {token}, and {needed} are needed",
+            hint="send it the missing tokens, or ask for less",
+        )
+        self.account = account
+        self.token = token
+        self.balance = balance
+        self.needed = needed
+
+
+class StakeTooSmall(InputError):
+    """A lighthouse takes no provider with less than its minimal stake. Amounts are wn."""
+
+    def __init__(self, stake: int, minimal_stake: int) -> None:
+        super().__init__(
+            f"a stake of {stake} wn is below the lighthouse's minimum of {minimal_stake} wn",
+            hint=f"stake {minimal_stake} wn or more: each such amount is one transaction a turn",
+        )
+        self.stake = stake
+        self.minimal_stake = minimal_stake
 
 
 class FeeTooHigh(ChainError):
@@ -96,15 +136,21 @@ class Reverted(ChainError):
     """A contract refused.
 
     `reason` is the name of its custom error (`CostMismatch`), or the text of a plain revert, `Panic`, `OutOfGas`, or
-    empty when it gave none; `arguments` are the custom error's; `data` is what it reverted with.
+    empty when it gave none; `arguments` are the custom error's; `data` is what it reverted with. `gas_used` and `wei`
+    are what that has cost: nothing, unless the transaction was mined.
     """
 
-    def __init__(self, reason: str, *, arguments: tuple[object, ...] = (), data: bytes = b"") -> None:
+    def __init__(
+        self, reason: str, *, arguments: tuple[object, ...] = (), data: bytes = b"", gas_used: int = 0, wei: int = 0
+    ) -> None:
         shown = ", ".join(_show(argument) for argument in arguments)
-        super().__init__(f"the contract refused: {reason or 'no reason given'}" + (f" ({shown})" if shown else ""))
+        said = f"the contract refused: {reason or 'no reason given'}" + (f" ({shown})" if shown else "")
+        super().__init__(said, hint=HINTS.get(reason, ""))
         self.reason = reason
         self.arguments = arguments
         self.data = data
+        self.gas_used = gas_used
+        self.wei = wei
 
 
 class TransactionTimeout(ChainError):
@@ -179,6 +225,12 @@ class InvalidName(InputError):
     def __init__(self, text: str, why: str) -> None:
         super().__init__(f"{text[:80]!r} is not an ENS name: {why}")
         self.text = text
+
+
+def _ether(wei: int) -> str:
+    """An amount of wei in ETH, all its digits."""
+    whole, part = divmod(wei, 10**18)
+    return f"{whole}.{part:018}".rstrip("0").rstrip(".") + " ETH"
 
 
 def _show(argument: object) -> str:

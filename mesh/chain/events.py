@@ -10,7 +10,7 @@ from eth_abi.abi import decode
 from eth_abi.exceptions import DecodingError
 
 from mesh.chain.artifacts import load_artifact, signature_of
-from schemas.address import checksum_address
+from schemas.address import ZERO_ADDRESS, checksum_address
 from schemas.cid import format_cid
 from schemas.errors import InvalidCid
 from schemas.keccak import keccak256
@@ -48,7 +48,7 @@ class NewLighthouse:
 
 @dataclass(frozen=True, slots=True)
 class Transfer:
-    """XRT changed hands; `value` in wn. The zero address mints and burns."""
+    """Tokens changed hands, XRT (`value` in wn) unless another was asked for. The zero address mints and burns."""
 
     sender: str
     recipient: str
@@ -58,7 +58,7 @@ class Transfer:
 
 @dataclass(frozen=True, slots=True)
 class Approval:
-    """An owner let a spender take up to `value` wn of its XRT."""
+    """An owner let a spender take up to `value` of its tokens, XRT (wn) unless another was asked for."""
 
     owner: str
     spender: str
@@ -99,7 +99,7 @@ ChainEvent: TypeAlias = NewLiability | Finalized | NewLighthouse | Transfer | Ap
 
 def decode_log(log: Any) -> ChainEvent | None:
     """The event in a log; None for another contract's that only looks alike."""
-    entry = _layouts().get(bytes(log["topics"][0]))
+    entry = _layouts().get(bytes(log["topics"][0])) if log["topics"] else None
     if entry is None:
         return None
     name, indexed, plain = entry
@@ -130,9 +130,20 @@ def lighthouse_created(logs: Iterable[Any]) -> NewLighthouse:
     return next(event for log in logs if isinstance(event := decode_log(log), NewLighthouse))
 
 
-def liability_created(logs: Iterable[Any]) -> NewLiability:
-    """The one liability that a transaction made."""
-    return next(event for log in logs if isinstance(event := decode_log(log), NewLiability))
+def liability_created(logs: Iterable[Any], *, factory: str) -> NewLiability:
+    """The one liability that a transaction made. Tokens, which it may have called, can log the same."""
+    ours = (decode_log(log) for log in logs if _address(log["address"]) == factory)
+    return next(event for event in ours if isinstance(event, NewLiability))
+
+
+def xrt_minted(logs: Iterable[Any], *, xrt: str, account: str) -> int:
+    """The XRT (wn) that a transaction made for an account. Other tokens may say what they like."""
+    transfers = (decode_log(log) for log in logs if _address(log["address"]) == xrt)
+    return sum(
+        transfer.value
+        for transfer in transfers
+        if isinstance(transfer, Transfer) and (transfer.sender, transfer.recipient) == (ZERO_ADDRESS, account)
+    )
 
 
 def _event(name: str, emitter: str, values: tuple[Any, ...], tx: str) -> ChainEvent:

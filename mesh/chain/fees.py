@@ -6,7 +6,8 @@ import asyncio
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from mesh.chain.errors import FeeTooHigh
+from mesh.chain.errors import FeeTooHigh, RequestRefused
+from mesh.chain.jsonrpc import METHOD_NOT_FOUND
 from mesh.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -98,8 +99,18 @@ async def _market(node: Node) -> tuple[int, Fees]:
     if base is None:
         price = int(await eth.gas_price)
         return price, Fees(maximum=price, priority=None)
-    priority = int(await eth.max_priority_fee)
+    priority = await _suggested_priority(node, int(base))
     return int(base) + priority, Fees(maximum=2 * int(base) + priority, priority=priority)
+
+
+async def _suggested_priority(node: Node, base: int) -> int:
+    """The priority fee that the node suggests; what its gas price is above the base fee where it has no word for it."""
+    try:
+        return int(await node.web3.eth.max_priority_fee)
+    except RequestRefused as refused:
+        if refused.code != METHOD_NOT_FOUND:
+            raise
+        return max(int(await node.web3.eth.gas_price) - base, 0)
 
 
 def _raised(price: int, percent: int) -> int:

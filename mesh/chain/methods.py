@@ -1,7 +1,7 @@
 """The JSON-RPC methods that the embedded node answers, by name: parameters parsed, results as JSON.
 
 Enough for this project's clients, for web3.py and ethers, and for the legacy JavaScript (which polls blocks and
-receipts): no node-side filters, no account that the node would sign for.
+receipts, and lists lighthouses by a filter): no account that the node would sign for.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from mesh.chain.jsonrpc import (
     parse_quantity,
     to_json,
 )
+from mesh.chain.log_filter import LogFilter
+from mesh.chain.node_filters import NodeFilters
 from schemas.keccak import keccak256
 
 if TYPE_CHECKING:
@@ -32,6 +34,7 @@ class Methods:
 
     def __init__(self, evm: Evm) -> None:
         self._evm = evm
+        filters = NodeFilters(evm, self._logs)
         self._table: dict[str, Callable[..., Any]] = {
             "web3_clientVersion": lambda: "aira-embedded/py-evm",
             "web3_sha3": lambda data: keccak256(parse_data(data)),
@@ -53,6 +56,11 @@ class Methods:
             "eth_getTransactionByHash": lambda hash_: evm.transaction(parse_data(hash_, length=32)),
             "eth_getTransactionReceipt": lambda hash_: evm.receipt(parse_data(hash_, length=32)),
             "eth_getLogs": self._logs,
+            "eth_newFilter": filters.of_logs,
+            "eth_newBlockFilter": filters.of_blocks,
+            "eth_getFilterChanges": filters.changes,
+            "eth_getFilterLogs": filters.everything,
+            "eth_uninstallFilter": filters.remove,
             "eth_call": lambda call, block="latest": evm.call(_call(call), self._height(block)),
             "eth_estimateGas": lambda call, block="latest": evm.estimate(_call(call), self._height(block)),
             "eth_sendRawTransaction": lambda raw: evm.send(parse_data(raw)),
@@ -113,10 +121,8 @@ class Methods:
         else:
             first = self._bound(query.get("fromBlock"))
             last = self._bound(query.get("toBlock"))
-        addresses = {_hex(parse_data(address, length=20)) for address in _alternatives(query.get("address")) or ()}
-        topics = [_alternatives(topic) for topic in query.get("topics") or ()]
-        wanted = [None if one is None else {_hex(parse_data(topic, length=32)) for topic in one} for one in topics]
-        return [log for log in self._evm.logs(first, last) if _matches(log, addresses, wanted)]
+        wanted = LogFilter(query)
+        return [log for log in self._evm.logs(first, last) if wanted.accepts(log)]
 
     def _bound(self, block: object) -> int:
         """A bound of a range of blocks, which unlike the block of a call may lie past the head."""
@@ -132,22 +138,3 @@ def _call(call: dict[str, Any]) -> Call:
         if call.get(name) is not None:
             fields[name] = parse_quantity(call[name])
     return fields
-
-
-def _alternatives(value: Any) -> list[Any] | None:
-    """A member of a log query as the list of what it accepts; None accepts anything."""
-    if value is None:
-        return None
-    return list(value) if isinstance(value, list | tuple) else [value]
-
-
-def _hex(data: bytes) -> str:
-    return "0x" + data.hex()
-
-
-def _matches(log: dict[str, Any], addresses: set[str], topics: Sequence[set[str] | None]) -> bool:
-    if addresses and log["address"] not in addresses:
-        return False
-    if len(topics) > len(log["topics"]):
-        return False
-    return all(wanted is None or topic in wanted for topic, wanted in zip(log["topics"], topics, strict=False))

@@ -43,8 +43,9 @@ class Node:
     `fees` is what its accounts pay at most. In the folder `journal`, where given, is written what they send: several
     processes of one account then never take the same number, and one that is started again takes up what it left.
 
-    Used with `async with`, which connects: raises `NodeUnreachable` when nobody answers, `ConfigurationError` for a
-    text that is no endpoint. Its methods raise `NodeUnreachable` when the node is lost, after bounded retries.
+    Used with `async with`, which connects: raises `NodeUnreachable` when nobody answers, `WrongChain` when one of
+    several is on another chain. Making it raises `ConfigurationError` for a text that is no endpoint. Its methods raise
+    `NodeUnreachable` when the node is lost, after bounded retries.
     """
 
     def __init__(
@@ -81,6 +82,7 @@ class Node:
         self._provider.open()
         try:
             self._chain_id = await self.web3.eth.chain_id
+            await self._provider.check_chains(self._chain_id)
             if self._journal is not None:
                 self._chain_folder = self._journal / await self._chain_name()
         except BaseException:

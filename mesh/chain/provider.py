@@ -14,7 +14,7 @@ from aiohttp import ClientError, ClientResponseError
 from web3.exceptions import Web3Exception
 from web3.providers.async_base import AsyncBaseProvider
 
-from mesh.chain.errors import NodeUnreachable, RequestRefused
+from mesh.chain.errors import NodeUnreachable, RequestRefused, WrongChain
 from mesh.chain.reverts import decode_revert
 from mesh.chain.transports import HttpTransport, WebSocketTransport
 from mesh.errors import AiraError, ClosedError, ConfigurationError
@@ -36,6 +36,9 @@ Endpoint: TypeAlias = "str | Sequence[str] | AsyncBaseProvider"
 
 SEND: Final = "eth_sendRawTransaction"
 TRANSIENT_STATUS: Final = frozenset({429, 500, 502, 503, 504})
+
+CHECK_TIMEOUT: Final = 2.0
+"""Seconds that opening waits for the nodes beside the one in use, to say which chain they are on."""
 
 
 class NotJsonRpc(ValueError):
@@ -59,7 +62,8 @@ class ReliableProvider(AsyncBaseProvider):
     A request goes to the node that answered last; when its connection fails, to the next, and so on around all of
     them, `timing.attempts` times with a growing delay in between. Only a transaction goes to one node once, as its
     sender has to know whether an earlier attempt may have arrived; the sender's next attempt goes to the next node.
-    A node that is on another chain than the first that answered is passed over.
+    A node that is on another chain than the first that answered is an error at the opening, where it answers soon, and
+    passed over later.
     """
 
     def __init__(self, ways: Sequence[Way], *, timing: Timing) -> None:
@@ -73,6 +77,26 @@ class ReliableProvider(AsyncBaseProvider):
     def open(self) -> None:
         """Let requests through, until `close`."""
         self._is_open = True
+
+    async def check_chains(self, expected: int) -> None:
+        """Look which chain the nodes are on that answer within `CHECK_TIMEOUT`. Raises `WrongChain`."""
+        if len(self._ways) == 1:
+            return
+        found = await asyncio.gather(*(self._chain_of(way) for way in self._ways))
+        for way, chain_id in zip(self._ways, found, strict=True):
+            if chain_id is None:
+                log.warning("the node %s does not answer now; it is asked when another fails", way.endpoint)
+            elif chain_id != expected:
+                raise WrongChain(way.endpoint, found=chain_id, expected=expected)
+
+    async def _chain_of(self, way: Way) -> int | None:
+        """The number of the chain that a node is on; None if it does not say."""
+        try:
+            async with asyncio.timeout(CHECK_TIMEOUT):
+                response: Any = await way.provider.make_request("eth_chainId", [])  # type: ignore[arg-type]
+                return int(response["result"], 16)
+        except (*CONNECTION_ERRORS, LookupError, TypeError):
+            return None
 
     async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
         """The node's response, which holds a result.
@@ -92,7 +116,7 @@ class ReliableProvider(AsyncBaseProvider):
                     raise
                 except CONNECTION_ERRORS as error:
                     failures.append(error)
-                    self._turn_from(way)
+                    self._turn_from(way, _why(error))
                     why = _why(error) if len(self._ways) == 1 else f"{way.endpoint}: {_why(error)}"
             if attempt == attempts or not any(_is_transient(failure) for failure in failures):
                 break
@@ -120,11 +144,12 @@ class ReliableProvider(AsyncBaseProvider):
             raise NotJsonRpc(f"it is on the chain {found}, the others are on {self._chain_id}")
         way.is_on_chain = True
 
-    def _turn_from(self, way: Way) -> None:
+    def _turn_from(self, way: Way, why: str) -> None:
         """Ask another node first from now on; the one that failed comes last."""
+        way.is_on_chain = False  # it may come back as another
         if len(self._ways) > 1 and self._ways[0] is way:
             self._ways = (*self._ways[1:], way)
-            log.warning("the node %s does not answer; turning to %s", way.endpoint, self._ways[0].endpoint)
+            log.warning("the node %s fails (%s); turning to %s", way.endpoint, why, self._ways[0].endpoint)
 
     async def is_connected(self, show_traceback: bool = False) -> bool:
         """Whether a node answers."""

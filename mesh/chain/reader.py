@@ -10,17 +10,17 @@ import asyncio
 from contextlib import aclosing
 from dataclasses import dataclass
 from itertools import groupby
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, cast
 
 from web3.exceptions import BlockNotFound
 
 from mesh.chain.errors import ChainWentBack, NodeUnreachable, ReorganisedTooDeep, RequestRefused
-from mesh.chain.events import ChainEvent, NewLiability, NewLighthouse, decode_log, topics_of
+from mesh.chain.events import ChainEvent, NewLiability, decode_log, topics_of
 from mesh.chain.history import History, Remembered
 from schemas.address import parse_address
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Awaitable, Callable, Collection, Sequence
+    from collections.abc import AsyncGenerator, Awaitable, Callable, Collection, Iterable, Sequence
 
     from web3.types import BlockIdentifier, FilterParams
 
@@ -57,10 +57,10 @@ class Reorganised(BlockEvents):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sources:
-    """Whose events are read: the factory, the token XRT, any lighthouses, and all liabilities of the factory."""
+    """Whose events are read: the factory, a token, any lighthouses, and all liabilities of the factory."""
 
     factory: str
-    xrt: str
+    token: str
     lighthouses: tuple[str, ...] = ()
     is_liability: Callable[[str], Awaitable[bool]]
     recognise: Callable[[str], None]
@@ -79,8 +79,12 @@ class _ReplacedMeanwhile(Exception):
     """The chain was reorganised between two questions: the answers don't belong together."""
 
 
+Read: TypeAlias = "Callable[[int, int], Awaitable[list[Remembered]]]"
+"""Reads the blocks from one to another, both included, as `read_range` does."""
+
+
 async def read_blocks(
-    node: Node, sources: Sources, from_block: int, *, history: History | None = None
+    node: Node, read: Read, from_block: int, *, history: History | None = None
 ) -> AsyncGenerator[BlockEvents, None]:
     """Events from `from_block` on, for ever; block numbers only grow, but for `Reorganised`.
 
@@ -89,7 +93,7 @@ async def read_blocks(
     `ReorganisedTooDeep`, `NodeUnreachable`, `RequestRefused`; reading goes on from the cursor with a new iterator.
     """
     history = history or History(node.timing.reorg_depth)
-    ranges = _Ranges(node, sources)
+    ranges = _Ranges(node, read)
     head = await _head(node)
     await _check_start(node, history, from_block=from_block, head=head)
     cursor = from_block
@@ -113,18 +117,19 @@ async def read_blocks(
         head = await _head(node)
 
 
-async def find_lighthouses(node: Node, sources: Sources, from_block: int) -> list[NewLighthouse]:
-    """All lighthouses made from a block to the latest, in order. Raises `NodeUnreachable`, `RequestRefused`."""
-    blocks = _Ranges(node, sources).read_to(from_block, await _head(node))
-    return [event async for block in blocks for event in block.events if isinstance(event, NewLighthouse)]
+async def read_once(node: Node, read: Read, from_block: int) -> AsyncGenerator[Remembered, None]:
+    """Events from a block to the latest, as it is now. Raises `NodeUnreachable`, `RequestRefused`."""
+    async with aclosing(_Ranges(node, read).read_to(from_block, await _head(node))) as blocks:
+        async for block in blocks:
+            yield block
 
 
 class _Ranges:
     """Reads ranges of blocks, as long as the node answers them."""
 
-    def __init__(self, node: Node, sources: Sources) -> None:
+    def __init__(self, node: Node, read: Read) -> None:
         self._node = node
-        self._sources = sources
+        self._read = read
         self._span = MAX_RANGE
 
     async def read_to(self, first: int, head: Head) -> AsyncGenerator[Remembered, None]:
@@ -132,7 +137,7 @@ class _Ranges:
         while first <= head.number:
             last = min(head.number, first + self._span - 1)
             try:
-                blocks = await read_range(self._node, self._sources, first=first, last=last)
+                blocks = await self._read(first, last)
             except (RequestRefused, NodeUnreachable) as error:
                 if first == last:
                     raise
@@ -147,21 +152,30 @@ class _Ranges:
             self._span = min(MAX_RANGE, self._span + max(1, self._span // 4))
 
 
-async def read_range(node: Node, sources: Sources, *, first: int, last: int) -> list[Remembered]:
+async def read_range(node: Node, sources: Sources, first: int, last: int) -> list[Remembered]:
     """The events of the blocks from `first` to `last`, both included; an empty one stands for an eventless last.
 
     Raises `_ReplacedMeanwhile` when a block's logs are of two different blocks.
     """
-    addresses = [sources.factory, sources.xrt, *sources.lighthouses]
+    addresses = [sources.factory, sources.token, *sources.lighthouses]
     ours = await _logs(node, first, last, addresses=addresses, topics=topics_of("Factory", "XRT", "Lighthouse"))
     for log in ours:
         if isinstance(event := decode_log(log), NewLiability) and parse_address(log["address"]) == sources.factory:
             sources.recognise(event.liability)
     finals = await _logs(node, first, last, addresses=(), topics=topics_of("Liability"))
     finals = [log for log in finals if await sources.is_liability(parse_address(log["address"]))]
-    logs = sorted((*ours, *finals), key=lambda log: (log["blockNumber"], log["logIndex"]))
+    return _by_block((*ours, *finals), last)
+
+
+async def read_made(node: Node, factory: str, first: int, last: int) -> list[Remembered]:
+    """As `read_range`, of the factory alone."""
+    return _by_block(await _logs(node, first, last, addresses=[factory], topics=topics_of("Factory")), last)
+
+
+def _by_block(logs: Iterable[Any], last: int) -> list[Remembered]:
+    ordered = sorted(logs, key=lambda log: (log["blockNumber"], log["logIndex"]))
     blocks = []
-    for number, group in groupby(logs, key=lambda log: int(log["blockNumber"])):
+    for number, group in groupby(ordered, key=lambda log: int(log["blockNumber"])):
         of_block = list(group)
         hashes = {bytes(log["blockHash"]) for log in of_block}
         if len(hashes) > 1:

@@ -52,24 +52,50 @@ class LighthouseState:
 
 @dataclass(frozen=True, slots=True)
 class Created:
-    """A liability that a transaction made, and the gas that it took."""
+    """A liability that a transaction made, and the gas that it took, for so many wei."""
 
     liability: str
     tx: str
     gas_used: int
+    wei: int
 
 
 @dataclass(frozen=True, slots=True)
 class Settled:
-    """The transaction that finalized or refunded a liability, and the gas that it took."""
+    """The transaction that finalized or refunded a liability, and the gas that it took, for so many wei.
+
+    `minted` is the XRT (wn) that its sender was given for that.
+    """
 
     tx: str
     gas_used: int
+    wei: int
+    minted: int
 
 
-async def read_liability(node: Node, address: str) -> Liability:
-    """The terms and the outcome of what is known to be a liability, as of one block. Raises `NodeUnreachable`."""
-    block = await node.block_number()
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RefundState:
+    """Whether the promisee of a liability can be paid back, as of the block `block_number`."""
+
+    liability: str
+    block_number: int
+    refundable_from: int
+    """The first block in which anybody may have that done, if the liability has not ended by then."""
+
+    is_finalized: bool
+
+    @property
+    def is_refundable(self) -> bool:
+        """Whether a transaction in the next block could do it."""
+        return not self.is_finalized and self.block_number + 1 >= self.refundable_from
+
+
+async def read_liability(node: Node, address: str, *, block: int | None = None) -> Liability:
+    """The terms and the outcome of what is known to be a liability, as of one block (by default the latest).
+
+    Raises `NodeUnreachable`, and `NoContracts` for a block before it was made.
+    """
+    block = await node.block_number() if block is None else block
     functions = node.contract("Liability", address).functions
     values = await node.read_all((functions[getter]() for getter in LIABILITY_GETTERS), block=block)
     held: dict[str, Any] = dict(zip(LIABILITY_GETTERS, values, strict=True))

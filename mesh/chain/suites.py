@@ -68,6 +68,10 @@ class Suite:
         call: AsyncContractFunction = self._liability(result.liability).finalize(*result_arguments(result), agree)
         return call
 
+    def cancellation(self, liability: str, promisee: bytes, promisor: bytes) -> AsyncContractFunction:
+        """The call that ends a liability as both parties have signed. Raises `NotOffered`."""
+        return self._factory.cancel(liability, promisee, promisor)
+
     def refund(self, liability: str) -> AsyncContractFunction:
         """The call that pays a promisee back. Raises `NotOffered`."""
         return self._factory.refund(liability)
@@ -130,6 +134,9 @@ class OriginalSuite(Suite):
         if self.generation == 5:
             raise NotOffered("finalization by a validator's own account", self.generation)
         return super().validation(result, agree=agree)
+
+    def cancellation(self, liability: str, promisee: bytes, promisor: bytes) -> AsyncContractFunction:
+        raise NotOffered("cancellation", self.generation)
 
     def refund(self, liability: str) -> AsyncContractFunction:
         raise NotOffered("refund", self.generation)

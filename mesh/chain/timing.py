@@ -43,6 +43,10 @@ class Timing:
     """Blocks, not seconds: how far behind the head a reader of events notices that blocks were replaced."""
 
     def __post_init__(self) -> None:
-        intervals = (self.poll_interval, self.receipt_interval, self.replace_after, self.request_timeout)
-        if min(self.attempts, self.confirmations, self.reorg_depth) < 1 or min(intervals) <= 0:
-            raise ConfigurationError("intervals and timeouts are above zero, and attempts and blocks one at least")
+        intervals = (self.poll_interval, self.receipt_interval, self.replace_after)
+        above_zero = (*intervals, self.receipt_timeout, self.request_timeout)
+        counts, others = (self.attempts, self.confirmations, self.reorg_depth), (self.retry_delay, self.repeat_within)
+        if min(counts) < 1 or min(above_zero) <= 0 or min(others) < 0:
+            raise ConfigurationError(
+                "intervals and timeouts are above zero, attempts and blocks one at least, and no time is negative"
+            )

@@ -44,11 +44,15 @@ NONCE_ATTEMPTS: Final = 25
 
 @dataclass(frozen=True, slots=True)
 class Receipt:
-    """A mined transaction that went through. `contract` is what it deployed, if anything; logs as web3 gives them."""
+    """A mined transaction that went through. `contract` is what it deployed, if anything; logs as web3 gives them.
+
+    `wei` is what its gas has cost.
+    """
 
     tx: str
     block_number: int
     gas_used: int
+    wei: int
     contract: str | None
     logs: tuple[Any, ...]
 
@@ -186,13 +190,14 @@ class Sender:
 
     async def _why_failed(self, fields: dict[str, Any], receipt: TxReceipt) -> Reverted:
         """Why a mined transaction failed though its simulation went through: asked of the state after its block."""
+        gas_used, wei = int(receipt["gasUsed"]), _wei(receipt)
         try:
             await self._node.web3.eth.call(self._call(fields), receipt["blockNumber"])
-        except Reverted as reverted:
-            return reverted
+        except Reverted as why:
+            return Reverted(why.reason, arguments=why.arguments, data=why.data, gas_used=gas_used, wei=wei)
         except RequestRefused as refused:
-            return Reverted(refused.detail)
-        return Reverted("OutOfGas" if receipt["gasUsed"] >= fields["gas"] else "")
+            return Reverted(refused.detail, gas_used=gas_used, wei=wei)
+        return Reverted("OutOfGas" if gas_used >= fields["gas"] else "", gas_used=gas_used, wei=wei)
 
     def _call(self, fields: dict[str, Any]) -> TxParams:
         """The same as a call, without prices: a simulation is not paid for."""
@@ -206,6 +211,12 @@ def _receipt(signed: SignedTransaction, receipt: TxReceipt) -> Receipt:
         tx=signed.hash,
         block_number=int(receipt["blockNumber"]),
         gas_used=int(receipt["gasUsed"]),
+        wei=_wei(receipt),
         contract=None if contract is None else parse_address(contract),
         logs=tuple(receipt["logs"]),
     )
+
+
+def _wei(receipt: TxReceipt) -> int:
+    """What a mined transaction's gas has cost."""
+    return int(receipt["gasUsed"]) * int(receipt["effectiveGasPrice"])

@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import asyncio
 import json
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from aiohttp import ClientSession, ClientWebSocketResponse, WSMsgType
 from web3.providers.async_base import AsyncJSONBaseProvider
 
 if TYPE_CHECKING:
     from web3.types import RPCEndpoint, RPCResponse
+
+
+TOO_MANY: Final = 429
 
 
 class HttpTransport(AsyncJSONBaseProvider):
@@ -31,8 +34,9 @@ class HttpTransport(AsyncJSONBaseProvider):
             self._session = ClientSession(headers={"Content-Type": "application/json"})
         async with self._session.post(self._url, data=self.encode_rpc_request(method, params)) as response:
             body = await response.read()
-            # Some nodes answer errors with HTTP 4xx or 5xx and say what is wrong in the body.
-            if not response.ok and not body.lstrip().startswith(b"{"):
+            # Some nodes answer errors with HTTP 4xx or 5xx and say what is wrong in the body; of too many requests at
+            # once there is nothing to say but to come again.
+            if response.status == TOO_MANY or (not response.ok and not body.lstrip().startswith(b"{")):
                 response.raise_for_status()
             return self.decode_rpc_response(body)
 

@@ -66,7 +66,11 @@ class Watch:
     async def _look(self) -> tuple[SignedTransaction, TxReceipt] | None:
         confirmations = self._node.timing.confirmations
         head = await self._node.block_number() if confirmations > 1 else 0
-        found = await find_receipt(self._node, reversed(self._entry.versions))
+        try:
+            found = await find_receipt(self._node, reversed(self._entry.versions))
+        except RequestRefused as refused:
+            log.debug("%s: %s", self._newest.hash, refused)  # as nodes do that are still indexing; it was sent
+            return None
         if found is not None:
             self._was_mined = True
             _, receipt = found

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest_asyncio
 
 from mesh.chain import XRT, Account, Chain, Deployment, DeploymentPlan, EmbeddedChain, Node, Timing, deploy
+from mesh.chain.embedded import EmbeddedProvider
 from schemas.address import ZERO_ADDRESS
 from schemas.cid import cid_of_digest
 from schemas.keccak import keccak256
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
     import pytest
     from web3.providers.async_base import AsyncBaseProvider
+    from web3.types import RPCEndpoint, RPCResponse
 
     from mesh.chain import BlockEvents, ChainEvent
 
@@ -121,6 +123,17 @@ async def read_to(chain: Chain, first: int, last: int, *, lighthouses: Iterable[
 
 def events_of(blocks: list[BlockEvents]) -> list[ChainEvent]:
     return [event for block in blocks for event in block.events]
+
+
+class Flaky(EmbeddedProvider):
+    """An embedded chain behind a wire that can be cut."""
+
+    is_lost = False
+
+    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+        if self.is_lost:
+            raise ConnectionError("the wire is cut")
+        return await super().make_request(method, params)
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module", params=["embedded", "anvil"])

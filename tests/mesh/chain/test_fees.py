@@ -10,12 +10,15 @@ import pytest
 
 from mesh.chain import GWEI, Account, FeePolicy, FeeTooHigh, Node, Sender, new_private_key
 from mesh.chain.fees import Fees
+from mesh.chain.transports import HttpTransport
 from mesh.errors import ConfigurationError
 from tests.mesh.chain.conftest import QUICK
 from tests.support.nodes import Anvil
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
+
+    from web3.types import RPCEndpoint, RPCResponse
 
 
 @pytest.fixture
@@ -83,6 +86,27 @@ async def test_a_replacement_is_dearer_by_what_nodes_want_or_there_is_none(anvil
         assert await policy.bumped(node, Fees(10 * GWEI, None)) == Fees(115 * GWEI // 10, None)
         cheap = await replace(policy, ceiling=GWEI // 2).bumped(node, Fees(1, 1))
         assert cheap == Fees(GWEI // 2, GWEI // 2), "the priority fee is never above the whole"
+
+
+class _Plain(HttpTransport):
+    """A node that lacks a word for priority fees."""
+
+    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+        if method == "eth_maxPriorityFeePerGas":
+            return {"jsonrpc": "2.0", "id": 1, "error": {"code": -32601, "message": "the method does not exist"}}
+        return await super().make_request(method, params)
+
+
+async def test_a_node_without_a_word_for_priority_fees_is_asked_for_its_price(anvil: Anvil) -> None:
+    wire = _Plain(anvil.url)
+    async with Node(wire, timing=QUICK) as node:
+        base = int((await node.web3.eth.get_block("latest"))["baseFeePerGas"])
+        price = int(await node.web3.eth.gas_price)
+        receipt = await _sender(node, anvil).send(to=_stranger(), data=b"", value=1)
+        sent = await _ask(node, "eth_getTransactionByHash", receipt.tx)
+    assert int(sent["maxPriorityFeePerGas"], 16) == price - base
+    assert int(sent["maxFeePerGas"], 16) == base + price
+    await wire.close()
 
 
 @pytest.mark.parametrize("wrong", [{"ceiling": 0}, {"patience": -1}, {"bump_percent": 9}])

@@ -170,6 +170,30 @@ async def test_a_transaction_whose_block_was_replaced_is_sent_again(anvil: Anvil
         assert await node.eth_balance(friend) == 5
 
 
+class _Indexing(HttpTransport):
+    """A node that is still busy with its index, and says so when it is asked for a receipt."""
+
+    asked = 0
+
+    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+        if method == "eth_getTransactionReceipt":
+            self.asked += 1
+            if self.asked < 5:
+                error = {"code": -32000, "message": "transaction indexing is in progress"}
+                return {"jsonrpc": "2.0", "id": 1, "error": error}  # type: ignore[typeddict-item]
+        return await super().make_request(method, params)
+
+
+async def test_a_node_that_is_still_indexing_is_asked_for_the_receipt_again(anvil: Anvil) -> None:
+    wire, friend = _Indexing(anvil.url), _stranger()
+    async with Node(wire, timing=QUICK) as node:
+        await _ask(node, "evm_setAutomine", True)
+        await Sender(node, Account.from_key(anvil.private_keys[0])).send(to=friend, data=b"", value=5)
+        assert await node.eth_balance(friend) == 5
+        assert wire.asked == 5
+    await wire.close()
+
+
 async def test_after_a_lost_answer_sending_the_same_again_means_the_first(anvil: Anvil) -> None:
     """The node takes the transaction and is gone before it says so; the caller tries again when it is back."""
     wire, friend = _Deaf(anvil.url), _stranger()

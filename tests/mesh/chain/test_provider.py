@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from aiohttp import web
 
-from mesh.chain import Chain, EmbeddedChain, JsonRpcServer, Node, NodeUnreachable, RequestRefused
+from mesh.chain import Chain, EmbeddedChain, JsonRpcServer, Node, NodeUnreachable, RequestRefused, WrongChain
 from mesh.errors import ClosedError, ConfigurationError, RemoteError
 from tests.mesh.chain.conftest import QUICK
 from tests.support.nodes import Anvil
@@ -220,15 +220,64 @@ async def test_a_node_that_is_not_there_at_the_start_is_passed_over() -> None:
         assert node.chain_id == 31337
 
 
-async def test_a_node_of_another_chain_is_not_taken_for_one_of_this() -> None:
-    async with (
-        Anvil() as anvil,
-        Anvil(arguments=("--chain-id", "4")) as other,
-        Node((anvil.url, other.url), timing=replace(QUICK, attempts=1)) as node,
-    ):
+@pytest.mark.parametrize("scheme", ["http", "ws"])
+async def test_nodes_of_different_chains_are_not_opened_together(scheme: str) -> None:
+    async with Anvil() as anvil, Anvil(arguments=("--chain-id", "4")) as other:
+        urls = [one.url if scheme == "http" else one.ws_url for one in (anvil, other)]
+        with pytest.raises(
+            WrongChain, match=f"{urls[1]} is on the chain 4, the others are on the chain 31337"
+        ) as caught:
+            async with Node(urls, timing=QUICK):
+                pass
+    assert isinstance(caught.value, ConfigurationError)
+    assert caught.value.hint
+
+
+async def test_a_node_of_another_chain_that_comes_later_is_not_taken_for_one_of_this() -> None:
+    other = Anvil(arguments=("--chain-id", "4"))
+    async with Anvil() as anvil, Node((anvil.url, other.url), timing=replace(QUICK, attempts=1)) as node, other:
         await asyncio.to_thread(anvil.kill)
         with pytest.raises(NodeUnreachable, match=f"{other.url}: it is on the chain 0x4, the others are on 0x7a69"):
             await node.block_number()
+
+
+async def test_a_node_that_comes_back_on_another_chain_is_not_taken_for_what_it_was() -> None:
+    first, second = Anvil(), Anvil()
+    async with second, Node((first.url, second.url), timing=replace(QUICK, attempts=1)) as node:
+        async with first:
+            await asyncio.to_thread(second.kill)
+            assert await node.block_number() == 0, "by the first"
+            await asyncio.to_thread(second.start)
+        assert await node.block_number() == 0, "by the second"
+        async with Anvil(port=first.port, arguments=("--chain-id", "4")):
+            await asyncio.to_thread(second.kill)
+            with pytest.raises(NodeUnreachable, match="on the chain 0x4"):
+                await node.block_number()
+            await asyncio.to_thread(second.start)
+
+
+async def test_a_node_that_is_asked_too_often_is_asked_again_whatever_it_says() -> None:
+    count = 0
+
+    async def busy(request: web.Request) -> web.Response:
+        nonlocal count
+        count += 1
+        if count < 3:
+            error = {"code": -32005, "message": "too many requests"}
+            return web.json_response({"jsonrpc": "2.0", "id": 1, "error": error}, status=429)
+        return web.json_response({"jsonrpc": "2.0", "id": (await request.json())["id"], "result": "0x7"})
+
+    async with _server(busy) as url, Node(url, timing=replace(QUICK, attempts=3)) as node:
+        assert node.chain_id == 7
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"attempts": 0}, {"request_timeout": 0}, {"receipt_timeout": 0}, {"retry_delay": -1}, {"repeat_within": -1}],
+)
+def test_times_that_can_not_be_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ConfigurationError, match="above zero"):
+        replace(QUICK, **wrong)
 
 
 @pytest.mark.parametrize("endpoint", [(), "http://127.0.0.1:1,", ["http://127.0.0.1:1", "ftp://x"]])

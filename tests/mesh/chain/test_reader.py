@@ -28,7 +28,7 @@ from mesh.chain.embedded import EmbeddedProvider
 from mesh.chain.errors import RequestRefused
 from mesh.chain.jsonrpc import RpcError
 from schemas.address import ZERO_ADDRESS
-from tests.mesh.chain.conftest import QUICK, events_of, read_to
+from tests.mesh.chain.conftest import QUICK, Flaky, events_of, read_to
 
 if TYPE_CHECKING:
     from web3.types import RPCEndpoint, RPCResponse
@@ -188,7 +188,7 @@ async def _prepare_lonely(node: EmbeddedChain) -> Account:
 async def test_a_lost_node_ends_the_reading_and_the_cursor_takes_it_up() -> None:
     async with EmbeddedChain() as node:
         await _prepare_lonely(node)
-        flaky = _Flaky(node)
+        flaky = Flaky(node)
         async with Chain(flaky, timing=QUICK) as chain:
             head = await chain.block_number()
             events = chain.events(head + 1)
@@ -199,14 +199,3 @@ async def test_a_lost_node_ends_the_reading_and_the_cursor_takes_it_up() -> None
             flaky.is_lost = False
             await node.mine(1)
             assert (await read_to(chain, head + 1, head + 1))[-1] == BlockEvents(head + 1, ())
-
-
-class _Flaky(EmbeddedProvider):
-    """An embedded chain behind a wire that can be cut."""
-
-    is_lost = False
-
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
-        if self.is_lost:
-            raise ConnectionError("the wire is cut")
-        return await super().make_request(method, params)

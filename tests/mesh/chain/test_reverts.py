@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from eth_abi.abi import encode
 
+from mesh.chain.refusals import HINTS
 from mesh.chain.reverts import custom_errors, decode_revert, explain
 from schemas.keccak import keccak256
 
@@ -29,6 +30,12 @@ def test_a_custom_error_is_found_where_a_node_puts_it(error: dict[str, Any]) -> 
     assert reverted is not None
     assert (reverted.reason, reverted.arguments) == ("NotAProvider", (ADDRESS,))
     assert str(reverted) == f"the contract refused: NotAProvider ({ADDRESS})"
+    assert reverted.hint.startswith("stake on the lighthouse first")
+
+
+def test_all_that_there_is_advice_for_is_an_error_of_the_contracts() -> None:
+    known = {name for name, _ in custom_errors().values()}
+    assert HINTS.keys() - known == {"OutOfGas"}, "which no contract says"
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,109 @@
+"""What accounts hold: ether, XRT and any other ERC-20; the parts of `Chain` that read and move it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from eth_abi.abi import decode
+from eth_abi.exceptions import DecodingError
+from web3.exceptions import BadFunctionCallOutput
+
+from mesh.chain.errors import NoContracts, Reverted
+from mesh.chain.opening import OpenChain
+
+if TYPE_CHECKING:
+    from web3.contract import AsyncContract
+    from web3.contract.async_contract import AsyncContractFunction
+
+LONGEST_LABEL: Final = 64
+"""Characters of a token's name or symbol that are shown: anybody may deploy a token and call it anything."""
+
+MAX_DECIMALS: Final = 255
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Token:
+    """What an ERC-20 says of itself; nothing that it says can be relied on but the address.
+
+    `symbol` and `name` are empty and `decimals` is 0 where it does not say. `total_supply` is in its smallest unit, of
+    which 10^`decimals` are one token.
+    """
+
+    address: str
+    symbol: str
+    name: str
+    decimals: int
+    total_supply: int
+
+
+class Tokens(OpenChain):
+    """Balances, allowances and transfers; a part of `Chain`."""
+
+    async def eth_balance(self, address: str | None = None) -> int:
+        """Wei of an account; of one's own by default."""
+        return await self.node.eth_balance(await self._whose(address))
+
+    async def send_eth(self, to: str, value: int) -> str:
+        """Send `value` wei; the transaction's hash."""
+        return (await self._signing().send(to=await self.resolve(to), data=b"", value=value)).tx
+
+    async def token(self, token: str | None = None) -> Token:
+        """What a token (XRT by default) says of itself. Raises `NoContracts` for what is no ERC-20."""
+        contract = await self._token(token)
+        functions = contract.functions
+        total_supply = int(await self.node.read(functions.totalSupply()))
+        return Token(
+            address=str(contract.address),
+            symbol=_label(await self._said(contract, functions.symbol())),
+            name=_label(await self._said(contract, functions.name())),
+            decimals=_decimals(await self._said(contract, functions.decimals())),
+            total_supply=total_supply,
+        )
+
+    async def balance_of(self, address: str | None = None, *, token: str | None = None) -> int:
+        """Units of a token (XRT by default) that an account holds."""
+        contract = await self._token(token)
+        return int(await self.node.read(contract.functions.balanceOf(await self._whose(address))))
+
+    async def allowance(self, owner: str, spender: str, *, token: str | None = None) -> int:
+        """Units of a token (XRT by default) that `spender` may take from `owner`."""
+        functions = (await self._token(token)).functions
+        return int(await self.node.read(functions.allowance(await self.resolve(owner), await self.resolve(spender))))
+
+    async def approve(self, spender: str, value: int, *, token: str | None = None) -> str:
+        """Let `spender` take up to `value` units of a token (XRT by default); the transaction's hash."""
+        functions = (await self._token(token)).functions
+        return (await self._send(functions.approve(await self.resolve(spender), value))).tx
+
+    async def transfer(self, to: str, value: int, *, token: str | None = None) -> str:
+        """Send units of a token (XRT by default); the transaction's hash."""
+        functions = (await self._token(token)).functions
+        return (await self._send(functions.transfer(await self.resolve(to), value))).tx
+
+    async def transfer_from(self, owner: str, to: str, value: int, *, token: str | None = None) -> str:
+        """Send what `owner` approved for this account; the transaction's hash."""
+        functions = (await self._token(token)).functions
+        return (await self._send(functions.transferFrom(await self.resolve(owner), await self.resolve(to), value))).tx
+
+    async def _said(self, contract: AsyncContract, function: AsyncContractFunction) -> bytes:
+        """The bytes that an optional function of a token answers; none where it lacks the function."""
+        call: Any = {"to": contract.address, "data": function._encode_transaction_data()}
+        try:
+            return bytes(await self.node.web3.eth.call(call))
+        except (Reverted, BadFunctionCallOutput, NoContracts):
+            return b""
+
+
+def _label(answer: bytes) -> str:
+    """A text that is fit to be shown. Tokens of the first years answer 32 bytes instead of a string."""
+    try:
+        text = answer.rstrip(b"\0").decode() if len(answer) == 32 else decode(["string"], answer)[0]
+    except (DecodingError, UnicodeDecodeError):
+        return ""
+    return "".join(character for character in text if character.isprintable())[:LONGEST_LABEL].strip()
+
+
+def _decimals(answer: bytes) -> int:
+    value = int.from_bytes(answer, "big") if len(answer) == 32 else 0
+    return value if value <= MAX_DECIMALS else 0

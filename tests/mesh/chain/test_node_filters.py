@@ -1,0 +1,118 @@
+"""Filters that the embedded node keeps, by web3's own client and by hand."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from web3 import AsyncWeb3
+
+from mesh.chain import Account, Chain, EmbeddedChain, deploy
+from mesh.chain.jsonrpc import RpcError
+from mesh.chain.node_filters import MAX_FILTERS
+from tests.mesh.chain.conftest import QUICK
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+FRIEND = "0x" + "12" * 20
+
+
+@pytest.fixture
+async def node() -> AsyncIterator[EmbeddedChain]:
+    async with EmbeddedChain() as node:
+        yield node
+
+
+@pytest.fixture
+async def chain(node: EmbeddedChain) -> AsyncIterator[Chain]:
+    """The contracts, for the account that deployed them."""
+    deployer = Account.from_key(node.funded_keys[0])
+    await deploy(node.provider, deployer)
+    async with Chain(node.provider, account=deployer, timing=QUICK) as chain:
+        yield chain
+
+
+def values(logs: list[Any]) -> list[int]:
+    return [
+        int(log["data"], 16) if isinstance(log["data"], str) else int.from_bytes(log["data"], "big") for log in logs
+    ]
+
+
+async def test_web3_polls_for_what_is_new(node: EmbeddedChain, chain: Chain) -> None:
+    web3: Any = AsyncWeb3(node.provider)
+    logs = await web3.eth.filter({"address": chain.xrt})
+    blocks = await web3.eth.filter("latest")
+    for value in (1, 2):
+        await chain.approve(FRIEND, value)
+    assert values(await logs.get_new_entries()) == [1, 2]
+    assert await logs.get_new_entries() == []
+    await chain.approve(FRIEND, 3)
+    assert values(await logs.get_new_entries()) == [3]
+    hashes = await blocks.get_new_entries()
+    assert [(await web3.eth.get_block(found))["number"] for found in hashes] == [
+        await chain.block_number() - back for back in (2, 1, 0)
+    ]
+    assert await web3.eth.uninstall_filter(logs.filter_id)
+    with pytest.raises(Exception, match="not found"):
+        await logs.get_new_entries()
+
+
+async def test_all_that_ever_was_is_had_by_a_filter_from_the_first_block(node: EmbeddedChain, chain: Chain) -> None:
+    """As the JavaScript of generation 3 lists the lighthouses."""
+    name = await node.request("eth_newFilter", [{"address": chain.factory, "fromBlock": "0x0", "toBlock": "latest"}])
+    found = await node.request("eth_getFilterLogs", [name])
+    [lighthouse] = await chain.lighthouses()
+    assert found[0]["transactionHash"] == lighthouse.tx
+    assert await node.request("eth_getFilterChanges", [name]) == [], "that was before it was made"
+    await chain.create_lighthouse(minimal_stake=1, timeout_blocks=1, name="other")
+    assert len(await node.request("eth_getFilterChanges", [name])) == 1
+
+
+async def test_a_filter_of_later_blocks_waits_for_them(node: EmbeddedChain, chain: Chain) -> None:
+    later = await chain.block_number() + 2
+    name = await node.request("eth_newFilter", [{"address": chain.xrt, "fromBlock": hex(later)}])
+    for value in (1, 2):
+        await chain.approve(FRIEND, value)
+    assert values(await node.request("eth_getFilterChanges", [name])) == [2]
+
+
+async def test_what_a_chain_that_was_taken_back_has_instead_is_new(node: EmbeddedChain, chain: Chain) -> None:
+    name = await node.request("eth_newFilter", [{"address": chain.xrt}])
+    await chain.approve(FRIEND, 1)
+    assert values(await node.request("eth_getFilterChanges", [name])) == [1]
+    await node.request("evm_revert", [hex(await chain.block_number() - 1)])
+    assert await node.request("eth_getFilterChanges", [name]) == []
+    await chain.approve(FRIEND, 2)
+    assert values(await node.request("eth_getFilterChanges", [name])) == [2]
+
+
+async def test_the_filter_that_was_asked_least_recently_makes_room(node: EmbeddedChain) -> None:
+    first, second = [await node.request("eth_newBlockFilter", []) for _ in range(2)]
+    await node.request("eth_getFilterChanges", [first])
+    for _ in range(MAX_FILTERS - 1):
+        await node.request("eth_newBlockFilter", [])
+    assert await node.request("eth_getFilterChanges", [first]) == []
+    with pytest.raises(RpcError, match="not found"):
+        await node.request("eth_getFilterChanges", [second])
+
+
+@pytest.mark.parametrize(
+    ("method", "params"),
+    [
+        ("eth_newFilter", ["all"]),
+        ("eth_newFilter", [{"topics": 7}]),
+        ("eth_getFilterChanges", ["0x77"]),
+        ("eth_getFilterLogs", [7]),
+    ],
+)
+async def test_what_is_no_filter_is_refused(node: EmbeddedChain, method: str, params: list[Any]) -> None:
+    with pytest.raises(RpcError):
+        await node.request(method, params)
+    assert await node.request("eth_uninstallFilter", params) is False
+
+
+async def test_a_filter_of_blocks_has_no_logs(node: EmbeddedChain) -> None:
+    name = await node.request("eth_newBlockFilter", [])
+    with pytest.raises(RpcError, match="of blocks"):
+        await node.request("eth_getFilterLogs", [name])
