@@ -21,6 +21,11 @@ MAX_DEPTH: Final = 12
 MAX_BLOCKS: Final = 400_000
 """Blocks of the largest tree taken: 100 GiB at the usual 256 KiB each."""
 
+_SPARE_BLOCKS: Final = 1024
+_SMALLEST_CHUNK: Final = 1024
+_FRAMING: Final = 256
+"""Bytes of a block, besides the file's own, for the node and for each of its links. IPFS writes about 60 for a link."""
+
 
 @dataclass(frozen=True, slots=True)
 class Place:
@@ -30,6 +35,11 @@ class Place:
     offset: int = 0
     size: int | None = None
     depth: int = 0
+
+
+def most_blocks(size: int) -> int:
+    """Blocks of the largest tree taken for a file of `size` bytes: chunks of 1 KiB, unless it is a small file."""
+    return min(MAX_BLOCKS, _SPARE_BLOCKS + size // _SMALLEST_CHUNK)
 
 
 def node_at(place: Place, block: bytes) -> Node:
@@ -42,6 +52,8 @@ def node_at(place: Place, block: bytes) -> Node:
         raise ContentCorrupt(place.cid, f"it is of {node.file_size} bytes where its parent says {place.size}")
     if any(link.size <= 0 for link in node.links):
         raise ContentCorrupt(place.cid, "a part of it is empty")
+    if len(block) > len(node.data) + _FRAMING * (1 + len(node.links)):
+        raise ContentCorrupt(place.cid, f"{len(block)} bytes are too many for what it says")
     if node.links and place.depth >= MAX_DEPTH:
         raise ContentCorrupt(place.cid, f"its tree is deeper than {MAX_DEPTH} levels")
     return node

@@ -1,4 +1,4 @@
-"""Why a file behind a CID can't be had, and why the store can't take one."""
+"""Why a file behind a CID can't be had, and why the store can't take one, or let go of it."""
 
 from __future__ import annotations
 
@@ -49,12 +49,60 @@ class ContentCorrupt(ContentError):
         self.why = why
 
 
-class StoreFull(AiraError):
-    """The disk under the store has no room left."""
+class ContentPinned(AiraError):
+    """A file was to be removed that is pinned; `labels` say what for."""
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(f"no room left on the disk of {path}", hint="free some space, or move the store elsewhere")
+    def __init__(self, cid: str, labels: Iterable[str]) -> None:
+        self.labels = tuple(sorted(labels))
+        super().__init__(f"{cid} is pinned ({', '.join(self.labels)})", hint="unpin it first")
+        self.cid = cid
+
+
+class StoreFull(AiraError):
+    """The store has no room for a file: the disk under it is full, or its own quota is reached."""
+
+    def __init__(self, path: Path, *, why: str = "", hint: str = "") -> None:
+        super().__init__(
+            why or f"no room left on the disk of {path}", hint=hint or "free some space, or move the store elsewhere"
+        )
         self.path = path
 
 
-__all__ = ["ContentCorrupt", "ContentTooLarge", "ContentUnavailable", "StoreFull"]
+class QuotaReached(StoreFull):
+    """All files together would be over the store's quota, `missing` bytes even if all that may be deleted were.
+
+    `kept` bytes may not be: they are pinned, or being written.
+    """
+
+    def __init__(self, path: Path, *, missing: int, quota: int, kept: int) -> None:
+        super().__init__(
+            path,
+            why=f"no room in the store {path}: {missing} bytes too many for its {quota}, of which {kept} are in use",
+            hint="raise content_limit, or unpin or remove files",
+        )
+        self.missing = missing
+        self.quota = quota
+        self.kept = kept
+
+
+class StoreDamaged(AiraError):
+    """The store's own books can't be read or written. The files themselves may be whole."""
+
+    def __init__(self, path: Path, why: str) -> None:
+        super().__init__(
+            f"the store {path} is damaged: {why}",
+            hint="stop all that use it, then open it again: what it knows of its files is found out anew",
+        )
+        self.path = path
+        self.why = why
+
+
+__all__ = [
+    "ContentCorrupt",
+    "ContentPinned",
+    "ContentTooLarge",
+    "ContentUnavailable",
+    "QuotaReached",
+    "StoreDamaged",
+    "StoreFull",
+]

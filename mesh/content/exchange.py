@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     import zenoh
 
+    from mesh.content.holdings import Progress
     from mesh.content.store import Store
 
 DEFAULT_TIMEOUT: Final = 30.0
@@ -79,20 +80,28 @@ class Exchange:
         if self._server is not None:
             await asyncio.to_thread(self._server.stop)
 
-    async def fetch(self, cid: str, *, size_limit: int | None = None, timeout: float = DEFAULT_TIMEOUT) -> Path:
+    async def fetch(
+        self,
+        cid: str,
+        *,
+        size_limit: int | None = None,
+        timeout: float = DEFAULT_TIMEOUT,
+        progress: Progress | None = None,
+    ) -> Path:
         """Where the file of that CID is in the store, once it is there whole and every block of it was checked.
 
         A file already held is hashed once per process. `timeout` is in seconds without a new block: a holder may
         come late, a large file may take long. `size_limit` is in bytes. Cancelling keeps the blocks that came; the
-        next fetch goes on from them.
+        next fetch goes on from them, in this process or another. `progress` is told, in the event loop, the bytes of
+        the file that are there and its size. A file that must stay is pinned before it is fetched.
 
         Raises `InvalidCid`, `ContentUnavailable`, `ContentTooLarge`, `ContentCorrupt` (with the holders, if all that
-        answered lied), `StoreFull`.
+        answered lied), `QuotaReached`, `StoreFull`.
         """
         turn = self._turns.setdefault(cid, asyncio.Lock())
         async with turn:
             held = await asyncio.to_thread(self._store.checked, cid)
-            return held or await self._fetch(cid, size_limit, timeout)
+            return held or await self._fetch(cid, size_limit, timeout, progress)
 
     def statistics(self) -> ExchangeStatistics:
         """A snapshot of the counters. Blocks of fetches that are under way count when they end."""
@@ -106,11 +115,12 @@ class Exchange:
             lies=dict(self._lies),
         )
 
-    async def _fetch(self, cid: str, size_limit: int | None, timeout: float) -> Path:
-        asker = Asker(self._session)
-        download = Download(self._store, asker, cid, size_limit=size_limit, patience=timeout)
+    async def _fetch(self, cid: str, size_limit: int | None, timeout: float, progress: Progress | None) -> Path:
+        loop, asker = asyncio.get_running_loop(), Asker(self._session)
+        tell = None if progress is None else _in_loop(loop, progress)
+        download = Download(self._store, asker, cid, patience=timeout, size_limit=size_limit, progress=tell)
         with ThreadPoolExecutor(self._width + 1, thread_name_prefix=f"aira-fetch-{cid[-6:]}") as pool:
-            running = asyncio.get_running_loop().run_in_executor(pool, download.run, pool, self._width)
+            running = loop.run_in_executor(pool, download.run, pool, self._width)
             self._running[download] = running
             try:
                 return await asyncio.shield(running)
@@ -125,3 +135,10 @@ class Exchange:
                 self._blocks += download.blocks
                 self._bytes += download.bytes
                 self._lies.update(asker.lies)
+
+
+def _in_loop(loop: asyncio.AbstractEventLoop, progress: Progress) -> Progress:
+    def tell(done: int, total: int | None) -> None:
+        loop.call_soon_threadsafe(progress, done, total)
+
+    return tell

@@ -21,6 +21,8 @@ PUT_PREFIX: Final = ".put-"
 PART_PREFIX: Final = ".part-"
 """Starts the name of a file that is being fetched; the next fetch of the same CID goes on from it."""
 
+_WRITE_BEHIND: Final = 8 << 20
+"""Bytes that are written before the disk is told to begin with them."""
 _NO_ROOM: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
@@ -35,6 +37,7 @@ class TemporaryFile:
         self.path = path
         self._descriptor = descriptor
         self._mine = True
+        self._unwritten = 0
 
     @classmethod
     def create(cls, directory: Path, prefix: str) -> TemporaryFile:
@@ -70,6 +73,11 @@ class TemporaryFile:
         os.close(self._descriptor)
 
     @property
+    def is_kept(self) -> bool:
+        """Whether the file will be there, under either name, after the `with` block."""
+        return not self._mine
+
+    @property
     def size(self) -> int:
         """Its length in bytes now."""
         return os.fstat(self._descriptor).st_size
@@ -81,6 +89,11 @@ class TemporaryFile:
             while view:
                 done = os.pwrite(self._descriptor, view, offset)
                 view, offset = view[done:], offset + done
+            self._unwritten += len(data)
+            if self._unwritten >= _WRITE_BEHIND:
+                self._unwritten = 0
+                # Has the disk begin with what is there, so that `finish` does not wait for all of a large file.
+                os.posix_fadvise(self._descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
 
     def read(self, length: int, *, offset: int) -> bytes:
         """The bytes from `offset`; fewer than `length` at the end of the file."""
@@ -90,15 +103,21 @@ class TemporaryFile:
         """Leave the file where it is when the `with` block ends."""
         self._mine = False
 
-    def settle(self, final: Path, *, size: int) -> None:
-        """Give the file its final name once all its `size` bytes are on the disk, replacing what is there. Atomic."""
-        with no_room_is_store_full(final.parent):
+    def discard(self) -> None:
+        """Delete the file when the `with` block ends, even if it was kept."""
+        self._mine = True
+
+    def finish(self, size: int, *, mode: int = 0o444) -> None:
+        """Put its first `size` bytes on the disk, and nothing after them. Raises `StoreFull`."""
+        with no_room_is_store_full(self.path.parent):
             os.ftruncate(self._descriptor, size)
-            os.fchmod(self._descriptor, 0o444)
+            os.fchmod(self._descriptor, mode)
             os.fsync(self._descriptor)
-            self.path.rename(final)
-            self._mine = False
-            sync_directory(final.parent)
+
+    def rename(self, final: Path) -> None:
+        """Give the file its final name, replacing what is there. Atomic; lasts once the directory is synced."""
+        self.path.rename(final)
+        self._mine = False
 
 
 @contextmanager
@@ -121,6 +140,21 @@ def directory_lock(directory: Path) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
+
+
+def is_taken(path: Path) -> bool:
+    """Whether somebody writes the temporary file at `path` now."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
 
 
 def sync_directory(directory: Path) -> None:

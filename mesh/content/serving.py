@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import logging
-import sqlite3
 import threading
 from typing import TYPE_CHECKING, Final
 
 import zenoh
 
-from mesh.errors import InvalidKey
+from mesh.errors import AiraError, InvalidKey
 from schemas.keys import CidKey, parse_key
 
 if TYPE_CHECKING:
@@ -58,7 +57,7 @@ class BlockServer:
             with query:
                 try:
                     self._answer(query)
-                except (OSError, sqlite3.Error, zenoh.ZError):
+                except (OSError, AiraError, zenoh.ZError):
                     log.exception("a block could not be given to who asked for it")
 
     def _answer(self, query: zenoh.Query) -> None:

@@ -130,7 +130,7 @@ def test_an_interrupted_assembly_is_gone_on_with(store: Store) -> None:
         put_all(assembly, blocks, at_most=7)
     assert not store.has(cid)
     with Store(store.directory) as again, again.assemble(cid) as assembly:
-        assert put_all(assembly, blocks) == 5
+        assert put_all(assembly, blocks) == 4
         assembly.finish()
     assert store.verify(cid) == store.path(cid)
 
@@ -143,7 +143,7 @@ def test_remains_that_have_rotted_are_not_believed(store: Store) -> None:
     part = next(store.directory.glob(".part-*"))
     part.write_bytes(b"\0" + part.read_bytes()[1:] + b"longer than the file will be" * 100_000)
     with store.assemble(cid) as assembly:
-        assert put_all(assembly, blocks) == 3
+        assert put_all(assembly, blocks) == 2, "the leaf that has rotted, and the one that had not come"
         assert assembly.finish().read_bytes() == data
 
 
@@ -157,7 +157,7 @@ def test_two_assemblies_of_one_file_do_not_disturb_each_other(store: Store) -> N
         put_all(second, blocks)
         second.finish()
     assert store.verify(cid).read_bytes() == data
-    assert list(store.directory.glob(".p*")) == []
+    assert list(store.directory.glob(".p*-*")) == []
 
 
 def test_a_place_knows_where_it_belongs(store: Store) -> None:

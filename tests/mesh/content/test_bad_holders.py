@@ -8,6 +8,7 @@ import pytest
 from mesh.content import ContentCorrupt, Exchange, Store
 from schemas.unixfs import CHUNK_SIZE, cid_of_bytes
 from tests.mesh.content.holders import answering, some
+from tests.support.waiting import until
 
 if TYPE_CHECKING:
     import zenoh
@@ -97,8 +98,12 @@ async def test_a_holder_that_never_answers_does_not_hold_up_another(
     cid = holder_store.put_bytes(data)
     kept: list[zenoh.Query] = []
     silent = third_session.declare_queryable("aira/cid/*", kept.append)
-    async with Exchange(other_session, holder_store), Exchange(session, store) as exchange:
-        path = await asyncio.wait_for(exchange.fetch(cid, timeout=60), 10)
+    async with Exchange(session, store) as exchange:
+        # The silent one is alone at first, so that it is asked; its answer would be waited for to the end.
+        fetching = asyncio.create_task(exchange.fetch(cid, timeout=600))
+        await until(lambda: kept, what="a query", seconds=30)
+        async with Exchange(other_session, holder_store):
+            path = await asyncio.wait_for(fetching, 60)
         assert path.read_bytes() == data
     silent.undeclare()  # type: ignore[no-untyped-call]
     kept.clear()

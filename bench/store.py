@@ -1,0 +1,297 @@
+"""The content store, the recorder and the player against what they stand on, and the bars; fails below the bars.
+
+- cid: naming a file, against bare sha-256 of the same bytes, in turns.
+- transfer: a file from one store to another through a router, three processes, hashing and fsync included.
+- recorder: JSON messages of 100 bytes from another process over Zenoh through `mesh.recording.Recorder` into a whole
+  file, against a bare `mcap.Writer` that has the messages in memory and writes them, in turns.
+- playback: how late messages recorded at 1 kHz are played.
+
+Each is measured three times and the best counts, since what else the machine does at that moment is not ours; but a
+message that is lost counts whenever it happens.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import io
+import json
+import multiprocessing
+import os
+import statistics
+import sys
+import tempfile
+import threading
+import time
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from mcap.writer import Writer
+from zenoh import CongestionControl
+
+from mesh.content import Exchange, Store
+from mesh.network import Endpoints, Network, free_endpoint
+from mesh.recording import Recorder, RecordingAbout, open_objective, play
+from messages import route
+from report import arguments
+from schemas.payloads import JSON
+from schemas.unixfs import cid_of_stream
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+SPAWN: Final = multiprocessing.get_context("spawn")
+MEGABYTE: Final = 1e6
+ROUNDS: Final = 3
+KEY: Final = "aira/bench/topic"
+HERTZ: Final = 1000
+BARS: Final = {
+    "cid ratio": (">=", 0.6),
+    "transfer mb_per_s": (">=", 100),
+    "recorder ratio": (">=", 0.6),
+    "recorder lost": ("<=", 0),
+    "playback p99_ms": ("<=", 2),
+}
+
+Figures = dict[str, dict[str, float]]
+
+
+def measure_cid(mebibytes: int) -> dict[str, float]:
+    """Megabytes a second of naming a file in memory, and of bare sha-256."""
+    data = os.urandom((mebibytes << 20) // 4)
+    ours = bare = float("inf")
+    for _ in range(4 * ROUNDS):
+        bare = min(bare, _seconds(lambda: hashlib.sha256(data)))
+        ours = min(ours, _seconds(lambda: cid_of_stream(io.BytesIO(data))))
+    size = len(data) / MEGABYTE
+    return {"mb_per_s": round(size / ours, 1), "sha256_mb_per_s": round(size / bare, 1), "ratio": round(bare / ours, 3)}
+
+
+def measure_transfer(folder: Path, mebibytes: int) -> dict[str, float]:
+    """Megabytes a second from the store of one process to that of another, through a router in a third."""
+    with Store(folder / "holder", limit=mebibytes << 20) as store:
+        cid = store.put_stream(_Noise(mebibytes << 20))
+    ready, done = SPAWN.Event(), SPAWN.Event()
+    with _router() as endpoint, _process(_hold, endpoint, folder / "holder", ready, done):
+        ready.wait()
+        seconds = min(asyncio.run(_fetch(endpoint, folder / str(number), cid)) for number in range(ROUNDS))
+        done.set()
+    return {"mb_per_s": round((mebibytes << 20) / MEGABYTE / seconds, 1)}
+
+
+def measure_recorder(folder: Path, count: int) -> dict[str, float]:
+    """Messages a second over Zenoh through the recorder, those of a bare writer, and how many were lost."""
+    ours = bare = 0.0
+    lost = 0
+    orders, their_orders = SPAWN.Pipe()
+    with _router() as endpoint, _process(_publish, endpoint, count, their_orders):
+        orders.recv()
+        for number in range(ROUNDS):
+            bare = max(bare, count / _write_bare(folder / f"bare-{number}.mcap", count))
+            seconds, missing = asyncio.run(_record(endpoint, folder / f"ours-{number}.mcap", count, orders))
+            ours, lost = max(ours, count / seconds), lost + missing
+        orders.send("enough")
+    return {
+        "messages_per_s": round(ours),
+        "bare_messages_per_s": round(bare),
+        "ratio": round(ours / bare, 3),
+        "lost": lost,
+    }
+
+
+def measure_playback(folder: Path, seconds: int) -> dict[str, float]:
+    """How many milliseconds late a message is played, in 99 of 100 cases at most, at a thousand a second."""
+    path = folder / "played.mcap"
+    with Recorder(path, RecordingAbout()) as recorder:
+        for number in range(seconds * HERTZ):
+            recorder.record("/pose", _message(number), JSON, log_time_ns=10**18 + number * 10**9 // HERTZ)
+    p99 = min(statistics.quantiles(asyncio.run(_play(path)), n=100)[98] for _ in range(ROUNDS))
+    return {"p99_ms": round(p99 * 1e3, 3)}
+
+
+def missed(figures: Figures) -> list[str]:
+    """The bars that are not reached."""
+    lines = []
+    for name, (sense, bar) in BARS.items():
+        group, _, key = name.partition(" ")
+        value = figures[group][key]
+        if (value < bar) if sense == ">=" else (value > bar):
+            lines.append(f"{name} is {value:g}, and the bar is {sense} {bar:g}")
+    return lines
+
+
+def table(figures: Figures) -> str:
+    """The figures for people."""
+    lines = []
+    for group, values in figures.items():
+        for name, value in values.items():
+            sense, bar = BARS.get(f"{group} {name}", ("", ""))
+            lines.append(f"{group:10}{name.replace('_', ' '):22}{value:>12,}   {sense} {bar}".rstrip())
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """Run from the command line; 1 if a bar is missed."""
+    options = arguments(__doc__.splitlines()[0], mebibytes=256, messages=200_000, seconds=5)
+    with tempfile.TemporaryDirectory(prefix="aira-bench-") as name:
+        folder = Path(name)
+        figures: Figures = {
+            "cid": measure_cid(options.mebibytes),
+            "transfer": measure_transfer(folder, options.mebibytes),
+            "recorder": measure_recorder(folder, options.messages),
+            "playback": measure_playback(folder, options.seconds),
+        }
+    print(json.dumps(figures) if options.json else table(figures))
+    too_low = missed(figures)
+    for line in too_low:
+        print(line, file=sys.stderr)
+    return 1 if too_low else 0
+
+
+def _hold(endpoint: str, folder: Path, ready: Any, done: Any) -> None:
+    """The process that has the file."""
+    asyncio.run(_holding(endpoint, folder, ready, done))
+
+
+async def _holding(endpoint: str, folder: Path, ready: Any, done: Any) -> None:
+    with Store(folder) as store:
+        async with Network(Endpoints(connect=(endpoint,))) as network, Exchange(network.session, store):
+            ready.set()
+            await asyncio.to_thread(done.wait)
+
+
+async def _fetch(endpoint: str, folder: Path, cid: str) -> float:
+    with Store(folder) as store:
+        async with Network(Endpoints(connect=(endpoint,))) as network, Exchange(network.session, store) as exchange:
+            started = time.perf_counter()
+            await exchange.fetch(cid)
+            return time.perf_counter() - started
+
+
+def _publish(endpoint: str, count: int, orders: Any) -> None:
+    """The process that says what is recorded, as often as it is told to."""
+    asyncio.run(_publishing(endpoint, count, orders))
+
+
+async def _publishing(endpoint: str, count: int, orders: Any) -> None:
+    payloads = [_message(number) for number in range(count)]
+    async with Network(Endpoints(connect=(endpoint,))) as network:
+        # A full queue must slow the flood down, not thin it out.
+        block = CongestionControl.BLOCK
+        publisher = network.session.declare_publisher(KEY, encoding=JSON.zenoh_encoding, congestion_control=block)
+        orders.send("ready")
+        while orders.recv() == "go":
+            await asyncio.to_thread(_until_heard, publisher)
+            for payload in payloads:
+                publisher.put(payload)
+
+
+def _until_heard(publisher: Any) -> None:
+    while not publisher.matching_status.matching:
+        time.sleep(0.01)
+
+
+async def _record(endpoint: str, path: Path, count: int, orders: Any) -> tuple[float, int]:
+    """Seconds from the first message to the finished file, and how many messages are not in it."""
+    async with Network(Endpoints(connect=(endpoint,))) as network:
+        hearing = _Hearing(Recorder(path, RecordingAbout()), count)
+        subscriber: Any = network.session.declare_subscriber(KEY, hearing.hear)
+        orders.send("go")
+        await asyncio.to_thread(hearing.all_heard.wait, 60)  # what is not there then is lost
+        summary = await asyncio.to_thread(hearing.recorder.close)
+        seconds = time.perf_counter() - hearing.started
+        subscriber.undeclare()
+    return seconds, count - summary.messages
+
+
+class _Hearing:
+    """Gives what a subscriber hears to a recorder, in Zenoh's thread, as an agent does."""
+
+    def __init__(self, recorder: Recorder, count: int) -> None:
+        self.recorder = recorder
+        self.started = 0.0
+        self.all_heard = threading.Event()
+        self._missing = count
+
+    def hear(self, sample: Any) -> None:
+        self.started = self.started or time.perf_counter()
+        self.recorder.record("/topic", sample.payload.to_bytes(), JSON)
+        self._missing -= 1
+        if not self._missing:
+            self.all_heard.set()
+
+
+def _write_bare(path: Path, count: int) -> float:
+    """Seconds that a bare writer takes for the messages, from the first to the end of the file."""
+    payloads = [_message(number) for number in range(count)]
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("", "jsonschema", b'{"type":"object"}')
+        channel = writer.register_channel("/topic", "json", schema)
+        started = time.perf_counter()
+        for number, payload in enumerate(payloads):
+            now = time.time_ns()
+            writer.add_message(channel, now, payload, now, number)
+        writer.finish()  # type: ignore[no-untyped-call]
+        stream.flush()
+        os.fsync(stream.fileno())
+        return time.perf_counter() - started
+
+
+async def _play(path: Path) -> list[float]:
+    """Seconds by which each message was late."""
+    late: list[float] = []
+    started = None
+    async for step in play(await asyncio.to_thread(open_objective, path)):
+        now = time.monotonic_ns()
+        started = now if started is None else started
+        late.append((now - started - step.due_ns) / 1e9)
+    return late
+
+
+def _message(number: int) -> bytes:
+    """A JSON message of 100 bytes."""
+    text = json.dumps({"n": number, "x": number / 7, "y": number / 11, "note": ""})
+    return (text[:-2] + "." * (100 - len(text)) + '"}').encode()
+
+
+class _Noise:
+    """A stream of `size` random bytes."""
+
+    def __init__(self, size: int) -> None:
+        self._left = size
+
+    def read(self, size: int, /) -> bytes:
+        data = os.urandom(min(size, self._left))
+        self._left -= len(data)
+        return data
+
+
+@contextmanager
+def _router() -> Iterator[str]:
+    endpoint = free_endpoint()
+    with _process(route, endpoint):
+        yield endpoint
+
+
+@contextmanager
+def _process(target: Callable[..., None], *given: Any) -> Iterator[None]:
+    process = SPAWN.Process(target=target, args=given, daemon=True)
+    process.start()
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.join()
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    started = time.perf_counter()
+    work()
+    return time.perf_counter() - started
+
+
+if __name__ == "__main__":
+    sys.exit(main())
