@@ -1,6 +1,7 @@
 """Recordings: objectives of unknown origin (MCAP or ROS 1 bags) checked and played, and what a device did recorded."""
 
 from mesh.recording.conversion import bag_to_mcap
+from mesh.recording.described import json_type
 from mesh.recording.errors import (
     CorruptRecording,
     NotARecording,
@@ -10,26 +11,39 @@ from mesh.recording.errors import (
     RecordingTooLarge,
     Unrecordable,
 )
-from mesh.recording.limits import Limits
-from mesh.recording.objective import Objective, Played, Topic, open_objective
+from mesh.recording.limits import GENEROUS, Limits
+from mesh.recording.lines import InvalidLine, messages_in
+from mesh.recording.objective import Objective, Played, Topic, Written, open_objective
+from mesh.recording.packing import Packed, pack
+from mesh.recording.partial import ABOUT, CLOSED
 from mesh.recording.playback import AtOnce, Clock, MonotonicClock, Pace, Rate, RecordedTimes, Step, paced, timeline
 from mesh.recording.player import play
 from mesh.recording.preflight import Preflight, preflight
+from mesh.recording.rates import Rates, rates_of
 from mesh.recording.recorder import Recorder, RecorderSettings, RecordingAbout, RecordingSummary
-from mesh.recording.recovery import Recovered, recover
+from mesh.recording.recovery import RECOVERED, Recovered, recover
+from mesh.recording.source import Attachment, Statistics
 
 __all__ = [
+    "ABOUT",
+    "CLOSED",
+    "GENEROUS",
+    "RECOVERED",
     "AtOnce",
+    "Attachment",
     "Clock",
     "CorruptRecording",
+    "InvalidLine",
     "Limits",
     "MonotonicClock",
     "NotARecording",
     "Objective",
     "Pace",
+    "Packed",
     "Played",
     "Preflight",
     "Rate",
+    "Rates",
     "RecordedTimes",
     "Recorder",
     "RecorderSettings",
@@ -40,14 +54,20 @@ __all__ = [
     "RecordingSummary",
     "RecordingTooLarge",
     "Recovered",
+    "Statistics",
     "Step",
     "Topic",
     "Unrecordable",
+    "Written",
     "bag_to_mcap",
+    "json_type",
+    "messages_in",
     "open_objective",
     "paced",
+    "pack",
     "play",
     "preflight",
+    "rates_of",
     "recover",
     "timeline",
 ]

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 MAGIC: Final = b"#ROSBAG V2.0\n"
 
 _LENGTH: Final = Struct("<I")
+_TIME: Final = Struct("<II")
 _HEADER: Final = 64 << 10
 """Bytes of the longest record header taken; what is long is in the data of a record."""
 _SECOND: Final = 10**9
@@ -40,6 +41,10 @@ class _Op(IntEnum):
     CHUNK = 5
     CHUNK_INFO = 6
     CONNECTION = 7
+
+
+_CONNECTION: Final = bytes([_Op.CONNECTION])
+_IN_CHUNKS: Final = frozenset({_CONNECTION, bytes([_Op.MESSAGE])})
 
 
 class Part(NamedTuple):
@@ -64,7 +69,9 @@ def open_bag(path: Path, size: int, limits: Limits) -> Source:
     """
     with path.open("rb") as file:
         expanded = 0
-        for part in parts(path, file, size):
+        for number, part in enumerate(parts(path, file, size)):
+            if number > 2 * limits.messages:
+                raise RecordingTooLarge(path, f"more than {2 * limits.messages} records")
             if part.opcode == _Op.CHUNK:
                 expanded += _chunk_block(path, part, limits).size
             if expanded > limits.expanded:
@@ -100,10 +107,13 @@ def parts(path: Path, file: BinaryIO, size: int) -> Iterator[Part]:
 
 def fields_of(path: Path, header: bytes) -> dict[bytes, bytes]:
     """The fields of a record header, or of a connection: each `name=value` after its length."""
-    cursor = Cursor(path, header)
-    fields = {}
-    while cursor.left:
-        name, equals, value = cursor.data().partition(b"=")
+    position, end, fields = 0, len(header), {}
+    while position < end:
+        length = int.from_bytes(header[position : position + 4], "little")
+        position += 4 + length
+        if position > end:
+            raise CorruptRecording(path, f"a field of {length} bytes goes beyond the end of its record")
+        name, equals, value = header[position - length : position].partition(b"=")
         if not equals:
             raise CorruptRecording(path, "a field of a record has no name")
         fields[name] = value
@@ -120,6 +130,8 @@ class _Reading:
     _defined: int = 0
     _messages: int = 0
     _blocks: int = 0
+    _connections: int = 0
+    _said: dict[int, tuple[dict[bytes, bytes], bytes]] = field(default_factory=dict)
 
     def take(self, part: Part) -> None:
         """Read one record of the file. Messages are checked and counted, and their places kept."""
@@ -153,7 +165,7 @@ class _Reading:
 
     def _checked(self, data: bytes) -> Iterator[Record]:
         for part in _parts_in(self.path, data):
-            if part.opcode == _Op.CONNECTION:
+            if part.fields[b"op"] == _CONNECTION:
                 self._connect(part, data[part.offset : part.offset + part.length])
                 continue
             record = _record_of(self.path, part, data)
@@ -162,7 +174,13 @@ class _Reading:
             yield record
 
     def _connect(self, part: Part, data: bytes) -> None:
+        self._connections += 1
+        if self._connections > self.limits.messages:
+            raise RecordingTooLarge(self.path, f"more than {self.limits.messages} records besides its messages")
         number = _number(self.path, part, b"conn")
+        if self._said.get(number) == (part.fields, data):
+            return
+        self._said[number] = part.fields, data
         channel = _channel_of(self.path, part, fields_of(self.path, data))
         if self.channels.setdefault(number, channel) is not channel:
             if self.channels[number] != channel:
@@ -179,27 +197,31 @@ def _parts_in(path: Path, data: bytes) -> Iterator[Part]:
     """The records in the decompressed data of a chunk."""
     position, end = 0, len(data)
     while position < end:
-        length = _length(path, data[position : position + _LENGTH.size])
-        header = position + _LENGTH.size
-        fields = fields_of(path, data[header : header + length])
-        offset = header + length + _LENGTH.size
-        part = Part(fields, position, offset, _length(path, data[offset - _LENGTH.size : offset]))
-        if part.length > end - offset or part.opcode not in (_Op.MESSAGE, _Op.CONNECTION):
+        header = position + 4
+        offset = header + int.from_bytes(data[position:header], "little") + 4
+        if offset > end:
+            raise CorruptRecording(path, "it is cut off in a chunk")
+        fields = fields_of(path, data[header : offset - 4])
+        length = int.from_bytes(data[offset - 4 : offset], "little")
+        if length > end - offset or fields.get(b"op") not in _IN_CHUNKS:
             raise CorruptRecording(path, "a chunk holds what is neither a whole message nor a connection")
-        yield part
-        position = offset + part.length
+        yield Part(fields, position, offset, length)
+        position = offset + length
 
 
 def _records_in(path: Path, data: bytes) -> Iterator[Record]:
     for part in _parts_in(path, data):
-        if part.opcode == _Op.MESSAGE:
+        if part.fields[b"op"] != _CONNECTION:
             yield _record_of(path, part, data)
 
 
 def _record_of(path: Path, part: Part, data: bytes) -> Record:
     """The message of a record; bags hold one time for it, and no sequence number."""
-    time = Cursor(path, part.fields.get(b"time", b""))
-    when = time.u32() * _SECOND + time.u32()
+    time = part.fields.get(b"time", b"")
+    if len(time) != _TIME.size:
+        raise CorruptRecording(path, "a message without a time")
+    seconds, nanoseconds = _TIME.unpack(time)
+    when = seconds * _SECOND + nanoseconds
     payload = data[part.offset : part.offset + part.length]
     return Record(_number(path, part, b"conn"), 0, when, when, payload)
 
@@ -238,10 +260,13 @@ def _check_first(path: Path, part: Part, size: int) -> None:
 
 
 def _number(path: Path, part: Part, name: bytes) -> int:
-    return Cursor(path, part.fields.get(name, b"")).u32()
+    value = part.fields.get(name, b"")
+    if len(value) != 4:
+        raise CorruptRecording(path, f"a record without its field {name.decode()}")
+    return int.from_bytes(value, "little")
 
 
 def _length(path: Path, data: bytes) -> int:
     if len(data) != _LENGTH.size:
         raise CorruptRecording(path, "it is cut off")
-    return int(_LENGTH.unpack(data)[0])
+    return int.from_bytes(data, "little")

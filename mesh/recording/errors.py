@@ -35,7 +35,7 @@ class CorruptRecording(RecordingError):
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(
-            path, why, reason="corrupt", hint="make it again; of a cut MCAP file, the beginning can be recovered"
+            path, why, reason="corrupt", hint="make it again, or save what is readable: `aira objective recover`"
         )
 
 

@@ -1,7 +1,7 @@
 """Writing MCAP so that every viewer opens it, and so that no bad argument can spoil the file.
 
-`mcap.Writer` leaves half a record behind when an argument is wrong, which makes the next one unreadable without an
-error; so everything is checked here before it is called. One owner a file: not for several threads.
+What no record can hold is refused here, in the project's own words, before the writer is called. One owner a file: not
+for several threads.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, BinaryIO, Final
 
-from mcap.writer import CompressionType, Writer
-
 from mesh.content.files import sync_directory
 from mesh.recording.errors import Unrecordable
+from mesh.recording.mcap_writer import McapWriter
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from pathlib import Path
 
+    from mesh.recording.source import Attachment
     from schemas.payloads import PayloadType
 
 CHUNK: Final = 128 << 10
@@ -31,7 +31,9 @@ _JSON_SCHEMA: Final = b'{"type":"object"}'
 
 
 @dataclass
-class _Channel:
+class FileChannel:
+    """A channel of one file: its number there, and the sequence number of its next message."""
+
     id: int
     sequence: int = 0
 
@@ -43,9 +45,9 @@ class McapFile:
     """
 
     def __init__(self, stream: BinaryIO, *, profile: str = "") -> None:
-        self._writer = Writer(stream, chunk_size=CHUNK, compression=CompressionType.ZSTD)
+        self._writer = McapWriter(stream, chunk_size=CHUNK)
         self._writer.start(profile)
-        self._channels: dict[object, _Channel] = {}
+        self._channels: dict[object, FileChannel] = {}
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self.messages = 0
 
@@ -66,7 +68,12 @@ class McapFile:
         `Unrecordable`, and then has written nothing; and `OSError`.
         """
         check_message(topic, payload, log_time_ns, publish_time_ns)
-        channel = self._channel(topic, type, metadata)
+        self.write(self.channel(topic, type, metadata), payload, log_time_ns, publish_time_ns, sequence)
+
+    def write(
+        self, channel: FileChannel, payload: bytes, log_time_ns: int, publish_time_ns: int, sequence: int | None = None
+    ) -> None:
+        """Write one message that was checked (see `check_message`) on a channel of this file. Raises `OSError`."""
         number = channel.sequence if sequence is None else sequence
         channel.sequence += 1
         self._writer.add_message(channel.id, log_time_ns, payload, publish_time_ns, number & 0xFFFFFFFF)
@@ -78,15 +85,22 @@ class McapFile:
             _check_text(text)
         self._writer.add_metadata(name, dict(values))
 
+    def add_attachment(self, attachment: Attachment, data: bytes) -> None:
+        """Write a file into the file: `data` under the names and times of `attachment`. Raises `OSError`."""
+        self._writer.add_attachment(
+            attachment.create_time, attachment.log_time, attachment.name, attachment.media_type, data
+        )
+
     def flush(self) -> None:
         """Close the chunk that is open and hand all to the operating system. Raises `OSError`."""
-        self._writer.flush()  # type: ignore[no-untyped-call]
+        self._writer.flush()
 
     def finish(self) -> None:
         """Write the index and the end of the file. Raises `OSError`."""
-        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._writer.finish()
 
-    def _channel(self, topic: str, type: PayloadType, metadata: Mapping[str, str]) -> _Channel:
+    def channel(self, topic: str, type: PayloadType, metadata: Mapping[str, str]) -> FileChannel:
+        """The channel of a topic, type and metadata, made when first asked for. Raises `Unrecordable`."""
         key = (topic, type, *metadata.items())
         known = self._channels.get(key)
         if known is not None:
@@ -96,7 +110,7 @@ class McapFile:
         for text in (type.encoding, type.schema_name, type.schema_encoding, *metadata, *metadata.values()):
             _check_text(text)
         schema = self._schema(type)
-        channel = _Channel(self._writer.register_channel(topic, type.encoding, schema, dict(metadata)))
+        channel = FileChannel(self._writer.register_channel(topic, type.encoding, schema, metadata))
         self._channels[key] = channel
         return channel
 

@@ -14,7 +14,7 @@ from mcap.opcode import Opcode
 
 from mesh.recording.cursor import Cursor
 from mesh.recording.errors import CorruptRecording, NotARecording, RecordingTooLarge
-from mesh.recording.source import Block, Channel, Record
+from mesh.recording.source import Attachment, Block, Channel, Record, Statistics
 from schemas.payloads import PayloadType
 
 if TYPE_CHECKING:
@@ -30,6 +30,8 @@ _MESSAGE: Final = Struct("<HIQQ")
 _CHUNK_HEAD: Final = 40
 """Bytes of a chunk record before its compression's name and the length of its data."""
 _LONGEST_COMPRESSION: Final = 32
+_ATTACHMENT_HEAD: Final = 64 << 10
+"""Bytes of an attachment in which its names and times must lie."""
 _PIECE: Final = 1 << 20
 
 
@@ -63,6 +65,8 @@ def frames(path: Path, file: BinaryIO, size: int) -> Iterator[Frame]:
         position += _PREFIX.size
         if length > size - position:
             raise CorruptRecording(path, f"a record at byte {position} goes beyond the end of the file")
+        if not opcode:
+            raise CorruptRecording(path, f"a record at byte {position} is of no kind")
         yield Frame(opcode, position, length)
         position += length
         if opcode == Opcode.FOOTER:
@@ -141,6 +145,34 @@ def metadata_of(path: Path, data: bytes) -> tuple[str, dict[str, str]]:
     """The name and the content of a metadata record."""
     cursor = Cursor(path, data)
     return cursor.text(), cursor.pairs()
+
+
+def statistics_of(path: Path, data: bytes) -> Statistics:
+    """What a statistics record says."""
+    cursor = Cursor(path, data)
+    messages, _schemas, channels = cursor.u64(), cursor.u16(), cursor.u32()
+    attachments, _metadata, chunks, start, end = cursor.u32(), cursor.u32(), cursor.u32(), cursor.u64(), cursor.u64()
+    counts = Cursor(path, cursor.data())
+    by_channel = {}
+    while counts.left:
+        number = counts.u16()
+        by_channel[number] = counts.u64()
+    return Statistics(messages, channels, attachments, chunks, start, end, by_channel)
+
+
+def attachment_of(path: Path, file: BinaryIO, frame: Frame) -> Attachment:
+    """The attachment of that frame, its checksum compared and its data not kept."""
+    file.seek(frame.offset)
+    head = Cursor(path, file.read(min(frame.length, _ATTACHMENT_HEAD)))
+    before = head.left
+    log_time, create_time, name, media_type, size = head.u64(), head.u64(), head.text(), head.text(), head.u64()
+    begin = before - head.left
+    if begin + size + 4 != frame.length:
+        raise CorruptRecording(path, f"an attachment of {frame.length} bytes can't hold {size} bytes of data")
+    end = frame.offset + begin + size
+    file.seek(end)
+    check_stretch(path, file, start=frame.offset, end=end, crc=Cursor(path, file.read(4)).u32())
+    return Attachment(name, media_type, log_time, create_time, frame.offset + begin, size)
 
 
 def check_crc(path: Path, data: bytes, crc: int) -> None:

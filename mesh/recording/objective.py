@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from pathlib import Path
 
-    from mesh.recording.source import Source
+    from mesh.recording.source import Channel, Source
 
 _DEFAULT: Final = Limits()
 
@@ -32,7 +32,11 @@ class Topic(Struct, frozen=True):
 
 
 class Played(Struct, frozen=True):
-    """A message of a recording. Times are nanoseconds of the recorder's clock."""
+    """A message of a recording. Times are nanoseconds of the recorder's clock.
+
+    `role` is what the metadata of its channel says: in recordings of ours, whether it was played (`objective`) or said
+    by the `device` or the `agent`.
+    """
 
     topic: str
     payload: bytes
@@ -40,13 +44,22 @@ class Played(Struct, frozen=True):
     publish_time_ns: int
     sequence: int
     type: PayloadType
+    role: str = ""
+
+
+class Written(Struct, frozen=True):
+    """A message as it lies in its file: on the channel of that number."""
+
+    channel: int
+    message: Played
 
 
 class Objective:
     """A recording whose every byte was checked. Keeps no file open; its messages are read anew each time.
 
     `format` is `mcap` or `bag`, `size` that of the file in bytes, `count` the number of messages, `metadata` the
-    records of that kind by their names (none in a bag).
+    records of that kind by their names, `attachments` the files in it (a bag has neither). `statistics` is what an
+    MCAP file says about itself, if it does, and `unchecked` how many blocks of messages have no checksum.
     """
 
     def __init__(self, source: Source) -> None:
@@ -55,6 +68,9 @@ class Objective:
         self.format: Final = source.format
         self.size: Final = source.size
         self.metadata: Final[Mapping[str, Mapping[str, str]]] = source.metadata
+        self.attachments: Final = source.attachments
+        self.statistics: Final = source.statistics
+        self.unchecked: Final = source.unchecked
         self.count: Final = sum(segment.count for segment in source.segments)
         self.start_ns: Final = min((segment.start for segment in source.segments), default=0)
         self.duration_ns: Final = max((segment.end for segment in source.segments), default=0) - self.start_ns
@@ -73,8 +89,13 @@ class Objective:
         """
         channels = self._source.channels
         for channel, sequence, log_time, publish_time, payload in self._source.in_time_order(skip=from_index):
-            there = channels[channel]
-            yield Played(there.topic, payload, log_time, publish_time, sequence, there.type)
+            yield _played(channels[channel], payload, log_time, publish_time, sequence)
+
+    def in_file_order(self) -> Iterator[Written]:
+        """The messages as they lie in the file, whatever their times. Otherwise as `messages`."""
+        channels = self._source.channels
+        for channel, sequence, log_time, publish_time, payload in self._source.in_file_order():
+            yield Written(channel, _played(channels[channel], payload, log_time, publish_time, sequence))
 
 
 def open_objective(path: Path, limits: Limits = _DEFAULT) -> Objective:
@@ -96,6 +117,11 @@ def open_source(path: Path, limits: Limits) -> Source:
     if magic.startswith(bag_source.MAGIC):
         return open_bag(path, size, limits)
     raise NotARecording(path, "it is neither an MCAP file nor a ROS 1 bag")
+
+
+def _played(channel: Channel, payload: bytes, log_time: int, publish_time: int, sequence: int) -> Played:
+    role = channel.metadata.get("role", "")
+    return Played(channel.topic, payload, log_time, publish_time, sequence, channel.type, role)
 
 
 def _look(path: Path) -> tuple[int, bytes]:

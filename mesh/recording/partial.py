@@ -11,18 +11,20 @@ import fcntl
 import os
 import time
 from functools import lru_cache
-from typing import TYPE_CHECKING, BinaryIO, Final, Literal, NamedTuple, Self, get_args
+from typing import TYPE_CHECKING, BinaryIO, Final, Literal, Self, TypeAlias, get_args
 
 from mesh.content.files import sync_directory
-from mesh.recording.errors import NotARecording, RecordingExists
+from mesh.recording.errors import NotARecording, RecordingExists, Unrecordable
 from mesh.recording.mcap_file import McapFile
-from mesh.recording.recovery import RECOVERED, copy_messages, readable_part
+from mesh.recording.recovery import RECOVERED, copy_content, readable_part
 from schemas.payloads import EMPTY, PayloadType
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
     from pathlib import Path
     from types import TracebackType
+
+    from mesh.recording.mcap_file import FileChannel
 
 Role = Literal["objective", "device", "agent"]
 
@@ -34,15 +36,11 @@ CLOSED: Final = "aira-closed"
 _ROLES: Final[Mapping[Role, Mapping[str, str]]] = {role: {"role": role} for role in get_args(Role)}
 
 
-class Message(NamedTuple):
-    """A message to be recorded, its fields checked. Times are in nanoseconds."""
+Message: TypeAlias = "tuple[str, bytes, PayloadType, Role, int, int]"
+"""A message to be recorded, checked: topic, payload, type, role, log time and publish time in nanoseconds.
 
-    topic: str
-    payload: bytes
-    type: PayloadType
-    role: Role
-    log_time_ns: int
-    publish_time_ns: int
+A bare tuple, since there may be hundreds of thousands a second.
+"""
 
 
 class PartialFile:
@@ -61,8 +59,10 @@ class PartialFile:
         _set_aside(final, self._part, self._cut)
         self._stream = _locked(self._part)
         self._file = McapFile(self._stream)
+        self._channels: dict[str, tuple[PayloadType, Role, FileChannel]] = {}
+        """The channel of the last message on each topic: the next is most likely of the same type and role."""
         self._unflushed_since: float | None = None
-        self._synced = time.monotonic()
+        self._unsynced_since: float | None = None
         self.recovered = 0
 
     def __enter__(self) -> Self:
@@ -77,41 +77,48 @@ class PartialFile:
         """Write whose recording it is, and what an interrupted one of the same name holds."""
         self._file.add_metadata(ABOUT, about)
         if self._cut.exists():
-            why = self._copy_cut()
+            self._file.add_metadata(RECOVERED, self._copy_cut())
             self.recovered = self._file.messages
-            self._file.add_metadata(RECOVERED, {"messages": str(self.recovered), "why": why})
         self._sync()
         self._cut.unlink(missing_ok=True)
         sync_directory(self._final.parent)
 
-    def add(self, message: Message) -> None:
-        """Write one message. Raises `Unrecordable`, and then has written nothing; and `OSError`."""
-        self._file.add(
-            message.topic,
-            message.payload,
-            _described(message.type),
-            metadata=_ROLES[message.role],
-            log_time_ns=message.log_time_ns,
-            publish_time_ns=message.publish_time_ns,
-        )
+    def add(self, messages: Iterable[Message]) -> list[Unrecordable]:
+        """Write messages in their order, but for those that no file can hold: why not. Raises `OSError`."""
+        refused: list[Unrecordable] = []
+        for topic, payload, type, role, log_time_ns, publish_time_ns in messages:
+            known = self._channels.get(topic)
+            if known is None or known[0] is not type or known[1] != role:
+                try:
+                    channel = self._file.channel(topic, _described(type), _ROLES[role])
+                except Unrecordable as error:
+                    refused.append(error)
+                    continue
+                known = self._channels[topic] = (type, role, channel)
+            self._file.write(known[2], payload, log_time_ns, publish_time_ns)
         if self._unflushed_since is None:
             self._unflushed_since = time.monotonic()
+            if self._unsynced_since is None:
+                self._unsynced_since = self._unflushed_since
+        return refused
 
-    def seconds_to_flush(self, every: float) -> float | None:
-        """How long until what was added must be handed over; None if all was."""
-        if self._unflushed_since is None:
-            return None
-        return max(0.0, self._unflushed_since + every - time.monotonic())
+    def seconds_to_keep(self, flush: float, sync: float) -> float | None:
+        """How long until something must be handed over or put on the disk (see `keep_what_is_due`); None if all is."""
+        due = [
+            since + every
+            for since, every in ((self._unflushed_since, flush), (self._unsynced_since, sync))
+            if since is not None
+        ]
+        return max(0.0, min(due) - time.monotonic()) if due else None
 
-    def flush_if_due(self, every: float, *, sync_every: float) -> None:
-        """Hand over what was added `every` seconds ago; put all on the disk if that was last `sync_every` ago."""
+    def keep_what_is_due(self, flush: float, sync: float) -> None:
+        """Hand over what was added `flush` seconds ago, and put on the disk what was added `sync` seconds ago."""
         now = time.monotonic()
-        if self._unflushed_since is None or now < self._unflushed_since + every:
-            return
-        self._file.flush()
-        self._unflushed_since = None
-        if now >= self._synced + sync_every:
+        if self._unsynced_since is not None and now >= self._unsynced_since + sync:
             self._sync()
+        elif self._unflushed_since is not None and now >= self._unflushed_since + flush:
+            self._file.flush()
+            self._unflushed_since = None
 
     def finish(self, closing: Mapping[str, str]) -> tuple[int, int]:
         """End the file, put it on the disk and give it its name; how many messages and bytes it has."""
@@ -123,19 +130,24 @@ class PartialFile:
         sync_directory(self._final.parent)
         return messages, self._stream.tell()
 
-    def _copy_cut(self) -> str:
+    def _copy_cut(self) -> dict[str, str]:
+        """Copy what is readable of the interrupted recording; gives what is to be said about it.
+
+        `seams` are the numbers of messages after which it was gone on with, each time that happened.
+        """
         try:
             source, why = readable_part(self._cut)
         except NotARecording:
-            return "nothing of it had reached the disk"
-        copy_messages(source, self._file)
-        return why
+            return {"messages": "0", "seams": "0", "why": "nothing of it had reached the disk"}
+        copy_content(source, self._file)
+        messages, earlier = str(self._file.messages), source.metadata.get(RECOVERED, {}).get("seams", "")
+        return {"messages": messages, "seams": f"{earlier},{messages}".lstrip(","), "why": why}
 
     def _sync(self) -> None:
         self._file.flush()
         self._stream.flush()
         os.fsync(self._stream.fileno())
-        self._synced = time.monotonic()
+        self._unflushed_since = self._unsynced_since = None
 
 
 def _set_aside(final: Path, part: Path, cut: Path) -> None:

@@ -10,12 +10,16 @@ from mesh.recording.errors import RecordingError
 from mesh.recording.limits import Limits
 from mesh.recording.objective import Objective, open_objective
 from schemas.chunks import topic_chunks
+from schemas.errors import InvalidPayload
+from schemas.values import decode_value
 
 if TYPE_CHECKING:
     from collections.abc import Collection
     from pathlib import Path
 
 _DEFAULT: Final = Limits()
+_READ: Final = frozenset({"ros1", "json"})
+"""The encodings some types of which are decoded here; all others travel as they are."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,8 +27,8 @@ class Preflight:
     """What came of looking at an objective.
 
     `reason` is machine-readable: empty if all is well, or one of `not-a-recording`, `too-large`, `expands-too-much`,
-    `corrupt`, `no-messages`, `too-long`, `unplayable-topic`, `unknown-topic`. `detail` is for people. `objective` is
-    there as soon as the file itself is sound.
+    `corrupt`, `no-messages`, `too-long`, `unplayable-topic`, `unknown-topic`, `unreadable-message` (one that is not
+    what its own schema says). `detail` is for people. `objective` is there as soon as the file itself is sound.
     """
 
     reason: str = ""
@@ -62,4 +66,20 @@ def _obstacle(objective: Objective, limits: Limits, topics: Collection[str] | No
             return "unplayable-topic", str(error)
         if topics is not None and topic.name not in topics:
             return "unknown-topic", f"nobody here takes {topic.name}"
+    return _unreadable(objective)
+
+
+def _unreadable(objective: Objective) -> tuple[str, str]:
+    """The first message that a handler would choke on in the middle of the job."""
+    if not any(topic.type.encoding in _READ for topic in objective.topics):
+        return "", ""
+    try:
+        for number, message in enumerate(objective.messages()):
+            if message.type.encoding in _READ:
+                try:
+                    decode_value(message.payload, message.type)
+                except InvalidPayload as error:
+                    return "unreadable-message", f"message {number} on {message.topic}: {error}"
+    except RecordingError as error:
+        return error.reason, str(error)
     return "", ""

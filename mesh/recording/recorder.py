@@ -9,12 +9,11 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections import deque
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final, Self
 
 from mesh.errors import ClosedError
-from mesh.recording.errors import RecordingFailed, Unrecordable
+from mesh.recording.errors import RecordingFailed
 from mesh.recording.mcap_file import check_message
 from mesh.recording.partial import Message, PartialFile
 
@@ -31,17 +30,24 @@ _COST: Final = 256
 """Bytes of memory that a message takes in the queue besides its payload."""
 _AT_ONCE: Final = 512
 """Messages written before the thread looks at the clock again."""
+_GATHERING_SECONDS: Final = 0.005
+"""How long messages gather before they are written: a thread that is woken for each of them costs more than that."""
+_KNOWN_TOPICS: Final = 4096
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingAbout:
-    """Whose recording it is: what goes into its metadata record `aira`. Any field may be empty."""
+    """Whose recording it is: what goes into its metadata record `aira`. Any field may be empty.
+
+    `topics` are those that are recorded, separated by commas; empty for all.
+    """
 
     liability: str = ""
     agent: str = ""
     lighthouse: str = ""
     objective: str = ""
     software: str = ""
+    topics: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,9 +90,12 @@ class Recorder:
         self._about = about
         self._lock = threading.Lock()
         self._wake = threading.Event()
-        self._queue: deque[Message] = deque()
+        self._queue: list[Message] = []
         self._queued = 0
+        self._taken = 0
+        self._topics: set[str] = set()
         self._closing = False
+        self._closed = threading.Event()
         self._lost = 0
         self._failure: Exception | None = None
         self._summary: RecordingSummary | None = None
@@ -128,21 +137,23 @@ class Recorder:
         """
         log_time = time.time_ns() if log_time_ns is None else log_time_ns
         publish_time = log_time if publish_time_ns is None else publish_time_ns
-        check_message(topic, payload, log_time, publish_time)
-        message = Message(topic, payload, type, role, log_time, publish_time)
+        if log_time_ns is not None or publish_time_ns is not None or topic not in self._topics:
+            self._check(topic, payload, log_time, publish_time)
+        elif payload.__class__ is not bytes:
+            check_message(topic, payload, log_time, publish_time)
+        cost = len(payload) + _COST
         with self._lock:
             if self._closing:
                 raise ClosedError(f"the recording {self.path} is closed")
             if self._failure is not None:
                 self._lost += 1
                 raise RecordingFailed(self.path, str(self._failure))
-            cost = len(payload) + _COST
             if self._queued + cost > self._settings.queue_bytes:
                 self._lost += 1
                 return
-            self._queue.append(message)
+            first = not self._queue
+            self._queue.append((topic, payload, type, role, log_time, publish_time))
             self._queued += cost
-            first = len(self._queue) == 1
         if first:
             self._wake.set()
 
@@ -153,6 +164,7 @@ class Recorder:
         """
         with self._lock:
             self._closing = True
+        self._closed.set()
         self._wake.set()
         self._thread.join()
         if self._failure is not None:
@@ -173,33 +185,42 @@ class Recorder:
         except Exception as error:
             with self._lock:
                 self._failure = error
-                self._lost += len(self._queue)
+                self._lost += len(self._queue) + self._taken
                 self._queue.clear()
 
     def _write(self, file: PartialFile) -> None:
         """Write what comes until `close` was called and nothing waits any more."""
+        every = self._settings.flush_seconds, self._settings.sync_seconds
         while True:
-            self._wake.wait(file.seconds_to_flush(self._settings.flush_seconds))
+            if self._wake.wait(file.seconds_to_keep(*every)):
+                self._closed.wait(_GATHERING_SECONDS)
             self._wake.clear()
             closing = self._closing
             while batch := self._take():
-                for message in batch:
-                    self._add(file, message)
-                file.flush_if_due(self._settings.flush_seconds, sync_every=self._settings.sync_seconds)
-            file.flush_if_due(self._settings.flush_seconds, sync_every=self._settings.sync_seconds)
+                for start in range(0, len(batch), _AT_ONCE):
+                    self._add(file, batch[start : start + _AT_ONCE])
+                    file.keep_what_is_due(*every)
+            file.keep_what_is_due(*every)
             if closing:
                 return
 
-    def _add(self, file: PartialFile, message: Message) -> None:
-        try:
-            file.add(message)
-        except Unrecordable as error:
-            with self._lock:
-                self._lost += 1
-            log.warning("%s: a message on %s is lost: %s", self.path.name, message.topic, error)
+    def _add(self, file: PartialFile, messages: list[Message]) -> None:
+        refused = file.add(messages)
+        with self._lock:
+            self._queued -= sum([len(message[1]) for message in messages]) + _COST * len(messages)
+            self._lost += len(refused)
+        self._taken -= len(messages)
+        for error in refused:
+            log.warning("%s: a message is lost: %s", self.path.name, error)
 
     def _take(self) -> list[Message]:
+        """All that waits; it counts as waiting until it is written."""
         with self._lock:
-            batch = [self._queue.popleft() for _ in range(min(_AT_ONCE, len(self._queue)))]
-            self._queued -= sum(len(message.payload) + _COST for message in batch)
+            batch, self._queue = self._queue, []
+        self._taken = len(batch)
         return batch
+
+    def _check(self, topic: str, payload: bytes, log_time: int, publish_time: int) -> None:
+        check_message(topic, payload, log_time, publish_time)
+        if len(self._topics) < _KNOWN_TOPICS:
+            self._topics.add(topic)

@@ -14,12 +14,19 @@ from mesh.recording.mcap_records import frames
 from mesh.recording.mcap_source import Reading
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
+    from typing import TypeAlias
 
     from mesh.recording.source import Source
 
+    Progress: TypeAlias = Callable[[int, int | None], None]
+
 RECOVERED: Final = "aira-recovered"
 """Name of the metadata record that marks a file, or its first part, as recovered."""
+
+PROGRESS_EVERY: Final = 1000
+"""Messages between two notes of progress."""
 
 _NO_LIMIT: Final = 1 << 62
 _OURS: Final = Limits(
@@ -44,9 +51,9 @@ class Recovered:
 def recover(path: Path, target: Path | None = None) -> Recovered:
     """Write the readable beginning of the MCAP file at `path` to a new, whole file; the old one is left as it is.
 
-    Without `target` that is `NAME.mcap` for `NAME.mcap.part`, else `NAME.recovered.mcap`. Messages, channels, schemas
-    and metadata are kept, attachments are not; metadata record `aira-recovered` says what was done. Reading stops at
-    the first record that is cut or whose checksum is wrong. Blocks on the disk.
+    Without `target` that is `NAME.mcap` for `NAME.mcap.part`, else `NAME.recovered.mcap`. Messages, channels, schemas,
+    metadata and attachments are kept; metadata record `aira-recovered` says what was done. Reading stops at the first
+    record that is cut or whose checksum is wrong. Blocks on the disk.
 
     Raises `NotARecording` if it is no MCAP file, `RecordingExists` if `target` is there, `OSError`.
     """
@@ -58,7 +65,7 @@ def recover(path: Path, target: Path | None = None) -> Recovered:
         file = McapFile(stream)
         for name, values in source.metadata.items():
             file.add_metadata(name, values)
-        copy_messages(source, file)
+        copy_content(source, file)
         file.add_metadata(RECOVERED, {"messages": str(file.messages), "why": why})
         file.finish()
     return Recovered(path=final, messages=file.messages, why=why)
@@ -83,9 +90,15 @@ def readable_part(path: Path) -> tuple[Source, str]:
     return reading.source(size), why
 
 
-def copy_messages(source: Source, file: McapFile) -> None:
-    """Write all messages of a source, in the order of their file, with their channels as they are."""
-    for number, sequence, log_time, publish_time, payload in source.in_file_order():
+def copy_content(source: Source, file: McapFile, *, progress: Progress | None = None) -> None:
+    """Write all messages of a source, in the order of their file, with their channels as they are, and what is attached
+    to it."""
+    with source.path.open("rb") as stream:
+        for attachment in source.attachments:
+            stream.seek(attachment.offset)
+            file.add_attachment(attachment, stream.read(attachment.size))
+    total = sum(segment.count for segment in source.segments)
+    for done, (number, sequence, log_time, publish_time, payload) in enumerate(source.in_file_order(), 1):
         channel = source.channels[number]
         file.add(
             channel.topic,
@@ -96,6 +109,8 @@ def copy_messages(source: Source, file: McapFile) -> None:
             publish_time_ns=publish_time,
             sequence=sequence,
         )
+        if progress is not None and (done % PROGRESS_EVERY == 0 or done == total):
+            progress(done, total)
 
 
 def _name_for(path: Path) -> Path:

@@ -40,6 +40,29 @@ class Channel:
     metadata: Mapping[str, str] = field(default_factory=dict)
 
 
+class Attachment(NamedTuple):
+    """A file within a file: `size` bytes from `offset`. Times are in nanoseconds."""
+
+    name: str
+    media_type: str
+    log_time: int
+    create_time: int
+    offset: int
+    size: int
+
+
+class Statistics(NamedTuple):
+    """What an MCAP file says at its end about itself. `by_channel` has the messages of each channel's number."""
+
+    messages: int
+    channels: int
+    attachments: int
+    chunks: int
+    start: int
+    end: int
+    by_channel: Mapping[int, int]
+
+
 @dataclass(frozen=True, slots=True)
 class Block:
     """Where messages are in a file: `stored` bytes from `offset`, which expand to `size`."""
@@ -81,6 +104,10 @@ class Source:
     segments: tuple[Segment, ...]
     metadata: Mapping[str, Mapping[str, str]]
     records: Callable[[bytes], Iterator[Record]]
+    attachments: tuple[Attachment, ...] = ()
+    statistics: Statistics | None = None
+    unchecked: int = 0
+    """Blocks of messages without a checksum."""
 
     def in_file_order(self) -> Iterator[Record]:
         """All messages as they lie in the file."""

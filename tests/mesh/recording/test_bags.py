@@ -105,7 +105,7 @@ def chunk(data: bytes, *, compression: bytes = b"none", size: int | None = None)
         (BAG + struct.pack("<I", 0xFFFFFFFF), "a record header of"),
         (BAG + struct.pack("<II", 5, 1) + b"x" + bytes(4), "no name"),
         (BAG + record({"op": b"\x07", "conn": bytes(4), "topic": b"/a"}, b""), "without topic or type"),
-        (BAG + record({"op": b"\x07", "topic": b"/a"}, b""), "a field of 4 bytes"),
+        (BAG + record({"op": b"\x07", "topic": b"/a"}, b""), "without its field conn"),
     ],
 )
 def test_what_no_writer_writes_is_corrupt(tmp_path: Path, content: bytes, why: str) -> None:

@@ -67,4 +67,14 @@ def test_a_kill_while_an_interrupted_recording_is_copied_loses_nothing(tmp_path:
     (tmp_path / "it.mcap.part").write_bytes((tmp_path / "it.mcap.cut").read_bytes()[:200])
     with Recorder(tmp_path / "it.mcap", ABOUT) as recorder:
         assert recorder.close().recovered == 100
+    assert open_objective(tmp_path / "it.mcap").metadata["aira-recovered"]["seams"] == "100"
     assert os.listdir(tmp_path) == ["it.mcap"]
+
+
+def test_every_place_where_a_recording_was_gone_on_with_is_told(tmp_path: Path) -> None:
+    for number in range(3):
+        with Recorder(tmp_path / "it.mcap", ABOUT) as recorder:
+            recorder.record("/a", b"%d" % number, RAW)
+        (tmp_path / "it.mcap").rename(tmp_path / "it.mcap.part")
+    Recorder(tmp_path / "it.mcap", ABOUT).close()
+    assert open_objective(tmp_path / "it.mcap").metadata["aira-recovered"]["seams"] == "1,2,3"

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 GOOD = with_messages([T0, T0 + 8 * 24 * 3600 * SECOND - 1])
 
 
-def on_topic(topic: str) -> bytes:
+def on_topic(topic: str, payload: bytes = b"{}") -> bytes:
     def write(writer: Writer) -> None:
-        writer.add_message(writer.register_channel(topic, "json", 0), T0, b"{}", T0)
+        writer.add_message(writer.register_channel(topic, "json", 0), T0, payload, T0)
 
     return mcap_file(write)
 
@@ -47,6 +47,7 @@ def test_a_good_objective_comes_back_open(tmp_path: Path, content: bytes) -> Non
         (on_topic("a b"), "unplayable-topic"),
         (on_topic("/a/**"), "unplayable-topic"),
         (on_topic("/c"), "unknown-topic"),
+        (on_topic("/a", b"{"), "unreadable-message"),
         (with_messages([T0] * 3000), "too-large"),
         (with_messages([T0] * 300), "expands-too-much"),
     ],
@@ -72,3 +73,18 @@ def test_what_is_no_file_is_no_recording(tmp_path: Path) -> None:
     assert preflight(tmp_path).reason == "not-a-recording"
     os.mkfifo(tmp_path / "pipe")
     assert preflight(tmp_path / "pipe").reason == "not-a-recording"
+
+
+@pytest.mark.parametrize(("kind", "payload"), [("std_msgs/String", b"\x09\0\0\0x"), ("std_msgs/Empty", b"x")])
+def test_a_message_that_is_not_what_its_type_says_is_named(tmp_path: Path, kind: str, payload: bytes) -> None:
+    path = tmp_path / "objective"
+    path.write_bytes(Bag([Sent("/b", payload, T0 + n, type=kind) for n in range(3)]).encode())
+    outcome = preflight(path)
+    assert outcome.reason == "unreadable-message"
+    assert outcome.detail.startswith(f"message 0 on /b: not a {kind}: ")
+
+
+def test_a_type_that_nobody_here_knows_is_carried_as_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "objective"
+    path.write_bytes(Bag([Sent("/b", b"\xff", T0, type="my/Type")]).encode())
+    assert preflight(path).ok

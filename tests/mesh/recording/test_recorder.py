@@ -51,6 +51,7 @@ def test_a_recording_holds_what_was_recorded_and_whose_it_is(tmp_path: Path) -> 
         "lighthouse": "a.eth",
         "objective": "Qm",
         "software": "aira 1",
+        "topics": "",
     }
     assert objective.metadata["aira-closed"] == {"messages": "3", "lost": "0"}
     played = list(objective.messages())
@@ -221,6 +222,25 @@ def test_what_was_recorded_is_handed_over_every_second_without_a_close(tmp_path:
                 break
         else:
             pytest.fail("nothing came to the file")
+
+
+def test_what_was_recorded_is_put_on_the_disk_in_time_though_nothing_more_comes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced = threading.Semaphore(0)
+    fsync = os.fsync
+
+    def counted(descriptor: int) -> None:
+        fsync(descriptor)
+        synced.release()
+
+    settings = RecorderSettings(flush_seconds=0.02, sync_seconds=0.3)
+    monkeypatch.setattr(os, "fsync", counted)
+    with Recorder(tmp_path / "it.mcap", ABOUT, settings=settings) as recorder:
+        for _ in ("the beginning", "its name in the folder"):
+            assert synced.acquire(timeout=30)
+        recorder.record("/a", b"soon", RAW)
+        assert synced.acquire(timeout=30)
 
 
 def record_for_ever(recorder: Recorder) -> None:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from mcap.reader import make_reader
 
-from mesh.recording import NotARecording, RecordingExists, open_objective, recover
+from mesh.recording import CorruptRecording, NotARecording, RecordingExists, open_objective, recover
 from tests.mesh.recording.files import T0, mcap_file, with_messages
 
 if TYPE_CHECKING:
@@ -89,3 +89,29 @@ def test_from_what_is_no_mcap_file_nothing_is_made(tmp_path: Path, content: byte
     with pytest.raises(NotARecording):
         recover(tmp_path / "it.mcap.part")
     assert [path.name for path in tmp_path.iterdir()] == ["it.mcap.part"]
+
+
+def with_attachment(writer: Writer) -> None:
+    writer.add_attachment(T0, T0 + 1, "map.png", "image/png", bytes(range(256)) * 1000)
+    writer.add_message(writer.register_channel("/a", "json", 0), T0, b"{}", T0)
+    writer.flush()  # type: ignore[no-untyped-call]
+
+
+def test_attachments_are_kept(tmp_path: Path) -> None:
+    (tmp_path / "it.mcap").write_bytes(mcap_file(with_attachment)[:-60])
+    recovered = recover(tmp_path / "it.mcap")
+    assert recovered.messages == 1
+    with recovered.path.open("rb") as file:
+        (kept,) = make_reader(file, validate_crcs=True).iter_attachments()
+    assert (kept.name, kept.media_type, kept.create_time, kept.log_time) == ("map.png", "image/png", T0, T0 + 1)
+    assert kept.data == bytes(range(256)) * 1000
+    (attachment,) = open_objective(recovered.path).attachments
+    assert (attachment.name, attachment.size) == ("map.png", 256_000)
+
+
+def test_a_rotten_attachment_is_found_out(tmp_path: Path) -> None:
+    whole = bytearray(mcap_file(with_attachment))
+    whole[whole.index(b"image/png") + 1000] ^= 1
+    (tmp_path / "it.mcap").write_bytes(whole)
+    with pytest.raises(CorruptRecording, match="checksum"):
+        open_objective(tmp_path / "it.mcap")

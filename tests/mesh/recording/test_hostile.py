@@ -1,0 +1,208 @@
+"""Files made to harm whoever opens them, in a process of their own: what each costs is measured, not assumed."""
+
+from __future__ import annotations
+
+import json
+import random
+import struct
+import sys
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import lz4.frame  # type: ignore[import-untyped]
+import pytest
+import zstandard
+from mcap.opcode import Opcode
+
+from mesh.recording import Limits
+from tests.mesh.recording.mutants import FILES, mutant
+from tests.mesh.recording.raw import SCHEMA, chunk, message, raw_file, record, text
+from tests.support.bags import MAGIC, Bag, Sent, compress
+from tests.support.bags import record as bag_record
+from tests.support.commands import run
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+ROOT = Path(__file__).parents[3]
+MUTANTS = 40
+"""Of each of the seven sound files."""
+MEMORY = 256 << 20
+SECONDS = 5.0
+SLOW = 5
+"""How much slower than one with nothing else to do the machine may be."""
+GIB = 1 << 30
+CHUNK = Limits().record
+PLAIN = record(Opcode.CHANNEL, struct.pack("<HH", 1, 1) + text("/a") + text("") + text(""))
+REASONS = {"not-a-recording", "corrupt", "expands-too-much", "too-long", "unreadable-message", "unplayable-topic"}
+
+OPENING = """
+import json, sys, time
+from pathlib import Path
+from mesh.recording import preflight
+for path in sorted(Path(sys.argv[1]).iterdir()):
+    begin = time.process_time()
+    outcome = preflight(path)
+    if outcome.objective is not None and sys.argv[2] == "play":
+        for message in outcome.objective.messages():
+            pass
+    seconds = time.process_time() - begin
+    peak = next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM:"))
+    print(json.dumps([path.name, outcome.reason, outcome.detail, seconds, 1024 * int(peak)]))
+"""
+
+
+def opened(folder: Path, how: str = "play") -> dict[str, tuple[str, str]]:
+    """The reason and the detail of each file of the folder, all of them examined (and read) within the bounds."""
+    done = run(sys.executable, "-c", OPENING, folder, how, PYTHONPATH=str(ROOT))
+    assert done.returncode == 0, done.stderr
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    for name, _, _, seconds, peak in lines:
+        assert seconds < SECONDS * SLOW, f"{name} took {seconds} seconds of the processor"
+        assert peak < MEMORY, f"{name} took {peak >> 20} MiB"
+    return {name: (reason, detail) for name, reason, detail, *_ in lines}
+
+
+@pytest.mark.parametrize("name", list(FILES))
+def test_mutants_are_read_or_refused_at_little_cost(tmp_path: Path, name: str) -> None:
+    dice = random.Random(name)
+    for number in range(MUTANTS):
+        (tmp_path / f"{number:02}").write_bytes(mutant(dice, FILES[name], number))
+    outcomes = opened(tmp_path)
+    assert len(outcomes) == MUTANTS
+    refused = [(reason, detail) for reason, detail in outcomes.values() if reason]
+    assert len(refused) >= MUTANTS // 6
+    for reason, detail in refused:
+        assert reason in REASONS
+        assert len(detail.splitlines()) == 1
+
+
+@cache
+def zeros(size: int) -> bytes:
+    return zstandard.compress(bytes(size), 19)
+
+
+def one_chunk() -> bytes:
+    """What the design calls the bomb: some 33 kB that expand to 1 GiB."""
+    return raw_file(chunk(zeros(GIB), compression="zstd", size=GIB))
+
+
+def many_chunks() -> bytes:
+    """The same in chunks as large as they may be, each one message of zeros."""
+    chunks = []
+    for number in range(GIB // CHUNK):
+        data = message(bytes(CHUNK - 31), time=number)
+        chunks.append(chunk(zstandard.compress(data), compression="zstd", size=CHUNK))
+    return raw_file(SCHEMA, PLAIN, *chunks)
+
+
+def nothing_but_zeros() -> bytes:
+    """A gigabyte of records of the kind 0 with no content."""
+    return raw_file(*[chunk(zeros(CHUNK), compression="zstd", size=CHUNK)] * (GIB // CHUNK))
+
+
+def private_records() -> bytes:
+    """A gigabyte of empty records of somebody's own kind."""
+    data = struct.pack("<BQ", 0x80, 0) * (CHUNK // 9)
+    return raw_file(*[chunk(zstandard.compress(data), compression="zstd", size=len(data))] * (GIB // CHUNK))
+
+
+def tiny_messages() -> bytes:
+    """More messages than anybody can count in time."""
+    data = message() * (CHUNK // 31)
+    return raw_file(SCHEMA, PLAIN, *[chunk(zstandard.compress(data), compression="zstd", size=len(data))] * 10)
+
+
+def tiny_records() -> bytes:
+    """A file of empty records, nothing compressed."""
+    return raw_file(record(0x80, b"") * 5_000_000)
+
+
+def interwoven() -> bytes:
+    """Chunks that all span the same time, so that giving their messages in order needs them all at once."""
+    data = message(bytes(1 << 20), time=0) * 20 + message(time=1)
+    return raw_file(SCHEMA, PLAIN, *[chunk(zstandard.compress(data), compression="zstd", size=len(data))] * 40)
+
+
+def backwards() -> bytes:
+    """A chunk of many messages in the wrong order."""
+    data = b"".join(message(time=n) for n in range(300_000, 0, -1))
+    return raw_file(SCHEMA, PLAIN, chunk(zstandard.compress(data), compression="zstd", size=len(data)))
+
+
+def lying_lz4() -> bytes:
+    """A chunk that expands to a quarter of a gigabyte and says that it has a kilobyte."""
+    return raw_file(chunk(bytes(lz4.frame.compress(bytes(GIB // 4))), compression="lz4", size=1000))
+
+
+def bag_of_zeros() -> bytes:
+    """A bag whose chunk expands a thousandfold, to more than it says."""
+    header = {"op": b"\x05", "compression": b"bz2", "size": struct.pack("<I", 1000)}
+    return (
+        MAGIC
+        + bag_record({"op": b"\x03", "index_pos": bytes(8)}, b"")
+        + bag_record(header, compress(bytes(GIB // 8), "bz2"))
+    )
+
+
+CONNECTION = bag_record({"op": b"\x07", "conn": bytes(4), "topic": b"/a"}, struct.pack("<I", 6) + b"type=x")
+
+
+def bag_of(records: bytes) -> bytes:
+    """A bag of chunks as large as they may be, full of these records."""
+    data = CONNECTION + records * ((CHUNK - len(CONNECTION)) // len(records))
+    header = {"op": b"\x05", "compression": b"lz4", "size": struct.pack("<I", len(data))}
+    one = bag_record(header, compress(data, "lz4"))
+    return MAGIC + bag_record({"op": b"\x03", "index_pos": bytes(8)}, b"") + one * 20
+
+
+def bag_of_connections() -> bytes:
+    """A bag that says the same connection a million times in every chunk."""
+    return bag_of(CONNECTION)
+
+
+def bag_of_tiny_messages() -> bytes:
+    """A bag of more messages than anybody can count in time."""
+    return bag_of(bag_record({"op": b"\x02", "conn": bytes(4), "time": bytes(8)}, b""))
+
+
+def huge_message() -> bytes:
+    """A bag of one message that is larger than what is taken."""
+    return Bag([Sent("/a", bytes(CHUNK + 1), 1)]).encode()
+
+
+BOMBS: dict[Callable[[], bytes], str] = {
+    one_chunk: "expands-too-much",
+    many_chunks: "",
+    nothing_but_zeros: "corrupt",
+    private_records: "expands-too-much",
+    tiny_messages: "expands-too-much",
+    tiny_records: "expands-too-much",
+    interwoven: "expands-too-much",
+    backwards: "",
+    lying_lz4: "corrupt",
+    bag_of_zeros: "corrupt",
+    bag_of_connections: "expands-too-much",
+    bag_of_tiny_messages: "expands-too-much",
+    huge_message: "expands-too-much",
+}
+
+
+@pytest.mark.parametrize(("bomb", "reason"), BOMBS.items(), ids=lambda item: getattr(item, "__name__", ""))
+def test_a_bomb_does_no_harm(tmp_path: Path, bomb: Callable[[], bytes], reason: str) -> None:
+    content = bomb()
+    assert len(content) <= Limits().size
+    (tmp_path / "bomb").write_bytes(content)
+    del content
+    found, detail = opened(tmp_path)["bomb"]
+    assert found == reason
+    assert bool(detail) == bool(reason)
+
+
+def test_the_bomb_of_a_gigabyte_is_a_small_file() -> None:
+    assert len(one_chunk()) < 70_000
+
+
+def test_no_opcode_of_the_format_is_private() -> None:
+    assert max(Opcode) < 0x80
