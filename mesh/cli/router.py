@@ -1,28 +1,170 @@
-"""`aira router`: a Zenoh router."""
+"""`aira router`: a Zenoh router, open on this machine or closed by a roster."""
 
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
 from mesh.cli.options import with_settings
-from mesh.network import Endpoints, Network
-from mesh.running import run_until_stopped
+from mesh.cli.printing import print_json, print_table, visible, with_json
+from mesh.errors import AiraError, ConfigurationError
+from mesh.running import fail, run_until_stopped
+from mesh.trouble import Trouble
 
 if TYPE_CHECKING:
+    from mesh.identity import Roster
+    from mesh.network import Endpoints
     from mesh.settings import Settings
 
+log = logging.getLogger(__name__)
 
-@click.command("router")
-@with_settings("listen")
-def command(settings: Settings) -> None:
-    """Run a Zenoh router, the place where agents, providers and people meet. Ctrl-C ends it."""
-    run_until_stopped(lambda: _serve(settings))
+SITE: Final = ("listen", "link", "tls_ca", "tls_certificate", "tls_key", "roster")
+LOOK: Final = 1.0
+"""Seconds between two looks at the roster."""
+
+
+@click.group("router", invoke_without_command=True)
+@with_settings(*SITE)
+@click.pass_context
+def command(context: click.Context, settings: Settings) -> None:
+    """Run a Zenoh router, the place where agents, providers and people meet. Ctrl-C ends it.
+
+    With a roster it lets in who has a certificate of the site, and each does what his role needs. Without one it
+    listens on loopback only. When the roster or its certificate changes, it begins anew by itself; clients come back
+    within a second.
+    """
+    context.obj = settings
+    if context.invoked_subcommand is None:
+        run_until_stopped(lambda: _serve(settings))
+
+
+@command.command("acl", short_help="say who may do what")
+@click.option("--check", is_flag=True, help="a table for people, instead of Zenoh's rules")
+@click.option("--roster", type=click.Path(dir_okay=False, path_type=Path), help="roster [the settings']")
+@with_json
+@click.pass_obj
+def acl(settings: Settings, check: bool, roster: Path | None, as_json: bool) -> None:
+    """Print what the roster allows: as Zenoh's `access_control`, or with --check who may do what.
+
+    What is not in the table is refused.
+    """
+    from mesh.identity import access_control
+
+    try:
+        found = _roster(settings, roster)
+    except AiraError as error:
+        fail(error)
+    if not check:
+        print_json(access_control(found))
+    elif as_json:
+        print_json(_access(found))
+    else:
+        rows = [
+            (visible(one["name"]), one["address"], ", ".join(one["roles"]), right, key)
+            for one in _access(found)
+            for right, keys in (one["may"] or {"nothing": ["(revoked)"]}).items()
+            for key in keys
+        ]
+        print_table(("NAME", "ADDRESS", "ROLES", "MAY", "KEYS"), rows)
+
+
+@command.command("config", short_help="write the same router's configuration for zenohd")
+@click.option("--out", required=True, type=click.Path(dir_okay=False, path_type=Path), help="file to write (JSON5)")
+@click.pass_obj
+def config(settings: Settings, out: Path) -> None:
+    """Write a configuration file for `zenohd`: the router that `aira router` with the same options is.
+
+    Give those options before `config`. zenohd reads the file when it starts, and so has to be started anew after a
+    change of the roster.
+    """
+    from mesh.identity.routers import router_endpoints, zenohd_configuration
+
+    try:
+        text = zenohd_configuration(router_endpoints(settings))
+        try:
+            out.write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise ConfigurationError(f"can't write {out}: {error.strerror}") from None
+    except AiraError as error:
+        fail(error)
+    click.echo(f"zenohd --config {out}")
 
 
 async def _serve(settings: Settings) -> None:
-    async with Network(Endpoints(listen=settings.listen, mode="router")) as network:
-        click.echo(f"router {network.id} listens at {', '.join(settings.listen)}")
-        await asyncio.Event().wait()
+    from mesh.identity.routers import router_endpoints
+    from mesh.network import Network
+
+    endpoints = router_endpoints(settings)
+    while True:
+        certificate = _contents(endpoints)
+        async with Network(endpoints) as network:
+            click.echo(f"router {network.id} listens at {', '.join(settings.listen)}")
+            click.echo(_who_is_let_in(endpoints))
+            endpoints = await _changed(settings, endpoints, certificate)
+        log.info("the roster or the certificate has changed: the router begins anew")
+
+
+async def _changed(settings: Settings, endpoints: Endpoints, certificate: bytes) -> Endpoints:
+    """Where and how to listen, once it is something else; what can't work is reported and left alone."""
+    from mesh.identity.routers import router_endpoints
+
+    trouble = Trouble(log)
+    while True:
+        await asyncio.sleep(LOOK)
+        try:
+            found = await asyncio.to_thread(router_endpoints, settings)
+            await asyncio.to_thread(found.config)
+        except AiraError as error:
+            trouble.met(error, "the router goes on as it is")
+            continue
+        trouble.over("the roster can be used again")
+        if found != endpoints or _contents(found) != certificate:
+            return found
+
+
+def _contents(endpoints: Endpoints) -> bytes:
+    """The router's own certificate, which Zenoh reads when it begins to listen."""
+    pair = endpoints.tls.pair if endpoints.tls is not None else None
+    try:
+        return pair[0].read_bytes() if pair is not None else b""
+    except OSError:
+        return b""
+
+
+def _who_is_let_in(endpoints: Endpoints) -> str:
+    if endpoints.access is None:
+        return "without a roster: only this machine reaches it, and everybody on it may do everything"
+    return f"let in: {len(endpoints.access['subjects'])} of the roster, by certificate"
+
+
+def _roster(settings: Settings, path: Path | None) -> Roster:
+    from mesh.identity import read_roster
+
+    if path is None and not settings.roster:
+        raise ConfigurationError(
+            "there is no roster", hint="give --roster; `aira identity new --roster FILE` begins one"
+        )
+    return read_roster(path or Path(settings.roster).expanduser())
+
+
+def _access(roster: Roster) -> list[dict[str, Any]]:
+    """Who may do what, the revoked among them with nothing."""
+    from mesh.identity import access_of
+
+    found: dict[str, dict[str, list[str]]] = {member.address: {} for member in roster.member}
+    for member, right, keys in access_of(roster):
+        found[member.address][right.value] = list(keys)
+    return [
+        {
+            "name": member.name,
+            "address": member.address,
+            "roles": list(member.roles),
+            "revoked": member.revoked,
+            "may": found[member.address],
+        }
+        for member in roster.member
+    ]

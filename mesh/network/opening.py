@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Final
 import zenoh
 
 from mesh.errors import ClosedError, ConfigurationError, NetworkUnavailable
+from mesh.network.endpoints import ATTEMPT
+from mesh.network.errors import NotAdmitted
 
 if TYPE_CHECKING:
     from mesh.network.endpoints import Endpoints
@@ -32,8 +34,8 @@ class Opening:
     def run(self) -> zenoh.Session:
         """The open session.
 
-        Raises `NetworkUnavailable` when no router answers in the endpoints' time, `ConfigurationError` when it can't
-        listen, `ClosedError` when it was abandoned.
+        Raises `NetworkUnavailable` when no router answers in the endpoints' time, `NotAdmitted` when each that there
+        is keeps this identity out, `ConfigurationError` when it can't listen, `ClosedError` when it was abandoned.
         """
         timeout = self._endpoints.timeout
         ends = time.monotonic() + timeout if timeout >= 0 else float("inf")
@@ -43,6 +45,7 @@ class Opening:
             except zenoh.ZError as error:
                 if self._endpoints.mode == "router":
                     raise self._not_listening(error) from None
+                self._check_admitted()
                 if time.monotonic() + PAUSE >= ends:
                     raise NetworkUnavailable(self._endpoints.connect, f"no answer within {timeout:g} s") from None
                 self._abandoned.wait(PAUSE)
@@ -66,6 +69,19 @@ class Opening:
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]
         raise ClosedError("the opening of the network session was abandoned")
+
+    def _check_admitted(self) -> None:
+        """Waiting does not help who is not let in anywhere."""
+        if (tls := self._endpoints.tls) is None:
+            return
+        from mesh.network.handshake import refusal
+
+        refusals = []
+        for locator in self._endpoints.connect:
+            if (why := refusal(tls, locator, ATTEMPT)) is None:
+                return
+            refusals.append(f"{locator}: {why}")
+        raise NotAdmitted(*refusals)
 
     def _not_listening(self, error: zenoh.ZError) -> ConfigurationError:
         found = CAUSE.search(str(error))

@@ -17,7 +17,7 @@ import zenoh
 from mesh.errors import AiraError, ClosedError, RemoteError
 from mesh.network.crossing import call_in_loop
 from schemas import InvalidRecord, Record, RpcKey
-from schemas.rpc import SERVICES
+from schemas.rpc import SERVICES, SPENDING
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -29,6 +29,10 @@ log = logging.getLogger(__name__)
 
 TIMEOUT: Final = 10.0
 """Seconds to wait for an answer."""
+SPENDING_TIMEOUT: Final = 240.0
+"""Seconds to wait for an answer that is given when a transaction is mined: who asks again too early pays twice."""
+AT_ONCE: Final = 256
+"""Questions that an agent answers at the same time; whoever asks more is told to come again."""
 
 
 class Failure(Record, frozen=True):
@@ -36,6 +40,9 @@ class Failure(Record, frozen=True):
 
     error: str
     hint: str = ""
+
+
+BUSY: Final = Failure("the agent is answering too many questions", "ask again later").encode()
 
 
 class ServiceFailed(RemoteError):
@@ -98,6 +105,10 @@ class Services:
         if not self._open:
             query.drop()  # type: ignore[no-untyped-call]
             return
+        if len(self._answers) >= AT_ONCE:
+            with query:
+                query.reply_err(BUSY)
+            return
         answer = asyncio.create_task(self._answer(query, key, request_type, handler), name=f"answer {key}")
         self._answers.add(answer)
         answer.add_done_callback(self._answers.discard)
@@ -118,12 +129,17 @@ class Services:
                 query.reply(key, reply, encoding="application/json")
 
 
-async def call(session: zenoh.Session, agent: str, service: str, request: Record, *, timeout: float = TIMEOUT) -> Any:
+async def call(
+    session: zenoh.Session, agent: str, service: str, request: Record, *, timeout: float | None = None
+) -> Any:
     """Ask `service` (one of `schemas.rpc.SERVICES`) of the agent at `agent` (address); its reply is that service's.
 
-    Raises `ServiceFailed` with the agent's own words, or that nobody answers within `timeout` seconds. Cancelling ends
-    the asking; what was asked may be done all the same.
+    Raises `ServiceFailed` with the agent's own words, or that nobody answers within `timeout` seconds (by default
+    `TIMEOUT`, or `SPENDING_TIMEOUT` for what sends a transaction). Cancelling ends the asking; what was asked may be
+    done all the same.
     """
+    if timeout is None:
+        timeout = SPENDING_TIMEOUT if service in SPENDING else TIMEOUT
     key, reply_type = str(RpcKey(agent, service)), _service(service).reply
     asking = zenoh.CancellationToken()
     get = partial(session.get, key, payload=request.encode(), encoding="application/json", timeout=timeout)

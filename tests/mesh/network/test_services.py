@@ -10,6 +10,7 @@ import pytest
 
 from mesh.errors import AiraError, ClosedError
 from mesh.network import ServiceFailed, Services, call
+from mesh.network.services import AT_ONCE
 from schemas import Liability, RpcKey
 from schemas.rpc import (
     AccountBalance,
@@ -204,6 +205,26 @@ async def test_questions_are_answered_side_by_side(here: zenoh.Session, there: z
         replies = await asyncio.gather(*(call(here, ADDRESS, "start", REQUEST) for _ in range(3)))
 
     assert replies == [Done(True)] * 3
+
+
+async def test_whoever_asks_too_much_is_told_to_come_again(here: zenoh.Session, there: zenoh.Session) -> None:
+    enough = asyncio.Event()
+
+    async def start(request: StartLiability) -> Done:
+        await enough.wait()
+        return Done(True)
+
+    async with offering(there, here, start=start) as services:
+        key = str(RpcKey(ADDRESS, "start"))
+        waiting = [here.get(key, payload=REQUEST.encode(), timeout=60) for _ in range(AT_ONCE)]
+        await until(lambda: len(services._answers) == AT_ONCE, what="a full house", seconds=30)
+        with pytest.raises(ServiceFailed, match="too many questions") as caught:
+            await call(here, ADDRESS, "start", REQUEST)
+        assert caught.value.hint == "ask again later"
+        enough.set()
+        answered = await asyncio.to_thread(lambda: [reply.ok is not None for one in waiting for reply in one])
+        assert answered == [True] * AT_ONCE
+        assert await call(here, ADDRESS, "start", REQUEST) == Done(True)
 
 
 async def test_leaving_breaks_off_what_is_not_answered(here: zenoh.Session, there: zenoh.Session) -> None:

@@ -1,0 +1,275 @@
+"""`aira identity`: who belongs to a site: its certificate, and those of its members."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from mesh.cli.options import with_settings
+from mesh.cli.printing import print_facts, print_json, visible, with_json
+from mesh.errors import AiraError, ConfigurationError, InputError
+from mesh.identity.roles import ROLES
+from mesh.running import fail, run_to_end
+from mesh.settings import NETWORK_SETTINGS
+
+if TYPE_CHECKING:
+    from mesh.identity.certificates import Facts
+    from mesh.identity.folders import SiteFolder
+    from mesh.identity.roster import Member
+    from mesh.settings import Settings
+
+FOLDER = click.Path(file_okay=False, path_type=Path)
+FILE = click.Path(dir_okay=False, path_type=Path)
+DAYS = click.FloatRange(0, 36_500, min_open=True)
+SITE = click.option("--site", required=True, type=FOLDER, help="folder of the site, made by `aira identity site`")
+ROSTER = click.option("--roster", type=FILE, help="roster of the site, which is brought up to date")
+
+
+@click.group("identity")
+def command() -> None:
+    """Make certificates by which a site's routers know who connects, and look at them.
+
+    The common name of a certificate is an account's address. What its holder may do is said by the roster, a TOML file:
+    put `revoked = true` there to shut a member out.
+    """
+
+
+@command.command("site", short_help="begin a site")
+@click.argument("folder", type=FOLDER)
+@click.option("--name", default="AIRA mesh site", show_default=True, help="what the site is called")
+@click.option("--days", type=DAYS, default=3650, show_default=True, help="how long its certificate is valid")
+def site(folder: Path, name: str, days: float) -> None:
+    """Make the certificate and the key of a site in FOLDER. Whoever has the key can let in anybody."""
+    try:
+        authority = _site(folder)
+        authority.make(name=_text(name), days=days)
+    except AiraError as error:
+        fail(error)
+    print_facts({"certificate": authority.certificate, "key": authority.key})
+
+
+@command.command("new", short_help="make a member's certificate and key")
+@click.argument("folder", type=FOLDER)
+@SITE
+@click.option("--name", required=True, help="what the member is called; of an edge agent, also its device's name")
+@click.option("--address", help="the account's address [a router needs none]")
+@click.option("--keyfile", type=FILE, help="the account's keyfile, instead of its address")
+@click.option("--role", "roles", multiple=True, required=True, type=click.Choice(list(ROLES)), help="one or more")
+@click.option("--host", "hosts", multiple=True, help="name or IP address at which a router is reached")
+@click.option("--agent", default="", help="address of the agent whose device an edge agent serves")
+@click.option("--device", default="", help="name of that device [the member's]")
+@click.option("--days", type=DAYS, default=90, show_default=True, help="how long the certificate is valid")
+@ROSTER
+@with_json
+def new(folder: Path, site: Path, days: float, roster: Path | None, as_json: bool, **about: Any) -> None:
+    """Make a key and a certificate in FOLDER, and print what the roster has to say of the member.
+
+    With --roster it is written there. Nothing is overwritten, and no key is shown.
+    """
+    try:
+        facts, member = _make(folder, _site(site), days, roster, **about)
+    except AiraError as error:
+        fail(error)
+    _print(facts, as_json)
+    if roster is None and not as_json:
+        from mesh.identity import entry_of
+
+        click.echo(f"\n# for the roster:\n{entry_of(member)}", nl=False)
+
+
+@command.command("show", short_help="say whose a certificate is")
+@click.argument("folder", type=FOLDER)
+@click.option("--roster", type=FILE, help="roster of the site: is the member in it?")
+@with_json
+def show(folder: Path, roster: Path | None, as_json: bool) -> None:
+    """Print name, address, roles, validity and fingerprint of the identity in FOLDER."""
+    try:
+        facts = _member(folder).facts()
+        standing = _standing(facts, roster) if roster is not None else None
+    except AiraError as error:
+        fail(error)
+    _print(facts, as_json, standing)
+
+
+@command.command("renew", short_help="make a new certificate for the same member and key")
+@click.argument("folder", type=FOLDER)
+@SITE
+@click.option("--days", type=DAYS, default=90, show_default=True, help="how long the new certificate is valid")
+@ROSTER
+@with_json
+def renew(folder: Path, site: Path, days: float, roster: Path | None, as_json: bool) -> None:
+    """Put a new certificate in the place of the one in FOLDER, for the same member and key.
+
+    Sessions go on: they take the new one when they connect the next time.
+    """
+    try:
+        facts = _renew(folder, _site(site), days, roster)
+    except AiraError as error:
+        fail(error)
+    _print(facts, as_json)
+
+
+@command.command("check", short_help="ask the router whether it heeds an identity")
+@click.option("--agent", default="", help="of an edge agent: address of the agent whose device it serves")
+@click.option("--device", default="", help="of an edge agent: name of that device")
+@with_settings(*NETWORK_SETTINGS)
+def check(settings: Settings, agent: str, device: str) -> None:
+    """Connect as the settings say, and see whether what this identity does has an effect.
+
+    A router does not tell whom it denies something: it drops it. Exits 1 for who is not let in or not heeded.
+    """
+    try:
+        address = _own_address(settings)
+        if bool(agent) != bool(device):
+            raise InputError("of --agent and --device one is missing")
+    except AiraError as error:
+        fail(error)
+    run_to_end(lambda: _check(settings, address, agent, device))
+
+
+async def _check(settings: Settings, address: str, agent: str, device: str) -> None:
+    from mesh.identity.standing import check_standing
+    from mesh.network.endpoints import Endpoints
+
+    await check_standing(Endpoints.from_settings(settings), address, agent=agent, device=device)
+    click.echo(f"{address} is let in and heeded at {', '.join(settings.connect)}")
+
+
+def _own_address(settings: Settings) -> str:
+    """The address in the settings' certificate."""
+    if not settings.tls_certificate:
+        raise ConfigurationError("there is no identity", hint="give --tls-ca, --tls-certificate and --tls-key")
+    _check_installed()
+    from mesh.identity.certificates import facts_of, read_certificate
+
+    path = Path(settings.tls_certificate).expanduser()
+    return facts_of(read_certificate(path), path).holder.address
+
+
+def _make(folder: Path, site: SiteFolder, days: float, roster: Path | None, **about: Any) -> tuple[Facts, Member]:
+    from msgspec.structs import replace
+
+    from mesh.identity.certificates import Holder
+    from mesh.identity.roster import Member, entry_of, roster_from
+    from mesh.identity.roster_file import with_member, write_roster
+
+    if "router" in about["roles"] and not about["hosts"]:
+        raise InputError("clients check where they connect to", hint="give the router's name or IP address by --host")
+    name, agent, device = (_text(about[field]) for field in ("name", "agent", "device"))
+    roles = tuple(dict.fromkeys(about["roles"]))
+    member = Member(name=name, address=_address(about), roles=roles, agent=agent, device=device)
+    member = roster_from(entry_of(member), where="entry").member[0]
+    if roster is not None:
+        with_member(roster, member)  # raises for one that it can't hold
+    holder = Holder(address=member.address, name=member.name, roles=member.roles, hosts=about["hosts"])
+    facts = _member(folder).make(holder, site=site, days=days)
+    member = replace(member, fingerprint=facts.fingerprint)
+    if roster is not None:
+        write_roster(roster, with_member(roster, member))
+    return facts, member
+
+
+def _renew(folder: Path, site: SiteFolder, days: float, roster: Path | None) -> Facts:
+    from mesh.identity.roster_file import with_fingerprint, write_roster
+
+    member = _member(folder)
+    before = member.facts().fingerprint
+    if roster is not None:
+        with_fingerprint(roster, before, before)  # raises where the member is not in it
+    facts: Facts = member.renew(site=site, days=days)
+    if roster is not None:
+        write_roster(roster, with_fingerprint(roster, before, facts.fingerprint))
+    return facts
+
+
+def _address(about: dict[str, Any]) -> str:
+    import secrets
+
+    if about["keyfile"] is not None:
+        from mesh.cli.opening import claimed_address
+
+        if about["address"] is not None:
+            raise InputError("both --address and --keyfile are given", hint="give one of them")
+        return claimed_address(about["keyfile"])
+    if about["address"] is not None:
+        return str(about["address"])
+    if set(about["roles"]) == {"router"}:
+        return "0x" + secrets.token_hex(20)  # it has no account; nobody else must have its name
+    raise InputError("whose certificate is it to be?", hint="give the account's --address or its --keyfile")
+
+
+def _standing(facts: Facts, path: Path) -> str:
+    """What the roster says of the certificate's holder."""
+    from mesh.identity import read_roster
+
+    member = read_roster(path).find(facts.holder.address)
+    if member is None:
+        return "not in the roster"
+    if member.revoked:
+        return "revoked"
+    if member.fingerprint and member.fingerprint != facts.fingerprint:
+        return "in the roster, with another certificate"
+    return f"in the roster as {', '.join(member.roles)}"
+
+
+def _print(facts: Facts, as_json: bool, standing: str | None = None) -> None:
+    from datetime import UTC, datetime
+
+    left = facts.until - datetime.now(UTC)
+    expired = left.total_seconds() <= 0
+    if as_json:
+        print_json(
+            {
+                "name": facts.holder.name,
+                "address": facts.holder.address,
+                "roles": facts.holder.roles,
+                "hosts": facts.holder.hosts,
+                "validFrom": facts.since.isoformat(),
+                "validUntil": facts.until.isoformat(),
+                "expired": expired,
+                "fingerprint": facts.fingerprint,
+                "roster": standing,
+            }
+        )
+        return
+    print_facts(
+        {
+            "name": visible(facts.holder.name),
+            "address": facts.holder.address,
+            "roles": visible(", ".join(facts.holder.roles)),
+            "hosts": visible(", ".join(facts.holder.hosts)) or None,
+            "valid from": facts.since.isoformat(" "),
+            "valid until": f"{facts.until.isoformat(' ')} ({'expired' if expired else f'{left.days} days left'})",
+            "fingerprint": facts.fingerprint,
+            "roster": standing,
+        }
+    )
+
+
+def _text(text: str) -> str:
+    if not text.isprintable() or len(text) > 64:
+        raise InputError("a name is at most 64 printable characters")
+    return text
+
+
+def _site(folder: Path) -> SiteFolder:
+    _check_installed()
+    from mesh.identity.folders import SiteFolder
+
+    return SiteFolder(folder)
+
+
+def _member(folder: Path) -> Any:
+    _check_installed()
+    from mesh.identity.folders import MemberFolder
+
+    return MemberFolder(folder)
+
+
+def _check_installed() -> None:
+    from importlib.util import find_spec
+
+    if find_spec("cryptography") is None:
+        raise ConfigurationError("certificates need the package cryptography", hint="pip install 'aira-mesh[identity]'")

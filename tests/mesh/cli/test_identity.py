@@ -1,0 +1,272 @@
+"""`aira identity`: a site and its members, made, shown and renewed; keys stay where they are."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.chain import new_private_key, write_keyfile
+from mesh.identity import Member, read_roster
+from mesh.network import Endpoints, Tls
+from tests.support.commands import aira
+from tests.support.sites import Site
+
+if TYPE_CHECKING:
+    import subprocess
+    from pathlib import Path
+
+    from mesh.identity.folders import MemberFolder
+
+ARM = "0x" + "0a" * 20
+OTHER = "0x" + "0b" * 20
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Path:
+    folder = tmp_path / "site"
+    done = aira("identity", "site", folder)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == f"certificate  {folder}/ca.pem\nkey          {folder}/ca.key\n"
+    return folder
+
+
+def new(folder: Path, site: Path, *more: str | Path, name: str = "arm") -> subprocess.CompletedProcess[str]:
+    return aira("identity", "new", folder, "--site", site, "--name", name, *more)
+
+
+def made(folder: Path, site: Path, *more: str | Path, name: str = "arm") -> dict[str, object]:
+    done = new(folder, site, "--json", *more, name=name)
+    assert done.returncode == 0, done.stderr
+    found: dict[str, object] = json.loads(done.stdout)
+    return found
+
+
+def refused(done: subprocess.CompletedProcess[str]) -> str:
+    """The one line of a refusal, which is followed by what to do."""
+    assert done.returncode == 2, (done.stdout, done.stderr)
+    line, *hint = done.stderr.splitlines()
+    assert len(hint) <= 1
+    return line.removeprefix("aira: ")
+
+
+def test_a_member_s_files_make_an_identity_whose_common_name_is_the_address(tmp_path: Path, site: Path) -> None:
+    folder = tmp_path / "arm"
+
+    found = made(folder, site, "--address", ARM.upper().replace("X", "x"), "--role", "agent", "--role", "person")
+
+    tls = Tls(ca=folder / "ca.pem", certificate=folder / "identity.pem", key=folder / "identity.key")
+    Endpoints(connect=("tls/127.0.0.1:7447",), tls=tls).config()  # takes files that can work only
+    assert (found["name"], found["address"], found["roles"]) == ("arm", ARM, ["agent", "person"])
+    assert found["expired"] is False
+    assert json.loads(aira("identity", "show", folder, "--json").stdout) == found
+
+
+def test_show_tells_name_address_role_validity_and_fingerprint(tmp_path: Path, site: Path) -> None:
+    found = made(tmp_path / "arm", site, "--address", ARM, "--role", "agent", "--days", "30")
+
+    lines = aira("identity", "show", tmp_path / "arm").stdout.splitlines()
+
+    assert lines[:3] == ["name         arm", f"address      {ARM}", "roles        agent"]
+    assert lines[4].startswith("valid until  ")
+    assert lines[4].endswith("(29 days left)")
+    assert lines[5] == f"fingerprint  {found['fingerprint']}"
+
+
+def test_the_address_may_come_from_a_keyfile(tmp_path: Path, site: Path) -> None:
+    address = write_keyfile(tmp_path / "keyfile", new_private_key(), "secret")
+
+    found = made(tmp_path / "arm", site, "--keyfile", tmp_path / "keyfile", "--role", "agent")
+
+    assert found["address"] == address.lower()
+
+
+def test_no_key_is_ever_shown_and_only_its_owner_can_read_it(tmp_path: Path, site: Path) -> None:
+    folder = tmp_path / "arm"
+    commands = [
+        new(folder, site, "--address", ARM, "--role", "agent"),
+        aira("identity", "show", folder),
+        aira("identity", "renew", folder, "--site", site),
+        new(folder, site, "--address", ARM, "--role", "agent"),
+    ]
+
+    for key in (site / "ca.key", folder / "identity.key"):
+        assert key.stat().st_mode & 0o777 == 0o600
+        secret = "".join(key.read_text().splitlines()[1:-1])
+        assert not any(secret[:20] in done.stdout + done.stderr for done in commands)
+
+
+def test_nothing_is_overwritten(tmp_path: Path, site: Path) -> None:
+    folder = tmp_path / "arm"
+    made(folder, site, "--address", ARM, "--role", "agent")
+    before = {path: path.read_bytes() for path in (*folder.iterdir(), *site.iterdir())}
+
+    again = new(folder, site, "--address", OTHER, "--role", "agent")
+
+    assert refused(again) == f"{folder}/identity.pem exists already"
+    assert refused(aira("identity", "site", site)) == f"{site}/ca.pem exists already"
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_the_roster_is_written_along_and_keeps_what_people_wrote(tmp_path: Path, site: Path) -> None:
+    roster = tmp_path / "roster.toml"
+    roster.write_text("# our site\nlighthouses = []\n")
+
+    arm = made(tmp_path / "arm", site, "--address", ARM, "--role", "agent", "--roster", roster)
+    more = ("--role", "edge", "--agent", ARM, "--device", "gripper", "--roster", roster)
+    made(tmp_path / "board", site, "--address", OTHER, *more, name="board")
+
+    assert roster.read_text().startswith("# our site\nlighthouses = []\n")
+    first, second = read_roster(roster).member
+    assert (first.address, first.roles, first.fingerprint) == (ARM, ("agent",), arm["fingerprint"])
+    assert (second.agent, second.device) == (ARM, "gripper")
+    shown = aira("identity", "show", tmp_path / "arm", "--roster", roster).stdout
+    assert shown.splitlines()[-1] == "roster       in the roster as agent"
+
+
+def test_who_can_t_be_in_the_roster_gets_no_certificate(tmp_path: Path, site: Path) -> None:
+    roster = tmp_path / "roster.toml"
+    made(tmp_path / "arm", site, "--address", ARM, "--role", "agent", "--roster", roster)
+
+    twice = new(tmp_path / "again", site, "--address", ARM, "--role", "agent", "--roster", roster, name="again")
+
+    assert refused(twice) == f"the roster {roster}: the address '{ARM}' is there twice"
+    assert not (tmp_path / "again").exists()
+
+
+def test_renewal_keeps_holder_and_key_and_tells_the_roster(tmp_path: Path, site: Path) -> None:
+    folder, roster = tmp_path / "arm", tmp_path / "roster.toml"
+    before = made(folder, site, "--address", ARM, "--role", "agent", "--days", "0.5", "--roster", roster)
+    key = (folder / "identity.key").read_bytes()
+
+    done = aira("identity", "renew", folder, "--site", site, "--days", "30", "--roster", roster, "--json")
+
+    after = json.loads(done.stdout)
+    assert after["validUntil"] > str(before["validUntil"])
+    assert [after[fact] for fact in ("name", "address", "roles")] == [
+        before[fact] for fact in ("name", "address", "roles")
+    ]
+    assert (folder / "identity.key").read_bytes() == key
+    assert read_roster(roster).member[0].fingerprint == after["fingerprint"] != before["fingerprint"]
+    assert sorted(path.name for path in folder.iterdir()) == ["ca.pem", "identity.key", "identity.pem"]
+
+
+def test_show_says_what_the_roster_thinks(tmp_path: Path, site: Path) -> None:
+    folder, roster = tmp_path / "arm", tmp_path / "roster.toml"
+    made(folder, site, "--address", ARM, "--role", "agent", "--roster", roster)
+    text = roster.read_text()
+
+    def standing() -> object:
+        return json.loads(aira("identity", "show", folder, "--roster", roster, "--json").stdout)["roster"]
+
+    roster.write_text(text + "revoked = true\n")
+    assert standing() == "revoked"
+    roster.write_text(text.replace(read_roster(roster).member[0].fingerprint, "ab" * 32))
+    assert standing() == "in the roster, with another certificate"
+    roster.write_text("")
+    assert standing() == "not in the roster"
+
+
+def test_a_router_is_made_without_an_account_but_for_a_host(tmp_path: Path, site: Path) -> None:
+    found = made(tmp_path / "hub", site, "--role", "router", "--host", "127.0.0.1", "--host", "hub.example", name="hub")
+
+    assert found["hosts"] == ["127.0.0.1", "hub.example"] or found["hosts"] == ["hub.example", "127.0.0.1"]
+    nowhere = new(tmp_path / "two", site, "--role", "router", name="two")
+    assert refused(nowhere) == "clients check where they connect to"
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (("--role", "agent"), "whose certificate is it to be?"),
+        (("--role", "agent", "--address", "0x12"), "'0x12' is not an address: an address is 0x and 40 hexadecimal"),
+        (("--role", "agent", "--address", ARM, "--agent", OTHER), "only one with the role edge serves a device"),
+        (("--role", "router", "--address", ARM, "--host", "a host"), "is no host"),
+    ],
+)
+def test_a_member_who_can_t_be_is_refused_in_a_line(
+    tmp_path: Path, site: Path, more: tuple[str, ...], said: str
+) -> None:
+    assert said in refused(new(tmp_path / "arm", site, *more))
+    assert not (tmp_path / "arm").exists()
+
+
+def test_an_unknown_role_names_those_that_there_are(tmp_path: Path, site: Path) -> None:
+    done = new(tmp_path / "arm", site, "--address", ARM, "--role", "king")
+
+    assert done.returncode == 2
+    assert "'king' is not one of" in done.stderr
+    assert "'watcher'" in done.stderr
+
+
+def test_files_that_are_no_identity_are_named(tmp_path: Path, site: Path) -> None:
+    folder = tmp_path / "arm"
+    made(folder, site, "--address", ARM, "--role", "agent")
+    made(tmp_path / "other", site, "--address", OTHER, "--role", "agent", name="other")
+    certificate, key = folder / "identity.pem", folder / "identity.key"
+    good = certificate.read_bytes()
+
+    assert refused(aira("identity", "show", tmp_path / "nobody")).endswith(
+        "it can't be read: No such file or directory"
+    )
+    key.write_bytes((tmp_path / "other" / "identity.key").read_bytes())
+    assert refused(aira("identity", "show", folder)) == f"{key}: the key does not belong to the certificate"
+    key.write_text("rubbish")
+    assert refused(aira("identity", "show", folder)) == f"{key}: this is no private key (PEM, without password)"
+    certificate.write_text("rubbish")
+    assert refused(aira("identity", "show", folder)) == f"{certificate}: this is no certificate (PEM)"
+    key.unlink()
+    certificate.write_bytes((site / "ca.pem").read_bytes())
+    assert refused(aira("identity", "show", folder)) == (
+        f"{certificate}: the common name of the certificate is 'AIRA mesh site', and not an address"
+    )
+    certificate.write_bytes(good)
+    other_site = tmp_path / "elsewhere"
+    aira("identity", "site", other_site)
+    assert refused(aira("identity", "renew", folder, "--site", other_site)) == (
+        f"{folder}/ca.pem: this identity is not of the site in {other_site}"
+    )
+    assert certificate.read_bytes() == good
+
+
+def test_a_site_that_has_expired_signs_nothing(tmp_path: Path) -> None:
+    aira("identity", "site", tmp_path / "site", "--days", "0.000001")
+
+    done = new(tmp_path / "arm", tmp_path / "site", "--address", ARM, "--role", "agent")
+
+    assert refused(done) == f"{tmp_path}/site/ca.pem: the site's certificate has expired"
+
+
+def test_check_tells_who_is_let_in_and_heeded_from_who_is_not(tmp_path: Path) -> None:
+    site = Site(tmp_path / "closed")
+    board = Member(name="board", address=OTHER, roles=("edge",), agent=ARM, device="gripper")
+    members = [
+        site.enlist(Member(name="arm", address=ARM, roles=("agent",))),
+        site.enlist(Member(name="screen", address="0x" + "0c" * 20, roles=("watcher",))),
+        site.enlist(board),
+    ]
+    gone = site.enlist(Member(name="gone", address="0x" + "0d" * 20, roles=("agent",), revoked=True))
+    stranger = site.certify("stranger", "0x" + "0e" * 20, "agent")
+
+    def check(folder: MemberFolder, *more: str) -> subprocess.CompletedProcess[str]:
+        own = ("--tls-certificate", folder.certificate, "--tls-key", folder.key)
+        return aira("identity", "check", "--connect", site.endpoint, "--tls-ca", folder.ca, *own, *more)
+
+    with site.open_router("wheel"):
+        arm, screen = (check(folder) for folder in members[:2])
+        edge = check(members[2], "--agent", ARM, "--device", "gripper")
+        for folder, address in ((gone, "0x" + "0d" * 20), (stranger, "0x" + "0e" * 20)):
+            done = check(folder)
+            assert done.returncode == 1
+            assert done.stderr.splitlines()[0] == (
+                f"aira: the router lets {address} in, and heeds nothing that it does: "
+                "it is not in the roster, or revoked"
+            )
+
+    assert (arm.returncode, arm.stdout) == (0, f"{ARM} is let in and heeded at {site.endpoint}\n")
+    assert (screen.returncode, edge.returncode) == (0, 0), (screen.stderr, edge.stderr)
+
+
+def test_check_without_an_identity_says_what_to_give() -> None:
+    assert refused(aira("identity", "check")) == "there is no identity"

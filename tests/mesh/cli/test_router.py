@@ -1,0 +1,191 @@
+"""`aira router`: open on this machine only, or closed by a roster that may change while it runs."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from contextlib import aclosing
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.identity import Member
+from mesh.network import Network, NetworkChange
+from tests.support.commands import AIRA, Serving, aira
+from tests.support.ports import free_port
+from tests.support.sites import Site, SiteZenohd
+from tests.support.waiting import until, until_heard
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mesh.identity.folders import MemberFolder
+
+ARM, ANN = "0x" + "01" * 20, "0x" + "02" * 20
+SECONDS = 60.0
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Site:
+    return Site(tmp_path)
+
+
+def options(site: Site) -> tuple[str, ...]:
+    settings = site.settings()
+    names = ("roster", "tls_ca", "tls_certificate", "tls_key")
+    flags = [word for name in names for word in (f"--{name.replace('_', '-')}", getattr(settings, name))]
+    return ("--listen", site.endpoint, *flags)
+
+
+def test_without_a_roster_it_says_that_only_this_machine_reaches_it() -> None:
+    says = "without a roster: only this machine reaches it, and everybody on it may do everything"
+    with Serving(*AIRA, "router", "--listen", f"tcp/127.0.0.1:{free_port()}", says=says) as router:
+        assert "listens at tcp/127.0.0.1:" in router.log()
+
+
+@pytest.mark.parametrize("command", ["router", "up"])
+@pytest.mark.parametrize("listen", ["tcp/0.0.0.0:{}", "tcp/[::]:{}", "tcp/example.org:{}", "udp/192.0.2.1:{}"])
+def test_without_a_roster_it_listens_nowhere_else(command: str, listen: str) -> None:
+    locator = listen.format(free_port())
+
+    done = aira(command, "--listen", locator)
+
+    assert done.returncode == 2
+    assert done.stderr.startswith(
+        f"aira: without a roster a router listens on loopback only, and {locator} is open to everybody\n"
+    )
+    assert "--roster" in done.stderr.splitlines()[1]
+
+
+def test_with_a_roster_it_does_not_listen_where_nobody_shows_who_he_is(site: Site) -> None:
+    done = aira("router", "--roster", site.roster, "--listen", "tcp/127.0.0.1:7447")
+
+    assert done.returncode == 2
+    assert done.stderr.splitlines() == [
+        "aira: tcp/127.0.0.1:7447 does not tell who connects, and there is a roster",
+        "      write it as tls/HOST:PORT",
+    ]
+
+
+def test_with_a_roster_it_needs_a_certificate(site: Site) -> None:
+    done = aira("router", "--roster", site.roster, "--listen", site.endpoint)
+
+    assert done.returncode == 2
+    assert "needs the site's certificate, its own and its key" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+async def speak(speaker: Network, listener: Network, key: str) -> None:
+    """Return when a put of the one has reached the other."""
+    heard: list[str] = []
+    with listener.session.declare_subscriber(key, lambda sample: heard.append(str(sample.key_expr))):
+        await until_heard(speaker.session, key)
+        speaker.session.put(key, b"")
+        await until(lambda: heard, seconds=SECONDS)
+
+
+async def test_who_is_revoked_is_cut_off_while_the_others_go_on(site: Site) -> None:
+    arm = site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
+    thief = site.enlist(Member(name="thief", address=ANN, roles=("agent",)))
+    screen = site.enlist(Member(name="screen", address="0x" + "03" * 20, roles=("watcher",)))
+    key = "aira/agent/{}/device/arm/state"
+    with Serving(*AIRA, "router", *options(site), says="let in: 3 of the roster") as router:
+        async with network(site, arm) as arms, network(site, thief) as thiefs, network(site, screen) as screens:
+            heard: list[str] = []
+            hear = screens.session.declare_subscriber("aira/agent/**", lambda one: heard.append(str(one.key_expr)))
+            await speak(thiefs, screens, key.format(ANN))
+            async with aclosing(screens.changes()) as changes:
+                change = asyncio.ensure_future(anext(changes))
+                await asyncio.sleep(0)
+                revoke(site, "thief")
+                async with asyncio.timeout(SECONDS):
+                    assert await change == NetworkChange.LOST
+                    assert await anext(changes) == NetworkChange.REGAINED
+            await until(lambda: "let in: 2 of the roster" in router.log(), seconds=SECONDS)
+
+            await until(lambda: thiefs.connected and arms.connected, seconds=SECONDS)
+            heard.clear()
+            thiefs.session.put(key.format(ANN), b"")
+            list(thiefs.session.get("aira/nobody"))  # the router has taken what came before
+            await speak(arms, screens, key.format(ARM))
+            assert set(heard) == {key.format(ARM)}
+            hear.undeclare()  # type: ignore[no-untyped-call]
+
+
+async def test_a_roster_that_is_broken_meanwhile_changes_nothing(site: Site) -> None:
+    arm = site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
+    good = site.roster.read_text()
+    with Serving(*AIRA, "router", *options(site), says="let in: 1 of the roster") as router:
+        async with network(site, arm) as arms, aclosing(arms.changes()) as changes:
+            change = asyncio.ensure_future(anext(changes))
+            site.roster.write_text("[[member]]\nname=")
+            await until(lambda: "the router goes on as it is" in router.log(), seconds=SECONDS)
+            site.roster.write_text(good)
+            await until(lambda: "the roster can be used again" in router.log(), seconds=SECONDS)
+            assert not change.done()
+            change.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await change
+        assert router.log().count("the router goes on as it is") == 1
+        assert "Traceback" not in router.log()
+
+
+def network(site: Site, folder: MemberFolder) -> Network:
+    return Network(site.client(folder))
+
+
+def revoke(site: Site, name: str) -> None:
+    text = site.roster.read_text()
+    fresh = site.roster.with_suffix(".fresh")
+    fresh.write_text(text.replace(f'name = "{name}"', f'name = "{name}"\nrevoked = true'))
+    fresh.replace(site.roster)
+
+
+def test_acl_says_what_each_may_do_and_of_the_revoked_nothing(site: Site) -> None:
+    site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
+    site.enlist(Member(name="gone", address=ANN, roles=("agent",), revoked=True))
+
+    table = aira("router", "acl", "--check", "--roster", site.roster)
+    found = json.loads(aira("router", "acl", "--check", "--json", "--roster", site.roster).stdout)
+    rules = json.loads(aira("router", "acl", "--roster", site.roster).stdout)
+
+    assert table.returncode == 0
+    rows = [line.split() for line in table.stdout.splitlines()]
+    assert rows[0] == ["NAME", "ADDRESS", "ROLES", "MAY", "KEYS"]
+    assert ["arm", ARM, "agent", "delete", f"aira/agent/{ARM}/**"] in rows
+    assert ["gone", ANN, "agent", "nothing", "(revoked)"] in rows
+    assert [one["name"] for one in found] == ["arm", "gone"]
+    assert found[0]["may"]["delete"] == [f"aira/agent/{ARM}/**"]
+    assert found[1] == {"name": "gone", "address": ANN, "roles": ["agent"], "revoked": True, "may": {}}
+    assert rules["default_permission"] == "deny"
+    assert [subject["id"] for subject in rules["subjects"]] == [ARM]
+
+
+def test_acl_without_a_roster_says_what_to_give() -> None:
+    done = aira("router", "acl", "--check")
+
+    assert done.returncode == 2
+    assert done.stderr.startswith("aira: there is no roster\n")
+
+
+async def test_config_makes_the_same_router_of_zenohd(site: Site, tmp_path: Path) -> None:
+    arm = site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
+    screen = site.enlist(Member(name="screen", address=ANN, roles=("watcher",)))
+    file = tmp_path / "zenohd.json5"
+
+    done = aira("router", *options(site), "config", "--out", file)
+
+    assert (done.returncode, done.stdout) == (0, f"zenohd --config {file}\n")
+    with SiteZenohd(site.port, file.read_text()):
+        async with network(site, arm) as arms, network(site, screen) as screens:
+            await speak(arms, screens, f"aira/agent/{ARM}/device/arm/state")
+
+
+def test_config_writes_nothing_that_cannot_work(site: Site, tmp_path: Path) -> None:
+    site.roster.write_text('[[member]]\nname="x"\naddress="0x12"\nroles=["agent"]\n')
+
+    done = aira("router", *options(site), "config", "--out", tmp_path / "zenohd.json5")
+
+    assert done.returncode == 2
+    assert "'0x12' is not an address" in done.stderr
+    assert not (tmp_path / "zenohd.json5").exists()

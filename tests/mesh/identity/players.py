@@ -1,0 +1,150 @@
+"""Who plays in the matrix: members of a site and two who don't belong, the keys that each tries, and what each may.
+
+The tables say by hand what `mesh.identity.roles` says for Zenoh.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mesh.identity import Member
+from schemas import (
+    CidKey,
+    DemandKey,
+    DeviceTopicKey,
+    EthEventKey,
+    EventKey,
+    FeedbackKey,
+    LiabilityTopicKey,
+    ObjectiveTopicKey,
+    OfferKey,
+    PendingKey,
+    PresenceKey,
+    RejectKey,
+    ResultKey,
+    RpcKey,
+)
+from tests.support.sites import MARKET
+
+ADDRESSES = {
+    name: "0x" + f"{number:02x}" * 20
+    for number, name in enumerate(
+        ("arm", "crane", "ann", "miner", "boss", "board", "bridge", "screen", "stranger", "gone", "witness"), 1
+    )
+}
+MEMBERS = (
+    Member(name="arm", address=ADDRESSES["arm"], roles=("agent",)),
+    Member(name="ann", address=ADDRESSES["ann"], roles=("person",)),
+    Member(name="miner", address=ADDRESSES["miner"], roles=("provider",)),
+    Member(name="boss", address=ADDRESSES["boss"], roles=("operator",)),
+    Member(name="board", address=ADDRESSES["board"], roles=("edge",), agent=ADDRESSES["arm"]),
+    Member(name="bridge", address=ADDRESSES["bridge"], roles=("bridge",)),
+    Member(name="screen", address=ADDRESSES["screen"], roles=("watcher",)),
+    Member(name="gone", address=ADDRESSES["gone"], roles=("agent", "provider"), revoked=True),
+    Member(name="witness", address=ADDRESSES["witness"], roles=("router",)),
+)
+WHO = ("arm", "ann", "miner", "boss", "board", "bridge", "screen", "stranger", "gone")
+"""Who tries. The stranger has a certificate of the site and is not in the roster."""
+
+MODEL = "QmWATWQ7fVPP2EFGu71UkfnqhYXDYH566qy47CnJDgvs8u"
+HASH = "ab" * 32
+LIABILITY = "0x" + "ee" * 20
+
+
+def space(agent: str, device: str) -> dict[str, str]:
+    """One key of each family below an agent."""
+    return {
+        "event": str(EventKey(agent, LIABILITY, "ready")),
+        "objective": str(ObjectiveTopicKey(agent, LIABILITY, "/a/b")),
+        "topic": str(LiabilityTopicKey(agent, LIABILITY, "/a/b")),
+        "device": str(DeviceTopicKey(agent, device, "/a/b")),
+        "rpc": str(RpcKey(agent, "eth/transfer")),
+        "eth": str(EthEventKey(agent, "transfer")),
+    }
+
+
+def keys_of(who: str) -> dict[str, str]:
+    """A key of each family: the own ones, those of a robot that the board serves, and those of others."""
+    own, other = ADDRESSES[who], ADDRESSES["crane"]
+    roles = ("agent", "person", "provider", "operator", "edge", "bridge", "bridge-turn-0-00000000000000ff", "watcher")
+    keys: dict[str, Any] = {
+        "demand": DemandKey(MARKET, MODEL, HASH),
+        "offer": OfferKey(MARKET, MODEL, HASH),
+        "result": ResultKey(MARKET, LIABILITY, HASH),
+        "feedback": FeedbackKey(MARKET, HASH, HASH),
+        "pending": PendingKey(MARKET, HASH),
+        "reject": RejectKey(MARKET, HASH, own),
+        "other reject": RejectKey(MARKET, HASH, other),
+        "cid": CidKey(MODEL),
+        "other market": DemandKey("elsewhere.lighthouse.3.robonomics.eth", MODEL, HASH),
+        "other presence": PresenceKey(MARKET, "agent", other),
+        "nowhere": "aira/nowhere",
+    }
+    keys |= {f"as {role}": PresenceKey(MARKET, role, own) for role in roles}
+    keys |= {f"own {name}": key for name, key in space(own, who).items()}
+    keys |= {f"other {name}": key for name, key in space(other, who).items()}
+    if who == "board":
+        keys |= {f"robot {name}": key for name, key in space(ADDRESSES["arm"], who).items()}
+        keys["robot's other device"] = DeviceTopicKey(ADDRESSES["arm"], "camera", "/a/b")
+    return {name: str(key) for name, key in keys.items()}
+
+
+KEYS = {who: keys_of(who) for who in WHO}
+OWN = {"own event", "own objective", "own topic", "own device", "own rpc", "own eth"}
+OTHER = {"other event", "other objective", "other topic", "other device", "other rpc", "other eth"}
+MARKETS = {"demand", "offer", "result", "feedback", "pending", "reject", "other reject"}
+PRESENCES = {name for name in KEYS["arm"] if name.startswith("as ")} | {"other presence"}
+NOBODY: dict[str, set[str]] = {who: set() for who in WHO}
+
+PUT = NOBODY | {
+    "arm": OWN | {"offer", "result"},
+    "ann": OWN | {"demand"},
+    "miner": OWN | {"feedback", "pending", "reject"},
+    "boss": OWN,
+    "board": {"robot topic", "robot device"},
+    "bridge": OWN | {"demand", "offer", "result", "feedback", "pending"},
+}
+DELETE = NOBODY | dict.fromkeys(("arm", "ann", "miner", "boss", "bridge"), OWN)
+SERVE = NOBODY | {
+    "arm": OWN | {"cid"},
+    "ann": OWN | {"cid"},
+    "miner": OWN | MARKETS,
+    "boss": OWN,
+    "board": {"robot topic", "robot device"},
+    "bridge": OWN | {"cid"},
+}
+TOKEN = NOBODY | {
+    "arm": OWN | {"as agent"},
+    "ann": OWN | {"as agent", "as person"},
+    "miner": OWN | {"as provider"},
+    "boss": OWN | {"as operator"},
+    "board": {"robot device"},
+    "bridge": OWN | {"as bridge", "as bridge-turn-0-00000000000000ff"},
+}
+GET = NOBODY | {
+    "arm": OWN | MARKETS | {"cid"},
+    "ann": OWN | MARKETS | {"cid"},
+    "miner": OWN | MARKETS,
+    "boss": OWN | OTHER | MARKETS | {"cid"},
+    "board": {"robot device"},
+    "bridge": OWN | MARKETS | {"cid"},
+    "screen": MARKETS | {"cid"},
+}
+SUBSCRIBE = NOBODY | {
+    "arm": OWN | MARKETS,
+    "ann": OWN | MARKETS,
+    "miner": OWN | MARKETS,
+    "boss": OWN | OTHER | MARKETS,
+    "board": {"robot topic", "robot device", "robot event", "robot objective"},
+    "bridge": OWN | MARKETS,
+    "screen": OWN | OTHER | MARKETS,
+}
+PRESENCE = NOBODY | {
+    "arm": OWN | PRESENCES,
+    "ann": OWN | PRESENCES,
+    "miner": OWN | PRESENCES,
+    "boss": OWN | OTHER | PRESENCES,
+    "board": {"robot device"},
+    "bridge": OWN | PRESENCES,
+    "screen": OWN | OTHER | PRESENCES,
+}

@@ -1,0 +1,89 @@
+"""A job on a closed site: robot, person and provider have what they need, and no change of the roster breaks it off."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from mesh.identity import Member
+from mesh.work import outbox
+from tests.mesh.operations.site import FEE
+from tests.mesh.operations.site import Site as Market
+from tests.support.commands import AIRA, Serving
+from tests.support.sites import Site
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mesh.identity.folders import MemberFolder
+    from schemas import Demand, Verified
+    from tests.support.nodes import Anvil
+
+COST = 500
+PATIENCE = 60.0
+ROLES = {"robot": "agent", "person": "person", "provider": "provider"}
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outbox, "RESEND", 0.3)
+
+
+def tls(folder: MemberFolder) -> dict[str, str]:
+    """The settings of who has this identity."""
+    return {"tls_ca": str(folder.ca), "tls_certificate": str(folder.certificate), "tls_key": str(folder.key)}
+
+
+def router(site: Site) -> Serving:
+    settings = site.settings()
+    flags = ("--listen", site.endpoint, "--roster", settings.roster, "--tls-ca", settings.tls_ca)
+    own = ("--tls-certificate", settings.tls_certificate, "--tls-key", settings.tls_key)
+    return Serving(*AIRA, "router", *flags, *own, says="let in: ")
+
+
+async def test_a_running_job_is_done_and_paid_while_one_is_revoked_and_another_renewed(
+    anvil: Anvil, tmp_path: Path
+) -> None:
+    site = Site(tmp_path / "site")
+    market = await Market.found(anvil.url, anvil.private_keys, site.endpoint, tmp_path)
+    folders = {
+        name: site.enlist(Member(name=name, address=market.address(name), roles=(role,)))  # type: ignore[arg-type]
+        for name, role in ROLES.items()
+    }
+    site.enlist(Member(name="thief", address="0x" + "0c" * 20, roles=("agent",)))
+    done: list[str] = []
+    robot, may_work = market.agent("robot", **tls(folders["robot"])), asyncio.Event()
+    person = market.agent("person", **tls(folders["person"]))
+    provider = Serving(
+        *AIRA,
+        "provider",
+        says="serves ",
+        variables=market.variables("provider", **tls(folders["provider"])),
+    )
+
+    @robot.on_demand
+    async def offer(demand: Verified[Demand]) -> None:
+        await robot.offer(demand, lighthouse_fee=FEE)
+
+    @robot.on("/say")
+    async def say(job: object, message: Any) -> None:
+        done.append(message.data)
+        await may_work.wait()
+
+    async with asyncio.timeout(3 * PATIENCE), router(site) as door, provider, robot, person:
+        before = await person.parts.chain.balance_of(market.address("robot"))
+        order = await person.demand(market.job("word"), cost=COST)
+        await until(lambda: done, what="the job under way", seconds=PATIENCE)
+
+        folders["robot"].renew(site=site.authority, days=1)
+        revoked = site.roster.read_text().replace('name = "thief"', 'name = "thief"\nrevoked = true')
+        site.roster.write_text(revoked)
+        await until(lambda: "let in: 3 of the roster" in door.log(), what="the new rules", seconds=PATIENCE)
+        may_work.set()
+
+        assert (await order.outcome()).success
+        assert done == ["word"]
+        assert await person.parts.chain.balance_of(market.address("robot")) == before + COST - FEE

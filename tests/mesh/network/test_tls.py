@@ -1,0 +1,274 @@
+"""Identities at the door: who is let in, what others are told, and sessions that go on when certificates change."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import shutil
+from contextlib import aclosing, closing
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+import zenoh
+
+from mesh.errors import ConfigurationError, NetworkUnavailable
+from mesh.identity import Member
+from mesh.identity.certificates import Holder
+from mesh.identity.folders import MemberFolder, SiteFolder
+from mesh.identity.routers import router_endpoints
+from mesh.network import Endpoints, Network, NetworkChange, NotAdmitted, Tls
+from tests.support.ports import free_port
+from tests.support.sites import Site
+from tests.support.waiting import at_most, until, until_heard
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+ARM = "0x" + "01" * 20
+ANN = "0x" + "02" * 20
+SECONDS = 60.0
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Site:
+    return Site(tmp_path)
+
+
+@pytest.fixture
+def arm(site: Site) -> MemberFolder:
+    return site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
+
+
+def foreigner(site: Site, address: str) -> MemberFolder:
+    """Somebody with a certificate that names an address of ours, from another site."""
+    elsewhere = SiteFolder(site.folder / "elsewhere")
+    elsewhere.make(name="another site", days=1)
+    folder = MemberFolder(site.folder / "foreigner")
+    folder.make(Holder(address=address), site=elsewhere, days=1)
+    return folder
+
+
+async def refused(endpoints: Endpoints) -> NotAdmitted:
+    """What is said to who is not let in, though he would wait for ever."""
+    with at_most(20), pytest.raises(NotAdmitted) as error:
+        async with Network(replace(endpoints, timeout=-1)):
+            pass
+    assert "\n" not in str(error.value)
+    assert "--tls-ca" in error.value.hint
+    return error.value
+
+
+@pytest.mark.parametrize("kind", ["wheel", "zenohd"])
+async def test_who_does_not_belong_is_told_so_at_once(site: Site, arm: MemberFolder, kind: str) -> None:
+    other = foreigner(site, ARM)
+    with site.open_router(kind):
+        async with Network(site.client(arm)) as network:
+            assert network.connected
+
+        nobody = Endpoints(connect=(site.endpoint,), tls=Tls(ca=arm.ca))
+        at = f"not let in by the Zenoh router at {site.endpoint}: "
+        assert str(await refused(nobody)) == at + "it lets nobody in without a certificate"
+
+        # To be known to the router by it, the foreigner says that it is of the router's site.
+        pretended = Tls(ca=other.ca, certificate=other.certificate, key=other.key)
+        said = str(await refused(Endpoints(connect=(site.endpoint,), tls=pretended)))
+        assert said.startswith(at + "its own certificate is not to be trusted: ")
+
+        mixed = Tls(ca=arm.ca, certificate=other.certificate, key=other.key)
+        with pytest.raises(ConfigurationError, match="it is not from the site of"):
+            async with Network(Endpoints(connect=(site.endpoint,), tls=mixed)):
+                pass
+
+
+@pytest.mark.parametrize("kind", ["wheel", "zenohd"])
+async def test_a_router_takes_no_certificate_of_another_site_even_if_the_client_trusts_both(
+    site: Site, kind: str
+) -> None:
+    other = foreigner(site, ARM)
+    both = site.folder / "both.pem"
+    both.write_bytes(site.authority.certificate.read_bytes() + other.ca.read_bytes())
+    tls = Tls(ca=both, certificate=other.certificate, key=other.key)
+
+    with site.open_router(kind):
+        error = await refused(Endpoints(connect=(site.endpoint,), tls=tls))
+
+    assert str(error).endswith("the certificate is not from its site")
+
+
+@pytest.mark.parametrize("kind", ["wheel", "zenohd"])
+async def test_an_expired_certificate_is_named(site: Site, kind: str) -> None:
+    old = site.certify("old", ARM, "agent", days=-0.001)
+
+    with site.open_router(kind), at_most(20), pytest.raises(ConfigurationError) as error:
+        async with Network(site.client(old, timeout=-1)):
+            pass
+
+    assert str(error.value) == f"the certificate {old.certificate} is of no use: it has expired"
+    assert "aira identity renew" in error.value.hint
+
+
+@pytest.mark.parametrize("kind", ["wheel", "zenohd"])
+async def test_the_router_itself_keeps_them_out_whatever_their_program_checks(
+    site: Site, arm: MemberFolder, kind: str
+) -> None:
+    old, other = site.certify("old", ARM, "agent", days=-0.001), foreigner(site, ARM)
+    identities = [
+        Tls(ca=arm.ca),
+        Tls(ca=arm.ca, certificate=old.certificate, key=old.key),
+        Tls(ca=arm.ca, certificate=other.certificate, key=other.key),
+    ]
+    with site.open_router(kind):
+        for tls in identities:
+            config = zenoh.Config()
+            for path, value in Endpoints(connect=(site.endpoint,), tls=tls).options().items():
+                config.insert_json5(path, json.dumps(value))
+            with pytest.raises(zenoh.ZError):
+                await asyncio.to_thread(zenoh.open, config)
+
+
+async def test_a_router_at_another_host_than_its_certificate_says_is_not_trusted(site: Site, arm: MemberFolder) -> None:
+    with site.open_router("wheel"):
+        elsewhere = replace(site.client(arm), connect=(f"tls/localhost:{site.port}",))
+        error = await refused(elsewhere)
+
+    assert "Hostname mismatch, certificate is not valid for 'localhost'" in str(error)
+
+
+async def test_a_router_that_is_not_there_is_waited_for_as_long_as_told(site: Site, arm: MemberFolder) -> None:
+    with at_most(20), pytest.raises(NetworkUnavailable, match=r"no answer within 0\.5 s"):
+        async with Network(site.client(arm, timeout=0.5)):
+            pass
+
+
+async def test_of_two_routers_the_one_that_lets_in_will_do(site: Site, tmp_path: Path) -> None:
+    ours = Site(tmp_path / "ours")
+    arm = ours.enlist(Member(name="arm", address=ARM, roles=("agent",)))
+    with site.open_router("wheel"), ours.open_router("wheel"):
+        both = replace(ours.client(arm), connect=(site.endpoint, ours.endpoint))
+        async with Network(both) as network:
+            assert network.connected
+
+
+async def test_a_second_router_of_the_site_takes_over(site: Site, arm: MemberFolder) -> None:
+    first, second = site.endpoint, f"tls/127.0.0.1:{free_port()}"
+    ann = site.enlist(Member(name="ann", address=ANN, roles=("watcher",)))
+    endpoints = router_endpoints(site.settings())
+    key = f"aira/agent/{ARM}/device/arm/state"
+    async with Network(replace(endpoints, listen=(second,))), Network(endpoints) as gone:
+        arms = Network(replace(site.client(arm), connect=(first, second)))
+        anns = Network(replace(site.client(ann), connect=(first, second)))
+        async with arms, anns, aclosing(arms.changes()) as changes:
+            change = asyncio.ensure_future(anext(changes))
+            await asyncio.sleep(0)
+            await gone.__aexit__(None, None, None)
+            async with asyncio.timeout(SECONDS):
+                assert await change == NetworkChange.LOST
+                assert await anext(changes) == NetworkChange.REGAINED
+            await heard(anns.session, arms.session, key)
+
+
+async def heard(listener: zenoh.Session, speaker: zenoh.Session, key: str) -> None:
+    """Return when what one puts on the key has reached the other."""
+    heard: list[str] = []
+    with listener.declare_subscriber(key, lambda sample: heard.append(str(sample.key_expr))):
+        await until_heard(speaker, key)
+        speaker.put(key, b"")
+        await until(lambda: heard, seconds=SECONDS)
+
+
+@pytest.mark.parametrize("kind", ["wheel", "zenohd"])
+async def test_a_session_outlives_its_certificate_when_that_was_renewed(site: Site, kind: str) -> None:
+    site.roster.write_text(site.roster.read_text() + f'[[member]]\nname="arm"\naddress="{ARM}"\nroles=["agent"]\n')
+    seconds = 8.0
+    arm = site.certify("arm", ARM, "agent", days=seconds / 86_400)
+    key = f"aira/agent/{ARM}/device/arm/state"
+    with site.open_router(kind):
+        async with Network(site.client(arm)) as network:
+            session = network.session
+            got: list[str] = []
+            with session.declare_subscriber(key, lambda sample: got.append(str(sample.key_expr))):
+                async with aclosing(network.changes()) as changes:
+                    change = asyncio.ensure_future(anext(changes))
+                    await asyncio.sleep(0)
+                    arm.renew(site=site.authority, days=1)
+                    async with asyncio.timeout(SECONDS):
+                        assert await change == NetworkChange.LOST
+                        assert await anext(changes) == NetworkChange.REGAINED
+
+                assert network.session is session
+                async with Network(site.client(arm)) as second:
+                    await until_heard(second.session, key)
+                    second.session.put(key, b"")
+                    await until(lambda: got, seconds=SECONDS)
+
+
+async def test_files_that_cannot_work_are_named(site: Site, arm: MemberFolder, tmp_path: Path) -> None:
+    ann = site.certify("ann", ANN, "person")
+    rubbish = tmp_path / "rubbish"
+    rubbish.write_text("rubbish")
+    missing = tmp_path / "missing"
+    cases = [
+        (Tls(ca=missing), f"can't read the site's certificate {missing}: No such file or directory"),
+        (Tls(ca=rubbish), f"the site's certificate {rubbish} is no certificate (PEM)"),
+        (Tls(ca=arm.ca, certificate=arm.certificate), "of tls_certificate and tls_key only one is set"),
+        (
+            Tls(ca=arm.ca, certificate=missing, key=arm.key),
+            f"can't read the certificate {missing}: No such file or directory",
+        ),
+        (
+            Tls(ca=arm.ca, certificate=arm.certificate, key=missing),
+            f"can't read the key {missing}: No such file or directory",
+        ),
+        (
+            Tls(ca=arm.ca, certificate=arm.certificate, key=ann.key),
+            f"the key {ann.key} does not belong to the certificate {arm.certificate}",
+        ),
+        (
+            Tls(ca=arm.ca, certificate=rubbish, key=arm.key),
+            f"the certificate {rubbish} or its key {arm.key} is not PEM, or has a password",
+        ),
+        (None, "a tls/ endpoint needs the site's certificate"),
+    ]
+    for tls, said in cases:
+        with pytest.raises(ConfigurationError) as error:
+            Endpoints(connect=(site.endpoint,), tls=tls).config()
+        assert str(error.value) == said
+        assert error.value.hint
+    with pytest.raises(ConfigurationError, match="a router needs a certificate"):
+        Endpoints(mode="router", listen=(site.endpoint,), tls=Tls(ca=arm.ca)).config()
+
+
+async def test_a_router_whose_certificate_is_of_another_site_does_not_begin(site: Site) -> None:
+    other = foreigner(site, ARM)
+    shutil.copy(site.authority.certificate, site.folder / "ca.pem")
+    tls = Tls(ca=site.folder / "ca.pem", certificate=other.certificate, key=other.key)
+
+    with pytest.raises(ConfigurationError, match="is not from the site of"):
+        Endpoints(mode="router", listen=(site.endpoint,), tls=tls).config()
+
+
+async def test_who_speaks_no_tls_is_not_let_in(site: Site, arm: MemberFolder) -> None:
+    with site.open_router("wheel"), at_most(20), pytest.raises(NetworkUnavailable):
+        async with Network(Endpoints(connect=(f"tcp/127.0.0.1:{site.port}",), timeout=0.5)):
+            pass
+
+
+def test_no_file_with_a_key_can_be_read_by_others(site: Site, arm: MemberFolder) -> None:
+    umask = os.umask(0)
+    try:
+        ann = site.certify("ann", ANN, "person")
+    finally:
+        os.umask(umask)
+
+    assert [path.stat().st_mode & 0o777 for path in (site.authority.key, arm.key, ann.key)] == [0o600] * 3
+
+
+def test_a_port_that_answers_nothing_is_no_refusal(site: Site, arm: MemberFolder) -> None:
+    import socket
+
+    from mesh.network.handshake import refusal
+
+    with closing(socket.create_server(("127.0.0.1", site.port))):
+        assert refusal(site.client(arm).tls or pytest.fail("no identity"), site.endpoint, 0.2) is None
