@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from schemas import Verified
 
 
+USED: Final = "OrderUsed"
+"""The contracts' error of an order that has become a contract before."""
 NAMELESS: Final = "Reverted"
 """What a refusal is called whose contract gave it no name."""
 
@@ -29,7 +31,7 @@ def at_fault(match: Match, reason: str, arguments: Sequence[Any]) -> tuple[Verif
     """
     both: tuple[Verified[Order], ...] = (match.demand, match.offer)
     match reason, *arguments:
-        case "OrderUsed", used:
+        case name, used if name == USED:
             return tuple(order for order in both if order.hash == _bytes(used)) or both
         case "DeadlineReached", deadline:
             return tuple(order for order in both if order.message.deadline == deadline) or both

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from mesh.errors import ConfigurationError
-from mesh.settings import MEANING, NOT_OPTIONS, Settings, load
+from mesh.settings import CHAIN_SETTINGS, MEANING, NOT_OPTIONS, Settings, load
 
 NOTHING: dict[str, str] = {}
 
@@ -32,6 +32,35 @@ def test_without_anything_the_legacy_defaults_hold() -> None:
     assert settings.erc20_token == "xrt.3.robonomics.eth"
     assert settings.enable_executor is True
     assert settings.recording_topics == settings.ens_contract == ""
+
+
+def test_the_names_of_the_contracts_are_those_of_the_generation() -> None:
+    settings = load(environ={"AIRA_GENERATION": "5"})
+
+    assert settings.factory_contract == "factory.5.robonomics.eth"
+    assert settings.lighthouse_contract == "airalab.lighthouse.5.robonomics.eth"
+    assert settings.xrt_contract == settings.erc20_token == "xrt.5.robonomics.eth"
+
+
+def test_names_that_are_given_are_kept_whatever_the_generation() -> None:
+    given = {"factory_contract": "0xFactory", "lighthouse_contract": "mine.lighthouse.3.robonomics.eth"}
+
+    settings = load(environ=NOTHING, flags=given | {"generation": 5, "erc20_token": "dai.test"})
+
+    assert (settings.factory_contract, settings.lighthouse_contract) == tuple(given.values())
+    assert (settings.erc20_token, settings.xrt_contract) == ("dai.test", "xrt.5.robonomics.eth")
+
+
+def test_an_empty_name_is_one_that_is_not_given() -> None:
+    assert load(environ={"AIRA_FACTORY_CONTRACT": "", "AIRA_GENERATION": "5"}) == Settings(generation=5)
+
+
+def test_the_websocket_is_used_where_there_is_no_other_address() -> None:
+    assert Settings().node == "http://127.0.0.1:8545"
+    assert load(environ={"AIRA_WEB3_HTTP_PROVIDER": " "}).node == "ws://127.0.0.1:8546"
+    assert Settings(web3_http_provider="http://a:1, ws://b:2").node == "http://a:1, ws://b:2"
+    with pytest.raises(ConfigurationError, match="web3_http_provider and web3_ws_provider are both empty"):
+        Settings(web3_http_provider="", web3_ws_provider="").node  # noqa: B018
 
 
 def test_variables_win_over_the_file_and_flags_over_both(tmp_path: Path) -> None:
@@ -134,6 +163,11 @@ def test_a_retired_option_is_reported_and_not_obeyed(
     ("option", "value"),
     [
         ("generation", 4),
+        ("contracts", "others"),
+        ("max_fee_gwei", 0),
+        ("max_fee_gwei", float("nan")),
+        ("confirmations", 0),
+        ("reorg_depth", 0),
         ("generation", "three"),
         ("enable_executor", "perhaps"),
         ("poll_interval", 0),
@@ -199,6 +233,10 @@ def test_another_lighthouse_changes_nothing_else() -> None:
 
 def test_every_option_has_its_meaning_in_words() -> None:
     assert set(MEANING) == set(Settings.__struct_fields__)
+
+
+def test_what_decides_of_the_chain_are_options() -> None:
+    assert set(Settings.__struct_fields__) >= set(CHAIN_SETTINGS)
 
 
 def test_the_file_that_aira_config_names_is_read(tmp_path: Path) -> None:

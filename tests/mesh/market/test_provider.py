@@ -352,7 +352,9 @@ async def test_a_provider_runs_inside_async_with_and_needs_an_account(floor: Flo
         provider = Provider(floor.session, chain, floor.market)
         with pytest.raises(ClosedError):
             await provider.run()
-        assert provider.earnings() == Earnings(created=0, finalized=0, rejected={}, gas_used=0, fees=0)
+        assert provider.earnings() == Earnings(
+            created=0, finalized=0, rejected={}, gas_used=0, spent=0, fees=0, minted=0
+        )
         async with provider:
             pass
         with pytest.raises(ClosedError):

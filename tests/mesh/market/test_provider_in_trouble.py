@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.chain import JsonRpcServer
+from mesh.chain import GWEI, JsonRpcServer
 from mesh.demo.market import found_market
-from mesh.market import order_id, sending
-from mesh.market import provider as provider_module
+from mesh.market import order_id, sending, watching
 from schemas import verify_message
 from tests.mesh.market.floor import QUICK, Floor
 from tests.mesh.market.tokens import BURNS_ALL_GAS, deploy_token, refuses_with, says
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
 @pytest.fixture(autouse=True)
 def impatience(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is tried again is tried again soon."""
-    for module in (sending, provider_module):
+    for module in (sending, watching):
         monkeypatch.setattr(module, "RETRY", 0.05)
 
 
@@ -69,7 +68,7 @@ async def test_a_provider_without_a_stake_waits_and_rejects_nobody(
         demand = floor.demand()
         floor.publish(demand, floor.offer())
         with caplog.at_level("INFO"):
-            await until(lambda: "NotAProvider" in caplog.text)
+            await until(lambda: "has no stake at the lighthouse" in caplog.text)
 
         await floor.stake("provider", floor.lighthouse, 5)
 
@@ -156,6 +155,7 @@ async def test_a_node_that_is_away_for_a_while_costs_no_order_and_no_result(
         first, second = floor.demand(cost=0), floor.demand(cost=0)
         floor.publish(first, floor.offer(cost=0))
         liability = await floor.liability_of(first)
+        await until(lambda: liability.address in provider._watching._open)
 
         await node.__aexit__(None, None, None)
         floor.publish(second, floor.offer(cost=0), floor.result(liability.address))
@@ -169,6 +169,8 @@ async def test_a_node_that_is_away_for_a_while_costs_no_order_and_no_result(
             await until(lambda: len(provider.book) == 1)
             await floor.mine(2)
             await until(lambda: len(provider.book) == 0)
+            assert caplog.text.count("can't be read on") == 1
+            assert caplog.text.count("a transaction waits") == 1
     assert floor.rejections == []
 
 
@@ -209,6 +211,34 @@ async def test_a_transaction_that_is_not_mined_for_long_is_waited_for(
         assert floor.rejections == []
 
 
+async def test_gas_that_is_too_dear_is_waited_for_and_said_once(
+    anvil: Anvil, router: EmbeddedRouter, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    market = await found_market(anvil.url, anvil.private_keys)
+    floor = Floor(market, router.endpoint, node=anvil.url, keys=anvil.private_keys)
+    async with floor, floor.provider() as provider:
+        await base_fee(floor, 900 * GWEI)
+        demand = floor.demand()
+        floor.publish(demand, floor.offer())
+        await until(lambda: "gas costs" in caplog.text)
+        await asyncio.sleep(0.5)  # for some more attempts
+        assert caplog.text.count("gas costs") == 1
+
+        await base_fee(floor, GWEI)
+
+        await floor.liability_of(demand)
+        await until(lambda: provider.earnings().created == 1)
+        assert caplog.text.count("transactions go through again") == 1
+        assert floor.rejections == []
+
+
+async def base_fee(floor: Floor, wei: int) -> None:
+    """Have a block in which gas costs so much."""
+    await floor.request("anvil_setNextBlockBaseFeePerGas", hex(wei))
+    await floor.request("evm_mine")
+
+
 async def test_what_the_chain_takes_back_is_done_again(floor: Floor) -> None:
     async with floor.provider() as provider:
         early = floor.demand(cost=0)
@@ -220,14 +250,17 @@ async def test_what_the_chain_takes_back_is_done_again(floor: Floor) -> None:
         floor.publish(late := floor.demand(cost=0), floor.offer(cost=0))
         await floor.liability_of(late)
         await until(lambda: (provider.earnings().created, provider.earnings().finalized) == (2, 1))
-        await until(lambda: not provider._liabilities.keys() & {liability.address})
+        await until(lambda: not provider._watching._open.keys() & {liability.address})
 
         await floor.request("evm_revert", snapshot)
         assert not (await floor.chain.liability(liability.address)).is_finalized
         await floor.mine(5)
 
-        await until(lambda: (provider.earnings().created, provider.earnings().finalized) == (3, 2))
-        assert (await floor.chain.liability(liability.address)).is_finalized
+        async def finalized() -> bool:
+            return (await floor.chain.liability(liability.address)).is_finalized
+
+        await until_found(finalized)
+        await until(lambda: (provider.earnings().created, provider.earnings().finalized) == (2, 1))
         assert len(await floor.liabilities_of(late)) == 1
 
 

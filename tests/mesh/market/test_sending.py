@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 async def sender(floor: Floor) -> AsyncIterator[Sending]:
     """The transactions of the market's provider."""
     async with floor.chain_of("provider") as chain:
-        yield Sending(chain, floor.lighthouse)
+        yield Sending(chain, floor.lighthouse, provider=floor.address("provider"), head=lambda: 0)
 
 
 async def test_work_is_done_in_its_order_one_at_a_time(sender: Sending) -> None:

@@ -1,0 +1,110 @@
+"""Making contracts of orders that agree, and ending them by their Results: a provider's work on the chain."""
+
+from __future__ import annotations
+
+import logging
+from functools import partial
+from typing import TYPE_CHECKING, Any, Protocol
+
+from mesh.chain import NodeUnreachable, RequestRefused, Reverted
+from mesh.errors import AiraError, InputError
+from mesh.market.blame import at_fault, word_for
+
+if TYPE_CHECKING:
+    from mesh.chain import Chain
+    from mesh.market.book import Match, Order
+    from mesh.market.earnings import Books
+    from mesh.market.sending import Sending
+    from mesh.market.used import Used
+    from schemas import Result, Verified
+
+log = logging.getLogger(__name__)
+
+
+class Desk(Protocol):
+    """Where orders and Results come from, and go back to."""
+
+    def put_back(self, order: Verified[Order]) -> None:
+        """An order that was matched stays in the market: its counterpart was to blame."""
+
+    def reject(self, message: Verified[Any], reason: str, detail: str) -> None:
+        """A message can't be used: for its sender the machine-readable reason, and words for people."""
+
+    def forget(self, result: Verified[Result]) -> None:
+        """Nothing came of a Result this time: it counts when it is sent again."""
+
+
+class Contracting:
+    """The contracts of the lighthouse at the address `lighthouse`. Whatever is asked for is done in its turn."""
+
+    def __init__(
+        self, chain: Chain, lighthouse: str, desk: Desk, *, sending: Sending, books: Books, used: Used
+    ) -> None:
+        self._chain = chain
+        self._lighthouse = lighthouse
+        self._desk = desk
+        self._sending = sending
+        self._books = books
+        self._used = used
+
+    def make(self, match: Match) -> None:
+        """Make a contract of a pair; what can't become one leaves the market, the other order stays."""
+        self._sending.put(partial(self._make, match))
+
+    def end(self, result: Verified[Result]) -> None:
+        """Finalize a contract by its Result."""
+        self._sending.put(partial(self._end, result))
+
+    async def _make(self, match: Match) -> None:
+        demand, offer = match
+        try:
+            created = await self._sending.send(
+                lambda: self._chain.create_liability(self._lighthouse, demand.message, offer.message)
+            )
+        except Reverted as error:
+            self._books.failed(error)
+            await self._part(match, gone=at_fault(match, error.reason, error.arguments), error=error)
+        except (NodeUnreachable, RequestRefused, InputError) as error:
+            await self._part(match, gone=match, error=error)
+        else:
+            self._books.made(created, fee=offer.message.lighthouse_fee)
+            self._used.add(created.liability, demand, offer)
+            log.info("%s: created, gas %d", created.liability, created.gas_used)
+
+    async def _part(self, match: Match, *, gone: tuple[Verified[Order], ...], error: AiraError) -> None:
+        """Reject the orders that are to blame, and put back the other one, unless it was used meanwhile."""
+        for order in match:
+            if order in gone:
+                self._desk.reject(order, _reason(error), str(error))
+            elif not await self._sending.ask(partial(self._is_used, order)):
+                self._desk.put_back(order)
+
+    async def _is_used(self, order: Verified[Order]) -> bool:
+        try:
+            if order.message.generation == 3:
+                return await self._chain.is_order_used(order.hash)
+            return await self._chain.nonce_of(order.signer) > int(order.message.nonce)
+        except RequestRefused:
+            return False  # the contracts will say so when it is matched
+
+    async def _end(self, result: Verified[Result]) -> None:
+        message = result.message
+        try:
+            settled = await self._sending.send(lambda: self._chain.finalize(self._lighthouse, message))
+        except Reverted as error:
+            self._books.failed(error)
+            if error.reason != "AlreadyFinalized":
+                self._desk.reject(result, _reason(error), str(error))
+        except (NodeUnreachable, RequestRefused) as error:
+            # Neither is the Result's fault for certain, and whoever is to be paid goes on sending it.
+            self._desk.reject(result, _reason(error), str(error))
+            self._desk.forget(result)
+        else:
+            self._books.ended(message.liability, settled)
+            self._used.add(message.liability, result)
+            log.info("%s: finalized, success %s, gas %d", message.liability, message.success, settled.gas_used)
+
+
+def _reason(error: AiraError) -> str:
+    """The machine-readable word for why something was refused."""
+    return word_for(error.reason if isinstance(error, Reverted) else type(error).__name__)

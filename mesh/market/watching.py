@@ -1,0 +1,119 @@
+"""What the chain says of a market: contracts that were made and have ended, and what it takes back."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from contextlib import aclosing
+from typing import TYPE_CHECKING
+
+from mesh.chain import (
+    Finalized,
+    History,
+    NewLiability,
+    NoContracts,
+    NodeUnreachable,
+    NotALiability,
+    Reorganised,
+    RequestRefused,
+)
+from mesh.market.sending import RETRY
+from mesh.trouble import Trouble
+from schemas import Demand, Offer, Result, address_bytes
+
+if TYPE_CHECKING:
+    from mesh.chain import BlockEvents, Chain
+    from mesh.market.book import OrderBook
+    from mesh.market.contracting import Contracting, Desk
+    from mesh.market.earnings import Books
+    from mesh.market.used import Used
+    from schemas import Liability
+
+log = logging.getLogger(__name__)
+
+
+class Watching:
+    """Reads the chain for the provider of the lighthouse at the address `lighthouse`, from after block `head`."""
+
+    def __init__(
+        self,
+        chain: Chain,
+        lighthouse: str,
+        desk: Desk,
+        *,
+        head: int,
+        book: OrderBook,
+        contracting: Contracting,
+        books: Books,
+        used: Used,
+    ) -> None:
+        self.head = head
+        """The latest block that was read."""
+        self._chain = chain
+        self._lighthouse = lighthouse
+        self._desk = desk
+        self._book = book
+        self._contracting = contracting
+        self._books = books
+        self._used = used
+        self._history = History(chain.node.timing.reorg_depth)
+        self._open: dict[str, Liability] = {}
+        self._trouble = Trouble(log)
+
+    async def run(self) -> None:
+        """Read until cancelled: orders that others made into contracts, and those whose time has passed, leave the
+        book; what the chain takes back is done again."""
+        while True:
+            try:
+                async with aclosing(self._chain.events(self.head + 1, history=self._history)) as blocks:
+                    async for block in blocks:
+                        self._trouble.over(f"the chain can be read again, from block {block.block_number}")
+                        if isinstance(block, Reorganised):
+                            self._take_back(block)
+                        else:
+                            await self._take_block(block)
+            except (NodeUnreachable, RequestRefused, NotALiability, NoContracts) as error:
+                # The latter two of a contract in a block that the chain has replaced meanwhile: that is told next.
+                self._trouble.met(error, f"the chain can't be read on from block {self.head + 1}")
+                await asyncio.sleep(RETRY)
+
+    async def liability(self, address: str) -> Liability:
+        """The record of a liability. Raises `NotALiability`, `NodeUnreachable`, `RequestRefused`."""
+        return self._open.get(address) or await self._chain.liability(address)
+
+    async def _take_block(self, block: BlockEvents) -> None:
+        for event in block.events:
+            if isinstance(event, NewLiability):
+                await self._forget_orders(event.liability)
+            elif isinstance(event, Finalized):
+                self._open.pop(event.liability, None)
+        self.head = block.block_number
+        for order in self._book.expire(self.head):
+            log.info("expired order %s of %s", order.hash.hex(), order.signer)
+
+    async def _forget_orders(self, address: str) -> None:
+        liability = await self._chain.liability(address)
+        if liability.lighthouse != self._lighthouse:
+            return
+        demand_hash, offer_hash = await self._chain.order_hashes(address)
+        demand = self._book.remove(demand_hash + address_bytes(liability.promisee))
+        offer = self._book.remove(offer_hash + address_bytes(liability.promisor))
+        self._used.add(address, demand, offer)
+        if not liability.is_finalized:
+            self._open[address] = liability
+
+    def _take_back(self, block: Reorganised) -> None:
+        """What the chain has undone is done again, unless it comes again by itself: then the contracts say so."""
+        self.head = block.back_to
+        created = [event.liability for event in block.events_taken_back if isinstance(event, NewLiability)]
+        finalized = [event.liability for event in block.events_taken_back if isinstance(event, Finalized)]
+        log.warning("the chain took back %d contracts and %d endings", len(created), len(finalized))
+        for address in created:
+            self._open.pop(address, None)
+            self._books.unmade(address)
+            for order in self._used.pop(address, Demand, Offer):
+                self._desk.put_back(order)
+        for address in finalized:
+            self._books.unended(address)
+            for result in self._used.pop(address, Result):
+                self._contracting.end(result)

@@ -1,0 +1,73 @@
+"""A provider's account: what was earned, what was spent, what the chain took back."""
+
+from __future__ import annotations
+
+from mesh.chain import Created, Reverted, Settled
+from mesh.market.earnings import Books, Earnings
+
+ADDRESS = "0x19437Cb65760805A0e55339186F03B2d980eBBf9"
+OTHER = "0x27023154114b066515Ae678cb06E19417B8fcA73"
+NOTHING = Earnings(created=0, finalized=0, rejected={}, gas_used=0, spent=0, fees=0, minted=0)
+
+
+def created(address: str = ADDRESS) -> Created:
+    return Created(address, "0xabc", gas_used=150_000, wei=3 * 10**14)
+
+
+def settled() -> Settled:
+    return Settled("0xdef", gas_used=100_000, wei=2 * 10**14, minted=42_000)
+
+
+def test_a_whole_job_is_summed_up() -> None:
+    books = Books()
+    books.made(created(), fee=5)
+    books.ended(ADDRESS, settled())
+    assert books.earnings() == Earnings(
+        created=1, finalized=1, rejected={}, gas_used=250_000, spent=5 * 10**14, fees=5, minted=42_000
+    )
+
+
+def test_what_failed_is_paid_for_if_it_was_mined() -> None:
+    books = Books()
+    books.failed(Reverted("NotYourTurn"))
+    assert books.earnings() == NOTHING
+    books.failed(Reverted("NotYourTurn", gas_used=30_000, wei=7))
+    assert (books.earnings().gas_used, books.earnings().spent) == (30_000, 7)
+
+
+def test_what_the_chain_takes_back_is_struck_out() -> None:
+    books = Books()
+    books.made(created(), fee=5)
+    books.made(created(OTHER), fee=1)
+    books.ended(ADDRESS, settled())
+    books.unended(ADDRESS)
+    books.unmade(ADDRESS)
+    books.unmade(ADDRESS)
+    assert books.earnings() == Earnings(
+        created=1, finalized=0, rejected={}, gas_used=150_000, spent=3 * 10**14, fees=1, minted=0
+    )
+
+
+def test_what_others_made_is_not_struck_out() -> None:
+    books = Books()
+    books.unmade(ADDRESS)
+    books.unended(ADDRESS)
+    assert books.earnings() == NOTHING
+
+
+def test_rejections_are_counted_by_reason() -> None:
+    books = Books()
+    for reason in ("full", "expired", "full"):
+        books.rejected(reason)
+    assert books.earnings().rejected == {"full": 2, "expired": 1}
+
+
+def test_the_account_is_one_line() -> None:
+    books = Books()
+    books.made(created(), fee=2 * 10**9)
+    books.ended(ADDRESS, settled())
+    books.rejected("full")
+    assert str(books.earnings()) == (
+        "contracts: 1 made, 1 finalized; messages rejected: 1; "
+        "earned 2.000042 XRT (2 in fees, 0.000042 minted for gas), spent 0.0005 ETH on 250,000 gas"
+    )

@@ -1,0 +1,126 @@
+"""A market as it is operated: a chain behind a URL, a router, and programs of their own with keyfiles and state."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+from mesh.agent import Agent
+from mesh.agent.parts import chain_of
+from mesh.chain import XRT, Account, Chain, write_keyfile
+from mesh.demo.market import ALLOWANCE, ROLES, found_market
+from mesh.settings import Settings
+from schemas import cid_of_bytes
+from tests.support.commands import AIRA, Serving
+from tests.support.objectives import objective
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from mesh.chain import NewLighthouse
+    from schemas import Demand, Verified
+
+MODEL: Final = cid_of_bytes(b"what the robots of the operated market can do")
+PEOPLE: Final = (*ROLES, "rival", "poor")
+"""Who has an account; `rival` and `poor` have ETH only."""
+FEE: Final = 5
+"""What the robot's offers give to the provider, wn."""
+PASSWORD: Final = "only for tests"
+
+
+class Site:
+    """`await Site.found(url, keys, endpoint, folder)`: where the chain's node and the router are."""
+
+    def __init__(self, url: str, keys: Sequence[bytes], endpoint: str, folder: Path) -> None:
+        self.url = url
+        self.endpoint = endpoint
+        self.folder = folder
+        self.keys = dict(zip(PEOPLE, keys, strict=False))
+        self.accounts = {role: Account.from_key(key) for role, key in self.keys.items()}
+        self.lighthouse = Settings().lighthouse_contract
+
+    @classmethod
+    async def found(cls, url: str, keys: Sequence[bytes], endpoint: str, folder: Path) -> Site:
+        """Deploy a market, and have its promises allowed once for all."""
+        await found_market(url, keys)
+        site = cls(url, keys, endpoint, folder)
+        for role in ("robot", "person"):
+            async with site.chain(role) as chain:
+                await chain.approve(chain.factory, ALLOWANCE)
+        return site
+
+    def address(self, role: str) -> str:
+        return self.accounts[role].address
+
+    def settings(self, role: str, **options: Any) -> Settings:
+        """An agent's settings. Objectives are played at once."""
+        fields: dict[str, Any] = {
+            "connect": (self.endpoint,),
+            "data_dir": str(self.folder / "state"),
+            "web3_http_provider": self.url,
+            "lighthouse_contract": self.lighthouse,
+            "poll_interval": 0.05,
+            "playback": "at-once",
+        }
+        return Settings(**(fields | options))
+
+    def chain(self, role: str) -> Chain:
+        """The chain for an account, not yet open."""
+        return chain_of(self.settings(role), self.accounts[role])
+
+    def agent(self, role: str, **options: Any) -> Agent:
+        """An agent of that role, not yet running; always with the same memory."""
+        return Agent(MODEL, settings=self.settings(role, **options), account=self.accounts[role])
+
+    def variables(self, role: str, **options: str) -> dict[str, str]:
+        """The settings of a program of that role. Its keyfile is made when it is asked for first."""
+        keyfile, password = self.folder / f"{role}.json", self.folder / "password"
+        if not keyfile.exists():
+            password.write_text(PASSWORD + "\n")
+            write_keyfile(keyfile, self.keys[role], PASSWORD)
+        fields = {
+            "connect": self.endpoint,
+            "data_dir": str(self.folder / "state"),
+            "web3_http_provider": self.url,
+            "lighthouse_contract": self.lighthouse,
+            "poll_interval": "0.05",
+            "keyfile": str(keyfile),
+            "keyfile_password_file": str(password),
+        }
+        return {f"AIRA_{name.upper()}": value for name, value in (fields | options).items()}
+
+    def provider(self, role: str = "provider") -> Serving:
+        """`aira provider` as a process, not yet started."""
+        return Serving(*AIRA, "provider", says="serves ", variables=self.variables(role))
+
+    async def found_lighthouse(self, name: str, *, timeout_blocks: int, **quotas: int) -> NewLighthouse:
+        """Make a lighthouse where these roles have so many transactions a turn, and trade there from now on."""
+        async with self.chain("provider") as chain:
+            made = await chain.create_lighthouse(minimal_stake=XRT, timeout_blocks=timeout_blocks, name=name)
+            for role, quota in quotas.items():
+                await chain.transfer(self.address(role), quota * XRT)
+        for role, quota in quotas.items():
+            async with self.chain(role) as chain:
+                await chain.become_provider(made.lighthouse, quota * XRT)
+        self.lighthouse = f"{name}.lighthouse.3.robonomics.eth"
+        return made
+
+    def robot(self, done: list[str], **options: Any) -> Agent:
+        """A robot that offers to do whatever is asked, and notes what it was told."""
+        robot = self.agent("robot", **options)
+
+        @robot.on_demand
+        async def offer(demand: Verified[Demand]) -> None:
+            await robot.offer(demand, lighthouse_fee=FEE)
+
+        @robot.on("/say")
+        async def say(job: object, message: Any) -> None:
+            done.append(message.data)
+
+        return robot
+
+    def job(self, word: str) -> Path:
+        """An objective that has the robot told a word."""
+        path = self.folder / f"{word}.mcap"
+        path.write_bytes(objective(("/say", word)))
+        return path

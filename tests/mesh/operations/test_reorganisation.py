@@ -1,0 +1,80 @@
+"""The chain replaces the block in which a contract was made: the job is taken back, made again, done and paid once."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from web3.types import RPCEndpoint
+
+from mesh.agent import Phase
+from mesh.work import outbox
+from tests.mesh.operations.site import FEE, Site
+from tests.support.waiting import until, until_found
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mesh.chain import Chain
+    from schemas import Demand, Liability, Verified
+    from tests.support.nodes import Anvil
+    from tests.support.routers import EmbeddedRouter
+
+COST = 500
+PATIENCE = 60.0
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outbox, "RESEND", 0.3)
+
+
+async def request(chain: Chain, method: str, *parameters: Any) -> Any:
+    return (await chain.node.web3.provider.make_request(RPCEndpoint(method), list(parameters)))["result"]
+
+
+async def test_a_contract_that_the_chain_drops_is_made_again_and_its_job_paid_once(
+    anvil: Anvil, router: EmbeddedRouter, tmp_path: Path
+) -> None:
+    site = await Site.found(anvil.url, anvil.private_keys, router.endpoint, tmp_path)
+    robot, may_work = site.agent("robot"), asyncio.Event()
+    incoming: list[str] = []
+    done: list[str] = []
+
+    @robot.on_demand
+    async def offer(demand: Verified[Demand]) -> None:
+        await robot.offer(demand, lighthouse_fee=FEE)
+
+    @robot.on_liability
+    async def phase(phase: Phase, liability: Liability) -> None:
+        if phase is Phase.INCOMING:
+            incoming.append(liability.address)
+
+    @robot.on("/say")
+    async def say(job: object, message: Any) -> None:
+        await may_work.wait()
+        done.append(message.data)
+
+    async with site.provider() as provider, robot, site.agent("person") as person, asyncio.timeout(3 * PATIENCE):
+        chain = person.parts.chain
+        before = await chain.balance_of(site.address("robot"))
+        contract = await person.demand(site.job("once"), cost=COST)
+        first = contract.address
+        await until(lambda: incoming == [first], what="the job", seconds=PATIENCE)
+        await until_found(lambda: robot.parts.ledger.job(first), what="the job in the ledger", seconds=PATIENCE)
+
+        await request(chain, "anvil_reorg", 1, [])
+        await request(chain, "evm_mine")
+        await until(lambda: "the chain took back 1 contracts" in provider.log(), what="the loss", seconds=PATIENCE)
+        await until(lambda: len(incoming) == 2, what="the contract made again", seconds=PATIENCE)
+        assert await robot.parts.ledger.job(first) is None or contract.address == first
+        may_work.set()
+
+        assert (await contract.outcome()).success
+        assert contract.address == incoming[-1]
+        assert done == ["once"]
+        (made,) = await chain.liabilities(promisee=site.address("person"))
+        assert (made.address, made.is_finalized, made.is_success) == (contract.address, True, True)
+        assert await chain.balance_of(site.address("robot")) == before + COST - FEE
+        assert "Traceback" not in provider.log()

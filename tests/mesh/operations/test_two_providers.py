@@ -1,0 +1,139 @@
+"""Two providers of one lighthouse share its work by their stakes; one is killed, and the other does the rest."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import pytest
+
+from mesh.background import Background
+from mesh.chain import Chain, ServedChain, serve_embedded
+from tests.mesh.operations.site import FEE, Site
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Sequence
+    from pathlib import Path
+
+    from mesh.agent import Agent, Outcome
+    from tests.support.routers import EmbeddedRouter
+
+JOBS = 30
+COST = 1000
+QUOTAS = {"provider": 2, "rival": 1}
+TIMEOUT_BLOCKS = 6
+PATIENCE = 120.0
+
+
+class Sent(NamedTuple):
+    """A transaction to the lighthouse."""
+
+    block: int
+    role: str
+    went_through: bool
+
+
+@pytest.fixture
+async def served() -> AsyncIterator[ServedChain]:
+    """A chain of this test's own, which makes a block for each transaction."""
+    async with serve_embedded(port=0) as running:
+        yield running
+
+
+@pytest.fixture
+async def site(served: ServedChain, router: EmbeddedRouter, tmp_path: Path) -> Site:
+    site = await Site.found(served.url, served.node.funded_keys, router.endpoint, tmp_path)
+    await site.found_lighthouse("shared", timeout_blocks=TIMEOUT_BLOCKS, **QUOTAS)
+    return site
+
+
+async def test_jobs_are_shared_in_turns_and_taken_over_and_done_once_each(served: ServedChain, site: Site) -> None:
+    done: list[str] = []
+    async with site.chain("person") as chain, asyncio.timeout(2 * PATIENCE):
+        start, before = await chain.block_number(), await wealth(site, chain)
+        provider, rival = site.provider("provider"), site.provider("rival")
+        async with provider, rival, site.robot(done), site.agent("person") as person, Background() as tasks:
+            jobs = [asyncio.create_task(one_job(site, person, number)) for number in range(JOBS)]
+            await until(lambda: len(done) >= JOBS // 2, what="half of the jobs", seconds=PATIENCE)
+            shared = await sent(site, chain, start)
+            await asyncio.to_thread(rival.kill)
+            killed = await chain.block_number()
+            tasks.start(let_time_pass(served), "blocks without transactions")
+            outcomes = await asyncio.gather(*jobs)
+            log = await asyncio.to_thread(stopped, provider)
+        made = await chain.liabilities(from_block=start)
+        hashes = [await chain.order_hashes(liability.address) for liability in made]
+        after, supply = await wealth(site, chain), (await chain.token()).total_supply
+        transactions = await sent(site, chain, start)
+
+    assert all(outcome.success for outcome in outcomes)
+    assert sorted(done) == sorted(word(number) for number in range(JOBS)), "each once"
+    assert [(liability.is_finalized, liability.is_success) for liability in made] == [(True, True)] * JOBS
+    assert len({digest for pair in hashes for digest in pair}) == 2 * JOBS
+
+    assert_in_turns(shared)
+    assert {one.role for one in transactions if one.block > killed} == {"provider"}
+    assert Counter(one.went_through for one in transactions) == {True: 2 * JOBS}, "nobody raced anybody"
+
+    assert after["person"] == before["person"] - JOBS * COST
+    assert after["robot"] == before["robot"] + JOBS * (COST - FEE)
+    assert after["factory"] == before["factory"] == 0
+    assert after["provider"] + after["rival"] > before["provider"] + before["rival"] + JOBS * FEE
+    assert sum(after.values()) == supply, "nothing is lost, and nothing comes from nowhere"
+    assert "contracts: " in log
+    assert "Traceback" not in log
+
+
+def word(number: int) -> str:
+    return f"job{number}"
+
+
+async def one_job(site: Site, person: Agent, number: int) -> Outcome:
+    path = await asyncio.to_thread(site.job, word(number))
+    return await (await person.demand(path, cost=COST)).outcome()
+
+
+async def let_time_pass(served: ServedChain) -> None:
+    while True:
+        await served.node.mine()
+        await asyncio.sleep(0.03)
+
+
+def stopped(provider: Any) -> str:
+    """What a provider had said when it was asked to end."""
+    provider.stop()
+    return str(provider.log())
+
+
+async def sent(site: Site, chain: Chain, start: int) -> list[Sent]:
+    """The transactions to the lighthouse since a block, in order."""
+    lighthouse = await chain.lighthouse_address(site.lighthouse)
+    roles = {site.address(role): role for role in QUOTAS}
+    found = []
+    eth = chain.node.web3.eth
+    for number in range(start + 1, await chain.block_number() + 1):
+        block = await eth.get_block(number, full_transactions=True)
+        transactions: Sequence[Any] = block["transactions"]
+        for transaction in transactions:
+            if transaction.get("to") == lighthouse:
+                receipt = await eth.get_transaction_receipt(transaction["hash"])
+                found.append(Sent(number, roles[transaction["from"]], receipt["status"] == 1))
+    return found
+
+
+def assert_in_turns(transactions: list[Sent]) -> None:
+    """Without silence in between: twice the one who staked two, once the one who staked one, and so on."""
+    pattern = [role for role, quota in QUOTAS.items() for _ in range(quota)]
+    expected = [pattern[place % len(pattern)] for place in range(len(transactions))]
+    assert [one.role for one in transactions] == expected
+    assert len(transactions) > 2 * len(pattern)
+
+
+async def wealth(site: Site, chain: Chain) -> dict[str, int]:
+    """Who has how much XRT."""
+    holders = {role: account.address for role, account in site.accounts.items()}
+    for name in ("airalab", site.lighthouse):
+        holders[name] = await chain.lighthouse_address(name)
+    return {name: await chain.balance_of(address) for name, address in (holders | {"factory": chain.factory}).items()}
