@@ -24,12 +24,15 @@ if TYPE_CHECKING:
     from mesh.agent.party import Worker
     from mesh.chain import Account, Chain
     from mesh.network import Channel
+    from mesh.recording import Objective
     from mesh.settings import Settings
 
 log = logging.getLogger(__name__)
 
 LIFETIME: Final = 1000
 """Blocks for which an order is valid unless told otherwise."""
+DEMANDS: Final = 32
+"""Demands that handlers look at at once: the objective of one may take its time to come, or never come."""
 
 H = TypeVar("H", bound=Handler)
 
@@ -78,7 +81,7 @@ class Agent:
         return register
 
     def on_demand(self, handler: H) -> H:
-        """Handle each new Demand of the agent's model: `async def handler(demand: Verified[Demand])`."""
+        """Handle each new Demand of its model, several at once: `async def handler(demand: Verified[Demand])`."""
         return self._on_market(Demand, handler)
 
     def on_offer(self, handler: H) -> H:
@@ -159,18 +162,30 @@ class Agent:
     ) -> str:
         """Offer to do a job; returns the order's hash (hex). Sent again until it is taken or expires.
 
-        With a `demand` the offer agrees to its terms; else `objective` (CID), `cost` (the token's smallest unit),
-        `token` and `validator` (names or addresses) are the terms, valid for `lifetime` blocks. `lighthouse_fee` is in
-        wn, and paid to the provider.
+        With a `demand` the offer agrees to its terms, once its objective was found fit (see `examine`); else
+        `objective` (CID), `cost` (the token's smallest unit), `token` and `validator` (names or addresses) are the
+        terms, valid for `lifetime` blocks. `lighthouse_fee` is in wn, and paid to the provider.
+
+        Raises `UnfitObjective` and branches of `ContentError` for an objective that can't be played, `ShortOfFunds`.
         """
         trader = self._working().trader
         if demand is not None:
-            terms = trader.mirrored(demand.message if isinstance(demand, Verified) else demand)
+            wanted = demand.message if isinstance(demand, Verified) else demand
+            await self.examine(wanted.objective)
+            terms = trader.mirrored(wanted)
         else:
             terms = await trader.terms(
                 model=self.model, objective=objective, cost=cost, token=token, validator=validator, lifetime=lifetime
             )
         return await trader.offer(terms, lighthouse_fee=lighthouse_fee)
+
+    async def examine(self, cid: str) -> Objective:
+        """Look at the objective of that CID, fetched if it is not here, as before a job: what it is, how large it is,
+        whether the agent's handlers take its topics. It is kept until room is needed.
+
+        Raises `UnfitObjective`, whose `reason` is a word for programs, and branches of `ContentError`.
+        """
+        return await self._working().executor.examine(cid)
 
     async def demand(
         self,
@@ -218,14 +233,14 @@ class Agent:
         for kind, handlers in self._hooks.market.items():
             model = self.model if kind is not Result and self.model else "*"
             subscription = await stack.enter_async_context(self._channel.subscribe(kind, model=model))
-            subscriptions.append((subscription, handlers))
+            subscriptions.append((subscription, handlers, DEMANDS if kind is Demand else 1))
         # Last, and so ended first: until then, all that handlers and jobs use is open.
         tasks = await stack.enter_async_context(Background())
         if self._worker is not None:
             tasks.start(self._worker.run(), "worker")
-        for subscription, handlers in subscriptions:
+        for subscription, handlers, at_once in subscriptions:
             tasks.start(subscription.recall(), "recall")
-            tasks.start(_hear(subscription, handlers), "hear")
+            tasks.start(_hear(subscription, handlers, at_once=at_once), "hear")
         for seconds, handler in self._hooks.periodic:
             tasks.start(_repeat(seconds, handler), f"every {seconds:g} s")
 
@@ -260,10 +275,21 @@ class Agent:
         return self._worker
 
 
-async def _hear(subscription: Any, handlers: list[Handler]) -> None:
-    async for message in subscription:
-        for handler in handlers:
-            await call(handler, message)
+async def _hear(subscription: Any, handlers: list[Handler], *, at_once: int) -> None:
+    """Hand each message to all handlers in turn; so many messages at once."""
+    turns = asyncio.Semaphore(at_once)
+
+    async def handle(message: Any) -> None:
+        try:
+            for handler in handlers:
+                await call(handler, message)
+        finally:
+            turns.release()
+
+    async with asyncio.TaskGroup() as tasks:
+        async for message in subscription:
+            await turns.acquire()
+            tasks.create_task(handle(message), name="handler")
 
 
 async def _repeat(seconds: float, handler: Handler) -> None:

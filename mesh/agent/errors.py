@@ -25,6 +25,17 @@ class OrderRejected(AiraError):
         self.rejection = rejection
 
 
+class ServiceClosed(AiraError):
+    """A service that others may not use: it signs, spends or drives jobs, and the settings don't open it."""
+
+    def __init__(self, service: str) -> None:
+        super().__init__(
+            f"this agent does not offer {service} to others",
+            hint="on the agent: open_services = true, behind a router that only those reach who may use its account",
+        )
+        self.service = service
+
+
 class OrderExpired(AiraError):
     """An order's deadline has passed and nobody took it."""
 
@@ -49,4 +60,4 @@ class ShortOfFunds(AiraError):
         self.needed = needed
 
 
-__all__ = ["JobFailed", "OrderExpired", "OrderRejected", "ShortOfFunds"]
+__all__ = ["JobFailed", "OrderExpired", "OrderRejected", "ServiceClosed", "ShortOfFunds"]

@@ -71,21 +71,34 @@ def load_account(settings: Settings) -> Account:
 
 
 def chain_of(settings: Settings, account: Account | None) -> Chain:
-    """The chain that the settings name, not yet opened, for `account` or for reading only."""
-    from mesh.chain import Chain, Timing
+    """The chain that the settings name, not yet opened, for `account` or for reading only.
+
+    What is sent is written down in the settings' folder, so that a number that was used stays used after a restart,
+    and in other programs of the same account. Raises `ConfigurationError`.
+    """
+    from mesh.chain import GWEI, Chain, FeePolicy, Timing
 
     return Chain(
-        settings.web3_http_provider,
+        settings.node,
         account=account,
         ens=settings.ens_contract,
         factory=settings.factory_contract,
-        timing=Timing(poll_interval=settings.poll_interval),
+        xrt=settings.xrt_contract,
+        generation=settings.generation,
+        contracts=settings.contracts,
+        timing=Timing(
+            poll_interval=settings.poll_interval,
+            confirmations=settings.confirmations,
+            reorg_depth=settings.reorg_depth,
+        ),
+        fees=FeePolicy(ceiling=round(settings.max_fee_gwei * GWEI)),
+        journal=settings.state_directory / "transactions",
     )
 
 
 def endpoints_of(settings: Settings) -> Endpoints:
     """Where the settings' client session connects to."""
-    return Endpoints(connect=settings.connect, timeout=settings.connect_timeout)
+    return Endpoints.from_settings(settings)
 
 
 @asynccontextmanager
@@ -121,7 +134,9 @@ async def working(settings: Settings, account: Account, chain: Chain) -> AsyncIt
             )
         )
         ledger = await stack.enter_async_context(Ledger(directory / "ledger.sqlite"))
-        store = await asyncio.to_thread(Store, home / "content", limit=settings.objective_expanded_limit)
+        store = await asyncio.to_thread(
+            Store, home / "content", limit=settings.objective_expanded_limit, quota=settings.content_limit
+        )
         stack.callback(store.close)
         yield Parts(
             settings=settings,

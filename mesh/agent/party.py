@@ -8,23 +8,24 @@ from typing import TYPE_CHECKING, Final
 
 from mesh.agent.contract import Outcome
 from mesh.agent.hooks import call
+from mesh.agent.services import offer_services
+from mesh.agent.token_events import TokenEvents
 from mesh.agent.trade import Trader
 from mesh.work.dealings import Dealings
 from mesh.work.executor import Executor
-from mesh.work.lifecycle import Phase, WrongPhase
+from mesh.work.lifecycle import Phase
 from mesh.work.listener import Listener
-from schemas import parse_address
+from mesh.work.outbox import result_identity
 from schemas.keys import EventKey, LiabilityEvent
-from schemas.rpc import Done, LiabilityRead, Nothing
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Sequence
+    from collections.abc import Sequence
 
     from mesh.agent.hooks import Handler
     from mesh.agent.parts import Parts
+    from mesh.chain import Approval, Transfer
     from mesh.work.run import Performer
     from schemas import Liability
-    from schemas.rpc import FinishLiability, ReadLiability, RestartLiability, ResumeLiability, StartLiability
 
 log = logging.getLogger(__name__)
 
@@ -47,11 +48,13 @@ class Worker:
         self.executor = Executor(workshop, performer=performer, witness=self._phase)
         self._dealings = Dealings(workshop, self.executor, witness=self._phase)
         self._witnesses = witnesses
-        self._offer_services()
+        self._token_events = TokenEvents(parts.channel.put, parts.signer.address)
+        offer_services(parts, self.executor, drives_itself=performer is not None)
 
     async def run(self) -> None:
         """Work until cancelled."""
-        listener = Listener(self.parts.chain, self.parts.ledger, self.parts.signer.address, self)
+        parts = self.parts
+        listener = Listener(parts.chain, parts.ledger, parts.signer.address, self, token=parts.settings.erc20_token)
         try:
             async with asyncio.TaskGroup() as tasks:
                 if self.parts.settings.enable_executor:
@@ -70,6 +73,7 @@ class Worker:
     async def finalized(self, address: str, *, success: bool, result: str) -> None:
         """A contract has ended, perhaps one of ours."""
         await self._dealings.finalized(address, success=success)
+        await self.parts.outbox.settle(result_identity(address))  # of no job, but signed for somebody else
         self.trader.finalized(address, Outcome(success=success, result=result))
 
     async def taken_back(self, address: str) -> None:
@@ -79,6 +83,15 @@ class Worker:
     async def unmade(self, address: str) -> None:
         """A contract, perhaps one of ours, was not made after all."""
         await self._dealings.unmade(address)
+        await self.trader.unmade(address)
+
+    async def token_event(self, event: Transfer | Approval) -> None:
+        """Tokens changed hands, or may."""
+        self._token_events.tell(event)
+
+    async def token_event_taken_back(self, event: Transfer | Approval) -> None:
+        """That did not happen after all, or not yet."""
+        self._token_events.take_back(event)
 
     async def new_head(self, block: int) -> None:
         """The chain has grown."""
@@ -91,38 +104,3 @@ class Worker:
             self.parts.channel.put(key, liability.encode())
         for witness in self._witnesses:
             await call(witness, phase, liability)
-
-    def _offer_services(self) -> None:
-        services, executor = self.parts.services, self.executor
-
-        async def start(request: StartLiability) -> Done:
-            return await _done(executor.start(parse_address(request.address)))
-
-        async def restart(request: RestartLiability) -> Done:
-            return await _done(executor.restart(parse_address(request.address)))
-
-        async def resume(request: ResumeLiability) -> Done:
-            return await _done(executor.resume(parse_address(request.address)))
-
-        async def finish(request: FinishLiability) -> Nothing:
-            await executor.finish(parse_address(request.address), success=request.success)
-            return Nothing()
-
-        async def read(request: ReadLiability) -> LiabilityRead:
-            try:
-                return LiabilityRead(True, await executor.read(parse_address(request.address)))
-            except WrongPhase:
-                return LiabilityRead(False)
-
-        working = (start, restart, resume, finish) if self.parts.settings.enable_executor else ()
-        for handler in (read, *working):
-            services.offer(handler.__name__, handler)
-
-
-async def _done(work: Awaitable[object]) -> Done:
-    """The answer of the services that say whether they could."""
-    try:
-        await work
-    except WrongPhase as error:
-        return Done(False, str(error))
-    return Done(True)

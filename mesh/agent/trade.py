@@ -6,31 +6,35 @@ import asyncio
 import logging
 import secrets
 from collections import Counter
-from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from mesh.agent.contract import Contract, Outcome
 from mesh.agent.errors import OrderExpired, OrderRejected
 from mesh.agent.purse import Purse
-from mesh.errors import ClosedError
-from mesh.network.crossing import call_in_loop
-from schemas import ZERO_ADDRESS, Demand, InvalidRecord, Offer, market_selector, message_hash
-from schemas.rejection import Rejection
+from mesh.agent.rejections import Rejections
+from mesh.chain import NodeUnreachable, RequestRefused
+from mesh.errors import AiraError, ClosedError
+from mesh.market.book import Refusal
+from schemas import ZERO_ADDRESS, Demand, Offer, message_hash
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    import zenoh
+    from collections.abc import Mapping
 
     from mesh.agent.parts import Parts
     from mesh.chain import Chain
     from schemas import Liability
+    from schemas.rejection import Rejection
 
     Terms = Mapping[str, Any]
 
 log = logging.getLogger(__name__)
 
 AnOrder = TypeVar("AnOrder", Demand, Offer)
+
+
+class _Overtaken(Exception):
+    """Generation 5 counts an account's orders: another one was taken before this one, which has to be signed anew."""
 
 
 class Trader:
@@ -41,12 +45,20 @@ class Trader:
         self._chain = chain
         self._address = parts.signer.address
         self._purse = Purse(chain, self._address)
+        self._rejections = Rejections(
+            parts.network.session,
+            chain,
+            market=parts.channel.lighthouse,
+            lighthouse=parts.settings.lighthouse_contract,
+        )
         self._matches: dict[str, asyncio.Future[Contract]] = {}
+        self._nonces: dict[str, int] = {}
         self._deadlines: dict[str, int] = {}
         self._counted: dict[str, tuple[Terms, int]] = {}
         self._endings: dict[str, asyncio.Future[Outcome]] = {}
         self._contracts: dict[str, Contract] = {}
         self._closed = False
+        self._progress = asyncio.Event()
 
     async def close(self) -> None:
         """Nothing is heard of any more: who waits for a contract, or for its end, gets `ClosedError`."""
@@ -91,10 +103,7 @@ class Trader:
             signed = await self._signed(Demand, terms, validator_fee=validator_fee)
             try:
                 return await self._contract_of(signed, costs)
-            except OrderRejected:
-                if signed.generation == 3 or signed.nonce == await self._chain.nonce_of(self._address):
-                    raise
-                # Generation 5 counts an account's orders, and another one was taken before this one.
+            except _Overtaken:
                 log.info("demand %s is signed anew: its nonce was used meanwhile", message_hash(signed).hex())
 
     async def offer(self, terms: Terms, *, lighthouse_fee: int) -> str:
@@ -114,12 +123,19 @@ class Trader:
     async def matched(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
         """A contract was made of these orders; they need not be sent again."""
         for identity in (demand_hash.hex(), offer_hash.hex()):
-            await self._withdraw(identity)
+            self._forget(identity)
+            await self._parts.outbox.spend(identity, liability.address)
         self._made(demand_hash.hex(), liability)
-        for identity, (terms, fee) in list(self._counted.items()):
-            # Generation 5 counts an account's orders: the one that was taken has made the others invalid.
-            await self._withdraw(identity)
-            await self.offer(terms, lighthouse_fee=fee)
+        for identity in list(self._counted):
+            await self._offer_anew(identity)
+        used = self._nonces.get(demand_hash.hex())
+        for identity, nonce in self._nonces.items():
+            if used is not None and nonce <= used and not self._matches[identity].done():
+                self._matches[identity].set_exception(_Overtaken())
+
+    async def unmade(self, address: str) -> None:
+        """There is no contract at `address` after all; its orders are sent again."""
+        await self._parts.outbox.unspend(address)
 
     async def contract(self, address: str) -> Contract:
         """The contract at `address`, to be waited for. Raises `NotALiability`."""
@@ -142,6 +158,8 @@ class Trader:
 
     def passed(self, block: int) -> None:
         """Block `block` is there: orders whose deadline it reaches have expired."""
+        self._progress.set()
+        self._progress = asyncio.Event()
         for identity, deadline in list(self._deadlines.items()):
             if deadline <= block:
                 self._forget(identity)
@@ -159,14 +177,17 @@ class Trader:
         identity = message_hash(signed).hex()
         matched: asyncio.Future[Contract] = asyncio.get_running_loop().create_future()
         self._matches[identity] = matched
+        if signed.generation == 5:
+            self._nonces[identity] = int(signed.nonce)
         try:
-            with self._rejections_heard(identity):
+            async with self._rejections.heard(identity, partial(self._rejected, identity)):
                 await self._purse.promise(identity, costs)
                 self._deadlines[identity] = signed.deadline
                 await self._parts.outbox.post(signed)
                 return await matched
         finally:
             del self._matches[identity]
+            self._nonces.pop(identity, None)
             self._forget(identity)
             if not self._closed:
                 await self._parts.outbox.settle(identity)
@@ -190,9 +211,20 @@ class Trader:
     def _ending(self, address: str) -> asyncio.Future[Outcome]:
         return self._endings.setdefault(address, asyncio.get_running_loop().create_future())
 
-    async def _withdraw(self, identity: str) -> None:
-        """The order is sent no more, and costs nothing any more."""
+    async def _offer_anew(self, identity: str) -> None:
+        """Sign an offer of generation 5 again: that counts an account's orders, and another one was taken first.
+
+        Raises `NodeUnreachable` and `RequestRefused`, and may then be tried again.
+        """
+        terms, fee = counted = self._counted[identity]
         self._forget(identity)
+        try:
+            await self.offer(terms, lighthouse_fee=fee)
+        except (NodeUnreachable, RequestRefused):
+            self._counted[identity] = counted
+            raise
+        except AiraError as error:
+            log.warning("the offer %s is given up: %s", identity, error)
         await self._parts.outbox.settle(identity)
 
     def _forget(self, identity: str) -> None:
@@ -200,28 +232,19 @@ class Trader:
         self._deadlines.pop(identity, None)
         self._counted.pop(identity, None)
 
-    @contextmanager
-    def _rejections_heard(self, identity: str) -> Iterator[None]:
-        """Listen for providers that reject the order."""
-        loop, session = asyncio.get_running_loop(), self._parts.network.session
+    async def _rejected(self, identity: str, rejection: Rejection) -> None:
+        """A provider rejects an order; it means nothing where the order has become a contract, by whatever provider.
 
-        def heard(sample: zenoh.Sample) -> None:
-            try:
-                rejection = Rejection.decode(sample.payload.to_bytes())
-            except InvalidRecord as error:
-                log.info("an unreadable rejection: %s", error)
-                return
-            call_in_loop(loop, self._rejected, identity, rejection)
-
-        selector = market_selector(self._parts.channel.lighthouse, "reject").replace("/*/*", f"/{identity}/*")
-        subscriber: Any = session.declare_subscriber(selector, heard)
-        try:
-            yield
-        finally:
-            if not session.is_closed():
-                subscriber.undeclare()
-
-    def _rejected(self, identity: str, rejection: Rejection) -> None:
+        That is known when the chain has been read as far as it went when the nonce was asked for.
+        """
+        if rejection.reason == Refusal.FULL:
+            log.warning("provider %s has no room for the order %s now", rejection.provider, identity)
+            return
+        nonce = self._nonces.get(identity)
+        overtaken = nonce is not None and nonce < await self._chain.nonce_of(self._address)
+        head = await self._chain.block_number()
+        while self._parts.clock.head < head:
+            await self._progress.wait()
         matched = self._matches.get(identity)
-        if matched is not None and not matched.done() and rejection.order == identity:
-            matched.set_exception(OrderRejected(rejection))
+        if matched is not None and not matched.done():
+            matched.set_exception(_Overtaken() if overtaken else OrderRejected(rejection))

@@ -22,6 +22,7 @@ from mesh.work.objectives import Objectives
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable
 
+    from mesh.recording import Objective
     from mesh.work.ledger import Job
     from mesh.work.lifecycle import Witness
     from mesh.work.run import Performer, Run
@@ -34,6 +35,9 @@ STARTED: Final = (Phase.READY, Phase.RUNNING)
 """Phases in which a job may be begun anew or gone on with."""
 PROGRESS: Final = 0.5
 """Seconds between two notes of a playback's position in the ledger."""
+
+PATIENCE: Final = 10.0
+"""Seconds without a new block of an objective after which no job is taken on for it."""
 
 _playing: ContextVar[str] = ContextVar("playing", default="")
 """The job that the running code plays, or is a handler of."""
@@ -61,6 +65,7 @@ class Executor:
     async def run(self) -> None:
         """Go on with what the ledger holds, then serve; ends by cancellation. A running job is left to be resumed."""
         left = await self._shop.ledger.jobs((Phase.INCOMING, Phase.READY, Phase.RUNNING))
+        await self._shop.unpin_ended()
         try:
             async with asyncio.TaskGroup() as self._tasks:
                 for job in left:
@@ -75,6 +80,13 @@ class Executor:
         """Return when `run` has taken up what the ledger holds."""
         await self._opened.wait()
 
+    async def examine(self, cid: str) -> Objective:
+        """The objective of that CID, fetched and found fit to be played here, before a job is taken on for it.
+
+        Raises `UnfitObjective` or a `ContentError`.
+        """
+        return await self._objectives.examine(cid, patience=PATIENCE)
+
     def prepare(self, liability: Liability) -> None:
         """Fetch and examine a job's objective in a task; then it is ready, or complete without success."""
         self._objectives.prepare(liability.address, self._prepare(liability), self._begun())
@@ -88,6 +100,8 @@ class Executor:
                 await self._abandon(address)
                 self._objectives.forget(address)
             yield job
+            if job is not None:
+                await self._shop.unpin(address)
 
     async def start(self, address: str) -> None:
         """Play the objective of a ready job. Returns when the playback has begun. Raises `WrongPhase`."""
@@ -140,7 +154,7 @@ class Executor:
             await self._stop_playing(address)
             run = self._runs.pop(address, None) or await self._shop.new_run(job.liability)
             summary = await run.close(note)
-            cid = await asyncio.to_thread(self._shop.store.put_file, summary.path)
+            cid = await asyncio.to_thread(self._shop.store.put_file, summary.path, pin=address)
             await self._shop.owe_result(address, success=success, result=cid, note=note)
             await asyncio.to_thread(summary.path.unlink, missing_ok=True)
             self._objectives.forget(address)
@@ -171,7 +185,8 @@ class Executor:
     async def _prepare(self, liability: Liability) -> None:
         address = liability.address
         try:
-            objective = await self._objectives.examine(liability)
+            await self._shop.pin(liability.objective, address)
+            objective = await self._objectives.examine(liability.objective)
         except (ContentError, InputError) as error:
             log.warning("%s: refused: %s", address, error)
             await self._unless_ended(self.finish(address, success=False, note=str(error)))

@@ -42,9 +42,19 @@ CREATE TABLE IF NOT EXISTS outbox (
     deadline INTEGER,
     posted REAL NOT NULL
 );
+CREATE TABLE IF NOT EXISTS spent (
+    identity TEXT PRIMARY KEY,
+    kind TEXT NOT NULL,
+    payload BLOB NOT NULL,
+    deadline INTEGER,
+    posted REAL NOT NULL,
+    liability TEXT NOT NULL
+);
 CREATE TABLE IF NOT EXISTS cursors (name TEXT PRIMARY KEY, block INTEGER NOT NULL, history BLOB NOT NULL DEFAULT x'');
 """
 POST: Final = "INSERT OR IGNORE INTO outbox (identity, kind, payload, deadline, posted) VALUES (?, ?, ?, ?, ?)"
+SPENT_KEPT: Final = 4096
+"""Orders that are kept after they became contracts; the chain replaces its last blocks only."""
 
 
 class Job(msgspec.Struct, frozen=True, kw_only=True):
@@ -147,20 +157,10 @@ class Ledger:
 
     async def complete(self, liability: str, *, success: bool, result: str, note: str, outgoing: Outgoing) -> None:
         """Write down the job's end and the signed Result that tells of it, both or neither (when cancelled, too)."""
-        database = self._open()
-        async with self._writing:
-            try:
-                await database.execute("BEGIN IMMEDIATE")
-                await database.execute(
-                    "UPDATE jobs SET phase = ?, success = ?, result = ?, note = ?, changed = ? WHERE liability = ?",
-                    (Phase.COMPLETE, success, result, note, time.time(), liability),
-                )
-                await database.execute(POST, _posted(outgoing))
-                await database.commit()
-            except BaseException:
-                # What was cancelled is executed all the same, in the ledger's thread: nothing may stay open behind it.
-                await database.rollback()
-                raise
+        ended = "UPDATE jobs SET phase = ?, success = ?, result = ?, note = ?, changed = ? WHERE liability = ?"
+        await self._together(
+            (ended, (Phase.COMPLETE, success, result, note, time.time(), liability)), (POST, _posted(outgoing))
+        )
 
     async def job(self, liability: str) -> Job | None:
         """The job at `liability` (EIP-55 address), if it is ours."""
@@ -181,6 +181,22 @@ class Ledger:
     async def settle(self, identity: str) -> bool:
         """The effect of the message was seen: send it no more. False when it was not in the outbox."""
         return await self._run("DELETE FROM outbox WHERE identity = ?", (identity,))
+
+    async def spend(self, identity: str, liability: str) -> None:
+        """The order became the contract at the address `liability`: send it no more, but keep it for `unspend`."""
+        await self._together(
+            ("INSERT OR REPLACE INTO spent SELECT *, ? FROM outbox WHERE identity = ?", (liability, identity)),
+            ("DELETE FROM outbox WHERE identity = ?", (identity,)),
+            ("DELETE FROM spent WHERE rowid <= (SELECT MAX(rowid) FROM spent) - ?", (SPENT_KEPT,)),
+        )
+
+    async def unspend(self, liability: str) -> bool:
+        """There is no contract at this address after all: its orders are to be sent again. False when it had none."""
+        columns = "identity, kind, payload, deadline, posted"
+        await self._run(
+            f"INSERT OR IGNORE INTO outbox ({columns}) SELECT {columns} FROM spent WHERE liability = ?", (liability,)
+        )
+        return await self._run("DELETE FROM spent WHERE liability = ?", (liability,))
 
     async def outbox(self, *, head: int) -> list[Outgoing]:
         """What is to be sent, oldest first; forgets what has passed its deadline at block `head`."""
@@ -215,6 +231,20 @@ class Ledger:
         changed = cursor.rowcount > 0
         await cursor.close()
         return changed
+
+    async def _together(self, *statements: tuple[str, tuple[Any, ...]]) -> None:
+        """Run all statements or, when cancelled too, none."""
+        database = self._open()
+        async with self._writing:
+            try:
+                await database.execute("BEGIN IMMEDIATE")
+                for statement, values in statements:
+                    await database.execute(statement, values)
+                await database.commit()
+            except BaseException:
+                # What was cancelled is executed all the same, in the ledger's thread: nothing may stay open behind it.
+                await database.rollback()
+                raise
 
     async def _rows(self, statement: str, values: tuple[Any, ...] = ()) -> list[Any]:
         return list(await self._open().execute_fetchall(statement, values))

@@ -8,6 +8,7 @@ from contextlib import aclosing
 from typing import TYPE_CHECKING, Final, Protocol
 
 from mesh.chain import (
+    Approval,
     Finalized,
     History,
     NewLiability,
@@ -15,7 +16,9 @@ from mesh.chain import (
     NotALiability,
     Reorganised,
     RequestRefused,
+    Transfer,
 )
+from mesh.trouble import Trouble
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -45,6 +48,12 @@ class Party(Protocol):
     async def unmade(self, address: str) -> None:
         """The chain was reorganised: there is no contract at `address`, or not yet."""
 
+    async def token_event(self, event: Transfer | Approval) -> None:
+        """Tokens changed hands, or may be taken by somebody; perhaps none of this account's."""
+
+    async def token_event_taken_back(self, event: Transfer | Approval) -> None:
+        """The chain was reorganised: that did not happen, or not yet."""
+
     async def new_head(self, block: int) -> None:
         """All of `block` has been handled; after a reorganisation it may be lower than before."""
 
@@ -53,47 +62,52 @@ class Listener:
     """Reads from the block after the ledger's cursor, so that nothing is missed while the agent is down.
 
     An agent that never ran begins at the head. A block is handled again after a crash in its middle: what a `Party`
-    does must bear that.
+    does must bear that. Token events are those of `token` (name or address), XRT by default.
     """
 
     NAME = "listener"
 
-    def __init__(self, chain: Chain, ledger: Ledger, account: str, party: Party) -> None:
+    def __init__(self, chain: Chain, ledger: Ledger, account: str, party: Party, *, token: str = "") -> None:
         self._chain = chain
         self._ledger = ledger
         self._account = account
         self._party = party
-        self._lost = False
+        self._token = token
+        self._trouble = Trouble(log)
 
     async def run(self) -> None:
-        """Read until cancelled. A node that can't be reached is waited for. Raises `ChainWentBack`."""
+        """Read until cancelled. A node that can't be reached is waited for. Raises `ChainWentBack`, `UnknownName`."""
         while True:
             try:
                 await self._read()
             except (NodeUnreachable, RequestRefused) as error:
-                if not self._lost:
-                    log.warning("the chain can't be read, trying again: %s", error)
-                self._lost = True
+                self._trouble.met(error, "the chain can't be read, trying again")
                 await asyncio.sleep(RETRY)
 
     async def _read(self) -> None:
         """Read from the ledger's cursor on."""
-        cursor, history = await self._ledger.cursor(self.NAME), History()
-        if cursor is None:
-            cursor = await self._chain.block_number()
-            await self._ledger.set_cursor(self.NAME, cursor)
-        elif remembered := await self._ledger.history(self.NAME):
-            history = History.decode(remembered)
-        async with aclosing(self._chain.events(cursor + 1, history=history)) as blocks:
+        token = await self._chain.resolve(self._token) if self._token else ""
+        cursor, history = await self._memory()
+        async with aclosing(self._chain.events(cursor + 1, token=token, history=history)) as blocks:
             async for block in blocks:
-                if self._lost:
-                    log.info("the chain can be read again, from block %d", block.block_number)
-                self._lost = False
+                self._trouble.over(f"the chain can be read again, from block {block.block_number}")
                 if isinstance(block, Reorganised):
                     await self._take_back(block)
                 await self._handle(block.events)
                 await self._ledger.set_cursor(self.NAME, block.block_number, history=history.encode())
                 await self._party.new_head(block.block_number)
+
+    async def _memory(self) -> tuple[int, History]:
+        """The last block that was handled, and what is remembered of those before it."""
+        depth = self._chain.node.timing.reorg_depth
+        cursor = await self._ledger.cursor(self.NAME)
+        if cursor is None:
+            cursor = await self._chain.block_number()
+            await self._ledger.set_cursor(self.NAME, cursor)
+        remembered = await self._ledger.history(self.NAME)
+        history = History.decode(remembered) if remembered else History(depth)
+        history.depth = depth  # which may have been set otherwise since
+        return cursor, history
 
     async def _handle(self, events: Iterable[ChainEvent]) -> None:
         for event in events:
@@ -102,6 +116,8 @@ class Listener:
                     await self._new_liability(event)
                 case Finalized():
                     await self._party.finalized(event.liability, success=event.success, result=event.result)
+                case Transfer() | Approval():
+                    await self._party.token_event(event)
 
     async def _new_liability(self, event: NewLiability) -> None:
         try:
@@ -122,3 +138,5 @@ class Listener:
                     await self._party.unmade(event.liability)
                 case Finalized():
                     await self._party.taken_back(event.liability)
+                case Transfer() | Approval():
+                    await self._party.token_event_taken_back(event)

@@ -1,19 +1,22 @@
-"""The objectives of jobs that have not ended: fetched and examined several at once, and kept at hand."""
+"""The objectives of jobs, and of jobs offered: many fetched at once, examined in turn, kept at hand until the end."""
 
 from __future__ import annotations
 
 import asyncio
 from typing import TYPE_CHECKING, Final
 
+from mesh.settings import LONGEST
+
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
     from mesh.recording import Objective
     from mesh.work.workshop import Workshop
-    from schemas import Liability
 
-FETCHES: Final = 4
-"""Objectives fetched and examined at once."""
+FETCHES: Final = 32
+"""Objectives looked for at once: one that nobody has must not hold up the others until its time is over."""
+EXAMINATIONS: Final = 1
+"""Objectives examined at once: it takes one core, and up to 256 MiB of memory when a file is out to harm us."""
 
 
 class Objectives:
@@ -22,7 +25,8 @@ class Objectives:
     def __init__(self, shop: Workshop, *, topics: frozenset[str] | None) -> None:
         self._shop = shop
         self._topics = topics
-        self._turns = asyncio.Semaphore(FETCHES)
+        self._fetching = asyncio.Semaphore(FETCHES)
+        self._examining = asyncio.Semaphore(EXAMINATIONS)
         self._preparing: dict[str, asyncio.Task[None]] = {}
         self._at_hand: dict[str, Objective] = {}
 
@@ -37,10 +41,15 @@ class Objectives:
         preparing = self._preparing[address] = tasks.create_task(work, name=f"prepare {address}")
         preparing.add_done_callback(lambda task: self._prepared(address, task))
 
-    async def examine(self, liability: Liability) -> Objective:
-        """The liability's objective, found fit to be played. Raises `UnfitObjective` or a `ContentError`."""
-        async with self._turns:
-            return await self._shop.examine(liability, topics=self._topics)
+    async def examine(self, cid: str, *, patience: float = LONGEST) -> Objective:
+        """The objective of that CID, found fit to be played here. Raises `UnfitObjective` or a `ContentError`.
+
+        `patience` is as for `Workshop.fetch`.
+        """
+        async with self._fetching:
+            path = await self._shop.fetch(cid, patience=patience)
+        async with self._examining:
+            return await self._shop.examine(cid, path, topics=self._topics)
 
     def keep(self, address: str, objective: Objective) -> None:
         """Have it at hand until `forget`."""

@@ -65,6 +65,15 @@ class Outbox:
         """The message had its effect; False when it was not waiting."""
         return await self._ledger.settle(identity)
 
+    async def spend(self, identity: str, liability: str) -> None:
+        """The order became the contract at the address `liability`, as far as the chain says now."""
+        await self._ledger.spend(identity, liability)
+
+    async def unspend(self, liability: str) -> None:
+        """The chain has no such contract after all: its orders are sent again, now and until they have their effect."""
+        if await self._ledger.unspend(liability):
+            await self.send()
+
     async def send(self) -> None:
         """Send everything that waits, once."""
         for waiting in await self._ledger.outbox(head=self._head()):

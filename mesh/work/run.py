@@ -10,12 +10,13 @@ import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
+import msgspec
 import zenoh
 
 from mesh.errors import AiraError, ClosedError
-from mesh.recording import Recorder, Unrecordable, play
+from mesh.recording import Recorder, Unrecordable, json_type, play
 from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey, parse_key, topic_selector
-from schemas.payloads import STRING, PayloadType, String, payload_type
+from schemas.payloads import JSON, STRING, PayloadType, String, payload_type
 from schemas.values import encode_value
 
 if TYPE_CHECKING:
@@ -78,6 +79,7 @@ class Run:
         self._waiting: asyncio.Queue[Played | None] = asyncio.Queue(AHEAD)
         self._player: asyncio.Task[None] | None = None
         self._closing = False
+        self._types = _described(plan.objective)
         self.position = plan.position
         """How many of the objective's messages have been done with."""
         self.playing: Played | None = None
@@ -105,6 +107,9 @@ class Run:
             raise ClosedError(f"the run of {self.liability.address} is not open")
         payload, kind = encode_value(message)
         key = str(LiabilityTopicKey(self._agent, self.liability.address, topic))
+        if kind == JSON and isinstance(message, msgspec.Struct):
+            kind = json_type(type(message))
+            self._types[topic, kind.zenoh_encoding] = kind
         self._put(key, payload, kind)
 
     async def play(self, performer: Performer | None, *, progress: Callable[[int], Awaitable[None]]) -> None:
@@ -180,12 +185,17 @@ class Run:
         try:
             key = parse_key(str(sample.key_expr))
             if isinstance(key, LiabilityTopicKey) and self._wanted(key.topic):
-                self._recorder.record(key.topic, sample.payload.to_bytes(), payload_type(encoding), role="device")
+                kind = self._type_of(key.topic, encoding)
+                self._recorder.record(key.topic, sample.payload.to_bytes(), kind, role="device")
         except Exception as error:
             # Nobody stands behind a callback: what can't be recorded is counted and said, and the next one is heard.
             self.refused += 1
             level = logging.INFO if isinstance(error, Unrecordable) else logging.ERROR
             log.log(level, "%s: not recorded from %s: %s", self.liability.address, sample.key_expr, error)
+
+    def _type_of(self, topic: str, encoding: str) -> PayloadType:
+        """The type of what is heard: only its name travels, and who knows how it is described may be ourselves."""
+        return self._types.get((topic, encoding)) or self._types.get(("", encoding)) or payload_type(encoding)
 
     def _wanted(self, topic: str) -> bool:
         return self._plan.topics is None or topic in self._plan.topics
@@ -198,3 +208,11 @@ class Run:
             self._session.put(str(mark), self._mark, encoding=FLUSH, allowed_destination=zenoh.Locality.SESSION_LOCAL)
             self._flushed.wait(timeout=5)
             subscriber.undeclare()
+
+
+def _described(objective: Objective | None) -> dict[tuple[str, str], PayloadType]:
+    """The types that an objective describes and nobody here knows, by any topic ('') and their Zenoh encoding."""
+    if objective is None:
+        return {}
+    types = (topic.type for topic in objective.topics if topic.type.schema_name and topic.type.schema_data)
+    return {("", kind.zenoh_encoding): kind for kind in types if not payload_type(kind.zenoh_encoding).schema_data}

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import mesh
 from mesh.errors import InputError
 from mesh.recording import AtOnce, Limits, RecordedTimes, Recorder, RecordingAbout, preflight
+from mesh.settings import LONGEST
+from mesh.work.lifecycle import Phase
 from mesh.work.outbox import outgoing
 from mesh.work.run import Plan, Run
 from schemas import Result
@@ -51,21 +53,43 @@ class Workshop:
     settings: Settings
     recordings: Path
 
-    async def examine(self, liability: Liability, *, topics: frozenset[str] | None) -> Objective:
-        """The liability's objective: taken from the store or fetched from the mesh, and found fit to be played.
+    async def pin(self, cid: str, address: str) -> None:
+        """Let the store keep a file, which need not be there yet, for the liability at `address` until `unpin`."""
+        await asyncio.to_thread(self.store.pin, cid, address)
 
-        `topics` are those that the device understands; None for any. Raises `UnfitObjective` or a `ContentError`.
+    async def unpin(self, address: str) -> None:
+        """The liability at `address` needs no file any more, if it has ended; else nothing happens."""
+        job = await self.ledger.job(address)
+        if job is None or job.phase is Phase.FINALIZED:
+            await asyncio.to_thread(self.store.release, address)
+
+    async def unpin_ended(self) -> None:
+        """The same for all liabilities, as a crash may have come between their end and `unpin`."""
+        pins = await asyncio.to_thread(self.store.pins)
+        for label in frozenset().union(*pins.values()):
+            if label.startswith("0x"):  # other labels are not ours
+                await self.unpin(label)
+
+    async def fetch(self, cid: str, *, patience: float = LONGEST) -> Path:
+        """Where the file of an objective is: in the store, or fetched from the mesh. Raises a `ContentError`.
+
+        Gives up after `patience`, or the settings' `fetch_timeout`, seconds without a new block.
         """
         settings = self.settings
-        path = await asyncio.to_thread(self.store.checked, liability.objective)
-        if path is None:
-            path = await self.exchange.fetch(
-                liability.objective, size_limit=settings.objective_size_limit, timeout=settings.fetch_timeout
-            )
-        limits = Limits(size=settings.objective_size_limit, expanded=settings.objective_expanded_limit)
+        held = await asyncio.to_thread(self.store.checked, cid)
+        return held or await self.exchange.fetch(
+            cid, size_limit=settings.objective_size_limit, timeout=min(patience, settings.fetch_timeout)
+        )
+
+    async def examine(self, cid: str, path: Path, *, topics: frozenset[str] | None) -> Objective:
+        """The objective of that CID, which is at `path`, found fit to be played. Raises `UnfitObjective`.
+
+        `topics` are those that the device understands; None for any.
+        """
+        limits = Limits(size=self.settings.objective_size_limit, expanded=self.settings.objective_expanded_limit)
         outcome = await asyncio.to_thread(preflight, path, limits, topics=topics)
         if outcome.objective is None or not outcome.ok:
-            raise UnfitObjective(liability.objective, outcome.reason, outcome.detail)
+            raise UnfitObjective(cid, outcome.reason, outcome.detail)
         return outcome.objective
 
     async def new_run(self, liability: Liability, *, objective: Objective | None = None, position: int = 0) -> Run:
@@ -73,7 +97,7 @@ class Workshop:
 
         What an interrupted run of the same liability has recorded is gone on with.
         """
-        chosen = frozenset(name.strip() for name in self.settings.recording_topics.split(",") if name.strip())
+        chosen = self._chosen_topics()
         pace = AtOnce() if self.settings.playback == "at-once" else RecordedTimes()
         plan = Plan(liability=liability, objective=objective, pace=pace, position=position, topics=chosen or None)
         recorder = await asyncio.to_thread(self._new_recorder, liability)
@@ -89,6 +113,10 @@ class Workshop:
         for leftover in self._recording_files(address):
             leftover.unlink(missing_ok=True)
 
+    def _chosen_topics(self) -> frozenset[str]:
+        """The topics to record; none for all."""
+        return frozenset(name.strip() for name in self.settings.recording_topics.split(",") if name.strip())
+
     def _new_recorder(self, liability: Liability) -> Recorder:
         finished, partial, _ = self._recording_files(liability.address)
         if finished.exists():  # closed, but a crash came before the Result was written down
@@ -99,6 +127,7 @@ class Workshop:
             lighthouse=liability.lighthouse,
             objective=liability.objective,
             software=f"aira-mesh {mesh.__version__}",
+            topics=",".join(sorted(self._chosen_topics())),
         )
         return Recorder(finished, about)
 

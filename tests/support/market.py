@@ -148,6 +148,17 @@ def obliging(robot: Agent) -> Agent:
     return robot
 
 
+def careless(robot: Agent) -> Agent:
+    """The same robot, which offers without a look at the objective: such a job comes to nothing only later."""
+
+    @robot.on_demand
+    async def offer(demand: Verified[Demand]) -> None:
+        trader = robot._working().trader
+        await trader.offer(trader.mirrored(demand.message), lighthouse_fee=0)
+
+    return robot
+
+
 @pytest.fixture
 async def place(founded: Founded, router: EmbeddedRouter, tmp_path: Path) -> AsyncIterator[Place]:
     """A market's place of this test's own."""

@@ -1,7 +1,64 @@
-"""Markets for the tests of this folder."""
+"""Markets for the tests of this folder, and programs that ask agents for something."""
 
 from __future__ import annotations
 
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from mesh.chain import Sender
+from mesh.chain.artifacts import load_artifact
+from mesh.network import Endpoints, Network, ServiceFailed, call
+from schemas.rpc import Nothing
 from tests.support.market import founded, place
 
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from mesh.agent import Agent
+    from schemas import Record
+    from tests.support.market import Place
+
 __all__ = ["founded", "place"]
+
+
+async def other_token(place: Place, role: str, *, supply: int) -> str:
+    """The address of a token, XRT in all but its name, of which a role has all."""
+    chain, artifact = place.chains[role], load_artifact("XRT")
+    made = chain.node.web3.eth.contract(abi=artifact.abi, bytecode=artifact.bytecode).constructor(supply)
+    data = bytes.fromhex(made.data_in_transaction.removeprefix("0x"))
+    receipt = await Sender(chain.node, place.market.accounts[role]).send(to=None, data=data)
+    assert receipt.contract is not None
+    return receipt.contract
+
+
+class Asker:
+    """A program on the same router, which has no account."""
+
+    def __init__(self, network: Network, agent: Agent) -> None:
+        self._network = network
+        self.agent = agent
+
+    async def ask(self, service: str, request: Record | None = None) -> Any:
+        return await call(self._network.session, self.agent.address, service, request or Nothing())
+
+    async def refused(self, service: str, request: Record) -> str:
+        """The line with which a request is refused, which has a hint."""
+        with pytest.raises(ServiceFailed) as caught:
+            await self.ask(service, request)
+        assert "\n" not in str(caught.value)
+        return str(caught.value).removeprefix(f"{service}: ") + " / " + caught.value.hint
+
+
+@asynccontextmanager
+async def asking(place: Place, agent: Agent) -> AsyncIterator[Asker]:
+    async with agent, Network(Endpoints(connect=(place.endpoint,))) as network:
+        yield Asker(network, agent)
+
+
+@pytest.fixture
+async def opened(place: Place) -> AsyncIterator[Asker]:
+    """The robot with services that are open to all."""
+    async with asking(place, place.agent("robot", open_services=True)) as asker:
+        yield asker

@@ -24,7 +24,7 @@ from schemas.rpc import (
     ResumeLiability,
     StartLiability,
 )
-from tests.support.market import obliging
+from tests.support.market import careless, obliging
 from tests.support.objectives import objective
 from tests.support.waiting import until, until_found, until_heard
 
@@ -258,7 +258,7 @@ async def test_what_the_phase_does_not_allow_is_answered_with_the_reason(
 
 
 async def test_a_job_whose_objective_has_not_come_can_not_be_started(place: Place) -> None:
-    robot = obliging(place.agent("robot", fetch_timeout=30.0))
+    robot = careless(place.agent("robot", fetch_timeout=30.0))
     async with controlled(place, robot) as control, place.agent("person") as person:
         contract = await person.demand(cid_of_bytes(b"nobody's"))
         await in_phase(robot, contract, Phase.INCOMING)

@@ -6,23 +6,23 @@ import asyncio
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from msgspec.structs import replace
 
-from mesh.agent import OrderExpired, OrderRejected, Outcome, ShortOfFunds
-from mesh.chain import NotALiability
+from mesh.agent import Agent, OrderExpired, OrderRejected, Outcome, ShortOfFunds
+from mesh.chain import Chain, NotALiability, Timing
 from mesh.content import ContentUnavailable
 from mesh.errors import ClosedError
 from mesh.network import Endpoints, Network
 from mesh.work import outbox as outbox_module
 from schemas import ZERO_ADDRESS, Demand, RejectKey, cid_of_bytes, cid_of_file, message_hash
 from schemas.rejection import Rejection
-from tests.support.market import MODEL, Place, obliging
+from tests.support.market import MODEL, Place, careless, obliging
 from tests.support.objectives import objective
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.agent import Agent
     from mesh.work.run import Run
     from schemas import Verified
 
@@ -42,7 +42,7 @@ def working(robot: Agent) -> Agent:
     async def nothing(job: Run, message: Any) -> None:
         pass
 
-    return obliging(robot)
+    return careless(robot)
 
 
 def job(place: Place) -> Path:
@@ -108,6 +108,22 @@ async def test_offers_that_were_overtaken_in_generation_5_are_signed_anew(place:
             assert [(await contract.outcome()).success for contract in contracts] == [True, True]
 
 
+async def test_a_demand_that_was_overtaken_in_generation_5_is_signed_anew_without_being_told(place: Place) -> None:
+    """Nobody offers to do it, so no provider says that its nonce is used: the person knows it of the other demand."""
+    robot = place.agent("robot", generation=5)
+    async with place.provider(), robot, place.agent("person", generation=5) as person:
+        trader = person._working().trader
+        lonely = asyncio.create_task(person.demand(cid_of_bytes(b"what nobody offers")))
+        await posted(person)
+        (overtaken,) = trader._matches
+        await robot.offer(objective=OBJECTIVE)
+        await person.demand(OBJECTIVE)
+        await until(lambda: len(trader._matches) == 1 and overtaken not in trader._matches)
+        await until_found(lambda: all_posted(person, 1))
+        lonely.cancel()
+        await asyncio.wait([lonely])
+
+
 async def test_the_factory_is_allowed_what_all_open_demands_may_cost(place: Place) -> None:
     async with place.agent("person") as person:
         demands = [asyncio.create_task(person.demand(OBJECTIVE, cost=cost)) for cost in (7000, 500)]
@@ -148,23 +164,120 @@ async def test_a_demand_that_the_contracts_refuse_is_rejected_with_their_reason(
         assert await waiting(person) == []
 
 
-async def test_rejections_of_other_orders_and_rubbish_are_not_believed(place: Place) -> None:
+def rejection(place: Place, role: str, order: str, *, reason: str = "Unwanted") -> Rejection:
+    """What an account says of an order."""
+    account = place.market.accounts[role]
+    unsigned = Rejection(order=order, reason=reason, detail="go away", provider=account.address)
+    return unsigned.signed_by(account.signer)
+
+
+def untrue_rejections(place: Place, order: str) -> list[Rejection]:
+    """Of another order; in a provider's name, unsigned, or signed by somebody else; by who is no provider."""
+    true = rejection(place, "provider", order)
+    forged = rejection(place, "robot", order)
+    return [
+        rejection(place, "provider", "00" * 32),
+        replace(true, signature=""),
+        replace(forged, provider=true.provider),
+        forged,
+    ]
+
+
+async def test_a_rejection_is_believed_of_the_lighthouses_providers_only(
+    place: Place, caplog: pytest.LogCaptureFixture
+) -> None:
     async with place.agent("person") as person, Network(Endpoints(connect=(place.endpoint,))) as stranger:
         demand = asyncio.create_task(person.demand(OBJECTIVE))
         await posted(person)
         (identity,) = person._working().trader._matches
         key = str(RejectKey(person.channel.lighthouse, identity, place.address("provider")))
-        other = Rejection(order="00" * 32, reason="full", detail="", provider=place.address("provider"))
         stranger.session.put(key, b"no rejection at all")
-        stranger.session.put(key, other.encode())
+        for untrue in untrue_rejections(place, identity):
+            stranger.session.put(key, untrue.encode())
         arrived: list[object] = []
         with person.parts.network.session.declare_subscriber("last", arrived.append):
             await until(lambda: stranger.session.put("last", b"") or arrived)
         assert not demand.done()
-        ours = Rejection(order=identity, reason="full", detail="come later", provider=place.address("provider"))
-        stranger.session.put(key, ours.encode())
-        with pytest.raises(OrderRejected, match=r"rejects the order \(full\): come later"):
+        await until(lambda: "who is no provider, says of an order: Unwanted" in caplog.text)
+        assert not demand.done()
+        stranger.session.put(key, rejection(place, "provider", identity).encode())
+        with pytest.raises(OrderRejected, match=r"rejects the order \(Unwanted\): go away"):
             await demand
+
+
+async def test_a_rejection_of_what_is_a_contract_already_means_nothing(place: Place) -> None:
+    """Another provider was quicker, and this one says so before the person has read of the contract on the chain.
+
+    A person of generation 5 would sign a second demand, and pay for two contracts.
+    """
+    slowly, me = Timing(poll_interval=2.0), place.market.accounts["person"]
+    settings = place.settings("person", generation=5)
+    chain = Chain(place.node.provider, account=me, ens=place.market.deployment.ens, timing=slowly)
+    async with (
+        chain,
+        Agent(MODEL, settings=settings, account=me, chain=chain) as person,
+        working(place.agent("robot")),
+        Network(Endpoints(connect=(place.endpoint,))) as network,
+    ):
+        before = await chain.nonce_of(me.address)
+        demand = asyncio.create_task(person.demand(OBJECTIVE))
+        await posted(person)
+        (identity,) = person._working().trader._matches
+        async with place.provider() as provider:
+            await until(lambda: provider.earnings().created == 1)
+            key = str(RejectKey(person.channel.lighthouse, identity, place.address("provider")))
+            network.session.put(key, rejection(place, "provider", identity, reason="WrongSigner").encode())
+            contract = await demand
+        demand_hash, _ = await chain.order_hashes(contract.address)
+        assert demand_hash.hex() == identity
+        assert await chain.nonce_of(me.address) == before + 1
+
+
+async def test_a_provider_without_room_is_asked_again(place: Place, caplog: pytest.LogCaptureFixture) -> None:
+    async with place.agent("person") as person, Network(Endpoints(connect=(place.endpoint,))) as network:
+        demand = asyncio.create_task(person.demand(cid_of_file(job(place))))
+        await posted(person)
+        (identity,) = person._working().trader._matches
+        key = str(RejectKey(person.channel.lighthouse, identity, place.address("provider")))
+        network.session.put(key, rejection(place, "provider", identity, reason="full").encode())
+        await until(lambda: "has no room for the order" in caplog.text)
+        assert await waiting(person) == ["demand"]
+        async with place.provider(), working(place.agent("robot")):
+            assert (await demand).liability.promisee == place.address("person")
+
+
+async def test_orders_of_a_contract_that_the_chain_took_back_are_sent_again(place: Place) -> None:
+    """The provider who made it is gone, and another one has never heard of them."""
+    async with working(place.agent("robot")) as robot, place.agent("person") as person:
+        async with place.provider():
+            contract = await person.demand(cid_of_bytes(b"a job that nobody can begin"))
+            await known(robot, contract.address)
+        first = contract.address
+        await place.forget_blocks(1)
+        await until_found(lambda: all_posted(person, 1), what="the demand posted again")
+        await until_found(lambda: all_posted(robot, 1), what="the offer posted again")
+        async with place.provider():
+            await until(lambda: contract.address != first)
+            await until_found(lambda: all_posted(person, 0))
+
+
+async def test_an_offer_that_can_not_be_signed_anew_stops_nothing(
+    place: Place, caplog: pytest.LogCaptureFixture
+) -> None:
+    """One of two offers of generation 5 was taken; for the fee of the other one the robot has too little by then."""
+    everything = await place.balance("robot")
+    async with place.agent("robot", generation=5) as robot, place.agent("person", generation=5) as person:
+        await robot.offer(objective=OBJECTIVE)
+        await robot.offer(objective=cid_of_bytes(b"something dear"), lighthouse_fee=everything)
+        await place.chains["robot"].transfer(place.address("person"), 5)
+        async with place.provider():
+            await person.demand(OBJECTIVE)
+            await until(lambda: "is given up" in caplog.text)
+            await until_found(lambda: all_posted(robot, 0))
+            again = cid_of_bytes(b"something else")
+            await robot.offer(objective=again)
+            assert (await person.demand(again)).liability.promisor == place.address("robot")
+    await place.chains["person"].transfer(place.address("robot"), 5)
 
 
 async def test_who_is_short_of_funds_is_told_before_anything_is_sent(place: Place) -> None:
@@ -288,8 +401,9 @@ async def test_the_lighthouse_fee_of_an_offer_is_paid_and_then_promised_no_more(
 
 async def test_an_offer_may_agree_to_a_bare_demand(place: Place) -> None:
     async with place.agent("robot") as robot, place.agent("person") as person:
+        cid = await asyncio.to_thread(person.parts.store.put_file, job(place))
         terms = await person._working().trader.terms(
-            model=MODEL, objective=OBJECTIVE, cost=3, token="", validator="", lifetime=50
+            model=MODEL, objective=cid, cost=3, token="", validator="", lifetime=50
         )
         demand = person.parts.signer.sign(Demand(**terms, nonce="ab" * 32, validator_fee=0))
         offer = await robot.offer(demand)

@@ -14,7 +14,7 @@ from mesh.agent import JobFailed, Phase
 from mesh.recording import open_objective
 from mesh.work.run import NOTE_TOPIC
 from schemas import Empty, String, cid_of_bytes, cid_of_file
-from tests.support.market import Place, obliging
+from tests.support.market import Place, careless, obliging
 from tests.support.objectives import MILLISECOND, objective, timed
 from tests.support.waiting import until, until_found
 
@@ -181,7 +181,7 @@ async def test_a_message_of_another_type_than_the_handlers_fails_the_job(place: 
 
 
 async def test_a_topic_without_handler_is_refused_before_anything_is_played(place: Place) -> None:
-    robot = obliging(place.agent("robot"))
+    robot = careless(place.agent("robot"))
     done: list[object] = []
 
     @robot.on("/go")
@@ -195,24 +195,24 @@ async def test_a_topic_without_handler_is_refused_before_anything_is_played(plac
 
 
 async def test_what_is_no_recording_is_refused(place: Place) -> None:
-    note, _ = await refusal(place, doing_nothing(obliging(place.agent("robot"))), b"please go to the kitchen\n")
+    note, _ = await refusal(place, doing_nothing(careless(place.agent("robot"))), b"please go to the kitchen\n")
     assert "not-a-recording" in note
 
 
 async def test_an_objective_that_nobody_holds_is_given_up_and_refunded(place: Place) -> None:
-    robot = doing_nothing(obliging(place.agent("robot", fetch_timeout=0.2)))
+    robot = doing_nothing(careless(place.agent("robot", fetch_timeout=0.2)))
     note, _ = await refusal(place, robot, cid_of_bytes(b"held by nobody"))
     assert "is not to be had" in note
 
 
 async def test_an_objective_over_the_size_limit_is_refused(place: Place) -> None:
-    robot = doing_nothing(obliging(place.agent("robot", objective_size_limit=2000)))
+    robot = doing_nothing(careless(place.agent("robot", objective_size_limit=2000)))
     note, _ = await refusal(place, robot, objective(("/blob", os.urandom(4000))))
     assert "2000 allowed" in note
 
 
 async def test_a_job_whose_objective_is_missing_does_not_hold_up_the_next(place: Place) -> None:
-    robot = doing_nothing(obliging(place.agent("robot", fetch_timeout=30.0)))
+    robot = doing_nothing(careless(place.agent("robot", fetch_timeout=30.0)))
     async with place.at_work(robot) as person, asyncio.timeout(25):
         missing = await person.demand(cid_of_bytes(b"nobody has this"))
         good = await person.demand(place.save(objective(("/go", Empty()))))

@@ -13,9 +13,12 @@ import pytest
 
 from mesh.errors import ClosedError, ConfigurationError
 from mesh.work import Ledger, Phase
+from mesh.work import ledger as ledger_module
 from mesh.work.ledger import VERSION
+from mesh.work.outbox import outgoing
 from schemas import cid_of_bytes
 from tests.mesh.work.samples import liability, message
+from tests.support.orders import demand
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -314,3 +317,31 @@ async def test_a_closed_ledger_says_so(path: Path) -> None:
         await ledger.set_cursor("listener", 1)
     with pytest.raises(ClosedError):
         await ledger.add_job(liability())
+
+
+async def test_an_order_that_became_a_contract_is_kept_for_when_it_did_not(ledger: Ledger) -> None:
+    one, other = outgoing(demand(deadline=50)), outgoing(demand())
+    for order in (one, other):
+        await ledger.post(order)
+    await ledger.spend(one.identity, "0xA")
+    assert await ledger.outbox(head=0) == [other]
+
+    assert not await ledger.unspend("0xB")
+    assert await ledger.unspend("0xA")
+    assert await ledger.outbox(head=0) == [other, one]
+    assert not await ledger.unspend("0xA")
+    assert await ledger.outbox(head=50) == [other], "and it has its deadline as before"
+
+
+async def test_only_the_latest_orders_are_kept(ledger: Ledger, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ledger_module, "SPENT_KEPT", 2)
+    orders = [outgoing(demand()) for _ in range(4)]
+    for number, order in enumerate(orders):
+        await ledger.post(order)
+        await ledger.spend(order.identity, f"0x{number}")
+    assert [await ledger.unspend(f"0x{number}") for number in range(4)] == [False, False, True, True]
+
+
+async def test_what_is_not_in_the_outbox_is_not_spent(ledger: Ledger) -> None:
+    await ledger.spend("an order of before", "0xA")
+    assert not await ledger.unspend("0xA")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.background import Background
-from mesh.chain import Chain, ChainWentBack, JsonRpcServer, NewLiability, Timing
+from mesh.chain import Approval, Chain, ChainWentBack, History, JsonRpcServer, NewLiability, Timing, Transfer
 from mesh.work import Ledger
 from mesh.work import listener as listener_module
 from mesh.work.listener import Listener
@@ -38,6 +38,8 @@ class Diary:
         self.ends: list[tuple[str, bool, str]] = []
         self.taken_back_ends: list[str] = []
         self.taken_back_contracts: list[str] = []
+        self.token_events: list[Transfer | Approval] = []
+        self.taken_back_token_events: list[Transfer | Approval] = []
         self.head = 0
 
     async def new_liability(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
@@ -51,6 +53,12 @@ class Diary:
 
     async def unmade(self, address: str) -> None:
         self.taken_back_contracts.append(address)
+
+    async def token_event(self, event: Transfer | Approval) -> None:
+        self.token_events.append(event)
+
+    async def token_event_taken_back(self, event: Transfer | Approval) -> None:
+        self.taken_back_token_events.append(event)
 
     async def new_head(self, block: int) -> None:
         self.head = block
@@ -243,6 +251,45 @@ async def test_a_contract_that_the_chain_took_back_is_told_and_told_again_when_i
     assert diary.taken_back_contracts == [first]
     assert [liability.address for liability, *_ in diary.liabilities] == [first, again.liability]
     assert diary.taken_back_ends == []
+
+
+async def test_token_events_are_told_and_taken_back(place: Place, ledger: Ledger) -> None:
+    person = place.chains["person"]
+    async with listening(place, ledger) as diary:
+        await started(ledger)
+        await person.approve(place.address("robot"), 11)
+        await person.transfer(place.address("robot"), 12)
+        await until(lambda: len(diary.token_events) == 2)
+        await place.forget_blocks(1)
+        await until(lambda: diary.taken_back_token_events)
+    approval, transfer = diary.token_events
+    assert isinstance(approval, Approval)
+    assert (approval.owner, approval.spender, approval.value) == (place.address("person"), place.address("robot"), 11)
+    assert isinstance(transfer, Transfer)
+    assert (transfer.sender, transfer.recipient, transfer.value) == (
+        place.address("person"),
+        place.address("robot"),
+        12,
+    )
+    assert diary.taken_back_token_events == [transfer]
+
+
+async def test_as_much_of_the_chain_is_remembered_as_may_be_replaced_whatever_was_so_before(
+    place: Place, ledger: Ledger
+) -> None:
+    for depth in (3, 7, 2):
+        timing = Timing(poll_interval=0.03, reorg_depth=depth)
+        async with (
+            Chain(place.node.provider, ens=place.market.deployment.ens, timing=timing) as chain,
+            listening(place, ledger, chain=chain) as diary,
+        ):
+            await started(ledger)
+            for _ in range(2 * depth):
+                await contract(place)
+                head = await chain.block_number()
+                await until(lambda diary=diary, head=head: diary.head >= head)  # type: ignore[misc]
+        history = History.decode(await ledger.history(Listener.NAME))
+        assert (history.depth, len(history.blocks)) == (depth, depth + 1)
 
 
 async def test_a_contract_that_a_reorganisation_took_before_it_was_read_is_left_out(

@@ -5,14 +5,16 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import pytest
 import zenoh
 
 from mesh.errors import ClosedError
-from mesh.recording import AtOnce, RecordedTimes, Recorder, RecordingAbout, open_objective
+from mesh.recording import AtOnce, RecordedTimes, Recorder, RecordingAbout, json_type, open_objective
 from mesh.work.run import AHEAD, FLUSH, NOTE_TOPIC, HandlerCancelled, Plan, Run
 from schemas import Empty, InvalidPayload, String
 from tests.mesh.work.samples import liability
+from tests.support.bags import Bag, Sent
 from tests.support.objectives import objective
 from tests.support.routers import EmbeddedRouter, client_config
 from tests.support.waiting import until, until_heard
@@ -111,6 +113,32 @@ async def test_what_the_agent_publishes_is_recorded_with_its_type(making: Making
         ("/pose", b'{"x":1}', "application/json"),
         ("/tick", b"", "ros1;std_msgs/Empty"),
     ]
+
+
+class Wheel(msgspec.Struct):
+    """What a wheel says."""
+
+    turns: int
+
+
+async def test_a_struct_is_recorded_with_the_schema_of_its_class(making: Making) -> None:
+    run = making.run()
+    run.open()
+    run.publish("/wheel", Wheel(3))
+    await run.close()
+    (topic,) = open_objective(making.path).topics
+    assert topic.type == json_type(Wheel)
+    assert making.recorded() == [("/wheel", b'{"turns":3}', "application/json;Wheel")]
+
+
+async def test_a_type_that_the_objective_describes_is_recorded_with_that_description(making: Making) -> None:
+    scan = Sent("/scan", b"\0", 1, type="my/Scan", definition="float32 angle\n")
+    run = making.run(Bag([scan]).encode())
+    run.open()
+    making._session.put(f"{TOPICS}/scanned", b"\1", encoding="ros1;my/Scan")
+    await run.close()
+    (topic,) = open_objective(making.path).topics
+    assert (topic.name, topic.type.schema_data) == ("/scanned", b"float32 angle\n")
 
 
 async def test_what_another_session_puts_before_the_end_is_recorded(making: Making, device: zenoh.Session) -> None:

@@ -18,6 +18,7 @@ from tests.support.objectives import objective
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from mesh.recording import Objective
     from tests.support.market import Place
 
 
@@ -34,9 +35,14 @@ async def opened(place: Place, **settings: Any) -> AsyncIterator[Workshop]:
         yield robot.parts.workshop()
 
 
+async def examined(shop: Workshop, cid: str, *, topics: frozenset[str] | None = None) -> Objective:
+    """The objective of that CID, fetched where it has to be."""
+    return await shop.examine(cid, await shop.fetch(cid), topics=topics)
+
+
 async def test_an_objective_in_the_store_is_examined_where_it_is(shop: Workshop) -> None:
     cid = shop.store.put_bytes(objective(("/a", Empty())))
-    found = await shop.examine(liability(objective=cid), topics=None)
+    found = await examined(shop, cid)
     assert found.path == shop.store.path(cid)
     assert found.count == 1
 
@@ -44,14 +50,14 @@ async def test_an_objective_in_the_store_is_examined_where_it_is(shop: Workshop)
 async def test_an_objective_of_somebody_else_is_fetched(place: Place, shop: Workshop) -> None:
     async with place.agent("person") as person:
         cid = person.parts.store.put_bytes(objective(("/a", Empty())))
-        assert (await shop.examine(liability(objective=cid), topics=None)).count == 1
+        assert (await examined(shop, cid)).count == 1
     assert shop.store.has(cid)
 
 
 async def test_an_objective_that_nobody_has_is_not_to_be_had(place: Place) -> None:
     async with opened(place, fetch_timeout=0.1) as shop:
         with pytest.raises(ContentUnavailable):
-            await shop.examine(liability(objective=cid_of_bytes(b"nobody's")), topics=None)
+            await examined(shop, cid_of_bytes(b"nobody's"))
 
 
 async def test_an_objective_rotten_in_the_store_is_fetched_anew(place: Place, shop: Workshop) -> None:
@@ -63,14 +69,14 @@ async def test_an_objective_rotten_in_the_store_is_fetched_anew(place: Place, sh
     held.write_bytes(content.replace(b"/a", b"/b"))
     async with place.agent("person") as person:
         person.parts.store.put_bytes(content)
-        found = await shop.examine(liability(objective=cid), topics=None)
+        found = await examined(shop, cid)
     assert [topic.name for topic in found.topics] == ["/a"]
 
 
 async def test_an_unfit_objective_says_which_and_why(shop: Workshop) -> None:
     cid = shop.store.put_bytes(objective(("/a", Empty())))
     with pytest.raises(UnfitObjective, match=f"objective {cid} can't be played") as caught:
-        await shop.examine(liability(objective=cid), topics=frozenset({"/b"}))
+        await examined(shop, cid, topics=frozenset({"/b"}))
     assert caught.value.reason == "unknown-topic"
     assert isinstance(caught.value, InputError)
 

@@ -1,0 +1,200 @@
+"""What others may ask of an agent's account: to read for all, to spend and to sign where the settings say so."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from mesh.agent import Agent
+from mesh.chain import Account, Chain, new_private_key
+from schemas import ZERO_ADDRESS, cid_of_bytes
+from schemas.posting import SendResult
+from schemas.rpc import (
+    GUARDED,
+    AccountBalance,
+    Accounts,
+    AccountToAddressAllowance,
+    Allowance,
+    Approve,
+    Balance,
+    BlockNumber,
+    FinishLiability,
+    SignDemand,
+    SignOffer,
+    SignResult,
+    StartLiability,
+    Transfer,
+    TransferFrom,
+)
+from tests.mesh.agent.conftest import Asker, asking, other_token
+from tests.support.market import QUICK, obliging
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from schemas import Record
+    from tests.support.market import Place
+
+TERMS: dict[str, Any] = {
+    "model": cid_of_bytes(b"model"),
+    "objective": cid_of_bytes(b"objective"),
+    "token": "xrt.3.robonomics.eth",
+    "cost": 0,
+    "lighthouse": "airalab.lighthouse.3.robonomics.eth",
+    "validator": ZERO_ADDRESS,
+    "deadline": 10**9,
+}
+RESULT: dict[str, Any] = {"liability": ZERO_ADDRESS, "result": cid_of_bytes(b"result"), "success": True}
+SIGNED = {"nonce": "ab" * 32, "signature": "ab" * 65}
+
+
+@pytest.fixture
+async def closed(place: Place) -> AsyncIterator[Asker]:
+    """The robot, as it is when nothing is set."""
+    async with asking(place, place.agent("robot")) as asker:
+        yield asker
+
+
+async def test_all_may_read_what_accounts_have(place: Place, closed: Asker) -> None:
+    robot, person, chain = place.address("robot"), place.address("person"), place.chains["person"]
+    assert await closed.ask("eth/accounts") == Accounts((robot,))
+    assert await closed.ask("eth/current_block") == BlockNumber(await chain.block_number())
+    assert await closed.ask("eth/eth_balance") == Balance(await chain.eth_balance(robot))
+    assert await closed.ask("eth/xrt_balance") == Balance(await chain.balance_of(robot))
+    for account in (person, person.lower()):
+        assert await closed.ask("eth/account_eth_balance", AccountBalance(account)) == Balance(
+            await chain.eth_balance(person)
+        )
+        assert await closed.ask("eth/account_xrt_balance", AccountBalance(account)) == Balance(
+            await chain.balance_of(person)
+        )
+    factory = AccountBalance("factory.3.robonomics.eth")
+    assert (await closed.ask("eth/account_xrt_balance", factory)).balance == await chain.balance_of(chain.factory)
+
+
+async def test_all_may_read_who_may_take_how_much(place: Place, closed: Asker) -> None:
+    chain = place.chains["person"]
+    await chain.approve(place.address("robot"), 123)
+    asked = AccountToAddressAllowance(place.address("person"), place.address("robot"))
+    assert await closed.ask("eth/account_xrt_allowance", asked) == Allowance(123)
+    assert await closed.ask("eth/xrt_allowance") == Allowance(
+        await chain.allowance(place.address("robot"), chain.factory)
+    )
+
+
+async def test_the_token_is_that_of_the_settings(place: Place) -> None:
+    token, person = await other_token(place, "robot", supply=1000), place.address("person")
+    robot = place.agent("robot", erc20_token=token, open_services=True)
+    async with asking(place, robot) as asker:
+        assert await asker.ask("eth/xrt_balance") == Balance(1000)
+        await asker.ask("eth/transfer", Transfer(person, 300))
+        assert await asker.ask("eth/account_xrt_balance", AccountBalance(person)) == Balance(300)
+        await asker.ask("eth/approve", Approve(place.chains["robot"].factory, 5))
+        assert await asker.ask("eth/xrt_allowance") == Allowance(5)
+
+
+REQUESTS: dict[str, Record] = {
+    "eth/transfer": Transfer(ZERO_ADDRESS, 1),
+    "eth/transfer_from": TransferFrom(ZERO_ADDRESS, ZERO_ADDRESS, 1),
+    "eth/approve": Approve(ZERO_ADDRESS, 1),
+    "sign/demand": SignDemand(**TERMS, validator_fee=0),
+    "sign/offer": SignOffer(**TERMS, lighthouse_fee=0),
+    "sign/result": SignResult(**RESULT),
+    "send/result": SendResult(**RESULT, signature="ab" * 65),
+}
+
+
+@pytest.mark.parametrize("service", sorted(REQUESTS))
+async def test_nobody_spends_or_signs_with_an_agents_key_unless_it_lets_them(closed: Asker, service: str) -> None:
+    line = await closed.refused(service, REQUESTS[service])
+    assert line.startswith(f"this agent does not offer {service} to others / ")
+    assert "open_services" in line
+
+
+def test_all_that_is_guarded_is_tried() -> None:
+    assert GUARDED - REQUESTS.keys() == {"send/demand", "send/offer"}, "which are tried with the other messages"
+
+
+async def test_tokens_are_sent_for_who_may_ask_for_it(place: Place, opened: Asker) -> None:
+    before = await place.balance("robot"), await place.balance("person")
+    done = await opened.ask("eth/transfer", Transfer(place.address("person"), 250))
+    assert (await place.balance("robot"), await place.balance("person")) == (before[0] - 250, before[1] + 250)
+    receipt = await place.chains["person"].node.web3.eth.get_transaction_receipt(done.txhash)
+    assert receipt["status"] == 1
+
+
+async def test_who_asks_for_many_transfers_at_once_gets_each_of_them(place: Place, opened: Asker) -> None:
+    before = await place.balance("person")
+    request = Transfer(place.address("person"), 3)
+    done = await asyncio.gather(*(opened.ask("eth/transfer", request) for _ in range(10)))
+    assert len({one.txhash for one in done}) == 10
+    assert await place.balance("person") == before + 30
+
+
+async def test_tokens_that_were_approved_for_the_agent_are_sent(place: Place, opened: Asker) -> None:
+    before = await place.balance("person"), await place.balance("provider")
+    await place.chains["person"].approve(place.address("robot"), 40)
+    request = TransferFrom(place.address("person"), place.address("provider"), 40)
+    assert len((await opened.ask("eth/transfer_from", request)).txhash) == 66
+    assert (await place.balance("person"), await place.balance("provider")) == (before[0] - 40, before[1] + 40)
+
+
+async def test_an_allowance_is_given(place: Place, opened: Asker) -> None:
+    await opened.ask("eth/approve", Approve(place.address("person"), 77))
+    chain = place.chains["person"]
+    assert await chain.allowance(place.address("robot"), place.address("person")) == 77
+
+
+@pytest.mark.parametrize(
+    ("request_", "said"),
+    [
+        (Transfer("the kitchen", 1), "'the kitchen' is not an address"),
+        (Transfer("nobody.eth", 1), "the ENS name 'nobody.eth' is not known"),
+        (Transfer("kitchen.sink", 1), "'kitchen.sink' is not an ENS name"),
+        (Transfer(ZERO_ADDRESS, 1), "the contract refused: ERC20InvalidReceiver"),
+        (Transfer("0x" + "12" * 20, 10**30), "the contract refused: ERC20InsufficientBalance"),
+    ],
+)
+async def test_why_nothing_was_sent_is_told_in_a_line(opened: Asker, request_: Transfer, said: str) -> None:
+    assert (await opened.refused("eth/transfer", request_)).startswith(said)
+
+
+async def test_an_account_without_ether_says_what_it_lacks(place: Place) -> None:
+    poor = Account.from_key(new_private_key())
+    chain = Chain(place.node.provider, account=poor, ens=place.market.deployment.ens, timing=QUICK)
+    async with chain:
+        agent = Agent(settings=place.settings("poor", open_services=True), account=poor, chain=chain)
+        async with asking(place, agent) as asker:
+            line = await asker.refused("eth/approve", Approve(place.address("person"), 0))
+    assert line.startswith(f"{poor.address} has 0 ETH")
+    assert "send ETH" in line
+
+
+async def test_a_chain_that_was_opened_for_reading_sends_nothing(place: Place) -> None:
+    reader = Chain(place.node.provider, ens=place.market.deployment.ens, timing=QUICK)
+    async with reader:
+        settings = place.settings("robot", open_services=True)
+        agent = Agent(settings=settings, account=place.market.accounts["robot"], chain=reader)
+        async with asking(place, agent) as asker:
+            line = await asker.refused("eth/approve", Approve(place.address("person"), 0))
+    assert line.startswith("this needs an account")
+
+
+async def test_who_works_by_itself_is_not_driven_by_others(place: Place) -> None:
+    """Its own code starts and ends its jobs; without any, there is nobody else to do it."""
+    robot = obliging(place.agent("robot"))
+
+    @robot.on("/say")
+    async def say(job: Any, word: Any) -> None:
+        raise AssertionError
+
+    async with asking(place, robot) as asker:
+        assert "does not offer start to others" in await asker.refused("start", StartLiability(ZERO_ADDRESS))
+        assert "does not offer finish" in await asker.refused("finish", FinishLiability(ZERO_ADDRESS, False))
+        assert not (await asker.ask("read", StartLiability(ZERO_ADDRESS))).read
+    robot = place.agent("robot", open_services=True)
+    robot.on("/say")(say)
+    async with asking(place, robot) as asker:
+        assert not (await asker.ask("start", StartLiability(ZERO_ADDRESS))).success

@@ -1,0 +1,74 @@
+"""A look at the objective before anything is offered for it."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from mesh.content import ContentUnavailable
+from mesh.work.workshop import UnfitObjective
+from schemas import Empty, cid_of_bytes, cid_of_file
+from tests.support.market import Place, obliging
+from tests.support.objectives import objective
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from mesh.agent import Agent
+    from mesh.work.run import Run
+
+MISSING = cid_of_bytes(b"nobody has this objective")
+
+
+def going(robot: Agent) -> Agent:
+    """The same robot, which takes the topic `/go` and no other."""
+
+    @robot.on("/go")
+    async def go(job: Run, message: Any) -> None:
+        pass
+
+    return robot
+
+
+async def test_no_offer_is_made_for_an_objective_that_can_not_be_played(
+    place: Place, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.WARNING)
+    robot = going(obliging(place.agent("robot")))
+    async with place.at_work(robot) as person:
+        unfit = asyncio.create_task(person.demand(place.save(objective(("/fly", Empty())), "unfit.mcap")))
+        await until(lambda: "can't be played (unknown-topic): nobody here takes /fly" in caplog.text, seconds=30)
+        fit = await person.demand(place.save(objective(("/go", Empty()))))
+        assert (await fit.outcome()).success
+        assert not unfit.done()
+        unfit.cancel()
+
+
+async def test_demands_with_objectives_that_nobody_has_hold_up_no_other(place: Place) -> None:
+    robot = going(obliging(place.agent("robot", fetch_timeout=60.0)))
+    async with place.at_work(robot) as person, asyncio.timeout(50):
+        missing = [
+            asyncio.create_task(person.demand(cid_of_bytes(b"nobody has objective %d" % number))) for number in range(5)
+        ]
+        await until(lambda: len(person._working().trader._matches) == 5, seconds=30)
+        fit = await person.demand(place.save(objective(("/go", Empty()))))
+        assert (await fit.outcome()).success
+        for task in missing:
+            assert not task.done()
+            task.cancel()
+
+
+async def test_an_objective_may_be_examined_by_hand(place: Place) -> None:
+    robot = going(place.agent("robot", fetch_timeout=0.2))
+    async with robot, place.agent("person") as person:
+        fit, unfit = (place.save(objective((topic, Empty())), f"{topic[1:]}.mcap") for topic in ("/go", "/fly"))
+        for path in (fit, unfit):
+            await asyncio.to_thread(person.parts.store.put_file, path)
+        assert (await robot.examine(cid_of_file(fit))).count == 1
+        with pytest.raises(UnfitObjective) as caught:
+            await robot.examine(cid_of_file(unfit))
+        assert caught.value.reason == "unknown-topic"
+        with pytest.raises(ContentUnavailable):
+            await robot.examine(MISSING)

@@ -1,0 +1,147 @@
+"""The chain that settings name: every option of theirs reaches it, and what is sent is written down."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from mesh.agent.parts import chain_of
+from mesh.chain import GWEI, Account, FeeTooHigh, UnknownName, deploy, new_private_key, serve_embedded
+from mesh.errors import ConfigurationError
+from mesh.settings import Settings
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from mesh.chain import ServedChain
+
+PAYING = """
+import asyncio, sys
+from mesh.agent.parts import chain_of
+from mesh.chain import Account
+from mesh.settings import load
+
+async def main(key, friend, count):
+    async with chain_of(load(), Account.from_key(bytes.fromhex(key))) as chain:
+        await asyncio.gather(*(chain.transfer(friend, 1) for _ in range(int(count))))
+
+asyncio.run(main(*sys.argv[1:]))
+"""
+
+
+@pytest.fixture
+async def served() -> AsyncIterator[ServedChain]:
+    """A chain with the contracts, which the first of its accounts has deployed."""
+    async with serve_embedded(port=0) as running:
+        await deploy(running.node.provider, Account.from_key(running.node.funded_keys[0]))
+        yield running
+
+
+def settings(served: ServedChain, folder: Path, **options: Any) -> Settings:
+    fields: dict[str, Any] = {"web3_http_provider": served.url, "data_dir": str(folder), "poll_interval": 0.05}
+    return Settings(**(fields | options))
+
+
+def account(served: ServedChain) -> Account:
+    return Account.from_key(served.node.funded_keys[0])
+
+
+def test_all_that_is_set_is_passed_on(tmp_path: Path) -> None:
+    chain = chain_of(
+        Settings(
+            web3_http_provider="http://a:1, ws://b:2",
+            data_dir=str(tmp_path),
+            generation=5,
+            poll_interval=0.5,
+            confirmations=4,
+            reorg_depth=40,
+            max_fee_gwei=0.25,
+        ),
+        None,
+    )
+    assert chain.node.endpoint == "http://a:1, ws://b:2"
+    assert chain.generation == 5
+    timing = chain.node.timing
+    assert (timing.poll_interval, timing.confirmations, timing.reorg_depth) == (0.5, 4, 40)
+    assert chain.node.fees.ceiling == GWEI // 4
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_no_address_of_a_node_is_said(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="'nowhere' is not the address of a node"):
+        chain_of(Settings(web3_http_provider="http://a:1,nowhere"), None)
+
+
+@pytest.mark.parametrize("generation", [3, 5])
+async def test_names_are_those_of_the_generation(served: ServedChain, tmp_path: Path, generation: int) -> None:
+    async with chain_of(settings(served, tmp_path, generation=generation), None) as chain:
+        assert chain.factory == await chain.resolve(f"factory.{generation}.robonomics.eth")
+        assert chain.xrt == await chain.resolve(f"xrt.{generation}.robonomics.eth")
+        lighthouse = f"airalab.lighthouse.{generation}.robonomics.eth"
+        assert await chain.lighthouse_address("airalab") == await chain.resolve(lighthouse)
+
+
+async def test_the_contracts_may_be_the_original_ones(served: ServedChain, tmp_path: Path) -> None:
+    async with chain_of(settings(served, tmp_path, contracts="original", generation=5), None) as chain:
+        assert type(chain._suite).__name__ == "OriginalSuite"
+
+
+async def test_another_token_may_be_xrt(served: ServedChain, tmp_path: Path) -> None:
+    async with chain_of(settings(served, tmp_path), None) as chain:
+        factory = chain.factory
+    async with chain_of(settings(served, tmp_path, xrt_contract=factory), None) as chain:
+        assert chain.xrt == factory
+        with pytest.raises(UnknownName):
+            await chain.resolve("no.xrt.3.robonomics.eth")
+
+
+async def test_gas_that_is_too_dear_is_not_bought(served: ServedChain, tmp_path: Path) -> None:
+    dear = settings(served, tmp_path, max_fee_gwei=1e-9)
+    async with chain_of(dear, account(served)) as chain:
+        with pytest.raises(FeeTooHigh, match="the ceiling is 1e-09 gwei"):
+            await chain.approve(chain.factory, 1)
+
+
+async def test_what_was_left_behind_is_taken_up_by_the_next_run(served: ServedChain, tmp_path: Path) -> None:
+    """One that was cancelled while it waited; a second one, started anew, does not send the same again."""
+    mine, friend = account(served), Account.from_key(new_private_key()).address
+    async with chain_of(settings(served, tmp_path, confirmations=1000), mine) as chain:
+        sending = asyncio.create_task(chain.transfer(friend, 7))
+        while await chain.balance_of(friend) == 0:
+            await asyncio.sleep(0.01)
+        sending.cancel()
+        await asyncio.wait([sending])
+    async with chain_of(settings(served, tmp_path), mine) as chain:
+        await chain.transfer(friend, 7)
+        assert await chain.balance_of(friend) == 7
+        await chain.transfer(friend, 7)
+        assert await chain.balance_of(friend) == 14
+
+
+async def test_programs_of_one_account_get_not_in_each_others_way(served: ServedChain, tmp_path: Path) -> None:
+    friend = Account.from_key(new_private_key()).address
+    key = served.node.funded_keys[0].hex()
+    variables = {"AIRA_WEB3_HTTP_PROVIDER": served.url, "AIRA_DATA_DIR": str(tmp_path), "AIRA_POLL_INTERVAL": "0.05"}
+    programs = [
+        await asyncio.create_subprocess_exec(
+            *(sys.executable, "-c", PAYING, key, friend, "6"),
+            env=variables,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.STDOUT,
+        )
+        for _ in range(3)
+    ]
+    said = [(await program.communicate())[0].decode() for program in programs]
+    assert said == [""] * 3
+    async with chain_of(settings(served, tmp_path), None) as chain:
+        assert await chain.balance_of(friend) == 18
+    assert left_in_the_journal(tmp_path) == [], "all of them are settled"
+
+
+def left_in_the_journal(folder: Path) -> list[Path]:
+    (accounts,) = folder.glob("transactions/*/*")
+    return list(accounts.iterdir())
