@@ -1,0 +1,153 @@
+"""`aira objective show`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from mesh.cli.files import at_once, duration_words, size_words
+from mesh.cli.holdings import MESH, fetch, file_or_cid, opened_store, readable
+from mesh.cli.options import with_settings
+from mesh.cli.printing import plural, print_facts, print_json, print_table, visible, with_json
+from mesh.recording import GENEROUS, Objective, Rates, open_objective, rates_of
+from mesh.running import run_to_end
+from schemas import cid_of_file
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from mesh.settings import Settings
+    from schemas.payloads import PayloadType
+
+SPANS: Final = 48
+"""Columns of the plot in the terminal."""
+PNG_SPANS: Final = 200
+BARS: Final = " ▁▂▃▄▅▆▇█"
+
+
+@click.command("show")
+@click.argument("objective")
+@click.option("--schemas", is_flag=True, help="print the schema of each type, too")
+@click.option("--png", type=click.Path(path_type=Path), help="draw the messages a second to this file")
+@with_json
+@with_settings(*MESH)
+def command(settings: Settings, objective: str, schemas: bool, png: Path | None, as_json: bool) -> None:
+    """Show what is in OBJECTIVE, a file or a CID: how long, which topics of which types, whose recording it says it is,
+    and how many messages come when."""
+    path = at_once(lambda: file_or_cid(objective))
+    if isinstance(path, str):
+        path = _fetched(settings, path)
+    at_once(lambda: _show(path, schemas=schemas, png=png, as_json=as_json))
+
+
+def _fetched(settings: Settings, cid: str) -> Path:
+    found: list[Path] = []
+
+    async def main() -> None:
+        async with opened_store(settings) as store:
+            found.append(await fetch(settings, store, cid))
+
+    run_to_end(main)
+    return found[0]
+
+
+def _show(path: Path, *, schemas: bool, png: Path | None, as_json: bool) -> None:
+    objective = open_objective(readable(path), GENEROUS)
+    if png is not None:
+        from mesh.cli.objective.plot import draw
+
+        draw(_rates(objective, PNG_SPANS), png, title=path.name)
+    if as_json:
+        print_json(_facts(objective))
+        return
+    _print_summary(objective)
+    _print_topics(objective)
+    if schemas:
+        _print_schemas(objective)
+
+
+def _rates(objective: Objective, spans: int) -> Rates:
+    start, duration = objective.start_ns, objective.duration_ns
+    return rates_of(objective.messages(), start_ns=start, duration_ns=duration, spans=spans)
+
+
+def _facts(objective: Objective) -> dict[str, Any]:
+    rates = _rates(objective, SPANS)
+    return {
+        "cid": cid_of_file(objective.path),
+        "file": str(objective.path),
+        "format": objective.format,
+        "size": objective.size,
+        "messages": objective.count,
+        "startNs": objective.start_ns,
+        "durationNs": objective.duration_ns,
+        "topics": [
+            {"topic": name, "messages": sum(rates.counts.get(name, ())), "types": [_described(kind) for kind in kinds]}
+            for name, kinds in _kinds(objective).items()
+        ],
+        "metadata": objective.metadata,
+        "attachments": [
+            {"name": one.name, "mediaType": one.media_type, "size": one.size} for one in objective.attachments
+        ],
+        "spanNs": rates.span_ns,
+        "counts": rates.counts,
+    }
+
+
+def _kinds(objective: Objective) -> dict[str, list[PayloadType]]:
+    """The types of each topic, mostly one."""
+    kinds: dict[str, list[PayloadType]] = {}
+    for topic in objective.topics:
+        kinds.setdefault(topic.name, []).append(topic.type)
+    return kinds
+
+
+def _described(kind: PayloadType) -> dict[str, str]:
+    schema = kind.schema_data.decode(errors="replace")
+    return {"type": kind.zenoh_encoding, "schemaEncoding": kind.schema_encoding, "schema": schema}
+
+
+def _print_summary(objective: Objective) -> None:
+    attached = ", ".join(f"{visible(one.name)} ({size_words(one.size)})" for one in objective.attachments)
+    print_facts(
+        {
+            "cid": cid_of_file(objective.path),
+            "format": {"mcap": "MCAP", "bag": "ROS 1 bag"}[objective.format],
+            "size": size_words(objective.size),
+            "messages": f"{objective.count:,}",
+            "duration": duration_words(objective.duration_ns),
+            "attached": attached or None,
+        }
+    )
+    for name, values in objective.metadata.items():
+        click.echo(f"\n{visible(name)}")
+        print_facts({f"  {visible(key)}": visible(value) for key, value in values.items()})
+
+
+def _print_topics(objective: Objective) -> None:
+    rates = _rates(objective, SPANS)
+    rows = []
+    for name, kinds in _kinds(objective).items():
+        counts = rates.counts.get(name, [])
+        rate = f"{sum(counts) * 1e9 / objective.duration_ns:.3g}/s" if objective.duration_ns else ""
+        types = ", ".join(visible(kind.schema_name or kind.encoding or "bytes") for kind in kinds)
+        rows.append((visible(name), types, f"{sum(counts):,}", rate, _bars(counts)))
+    click.echo()
+    print_table(("topic", "type", "messages", "rate", "when"), rows, numbers=("messages", "rate"))
+    if objective.duration_ns:
+        click.echo(f"each column of `when` is {duration_words(rates.span_ns)} long")
+
+
+def _bars(counts: Sequence[int]) -> str:
+    """A bar for each count, the highest of them full; never nothing for something."""
+    most = max(counts, default=0)
+    return "".join(BARS[-(-count * (len(BARS) - 1) // most)] if count else " " for count in counts)
+
+
+def _print_schemas(objective: Objective) -> None:
+    for kind in dict.fromkeys(topic.type for topic in objective.topics):
+        click.echo(f"\n{visible(kind.zenoh_encoding)} ({plural(len(kind.schema_data), 'byte')} of schema)")
+        for line in kind.schema_data.decode(errors="replace").splitlines():
+            click.echo(f"  {visible(line.expandtabs())}")

@@ -1,0 +1,130 @@
+"""`aira verify`: a recording as evidence."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import click
+import msgspec
+
+from mesh.cli.holdings import MESH, fetch, opened_store, readable
+from mesh.cli.opening import reading
+from mesh.cli.options import with_settings
+from mesh.cli.printing import plural, print_facts, print_json, print_table, visible, with_json
+from mesh.errors import AiraError, InputError
+from mesh.evidence import Claim, Verdict, check_end, verify
+from mesh.running import run_to_end
+from mesh.settings import CHAIN_SETTINGS
+from schemas import parse_address
+
+if TYPE_CHECKING:
+    from mesh.settings import Settings
+
+FILE: Final = click.Path(path_type=Path)
+MARKS: Final = {True: "holds", False: "FAILS", None: "open"}
+
+
+@click.command("verify")
+@click.argument("liability", required=False)
+@click.option("--objective", type=FILE, help="the objective's file, instead of fetching it by its CID")
+@click.option("--result", type=FILE, help="the recording, instead of fetching it by its CID")
+@click.option("--message", type=FILE, help="the Result message as it travelled (JSON)")
+@click.option("--offline", is_flag=True, help="ask no chain; what only a contract can tell stays open")
+@with_json
+@with_settings(*dict.fromkeys((*MESH, *CHAIN_SETTINGS)))
+def command(
+    settings: Settings,
+    liability: str | None,
+    objective: Path | None,
+    result: Path | None,
+    message: Path | None,
+    offline: bool,
+    as_json: bool,
+) -> None:
+    """Check the objective and the recording of LIABILITY, an address, against each other and against the contract: the
+    files by their CIDs, who signed, that the recording is whole and this job's, and that it plays what was asked for.
+
+    Without a LIABILITY it needs --objective and --result, no chain and no network.
+
+    A line for each thing: it holds, fails, or stays open as nothing tells. Exit code 0: nothing fails; 1: something
+    does; 2: it could not be looked at.
+    """
+    holds = True
+
+    async def main() -> None:
+        nonlocal holds
+        files = Files(objective=objective, result=result, message=message)
+        try:
+            holds = await _verify(settings, liability, files, offline=offline, as_json=as_json)
+        except AiraError as error:  # whose fault it is does not matter here: exit code 1 is for what does not hold
+            raise InputError(str(error), hint=error.hint) from error
+
+    run_to_end(main)
+    if not holds:
+        raise SystemExit(1)
+
+
+class Files(msgspec.Struct, frozen=True, kw_only=True):
+    """The files that were given."""
+
+    objective: Path | None
+    result: Path | None
+    message: Path | None
+
+
+async def _verify(settings: Settings, liability: str | None, files: Files, *, offline: bool, as_json: bool) -> bool:
+    if (liability is None or offline) and None in (files.objective, files.result):
+        raise InputError("without a contract there is nothing to fetch", hint="give --objective and --result")
+    message = None if files.message is None else await asyncio.to_thread(readable(files.message).read_bytes)
+    claim = await _claim(settings, liability, offline=offline)
+    verdict = await _verdict(settings, claim, files, message)
+    if as_json:
+        print_json({"holds": verdict.holds, "claim": claim, "findings": verdict.findings})
+    else:
+        _print(claim, verdict)
+    return verdict.holds
+
+
+async def _claim(settings: Settings, liability: str | None, *, offline: bool) -> Claim:
+    if liability is None:
+        return Claim()
+    if offline:
+        return Claim(liability=parse_address(liability))
+    async with reading(settings) as chain:
+        return Claim.of_contract(await chain.liability(liability))
+
+
+async def _verdict(settings: Settings, claim: Claim, files: Files, message: bytes | None) -> Verdict:
+    if files.result is None and not claim.result:
+        return Verdict((check_end(claim),))
+    async with opened_store(settings) as store:
+        objective = readable(files.objective) if files.objective else await fetch(settings, store, claim.objective)
+        result = readable(files.result) if files.result else await fetch(settings, store, claim.result)
+        return await asyncio.to_thread(
+            verify,
+            claim,
+            objective=objective,
+            result=result,
+            message=message,
+            objective_cid="" if files.objective else claim.objective,
+            result_cid="" if files.result else claim.result,
+        )
+
+
+def _print(claim: Claim, verdict: Verdict) -> None:
+    print_facts(
+        {
+            "liability": claim.liability or None,
+            "promisor": claim.promisor or None,
+            "objective": claim.objective or None,
+            "result": claim.result or None,
+        }
+    )
+    rows = [(MARKS[finding.holds], finding.name, visible(finding.detail)) for finding in verdict.findings]
+    print_table(("", "what", "found"), rows)
+    failed = sum(finding.holds is False for finding in verdict.findings)
+    untold = sum(finding.holds is None for finding in verdict.findings)
+    open_ones = f"; {plural(untold, 'thing')} stayed open" if untold else ""
+    click.echo(f"{plural(failed, 'thing')} of {len(verdict.findings)} failed{open_ones}")

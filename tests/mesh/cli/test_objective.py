@@ -1,0 +1,378 @@
+"""`aira objective`: what its commands print, write and refuse."""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import zenoh
+from click.testing import CliRunner
+
+from mesh.cli import main
+from mesh.content import Exchange, Store
+from mesh.network import Endpoints, Network, free_endpoint
+from mesh.recording import Recorder, RecordingAbout, open_objective
+from schemas import cid_of_bytes, cid_of_file
+from schemas.payloads import JSON, RAW, STRING, String
+from tests.mesh.recording.files import T0, with_messages
+from tests.support.bags import Bag, Sent, string
+from tests.support.commands import Interrupted, aira, run
+from tests.support.objectives import objective
+from tests.support.routers import client_config
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from click.testing import Result
+
+    from tests.support.routers import EmbeddedRouter
+
+LINES = b"""{"topic": "/blink"}
+{"topic": "/blink", "time": 0.5, "data": "blue"}
+{"topic": "/move", "time": 2, "data": {"x": 1}}
+"""
+
+
+@pytest.fixture(autouse=True)
+def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A store of this test's own."""
+    monkeypatch.setenv("AIRA_DATA_DIR", str(tmp_path / "data"))
+
+
+@pytest.fixture
+def sound(tmp_path: Path) -> Path:
+    path = tmp_path / "sound.mcap"
+    path.write_bytes(objective(("/go", "there"), ("/go", {"x": 1}), ("/stop", b"\1")))
+    return path
+
+
+def call(*words: str | Path, given: bytes | None = None) -> Result:
+    return CliRunner().invoke(main, ["objective", *map(str, words)], input=given)
+
+
+def refused(done: Result, said: str, *, code: int = 2) -> None:
+    """One clear line, and what to do."""
+    assert done.exit_code == code, done.output
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("aira: ")]
+    assert said in line
+    assert "Traceback" not in done.stderr
+
+
+def test_lines_become_an_objective(tmp_path: Path) -> None:
+    (tmp_path / "lines").write_bytes(LINES)
+    done = call("pack", tmp_path / "lines", "--out", tmp_path / "it.mcap")
+    assert done.exit_code == 0, done.output
+    made = tmp_path / "it.mcap"
+    assert done.stdout == f"{cid_of_file(made)}  {made}  3 messages, 2 s, {made.stat().st_size:,} bytes\n"
+    assert [(one.topic, one.log_time_ns) for one in open_objective(tmp_path / "it.mcap").messages()] == [
+        ("/blink", 0),
+        ("/blink", 500_000_000),
+        ("/move", 2_000_000_000),
+    ]
+
+
+def test_lines_may_come_from_the_standard_input(tmp_path: Path) -> None:
+    done = call("pack", "-", "--out", tmp_path / "it.mcap", "--json", given=LINES)
+    assert json.loads(done.stdout) == {
+        "cid": cid_of_file(tmp_path / "it.mcap"),
+        "file": str(tmp_path / "it.mcap"),
+        "size": (tmp_path / "it.mcap").stat().st_size,
+        "messages": 3,
+        "topics": ["/blink", "/move"],
+        "durationNs": 2_000_000_000,
+    }
+
+
+def test_a_bag_is_packed_without_losing_anything(tmp_path: Path) -> None:
+    bag = tmp_path / "it.bag"
+    bag.write_bytes(Bag([Sent("/blink", string("blue"), T0)]).encode())
+    assert call("pack", bag, "--out", tmp_path / "it.mcap").exit_code == 0
+    assert open_objective(tmp_path / "it.mcap").metadata["aira"]["source"] == cid_of_file(bag)
+
+
+def test_a_line_that_is_wrong_is_named_and_nothing_is_written(tmp_path: Path) -> None:
+    done = call("pack", "-", "--out", tmp_path / "it.mcap", given=LINES + b'{"topic": "blink"}\n')
+    refused(done, "aira: line 4: 'blink' is not a key of the mesh: a topic begins with /")
+    assert not (tmp_path / "it.mcap").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["pack", "--out", "new"], "an objective is made of a SOURCE or of what is heard"),
+        (["pack", "-", "--hear", "a", "--out", "new"], "an objective is made of a SOURCE or of what is heard"),
+        (["pack", "missing", "--out", "new"], "can't read missing: No such file or directory"),
+        (["pack", "missing", "--out", "/"], "/ is there already"),
+        (["pack", "-", "--out", "nowhere/new"], "there is no folder nowhere"),
+        (["pack", "--hear", "a//b", "--out", "new"], "'a//b' is no key expression"),
+        (["show", "missing"], "'missing' is neither a file nor a CID"),
+        (["show", "."], "can't read .: it is a folder"),
+        (["convert", "missing"], "can't read missing: No such file or directory"),
+        (["add", "missing"], "can't read missing: No such file or directory"),
+        (["recover", "missing"], "can't read missing: No such file or directory"),
+        (["check", "missing"], "'missing' is neither a file nor a CID"),
+        (["get", "Qm", "--out", "new"], "'Qm' is not a CIDv0"),
+    ],
+)
+def test_what_can_not_be_is_one_clear_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], said: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    refused(call(*words), said)
+    assert {path.name for path in tmp_path.iterdir()} <= {"data"}
+
+
+def test_no_file_is_written_over(tmp_path: Path, sound: Path) -> None:
+    before = sound.read_bytes()
+    for words in (["pack", "-", "--out"], ["get", cid_of_bytes(b"x"), "--out"], ["recover", sound, "--out"]):
+        refused(call(*words, sound), f"{sound} is there already")
+    bag = tmp_path / "it.bag"
+    bag.write_bytes(Bag([Sent("/blink", string("blue"), T0)]).encode())
+    refused(call("convert", bag, sound), f"{sound} is there already")
+    assert sound.read_bytes() == before
+
+
+def test_show_tells_what_is_in_a_file(sound: Path) -> None:
+    done = call("show", sound)
+    assert done.exit_code == 0, done.output
+    lines = done.stdout.splitlines()
+    assert lines[0].split() == ["cid", cid_of_file(sound)]
+    assert lines[4].split() == ["duration", "0.04", "s"]
+    assert lines[6].split() == ["topic", "type", "messages", "rate", "when"]
+    assert lines[7].split()[:5] == ["/go", "std_msgs/String,", "raw", "2", "50/s"]
+    assert lines[7].count("█") == 2
+    assert lines[8].split()[:3] == ["/stop", "raw", "1"]
+
+
+def test_show_tells_schemas_metadata_and_attachments(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "it.mcap", RecordingAbout(liability="0x\x1b[2J1")) as recorder:
+        recorder.record("/a", String("x").encode(), STRING)
+    done = call("show", tmp_path / "it.mcap", "--schemas")
+    assert "  string data" in done.stdout
+    assert "\x1b" not in done.stdout
+    assert any(line.split() == ["liability", "0x\N{REPLACEMENT CHARACTER}[2J1"] for line in done.stdout.splitlines())
+
+
+def test_show_for_programs(sound: Path) -> None:
+    said = json.loads(call("show", sound, "--json").stdout)
+    assert (said["cid"], said["messages"], said["format"]) == (cid_of_file(sound), 3, "mcap")
+    assert said["topics"][0]["types"][1] == {
+        "type": "application/json;raw",
+        "schemaEncoding": "jsonschema",
+        "schema": JSON.schema_data.decode(),
+    }
+    assert sum(said["counts"]["/go"]) == 2
+
+
+def test_show_draws_a_plot(tmp_path: Path, sound: Path) -> None:
+    done = call("show", sound, "--png", tmp_path / "it.png")
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "it.png").read_bytes().startswith(b"\x89PNG\r\n")
+    refused(call("show", sound, "--png", tmp_path / "nowhere" / "it.png"), "can't write")
+
+
+def test_without_matplotlib_it_says_how_to_get_it(tmp_path: Path, sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    done = call("show", sound, "--png", tmp_path / "it.png")
+    refused(done, "drawing needs matplotlib")
+    assert "pip install 'aira-mesh[plot]'" in done.stderr
+
+
+def test_a_file_that_is_no_recording_can_not_be_shown(tmp_path: Path) -> None:
+    (tmp_path / "text").write_bytes(b"hello")
+    refused(call("show", tmp_path / "text"), "text: it is neither an MCAP file nor a ROS 1 bag")
+
+
+def test_a_bag_is_converted_beside_itself(tmp_path: Path) -> None:
+    bag = tmp_path / "it.bag"
+    sent = [Sent("/blink", string(f"{n}"), T0 + n) for n in range(3)]
+    bag.write_bytes(Bag(sent, "bz2").encode())
+    done = call("convert", bag, "--json")
+    made = tmp_path / "it.mcap"
+    assert json.loads(done.stdout) == {
+        "cid": cid_of_file(made),
+        "file": str(made),
+        "source": cid_of_file(bag),
+        "messages": 3,
+        "durationNs": 2,
+    }
+    assert [one.payload for one in open_objective(made).messages()] == [one.payload for one in sent]
+    refused(call("convert", made, tmp_path / "other.mcap"), "it.mcap: it is no ROS 1 bag")
+
+
+def test_added_files_are_in_the_store_and_stay(tmp_path: Path, sound: Path) -> None:
+    other = tmp_path / "other.mcap"
+    other.write_bytes(with_messages([T0]))
+    assert call("add", sound).stdout == f"{cid_of_file(sound)}\n"
+    assert call("add", sound, other).stdout == f"{cid_of_file(sound)}  {sound}\n{cid_of_file(other)}  {other}\n"
+    with Store(tmp_path / "data" / "content") as store:
+        assert set(store.list()) == {cid_of_file(sound), cid_of_file(other)}
+        assert store.pins()[cid_of_file(sound)] == {"user"}
+
+
+def test_a_file_that_robots_would_refuse_is_added_with_a_warning(tmp_path: Path) -> None:
+    (tmp_path / "text").write_bytes(b"hello")
+    done = call("add", tmp_path / "text", "--json")
+    assert done.exit_code == 0
+    assert done.stderr == (
+        "aira: robots would refuse it (not-a-recording): text: it is neither an MCAP file nor a ROS 1 bag\n"
+    )
+    assert json.loads(done.stdout)[0]["reason"] == "not-a-recording"
+
+
+def test_a_fit_objective_is_said_to_be_fit(sound: Path) -> None:
+    done = call("check", sound)
+    assert (done.exit_code, done.stdout) == (0, f"{cid_of_file(sound)}  fit to be played: 3 messages, 0.04 s\n")
+    call("add", sound)
+    assert call("check", cid_of_file(sound)).stdout == done.stdout
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [(["--topics", "/go"], "unknown-topic"), (["--objective-size-limit", "10"], "too-large")],
+)
+def test_an_unfit_one_is_told_by_a_word_and_the_exit_code(sound: Path, options: list[str], reason: str) -> None:
+    done = call("check", sound, "--json", *options)
+    assert done.exit_code == 1
+    said = json.loads(done.stdout)
+    assert (said["ok"], said["reason"]) == (False, reason)
+    assert call("check", sound, *options).stdout.startswith(f"{cid_of_file(sound)}  {reason}: ")
+
+
+def test_a_store_with_a_rotten_file_is_told_of(tmp_path: Path, sound: Path) -> None:
+    call("add", sound)
+    assert call("check").stdout.endswith(", 0 damaged\n")
+    kept = tmp_path / "data" / "content" / cid_of_file(sound)
+    kept.chmod(0o600)
+    kept.write_bytes(sound.read_bytes()[:-1] + b"x")
+    done = call("check", "--json")
+    assert done.exit_code == 1
+    assert json.loads(done.stdout)["damaged"] == [cid_of_file(sound)]
+
+
+def test_what_is_readable_of_a_cut_file_is_saved(tmp_path: Path) -> None:
+    (tmp_path / "it.mcap").write_bytes(with_messages([T0 + n for n in range(500)])[:3000])
+    done = call("recover", tmp_path / "it.mcap", "--json")
+    said = json.loads(done.stdout)
+    saved = tmp_path / "it.recovered.mcap"
+    assert (said["file"], said["cid"]) == (str(saved), cid_of_file(saved))
+    assert 0 < said["messages"] == open_objective(saved).count < 500
+    refused(call("recover", tmp_path / "it.mcap"), "is there already")
+    (tmp_path / "text").write_bytes(b"hello")
+    refused(call("recover", tmp_path / "text"), "it does not begin as an MCAP file does")
+
+
+class Holder:
+    """Somebody in the mesh who has a file."""
+
+    def __init__(self, endpoint: str, folder: Path, content: bytes) -> None:
+        self._endpoint = endpoint
+        self._folder = folder
+        self._content = content
+
+    async def __aenter__(self) -> str:
+        self._network = await Network(Endpoints(connect=(self._endpoint,))).__aenter__()
+        self._store = Store(self._folder)
+        cid = self._store.put_bytes(self._content)
+        self._exchange = await Exchange(self._network.session, self._store).__aenter__()
+        return cid
+
+    async def __aexit__(self, *exc_info: Any) -> None:
+        await self._exchange.__aexit__(None, None, None)
+        self._store.close()
+        await self._network.__aexit__(None, None, None)
+
+
+async def test_a_file_is_fetched_from_whoever_has_it(router: EmbeddedRouter, tmp_path: Path) -> None:
+    import asyncio
+
+    content = objective(("/go", "there"))
+    async with Holder(router.endpoint, tmp_path / "theirs", content) as cid:
+        words: list[str | Path] = ["objective", "get", cid, "--out", tmp_path / "it.mcap", "--connect", router.endpoint]
+        done = await asyncio.to_thread(aira, *words)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert (tmp_path / "it.mcap").read_bytes() == content
+        done = await asyncio.to_thread(aira, "objective", "show", cid, "--connect", router.endpoint)
+        assert done.stdout.splitlines()[0].split() == ["cid", cid]
+
+
+def test_what_nobody_has_and_no_router_are_one_clear_line(router: EmbeddedRouter, tmp_path: Path) -> None:
+    words: list[str | Path] = ["get", cid_of_bytes(b"nobody's"), "--out", tmp_path / "it", "--fetch-timeout", "0.2"]
+    refused(call(*words, "--connect", router.endpoint), "is not to be had", code=1)
+    nowhere = ["--connect", free_endpoint(), "--connect-timeout", "0.2"]
+    refused(call(*words, *nowhere), "no Zenoh router at", code=1)
+    refused(call("pack", "--hear", "a/**", "--out", tmp_path / "it", *nowhere), "no Zenoh router at", code=1)
+
+
+class Speaker:
+    """A device that says the same thing again and again until it is left."""
+
+    def __init__(self, endpoint: str, key: str) -> None:
+        self._endpoint = endpoint
+        self._key = key
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._speak, name="speaker of the test")
+
+    def __enter__(self) -> None:
+        self._thread.start()
+
+    def __exit__(self, *exc_info: object) -> None:
+        self._stopped.set()
+        self._thread.join()
+
+    def _speak(self) -> None:
+        with zenoh.open(client_config(self._endpoint)) as session:
+            while not self._stopped.wait(0.02):
+                session.put(self._key, String("on").encode(), encoding=STRING.zenoh_encoding)
+                session.put("elsewhere/x", b"\1")
+
+
+DEVICE = f"aira/agent/0x{'1' * 40}/device/lamp"
+
+
+@pytest.fixture
+def speaker(router: EmbeddedRouter) -> Iterator[None]:
+    with Speaker(router.endpoint, f"{DEVICE}/led/left"):
+        yield
+
+
+@pytest.mark.usefixtures("speaker")
+def test_what_is_said_now_becomes_an_objective(router: EmbeddedRouter, tmp_path: Path) -> None:
+    out = tmp_path / "heard.mcap"
+    words: list[str | Path] = ["--hear", f"{DEVICE}/**", "--hear", "elsewhere/*", "--seconds", "1.5", "--out", out]
+    done = call("pack", *words, "--connect", router.endpoint, "--json")
+    assert done.exit_code == 0, done.output
+    said = json.loads(done.stdout)
+    assert said["topics"] == ["/elsewhere/x", "/led/left"]
+    types = {topic.name: topic.type for topic in open_objective(out).topics}
+    assert types == {"/led/left": STRING, "/elsewhere/x": RAW}
+    assert said["cid"] == cid_of_file(out)
+
+
+@pytest.mark.usefixtures("speaker")
+def test_ctrl_c_ends_the_hearing_with_a_whole_file(router: EmbeddedRouter, tmp_path: Path) -> None:
+    out = tmp_path / "heard.mcap"
+    words: list[str | Path] = ["--hear", f"{DEVICE}/**", "--out", out, "--connect", router.endpoint]
+    done = Interrupted("objective", "pack", *words, after=3.0)
+    assert (done.code, done.output.split()[0]) == (0, cid_of_file(out)), done.errors
+    assert open_objective(out).count > 0
+
+
+def test_where_nobody_speaks_no_file_is_left(router: EmbeddedRouter, tmp_path: Path) -> None:
+    out = tmp_path / "it.mcap"
+    words: list[str | Path] = ["--hear", "silence/**", "--seconds", "0.2", "--out", out, "--connect", router.endpoint]
+    refused(call("pack", *words), "nobody said anything on silence/**", code=1)
+    assert not out.exists()
+
+
+def test_looking_at_files_loads_no_chain(sound: Path) -> None:
+    program = (
+        "import sys; from mesh.cli import main\n"
+        f"main(['objective', 'show', {str(sound)!r}], standalone_mode=False)\n"
+        "print([name for name in ('web3', 'eth_account', 'matplotlib') if name in sys.modules])"
+    )
+    assert run(sys.executable, "-c", program).stdout.splitlines()[-1] == "[]"

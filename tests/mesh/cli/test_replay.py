@@ -1,0 +1,174 @@
+"""`aira replay`: what is put where, when, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+import zenoh
+from click.testing import CliRunner
+
+from mesh.cli import main
+from mesh.content import Store
+from mesh.network import free_endpoint
+from mesh.recording import Recorder, RecordingAbout
+from schemas import String, cid_of_bytes
+from schemas.payloads import STRING
+from tests.support.commands import Interrupted
+from tests.support.listening import Listener
+from tests.support.objectives import objective, timed
+from tests.support.routers import client_config
+from tests.support.waiting import at_most
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from click.testing import Result
+
+    from tests.support.routers import EmbeddedRouter
+
+ROBOT = f"0x{'1' * 40}"
+SECOND = 10**9
+
+
+@pytest.fixture
+def listener(router: EmbeddedRouter) -> Iterator[Listener]:
+    with zenoh.open(client_config(router.endpoint)) as session:
+        yield Listener(session)
+
+
+class Stage:
+    """A file, and the command that plays it."""
+
+    def __init__(self, endpoint: str, folder: Path) -> None:
+        self._endpoint = endpoint
+        self.data = folder / "data"
+        self.path = folder / "it.mcap"
+        self.path.write_bytes(objective(("/go", "there"), ("/move/left", {"x": 1}), ("/go", b"\1")))
+
+    def words(self, *words: str | Path) -> list[str]:
+        options = ["--connect", self._endpoint, "--connect-timeout", "5", "--data-dir", self.data]
+        return [str(word) for word in ["replay", *words, *options]]
+
+    def play(self, *words: str | Path) -> Result:
+        return CliRunner().invoke(main, self.words(*words))
+
+
+@pytest.fixture
+def stage(router: EmbeddedRouter, tmp_path: Path) -> Stage:
+    return Stage(router.endpoint, tmp_path)
+
+
+def test_a_file_is_said_on_the_topics_of_a_device_as_it_was(stage: Stage, listener: Listener) -> None:
+    done = stage.play(stage.path, "--to", f"{ROBOT}/lamp")
+    assert done.exit_code == 0, done.output
+    assert done.stdout.startswith("3 messages in ")
+    device = f"aira/agent/{ROBOT}/device/lamp"
+    assert [(key, payload, encoding) for key, payload, encoding, _ in listener.heard(3)] == [
+        (f"{device}/go", String("there").encode(), "ros1;std_msgs/String"),
+        (f"{device}/move/left", b'{"x":1}', "application/json;raw"),
+        (f"{device}/go", b"\1", "application/octet-stream;raw"),
+    ]
+
+
+def test_or_on_keys_that_begin_as_one_likes(stage: Stage, listener: Listener) -> None:
+    assert stage.play(stage.path, "--to", "lab/stage").exit_code == 0
+    assert listener.keys(3) == ["lab/stage/go", "lab/stage/move/left", "lab/stage/go"]
+
+
+def test_or_on_those_of_ones_own_device(stage: Stage, listener: Listener, tmp_path: Path) -> None:
+    keyfile, password = tmp_path / "key.json", tmp_path / "password"
+    made = CliRunner().invoke(main, ["account", "new", str(keyfile), "--password-file", str(password)])
+    own = made.stdout.split()[-1].lower()
+    assert stage.play(stage.path, "--to", "lamp", "--keyfile", keyfile).exit_code == 0
+    assert listener.keys(3)[0] == f"aira/agent/{own}/device/lamp/go"
+
+
+def test_a_cid_is_played_from_the_store(stage: Stage, listener: Listener) -> None:
+    with Store(stage.data / "content") as store:
+        cid = store.put_file(stage.path)
+    assert stage.play(cid, "--to", "lab/stage").exit_code == 0
+    assert len(listener.keys(3)) == 3
+
+
+def test_only_what_is_wanted_is_said(stage: Stage, listener: Listener) -> None:
+    done = stage.play(stage.path, "--to", "lab/stage", "--topics", "/move/left", "--json")
+    assert json.loads(done.stdout)["messages"] == 1
+    assert listener.keys(1) == ["lab/stage/move/left"]
+
+
+def test_only_what_the_device_said(stage: Stage, listener: Listener, tmp_path: Path) -> None:
+    with Recorder(tmp_path / "job.mcap", RecordingAbout()) as recorder:
+        recorder.record("/go", String("there").encode(), STRING, role="objective")
+        recorder.record("/gone", String("there").encode(), STRING, role="device")
+    assert stage.play(tmp_path / "job.mcap", "--to", "lab/stage", "--role", "device").exit_code == 0
+    assert listener.keys(1) == ["lab/stage/gone"]
+
+
+def test_at_its_own_times(stage: Stage, listener: Listener) -> None:
+    stage.path.write_bytes(timed([("/go", "one", 0), ("/go", "two", SECOND // 2), ("/go", "three", SECOND)]))
+    assert stage.play(stage.path, "--to", "lab/stage").exit_code == 0
+    heard = listener.heard(3)
+    assert heard[1][3] - heard[0][3] > 0.4
+    assert heard[2][3] - heard[0][3] > 0.9
+
+
+@pytest.mark.parametrize(
+    ("options", "count"),
+    [(["--rate", "1200"], 3), (["--at-once"], 3), (["--from", "599.5"], 1)],
+    ids=str,
+)
+def test_ten_minutes_in_a_moment(stage: Stage, listener: Listener, options: list[str], count: int) -> None:
+    stage.path.write_bytes(timed([("/go", "one", 0), ("/go", "two", SECOND), ("/go", "three", 600 * SECOND)]))
+    with at_most(60):
+        assert stage.play(stage.path, "--to", "lab/stage", *options).exit_code == 0
+    assert len(listener.keys(count)) == count
+
+
+def test_ctrl_c_ends_it(stage: Stage, listener: Listener) -> None:
+    stage.path.write_bytes(timed([("/go", "one", 0), ("/go", "two", 3600 * SECOND)]))
+    done = Interrupted(*stage.words(stage.path, "--to", "lab/stage"), after=4.0)
+    assert (done.code, done.errors) == (130, "")
+    assert listener.keys(1) == ["lab/stage/go"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["missing", "--to", "a/b"], "'missing' is neither a file nor a CID"),
+        ([".", "--to", "a/b"], "can't read .: it is a folder"),
+        (["it.mcap"], "a file says nothing of where it is to be played"),
+        (["it.mcap", "--to", "lamp"], "whose device 'lamp' is can't be told without an account"),
+        (["it.mcap", "--to", f"{ROBOT}/la mp"], "'la mp' is not a key of the mesh"),
+        (["it.mcap", "--to", "a/**"], "'a/**' has a wildcard, and would reach everybody"),
+        (["it.mcap", "--to", "a//b"], "'a//b' is not the beginning of a key"),
+        (["it.mcap", "--to", "a/b", "--topics", "/stop"], "the recording has no topic /stop"),
+        (["text", "--to", "a/b"], "text: it is neither an MCAP file nor a ROS 1 bag"),
+        (["odd.mcap", "--to", "a/b"], "'a b' is not a key of the mesh"),
+    ],
+)
+def test_what_can_not_be_is_one_clear_line_and_nothing_is_said(
+    stage: Stage, listener: Listener, monkeypatch: pytest.MonkeyPatch, words: list[str], said: str
+) -> None:
+    monkeypatch.chdir(stage.path.parent)
+    (stage.path.parent / "text").write_bytes(b"hello")
+    (stage.path.parent / "odd.mcap").write_bytes(objective(("/fine", "x"), ("/a b", "x")))
+    done = stage.play(*words)
+    assert done.exit_code == 2, done.output
+    assert done.stderr.startswith(f"aira: {said}")
+    assert listener.heard(0) == []
+
+
+def test_no_router_nobody_who_has_it_and_no_chain_are_one_clear_line(stage: Stage) -> None:
+    nowhere = Stage(free_endpoint(), stage.path.parent)
+    done = nowhere.play(stage.path, "--to", "a/b", "--connect-timeout", "0.2")
+    assert (done.exit_code, done.stderr[:28]) == (1, "aira: no Zenoh router at tcp")
+    done = stage.play(cid_of_bytes(b"nobody's"), "--to", "a/b", "--fetch-timeout", "0.2")
+    assert done.exit_code == 1
+    assert "is not to be had" in done.stderr
+    done = stage.play(ROBOT, "--web3-http-provider", "http://127.0.0.1:9")
+    assert done.exit_code == 1
+    assert done.stderr.startswith("aira: ")
+    assert "Traceback" not in done.stderr

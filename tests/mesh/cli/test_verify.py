@@ -1,0 +1,202 @@
+"""`aira verify`."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import zenoh
+from click.testing import CliRunner
+
+from mesh.agent import Agent
+from mesh.agent.parts import load_account
+from mesh.cli import main
+from mesh.cli.demand import _demand
+from mesh.cli.replay import Replay, _replay
+from mesh.cli.up import _serve as serve_up
+from mesh.cli.verify import Files, _verify
+from mesh.errors import AiraError
+from mesh.network import free_endpoint
+from mesh.settings import Settings
+from schemas import cid_of_bytes
+from tests.mesh.evidence.jobs import LIABILITY, OTHER, made
+from tests.support.commands import aira
+from tests.support.listening import Listener
+from tests.support.market import obliging
+from tests.support.objectives import objective
+from tests.support.routers import client_config
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from click.testing import Result
+
+    from mesh.work.run import Run
+    from tests.mesh.evidence.jobs import Job
+
+MODEL = cid_of_bytes(b"what is verified")
+
+
+@pytest.fixture
+def job(tmp_path: Path) -> Job:
+    return made(tmp_path)
+
+
+def verified(job: Job, *more: str | Path) -> Result:
+    words = ["verify", "--objective", job.objective, "--result", job.result, "--data-dir", job.result.parent / "data"]
+    return CliRunner().invoke(main, [str(word) for word in [*words, *more]])
+
+
+def test_two_files_are_verified_without_chain_and_network(job: Job) -> None:
+    done = verified(job)
+    assert done.exit_code == 0, done.output
+    lines = done.stdout.splitlines()
+    assert any(line.startswith("holds") and "played" in line and "all 6 messages" in line for line in lines)
+    assert any(line.startswith("open") and "signature" in line for line in lines)
+    assert lines[-1] == "0 things of 14 failed; 7 things stayed open"
+
+
+def test_what_fails_is_named_and_the_exit_code_is_1(job: Job) -> None:
+    job.forge(lambda messages, metadata: messages[:4])
+    done = verified(job)
+    assert done.exit_code == 1
+    assert "FAILS  closed" in done.stdout
+    assert "closed it with 11 messages, and it has 4" in done.stdout
+    assert done.stdout.splitlines()[-1].startswith("1 thing of 14 failed")
+
+
+def test_an_address_is_compared_with_what_the_recording_says(job: Job) -> None:
+    assert verified(job, LIABILITY, "--offline").exit_code == 0
+    done = verified(job, OTHER, "--offline")
+    assert done.exit_code == 1
+    assert f"names the liability '{LIABILITY}'" in done.stdout
+
+
+def test_with_the_message_the_signature_is_verified(job: Job, tmp_path: Path) -> None:
+    message = tmp_path / "result.json"
+    message.write_bytes(job.message())
+    done = verified(job, "--message", message, "--json")
+    assert done.exit_code == 0
+    said = json.loads(done.stdout)
+    assert said["holds"] is True
+    found = {finding["name"]: finding["holds"] for finding in said["findings"]}
+    assert found["signature"] is True
+    assert found["finalized"] is None
+
+
+def test_a_strangers_text_does_not_steer_the_terminal(job: Job) -> None:
+    def evil(messages: list[Any], metadata: dict[str, dict[str, str]]) -> list[Any]:
+        metadata["aira"]["liability"] = "\x1b[2J" + LIABILITY
+        return messages
+
+    job.forge(evil)
+    done = verified(job, LIABILITY, "--offline")
+    assert done.exit_code == 1
+    assert "\x1b" not in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["verify"], "without a contract there is nothing to fetch"),
+        (["verify", LIABILITY, "--offline"], "without a contract there is nothing to fetch"),
+        (["verify", "--objective", "nowhere", "--result", "nowhere"], "can't read nowhere: No such file or directory"),
+        (["verify", "--objective", ".", "--result", "."], "can't read .: it is a folder"),
+        (["verify", "0x12", "--offline", "--objective", "a", "--result", "b"], "'0x12' is not an address"),
+        (["verify", LIABILITY, "--web3-http-provider", "http://127.0.0.1:9"], "http://127.0.0.1:9"),
+    ],
+)
+def test_what_can_not_be_looked_at_is_one_clear_line_and_exit_code_2(
+    tmp_path: Path, words: list[str], said: str
+) -> None:
+    done = CliRunner().invoke(main, [*words, "--data-dir", str(tmp_path)])
+    assert done.exit_code == 2, done.output
+    assert done.stderr.startswith("aira: ")
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_result_that_is_no_recording_fails(job: Job) -> None:
+    job.result.write_bytes(b"no recording")
+    done = verified(job)
+    assert done.exit_code == 1
+    assert "it is neither an MCAP file nor a ROS 1 bag" in done.stdout
+
+
+def test_as_a_program(job: Job) -> None:
+    done = aira("verify", "--objective", job.objective, "--result", job.result, AIRA_DATA_DIR=str(job.result.parent))
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def settings_of(role: str, endpoint: str, url: str, folder: Path) -> Settings:
+    keys = folder / "development"
+    return Settings(
+        connect=(endpoint,),
+        connect_timeout=5.0,
+        fetch_timeout=5.0,
+        web3_http_provider=url,
+        data_dir=str(folder / role),
+        poll_interval=0.05,
+        playback="at-once",
+        keyfile=str(keys / f"{role}.json"),
+        keyfile_password_file=str(keys / "password"),
+    )
+
+
+async def test_a_job_of_the_market_is_verified_from_its_address_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    endpoint = free_endpoint()
+    up = asyncio.create_task(serve_up(Settings(listen=(endpoint,), data_dir=str(tmp_path)), port=0, block_time=0.1))
+    printed = ""
+
+    def served() -> bool:
+        nonlocal printed
+        printed += capsys.readouterr().out
+        return up.done() or "provider    0x" in printed
+
+    await until(served, seconds=60)
+    url = next(line.split()[1] for line in printed.splitlines() if line.startswith("chain"))
+    robot, person = (settings_of(role, endpoint, url, tmp_path) for role in ("robot", "person"))
+    path = tmp_path / "job.mcap"
+    path.write_bytes(objective(("/go", "there"), ("/go", "back")))
+    agent = obliging(Agent(MODEL, settings=robot, account=load_account(robot)))
+
+    @agent.on("/go")
+    async def go(job: Run, message: object) -> None:
+        job.publish("/gone", message)
+
+    order: dict[str, Any] = {"model": MODEL, "cost": 7, "lifetime": 1000, "out": None, "as_json": True}
+    async with agent, asyncio.timeout(120):
+        await _demand(person, objective=str(path), **order)
+        liability = json.loads(capsys.readouterr().out.splitlines()[-1])["liability"]
+        nobody = Settings(
+            connect=(endpoint,), fetch_timeout=10.0, web3_http_provider=url, data_dir=str(tmp_path / "arbiter")
+        )
+        nothing = Files(objective=None, result=None, message=None)
+        assert await _verify(nobody, liability, nothing, offline=False, as_json=True)
+        said = json.loads(capsys.readouterr().out)
+        assert [finding["holds"] for finding in said["findings"]] == [True] * 14
+        with zenoh.open(client_config(endpoint)) as session:
+            listener = Listener(session)
+            await _replay(nobody, Replay(source=liability))
+            robots = f"aira/agent/{load_account(robot).address.lower()}/liability/{liability.lower()}"
+            keys = sorted(await asyncio.to_thread(listener.keys, 4))
+            assert keys == [f"{robots}/objective/go"] * 2 + [f"{robots}/topic/gone"] * 2
+            await _replay(nobody, Replay(source=liability, of_objective=True, to="lab/stage"))
+            assert (await asyncio.to_thread(listener.keys, 6))[4:] == ["lab/stage/go"] * 2
+        capsys.readouterr()
+        easier = tmp_path / "easier.mcap"
+        easier.write_bytes(objective(("/go", "there")))
+        other = Files(objective=easier, result=None, message=None)
+        assert not await _verify(nobody, liability, other, offline=False, as_json=False)
+        printed = capsys.readouterr().out
+        assert "FAILS  objective-file" in printed
+        with pytest.raises(AiraError):
+            await _verify(nobody, OTHER, nothing, offline=False, as_json=False)
+    up.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await up

@@ -1,0 +1,117 @@
+"""A job that was done, its two files, and what a forger would make of the recording."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from mesh.evidence import Claim, Verdict, verify
+from mesh.recording import Recorder, RecordingAbout, open_objective
+from mesh.recording.mcap_file import McapFile
+from schemas import Result, Signer, String, cid_of_file, encode
+from schemas.payloads import STRING
+from tests.support.objectives import objective
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from mesh.recording import Written
+
+ROBOT: Final = Signer(b"\x01" * 32)
+THIEF: Final = Signer(b"\x02" * 32)
+LIABILITY: Final = "0x" + "1" * 40
+OTHER: Final = "0x" + "2" * 40
+WORDS: Final = ("one", "two", "three", "four", "five")
+
+Metadata = dict[str, dict[str, str]]
+
+
+@dataclass
+class Job:
+    """The files of a job, and what the contract says of it."""
+
+    objective: Path
+    result: Path
+    claim: Claim
+
+    def verify(self, message: bytes | None = None, **claimed: Any) -> Verdict:
+        """What is found, with these fields of the claim changed."""
+        claim = msgspec.structs.replace(self.claim, **claimed)
+        return verify(claim, objective=self.objective, result=self.result, message=message)
+
+    def forge(self, change: Callable[[list[Written], Metadata], list[Written]]) -> None:
+        """Write the recording anew, its messages and metadata changed, as a valid file under a CID of its own."""
+        old = open_objective(self.result)
+        metadata = {name: dict(values) for name, values in old.metadata.items()}
+        written = change(list(old.in_file_order()), metadata)
+        with self.result.open("wb") as stream:
+            file = McapFile(stream)
+            for name, values in metadata.items():
+                file.add_metadata(name, values)
+            for one in written:
+                message = one.message
+                file.add(
+                    message.topic,
+                    message.payload,
+                    message.type,
+                    metadata={"role": message.role},
+                    log_time_ns=message.log_time_ns,
+                    publish_time_ns=message.publish_time_ns,
+                    sequence=message.sequence,
+                )
+            file.finish()
+        self.claim = msgspec.structs.replace(self.claim, result=cid_of_file(self.result))
+
+    def message(self, signer: Signer = ROBOT, **fields: Any) -> bytes:
+        """The signed Result as it travelled."""
+        said: dict[str, Any] = {"liability": LIABILITY, "result": cid_of_file(self.result), "success": True} | fields
+        return encode(signer.sign(Result(**said)))
+
+
+def made(folder: Path, *, played: tuple[str, ...] = WORDS, topics: str = "", **about: str) -> Job:
+    """A job whose objective has five messages on `/say`, of which these were `played`; the device answered each."""
+    path = folder / "objective.mcap"
+    path.write_bytes(objective(*(("/say", word) for word in WORDS), ("/stop", b"")))
+    says = {"liability": LIABILITY, "agent": ROBOT.address, "lighthouse": OTHER, "objective": cid_of_file(path)} | about
+    with Recorder(folder / "result.mcap", RecordingAbout(**says, topics=topics)) as recorder:
+        record(recorder, played)
+        if played == WORDS and not topics:
+            stop(recorder)
+    claim = Claim(
+        liability=LIABILITY,
+        promisor=ROBOT.address,
+        lighthouse=OTHER,
+        objective=cid_of_file(path),
+        result=cid_of_file(folder / "result.mcap"),
+        success=True,
+        finalized=True,
+    )
+    return Job(path, folder / "result.mcap", claim)
+
+
+def record(recorder: Recorder, words: tuple[str, ...]) -> None:
+    """Play these words, each answered by the device."""
+    for word in words:
+        recorder.record("/say", String(word).encode(), STRING, role="objective")
+        recorder.record("/said", String(word).encode(), STRING, role="device")
+
+
+def stop(recorder: Recorder) -> None:
+    """Play the last message of the objective."""
+    last = list(open_objective(recorder.path.with_name("objective.mcap")).messages())[-1]
+    recorder.record(last.topic, last.payload, last.type, role="objective")
+
+
+def renumbered(messages: list[Written]) -> list[Written]:
+    """The same with numbers without a gap, and the times of the originals in their order."""
+    counts: dict[str, int] = {}
+    times = sorted(one.message.log_time_ns for one in messages)
+    numbered = []
+    for one, time in zip(messages, times, strict=True):
+        number = counts[one.message.topic] = counts.get(one.message.topic, -1) + 1
+        message = msgspec.structs.replace(one.message, sequence=number, log_time_ns=time, publish_time_ns=time)
+        numbered.append(msgspec.structs.replace(one, message=message))
+    return numbered

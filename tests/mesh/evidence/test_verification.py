@@ -1,0 +1,359 @@
+"""What is found in sound recordings, and in forged ones."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import msgspec
+import pytest
+
+from mesh.evidence import Claim
+from mesh.recording import CLOSED, Recorder, RecordingAbout, open_objective
+from schemas import Demand, String, cid_of_bytes, cid_of_file, encode
+from schemas.payloads import STRING
+from tests.mesh.evidence.jobs import LIABILITY, OTHER, ROBOT, THIEF, WORDS, Job, made, record, renumbered, stop
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mesh.evidence import Verdict
+    from mesh.recording import Written
+    from tests.mesh.evidence.jobs import Metadata
+
+
+@pytest.fixture
+def job(tmp_path: Path) -> Job:
+    return made(tmp_path)
+
+
+def wrong(verdict: Verdict) -> dict[str, str]:
+    """What does not hold, with its detail."""
+    return {finding.name: finding.detail for finding in verdict.findings if finding.holds is False}
+
+
+def test_of_an_honest_job_everything_holds(job: Job) -> None:
+    verdict = job.verify()
+    assert [finding.name for finding in verdict.findings] == [
+        "finalized",
+        "signature",
+        "result-file",
+        "objective-file",
+        "readable",
+        "statistics",
+        "closed",
+        "sequence",
+        "times",
+        "liability",
+        "agent",
+        "lighthouse",
+        "objective",
+        "played",
+    ]
+    assert all(finding.holds for finding in verdict.findings)
+    assert verdict.holds
+    assert verdict.of("played") is not None
+
+
+def dropped_answer(messages: list[Written], metadata: Metadata) -> list[Written]:
+    del messages[3]
+    return messages
+
+
+def dropped_and_renumbered(messages: list[Written], metadata: Metadata) -> list[Written]:
+    del messages[4]
+    metadata[CLOSED]["messages"] = str(len(messages))
+    return renumbered(messages)
+
+
+def altered(messages: list[Written], metadata: Metadata) -> list[Written]:
+    message = msgspec.structs.replace(messages[2].message, payload=String("TWO").encode())
+    messages[2] = msgspec.structs.replace(messages[2], message=message)
+    return messages
+
+
+def reordered(messages: list[Written], metadata: Metadata) -> list[Written]:
+    messages[2], messages[4] = messages[4], messages[2]
+    return messages
+
+
+def reordered_and_renumbered(messages: list[Written], metadata: Metadata) -> list[Written]:
+    return renumbered(reordered(messages, metadata))
+
+
+def shortened(messages: list[Written], metadata: Metadata) -> list[Written]:
+    return messages[:6]
+
+
+def shortened_without_a_trace(messages: list[Written], metadata: Metadata) -> list[Written]:
+    metadata[CLOSED]["messages"] = "6"
+    return messages[:6]
+
+
+def added(messages: list[Written], metadata: Metadata) -> list[Written]:
+    metadata[CLOSED]["messages"] = str(len(messages) + 1)
+    message = msgspec.structs.replace(messages[0].message, payload=String("zero").encode())
+    return renumbered([msgspec.structs.replace(messages[0], message=message), *messages])
+
+
+def on_another_topic(messages: list[Written], metadata: Metadata) -> list[Written]:
+    message = msgspec.structs.replace(messages[0].message, topic="/shout")
+    return renumbered([msgspec.structs.replace(messages[0], message=message), *messages[1:]])
+
+
+def never_closed(messages: list[Written], metadata: Metadata) -> list[Written]:
+    del metadata[CLOSED]
+    return messages
+
+
+def lossy(messages: list[Written], metadata: Metadata) -> list[Written]:
+    metadata[CLOSED]["lost"] = "7"
+    return messages
+
+
+def of_another_liability(messages: list[Written], metadata: Metadata) -> list[Written]:
+    metadata["aira"]["liability"] = OTHER
+    return messages
+
+
+def of_another_agent(messages: list[Written], metadata: Metadata) -> list[Written]:
+    metadata["aira"]["agent"] = THIEF.address
+    return messages
+
+
+def of_another_objective(messages: list[Written], metadata: Metadata) -> list[Written]:
+    metadata["aira"]["objective"] = cid_of_bytes(b"easier work")
+    return messages
+
+
+def of_nobody(messages: list[Written], metadata: Metadata) -> list[Written]:
+    del metadata["aira"]
+    return messages
+
+
+@pytest.mark.parametrize(
+    ("forgery", "found"),
+    [
+        (dropped_answer, {"sequence": "message 1 on /said is missing", "closed": "closed it with 11 messages"}),
+        (dropped_and_renumbered, {"played": "message 2 on /say was not played"}),
+        (altered, {"played": "message 1 on /say was played with another content"}),
+        (
+            reordered,
+            {
+                "sequence": "message 1 on /say is missing (and 2 more)",
+                "times": "message 1 on /say was recorded",
+                "played": "messages 1 on /say and 2 on /say were played in the wrong order",
+            },
+        ),
+        (
+            reordered_and_renumbered,
+            {"played": "messages 1 on /say and 2 on /say were played in the wrong order"},
+        ),
+        (shortened, {"closed": "closed it with 11 messages, and it has 6", "played": "only the first 3 of"}),
+        (shortened_without_a_trace, {"played": "only the first 3 of the objective's 6 messages were played"}),
+        (added, {"played": "a message on /say was played before message 0 that is not the objective's"}),
+        (on_another_topic, {"played": "message 0 on /say was not played, but one on /shout"}),
+        (never_closed, {"closed": "did not close it"}),
+        (lossy, {"closed": "lost 7 messages"}),
+        (of_another_liability, {"liability": f"names the liability '{OTHER}', and it should be {LIABILITY}"}),
+        (of_another_agent, {"agent": f"names the agent '{THIEF.address}'"}),
+        (of_another_objective, {"objective": "names the objective 'Qm"}),
+        (of_nobody, {"liability": "names no liability"}),
+    ],
+)
+def test_a_forged_recording_is_found_out_and_the_fault_named(job: Job, forgery: object, found: dict[str, str]) -> None:
+    job.forge(forgery)  # type: ignore[arg-type]
+    said = wrong(job.verify())
+    assert set(said) == set(found)
+    for name, detail in found.items():
+        assert detail in said[name]
+
+
+def another_answer(messages: list[Written], metadata: Metadata) -> list[Written]:
+    message = msgspec.structs.replace(messages[1].message, payload=String("yes, one").encode())
+    messages[1] = msgspec.structs.replace(messages[1], message=message)
+    return messages
+
+
+def test_whatever_is_changed_it_is_not_the_file_that_was_signed(job: Job) -> None:
+    signed = job.claim.result
+    job.forge(another_answer)
+    assert job.verify().holds
+    verdict = job.verify(result=signed)
+    assert wrong(verdict) == {"result-file": f"the result is {cid_of_file(job.result)}, and it should be {signed}"}
+
+
+def test_a_file_that_is_cut_is_no_evidence(job: Job) -> None:
+    job.result.write_bytes(job.result.read_bytes()[:-20])
+    said = wrong(job.verify())
+    assert set(said) == {"result-file", "readable"}
+    assert "end" in said["readable"]
+
+
+def test_a_flipped_bit_is_found_by_a_checksum(job: Job) -> None:
+    content = bytearray(job.result.read_bytes())
+    content[content.index(b"\x28\xb5\x2f\xfd") + 40] ^= 1
+    job.result.write_bytes(content)
+    assert set(wrong(job.verify())) == {"result-file", "readable"}
+
+
+def test_another_objective_than_that_of_the_contract_is_told(job: Job) -> None:
+    said = wrong(job.verify(objective=cid_of_bytes(b"harder work")))
+    assert set(said) == {"objective-file", "objective"}
+
+
+def test_a_contract_that_has_not_ended_proves_nothing(job: Job) -> None:
+    verdict = job.verify(finalized=False, result="", success=None)
+    assert set(wrong(verdict)) == {"finalized"}
+    assert [finding.holds for finding in verdict.findings[:3]] == [False, None, None]
+
+
+def test_a_contract_that_was_refunded_holds_no_result(job: Job) -> None:
+    said = wrong(job.verify(result="", success=False))
+    assert said == {"finalized": "the contract was refunded or cancelled, and holds no result"}
+
+
+def test_a_held_result_message_proves_who_signed_it(job: Job) -> None:
+    verdict = job.verify(job.message(), finalized=None)
+    assert verdict.holds
+    signature = verdict.of("signature")
+    assert signature is not None
+    assert signature.detail == f"the promisor, {ROBOT.address}, signed it with success true"
+
+
+@pytest.mark.parametrize(
+    ("fields", "why"),
+    [
+        ({"signer": THIEF}, f"{THIEF.address} signed it, and the promisor is {ROBOT.address}"),
+        ({"liability": OTHER}, "for another liability"),
+        ({"result": cid_of_bytes(b"another")}, "for another recording"),
+    ],
+)
+def test_a_result_message_of_another_signer_liability_or_recording_proves_nothing(
+    job: Job, fields: dict[str, object], why: str
+) -> None:
+    said = wrong(job.verify(job.message(**fields)))  # type: ignore[arg-type]
+    assert set(said) == {"signature"}
+    assert why in said["signature"]
+
+
+@pytest.mark.parametrize("content", [b"", b"{}", b"\xff", b'{"liability": 1}'])
+def test_what_is_no_result_message_is_said_to_be_none(job: Job, content: bytes) -> None:
+    assert wrong(job.verify(content))["signature"].startswith("the Result message: ")
+
+
+def test_a_demand_is_no_result(job: Job) -> None:
+    demand = Demand(
+        model=cid_of_bytes(b"m"),
+        objective=cid_of_bytes(b"o"),
+        token=OTHER,
+        cost=1,
+        lighthouse=OTHER,
+        validator=OTHER,
+        validator_fee=0,
+        deadline=1,
+        nonce="0" * 64,
+    )
+    assert "is no Result" in wrong(job.verify(encode(ROBOT.sign(demand))))["signature"]
+
+
+def test_two_files_alone_show_that_they_belong_together_and_leave_the_rest_open(job: Job) -> None:
+    job.claim = Claim()
+    verdict = job.verify()
+    assert verdict.holds
+    untold = {finding.name for finding in verdict.findings if finding.holds is None}
+    assert untold == {"finalized", "signature", "result-file", "objective-file", "liability", "agent", "lighthouse"}
+
+
+def test_two_files_and_the_message_are_enough_for_an_arbiter_without_a_chain(job: Job) -> None:
+    job.claim = Claim()
+    verdict = job.verify(job.message())
+    assert verdict.holds
+    untold = {finding.name for finding in verdict.findings if finding.holds is None}
+    assert untold == {"finalized", "objective-file", "lighthouse"}
+
+
+def test_a_job_that_failed_may_have_played_only_the_beginning(tmp_path: Path) -> None:
+    job = made(tmp_path, played=WORDS[:2])
+    assert "only the first 2" in wrong(job.verify())["played"]
+    assert job.verify(success=False).holds
+
+
+def test_topics_that_were_not_to_be_recorded_need_not_be_there(tmp_path: Path) -> None:
+    job = made(tmp_path, topics="/say")
+    verdict = job.verify()
+    assert verdict.holds
+    played = verdict.of("played")
+    assert played is not None
+    assert played.detail.endswith("only 1 topics were to be recorded")
+
+
+def test_messages_that_were_lost_are_not_hidden(tmp_path: Path) -> None:
+    job = made(tmp_path)
+    job.result.unlink()
+    with Recorder(job.result, RecordingAbout(liability=LIABILITY)) as recorder:
+        recorder.record("/said", b"x" * (65 << 20), STRING)
+        record(recorder, WORDS)
+        stop(recorder)
+    assert wrong(job.verify())["closed"] == "the recorder lost 1 messages"
+
+
+def interrupted(tmp_path: Path, *parts: tuple[str, ...]) -> Job:
+    """A job whose agent broke down after each of the parts but the last."""
+    job = made(tmp_path)
+    about = {name: text for name, text in open_objective(job.result).metadata["aira"].items() if name != "software"}
+    job.result.unlink()
+    for number, words in enumerate(parts):
+        if number:
+            job.result.rename(f"{job.result}.part")
+        with Recorder(job.result, RecordingAbout(**about)) as recorder:
+            record(recorder, words)
+            if number == len(parts) - 1:
+                stop(recorder)
+    job.claim = msgspec.structs.replace(job.claim, result=cid_of_file(job.result))
+    return job
+
+
+@pytest.mark.parametrize(
+    ("parts", "detail"),
+    [
+        ((WORDS[:3], WORDS[3:]), "all 6 messages of the objective were played, in order"),
+        (
+            (WORDS[:3], WORDS[1:]),
+            "all 6 messages of the objective were played, in order, 2 of them once more after a breakdown",
+        ),
+        (
+            (WORDS[:3], WORDS[2:4], WORDS[3:]),
+            "all 6 messages of the objective were played, in order, 2 of them once more after a breakdown",
+        ),
+        (((), WORDS), "all 6 messages of the objective were played, in order"),
+    ],
+)
+def test_a_job_that_was_gone_on_with_after_a_breakdown_holds_and_says_so(
+    tmp_path: Path, parts: tuple[tuple[str, ...], ...], detail: str
+) -> None:
+    verdict = interrupted(tmp_path, *parts).verify()
+    assert wrong(verdict) == {}
+    closed, played = verdict.of("closed"), verdict.of("played")
+    assert closed is not None
+    assert (closed.holds, closed.detail[:21]) == (None, "the agent broke down ")
+    assert played is not None
+    assert (played.holds, played.detail) == (True, detail)
+
+
+def test_what_a_breakdown_has_cost_is_told_and_left_open(tmp_path: Path) -> None:
+    verdict = interrupted(tmp_path, WORDS[:2], WORDS[3:]).verify()
+    played = verdict.of("played")
+    assert played is not None
+    assert (played.holds, played.detail[:40]) == (None, "1 messages are not in the recording: the")
+
+
+def test_an_objective_that_is_no_recording_was_not_played(tmp_path: Path) -> None:
+    job = made(tmp_path, played=())
+    job.objective.write_bytes(b"no recording")
+    played = job.verify(success=False).of("played")
+    assert played is not None
+    assert (played.holds, "is no recording" in played.detail) == (None, True)
+    (tmp_path / "other").mkdir()
+    other = made(tmp_path / "other")
+    other.objective.write_bytes(b"no recording")
+    assert "played" in wrong(other.verify())
