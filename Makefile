@@ -13,7 +13,7 @@ LOCK := requirements/lock.txt
 TYPED := schemas mesh bridges peers tests bench examples
 BENCHES := $(shell grep -l __main__ bench/*.py)
 
-.PHONY: help setup demo test lint peers bench contracts contracts-check slither lock clean
+.PHONY: help setup demo test lint peers bench contracts contracts-check slither firmware lock clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -69,6 +69,9 @@ contracts-check: contracts/node_modules/.package-lock.json ## whether the built 
 
 slither: contracts/node_modules/.package-lock.json ## look for weaknesses in the contracts (`make peers` installs Slither)
 	@slither=$$($(PYTHON) -m peers.where slither) && SLITHER=$$slither npm --prefix contracts run --silent slither
+
+firmware: $(INSTALLED) ## compile the sketches of the examples into build/firmware (`make peers` installs the AVR tools)
+	@$(BIN)/python -m bridges.serial.firmware examples/*/*_frames examples/*/*_rosserial -o build/firmware -L examples/firmware
 
 lock: ## choose the exact versions anew (needs uv)
 	@uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 --generate-hashes --upgrade --quiet \

@@ -1,0 +1,175 @@
+"""What an edge agent costs, and how fast a device answers: memory, time to start, round trips on a simulated Uno.
+
+`wire_ms` is what the bytes of a round trip take on the line alone, `ratio` how many times that the round trip takes.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from queue import SimpleQueue
+from typing import TYPE_CHECKING, Any, Final
+
+import zenoh
+
+from bridges.serial import frames, roswire
+from bridges.serial.boards import SimulatedBoard
+from bridges.serial.dialect import Command, Ended, Happening, Ready, Said
+from bridges.serial.firmware import compile_sketch
+from bridges.serial.line import Line
+from bridges.serial.ports import PortName
+from bridges.serial.serving import dialect_of
+from mesh.errors import AiraError
+from mesh.network import Endpoints, free_endpoint
+from mesh.running import fail
+from report import arguments, show
+from schemas.payloads import String
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from bridges.serial.serving import Protocol
+
+LIBRARIES: Final = Path(__file__).parents[1] / "examples" / "firmware"
+SKETCHES: Final[dict[Protocol, Path]] = {
+    "frames": LIBRARIES / "AiraFrames" / "examples" / "Echo",
+    "rosserial": LIBRARIES / "MiniRosserial" / "examples" / "Echo",
+}
+BAUDS: Final = (57_600, 115_200)
+AGENT: Final = "0x" + "11" * 20
+MOST_MEMORY: Final = 40.0
+MOST_START: Final = 0.4
+STARTS: Final = 5
+SECONDS: Final = 30.0
+AT_REST: Final = 0.05
+"""Seconds until a rosserial board has announced its topics, by which it shows that it has read a command."""
+
+
+def main() -> None:
+    """Measure, print, and fail where a bar is missed."""
+    given = arguments(__doc__ or "", calls=200)
+    figures: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        figures |= start_and_memory(compiled("frames", BAUDS[0], Path(folder)))
+        for protocol in SKETCHES:
+            figures[protocol] = {
+                str(baud): round_trips(protocol, baud, compiled(protocol, baud, Path(folder)), given.calls)
+                for baud in BAUDS
+            }
+    show(figures, as_json=given.json)
+    if figures["memory_mb"] > MOST_MEMORY or figures["start_s"] > MOST_START:
+        sys.exit(f"an edge agent is to have {MOST_MEMORY:g} MB and {MOST_START:g} s at most")
+
+
+def compiled(protocol: Protocol, baud: int, folder: Path) -> Path:
+    """The echo firmware of a protocol at a baud rate."""
+    elf = folder / f"{protocol}-{baud}.elf"
+    return compile_sketch(SKETCHES[protocol], elf, libraries=[LIBRARIES], defines=[f"BAUD={baud}"])
+
+
+def start_and_memory(elf: Path) -> dict[str, float]:
+    """Seconds from the start of `aira edge` to what it first publishes, its board's presence; megabytes resident."""
+    endpoint = free_endpoint()
+    starts, memories = [], []
+    with zenoh.open(Endpoints(listen=(endpoint,), mode="router").config()) as router, SimulatedBoard(elf) as board:
+        for _ in range(STARTS):
+            present = threading.Event()
+            key = f"aira/agent/{AGENT}/device/board/present"
+            watch: Any = router.liveliness().declare_subscriber(key, partial(_seen, present))
+            began = time.perf_counter()
+            with edge(board.port, endpoint) as process:
+                if not present.wait(SECONDS):
+                    sys.exit("the edge agent did not come up")
+                starts.append(time.perf_counter() - began)
+                time.sleep(0.5)  # what it takes after its start counts, too
+                memories.append(resident(process.pid))
+            watch.undeclare()
+    return {"memory_mb": round(max(memories), 1), "start_s": round(statistics.median(starts), 3)}
+
+
+@contextmanager
+def edge(port: Path, endpoint: str) -> Iterator[subprocess.Popen[bytes]]:
+    """`aira edge` as a process."""
+    command = [sys.executable, "-m", "mesh", "edge", str(port), "--agent", AGENT, "--connect", endpoint]
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith("AIRA_")}
+    with subprocess.Popen(command, env=inherited, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        try:
+            yield process
+        finally:
+            process.terminate()
+
+
+def resident(pid: int) -> float:
+    """Megabytes of memory of a process."""
+    status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines() if ":" in line)
+    return int(status["VmRSS"].split()[0]) / 1024
+
+
+def round_trips(protocol: Protocol, baud: int, elf: Path, calls: int) -> dict[str, float]:
+    """16 bytes to the board and back, one after the other, each on a line at rest: milliseconds, median."""
+    arrived: SimpleQueue[tuple[Happening, float]] = SimpleQueue()
+    dialect = dialect_of(protocol, baud=baud, parameters={})
+    took = []
+    topic, payload, answer = (
+        ("/echo", b'"0123456789abcde"', Ended)
+        if protocol == "frames"
+        else ("/hear", String("0123456789ab").encode(), Said)
+    )
+    with SimulatedBoard(elf) as board:
+        line = Line(
+            PortName(str(board.port)),
+            dialect,
+            baud=baud,
+            deliver=lambda happening: arrived.put((happening, time.perf_counter())),
+        )
+        thread = threading.Thread(target=line.run, name="line")
+        thread.start()
+        try:
+            _next(arrived, Ready)
+            for _ in range(calls):
+                began = time.perf_counter()
+                line.do(lambda: dialect.submit(Command(topic, payload), time.monotonic()))
+                took.append(_next(arrived, answer) - began)
+                if answer is not Ended:
+                    _next(arrived, Ended)
+                    time.sleep(AT_REST)
+        finally:
+            line.stop()
+            thread.join()
+    p50, wire = statistics.median(took) * 1000, wire_bytes(protocol) * 10_000 / baud
+    return {"p50_ms": round(p50, 2), "wire_ms": round(wire, 2), "ratio": round(p50 / wire, 2)}
+
+
+def wire_bytes(protocol: Protocol) -> int:
+    """Bytes of a round trip: the message and its answer."""
+    if protocol == "frames":
+        return 2 * len(frames.encode(frames.Frame(frames.Kind.CALL, 0, 0, bytes(16))))
+    return 2 * roswire.frame_size(16)
+
+
+def _seen(present: threading.Event, sample: zenoh.Sample) -> None:
+    if sample.kind == zenoh.SampleKind.PUT:
+        present.set()
+
+
+def _next(arrived: SimpleQueue[tuple[Happening, float]], kind: type[Happening]) -> float:
+    """When the next happening of that kind came."""
+    while True:
+        happening, when = arrived.get(timeout=SECONDS)
+        if isinstance(happening, kind):
+            return when
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except AiraError as error:  # the AVR tools are missing: `make peers`
+        fail(error)

@@ -1,0 +1,51 @@
+"""`aira board`: boards without hardware."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from mesh.errors import AiraError
+from mesh.running import INTERRUPTED, fail
+
+HELP = "lines to type: adc CHANNEL MILLIVOLTS, noise RATE, unplug, plug, reset, quit"
+
+
+@click.group("board")
+def command() -> None:
+    """Run a board that is not there: firmware in a simulated Arduino Uno."""
+
+
+@command.command("run")
+@click.argument("firmware", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.option("--reset-on-open", "opening", flag_value="resets", help="opening the port resets it, as a real Uno")
+def run(firmware: Path, opening: str | None) -> None:
+    """Run FIRMWARE (an ELF file), print the port to use, and show its pins as they change.
+
+    Lines on stdin do to it what hands would: `adc 0 2500` puts 2.5 V on A0, `unplug` and `plug` pull the cable,
+    `reset` presses the button, `noise 0.01` damages one byte in a hundred on the line. `quit` or Ctrl-C ends it.
+    """
+    from bridges.serial.boards import SimulatedBoard
+
+    try:
+        with SimulatedBoard(firmware, resets=opening is not None, watch=_show) as board:
+            click.echo(f"{HELP}\nuse it with: aira edge {board.port} --agent ADDRESS")
+            for line in sys.stdin:
+                if line.strip() == "quit":
+                    return
+                board.tell(line)
+            board.wait_for_end()
+    except AiraError as error:
+        fail(error)
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
+
+
+def _show(line: str) -> None:
+    match line.split():
+        case ["pin", pin, level, microseconds]:
+            click.echo(f"{int(microseconds) / 1e6:10.3f} s  pin {pin:>2}  {'high' if level == '1' else 'low'}")
+        case ["port" | "opened" | "closed" | "unplugged" | "crashed", *_]:
+            click.echo(line)

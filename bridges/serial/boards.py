@@ -1,0 +1,204 @@
+"""Boards without hardware: firmware in a simulated Arduino Uno, its serial line on a pseudo-terminal.
+
+The simulator is a small C program of ours on libsimavr; it is compiled when it is first needed and kept in the cache
+folder that the tests' programs share. A board takes about two thirds of a core.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import tempfile
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Self
+
+from bridges.serial.errors import ConfigurationError
+from mesh.errors import RemoteError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import TracebackType
+
+SOURCE: Final = Path(__file__).parent / "board" / "board.c"
+HEADER: Final = Path("/usr/include/simavr/sim_avr.h")
+START: Final = 30.0
+"""Seconds that a board has to come up."""
+STOP: Final = 5.0
+
+
+class BoardFailed(RemoteError):
+    """The simulated board ended, or did not do what was waited for; the text has what it said last."""
+
+
+@dataclass(frozen=True)
+class PinChange:
+    """A pin went high or low; `at` is in seconds of the board's own time."""
+
+    pin: int
+    high: bool
+    at: float
+
+
+def simulator() -> Path:
+    """The simulator's program, compiled if need be. Raises `ConfigurationError` where libsimavr or gcc is missing."""
+    source = SOURCE.read_bytes()
+    program = _cache() / f"board-{hashlib.sha256(source).hexdigest()[:12]}"
+    if program.exists():
+        return program
+    hint = "on Debian: apt-get install libsimavr-dev gcc; `make peers` does it"
+    if not HEADER.exists():
+        raise ConfigurationError("libsimavr is not installed", hint=hint)
+    program.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=program.parent) as folder:
+        made = Path(folder) / "board"
+        command = ["gcc", "-O2", str(SOURCE), "-o", str(made), "-lsimavr", "-lutil"]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+        except FileNotFoundError:
+            raise ConfigurationError("gcc is not installed", hint=hint) from None
+        if done.returncode:
+            raise ConfigurationError(f"the simulator does not compile:\n{done.stderr.strip()}", hint=hint)
+        made.replace(program)
+    return program
+
+
+class SimulatedBoard:
+    """A board with the firmware `elf`: `with SimulatedBoard(elf) as board`; then `board.port` can be opened.
+
+    `port` stays the same when the cable is pulled and plugged in again. With `resets`, opening the port resets the
+    board, as it does a real Uno. Leaving `with` ends it.
+    """
+
+    def __init__(self, elf: Path, *, resets: bool = False, watch: Callable[[str], object] | None = None) -> None:
+        self._elf = elf
+        self._resets = resets
+        self._watch = watch
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self.port = Path()
+        """The path to open while the board runs; there is nothing while the cable is out."""
+        self.pins: list[PinChange] = []
+        """The changes of all pins so far, in order."""
+        self.said: list[str] = []
+        """All that the simulator has said."""
+        self._heard = threading.Condition()
+        self._process: subprocess.Popen[str] | None = None
+
+    def __enter__(self) -> Self:
+        self._folder = tempfile.TemporaryDirectory(prefix="aira-board-")
+        self.port = Path(self._folder.name) / "tty"
+        command = [str(simulator()), str(self._elf), str(self.port), *(["reset"] if self._resets else [])]
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, bufsize=1
+        )
+        self._reader = threading.Thread(target=self._read, args=(self._process,), name="board", daemon=True)
+        self._reader.start()
+        try:
+            self.wait_until(lambda: self._count("port ") > 0, what="the port")
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        process, self._process = self._process, None
+        if process is not None:
+            process.terminate()
+            try:
+                process.wait(STOP)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+            self._reader.join()
+            for stream in (process.stdin, process.stdout):
+                if stream is not None:
+                    stream.close()
+        if self._folder is not None:
+            self._folder.cleanup()
+
+    @property
+    def pid(self) -> int:
+        """The simulator's process id."""
+        return self._running().pid
+
+    def apply(self, channel: int, millivolts: int) -> None:
+        """Put a voltage, 0 to 5000 mV, on the analog input A0 to A7 with that number."""
+        self.tell(f"adc {channel} {millivolts}")
+
+    def disturb(self, rate: float, *, seed: int = 1) -> None:
+        """From now on damage this share of the bytes on the line, each way."""
+        self.tell(f"noise {rate} {seed}")
+
+    def reset(self) -> None:
+        """Press the reset button."""
+        self.tell("reset")
+
+    def unplug(self) -> None:
+        """Pull the cable; the board runs on."""
+        count = self._count("unplugged")
+        self.tell("unplug")
+        self.wait_until(lambda: self._count("unplugged") > count, what="the unplugging")
+
+    def plug(self) -> None:
+        """Plug the cable in again."""
+        count = self._count("port ")
+        self.tell("plug")
+        self.wait_until(lambda: self._count("port ") > count, what="the port")
+
+    def changes(self, pin: int) -> list[PinChange]:
+        """The changes of one pin so far."""
+        return [change for change in self.pins if change.pin == pin]
+
+    def wait_until(self, condition: Callable[[], object], *, what: str, seconds: float = START) -> None:
+        """Return when `condition()`, looked at whenever the board says something, is true. Raises `BoardFailed`."""
+        deadline = time.monotonic() + seconds
+        with self._heard:
+            while not condition():
+                left = deadline - time.monotonic()
+                if left <= 0 or (self._process is not None and self._process.poll() is not None):
+                    raise BoardFailed(f"{what} did not come about; the board said: {' | '.join(self.said[-10:])}")
+                self._heard.wait(min(left, 0.2))
+
+    def wait_for_end(self) -> None:
+        """Return when the simulator has ended."""
+        self._running().wait()
+
+    def _read(self, process: subprocess.Popen[str]) -> None:
+        assert process.stdout is not None
+        for line in process.stdout:
+            with self._heard:
+                self.said.append(line.strip())
+                match line.split():
+                    case ["pin", pin, level, microseconds]:
+                        self.pins.append(PinChange(int(pin), level == "1", int(microseconds) / 1e6))
+                self._heard.notify_all()
+            if self._watch is not None:
+                self._watch(line.strip())
+
+    def _count(self, word: str) -> int:
+        return sum(line.startswith(word) for line in self.said)
+
+    def tell(self, line: str) -> None:
+        """Give the simulator a line as it takes them: see `board.c`. Raises `BoardFailed` when it has ended."""
+        process = self._running()
+        assert process.stdin is not None
+        try:
+            process.stdin.write(f"{line.strip()}\n")
+            process.stdin.flush()
+        except BrokenPipeError:
+            raise BoardFailed(f"the board has ended; it said: {' | '.join(self.said[-10:])}") from None
+
+    def _running(self) -> subprocess.Popen[str]:
+        if self._process is None:
+            raise BoardFailed("the board is not running")
+        return self._process
+
+
+def _cache() -> Path:
+    """The folder that `make peers` uses, too; may be deleted at any time."""
+    return Path(os.environ.get("AIRA_PEERS_CACHE") or "~/.cache/aira-mesh").expanduser()

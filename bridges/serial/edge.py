@@ -1,0 +1,268 @@
+"""The edge agent: a board's topics as keys of its agent, and what is put or asked there brought to the board.
+
+Outside a job a topic is `aira/agent/{address}/device/{device}/{topic}`; what belongs to a job goes over the liability's
+topics, where it becomes part of the recording. A put is a command of which nobody hears again; a query is a call, and
+its reply says how it ended. The board is present as long as its liveliness token is, on the device's topic `/present`.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+import zenoh
+
+from bridges.serial.converting import converted
+from bridges.serial.dialect import BoardTopic, Command, Ended, Ending, Flow, Gone, Logged, Ready, Said
+from bridges.serial.errors import REASONS, UnfitMessage
+from bridges.serial.jobs import Jobs
+from bridges.serial.line import Line
+from mesh.errors import InvalidKey
+from schemas.keys import DeviceTopicKey, LiabilityTopicKey, event_selector, parse_key
+from schemas.payloads import payload_type
+
+if TYPE_CHECKING:
+    from bridges.serial.dialect import About, Dialect, Happening
+    from bridges.serial.ports import PortName
+    from schemas.payloads import PayloadType
+
+log = logging.getLogger(__name__)
+
+PATIENCE: Final = 30.0
+"""Seconds for which a command waits for a board that is not there, or busy."""
+LONGEST_PATIENCE: Final = 3600.0
+PRESENT: Final = "/present"
+"""The topic of the token."""
+ABOUT: Final = "/about"
+"""The topic on which the edge agent answers what device it serves."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeviceId:
+    """What the mesh knows a board by: its agent's address, and a name."""
+
+    agent: str
+    name: str
+
+    def key(self, topic: str) -> str:
+        """The key of a topic outside any job. Raises `InvalidKey`."""
+        return str(DeviceTopicKey(self.agent, self.name, topic))
+
+
+class Edge:
+    """A board in the mesh, on an open session: `Edge(session, device, port, dialect, baud=57600).run()`.
+
+    `run` serves until `stop` is called from another thread; it takes a thread of its own and no event loop. Raises
+    `InvalidKey` for a device that can't be named.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        device: DeviceId,
+        port: PortName,
+        dialect: Dialect,
+        *,
+        baud: int,
+        patience: float = PATIENCE,
+    ) -> None:
+        self._session = session
+        self._device = device
+        self._patience = patience
+        self._jobs = Jobs()
+        self._line = Line(port, dialect, baud=baud, deliver=self._deliver)
+        self._asked: dict[Command, zenoh.Query] = {}
+        self._declared: dict[str, list[Any]] = {}
+        self._token: Any = None
+        self._topics: dict[str, BoardTopic] = {}
+        device.key(PRESENT)
+
+    def run(self) -> None:
+        """Serve until `stop`."""
+        events: Any = self._session.declare_subscriber(event_selector(self._device.agent), self._heard_event)
+        about: Any = self._session.declare_queryable(self._device.key(ABOUT), self._asked_about)
+        try:
+            self._line.run()
+        finally:
+            for query in self._asked.values():
+                query.drop()  # type: ignore[no-untyped-call]
+            if not self._session.is_closed():
+                for declared in (events, about, *(each for several in self._declared.values() for each in several)):
+                    declared.undeclare()
+                self._be_absent()
+
+    def stop(self) -> None:
+        """End `run`; from any thread, and from a signal's handler."""
+        self._line.stop()
+
+    def _deliver(self, happening: Happening) -> None:
+        match happening:
+            case Ready(about):
+                self._serve(about)
+            case Gone(why):
+                log.warning("the board is absent: %s", why)
+                self._be_absent()
+            case Said(topic, payload):
+                self._said(topic, payload)
+            case Ended():
+                self._ended(happening)
+            case Logged(level, text):
+                log.log(level, "the board says: %s", text)
+
+    def _serve(self, about: About) -> None:
+        """The board is there: have its topics in the mesh, and show that it is present."""
+        topics = {topic.name: topic for topic in about.topics if topic.flow in (Flow.HEARS, Flow.SERVES)}
+        for name in self._declared.keys() - topics.keys():
+            for declared in self._declared.pop(name):
+                declared.undeclare()
+        for name in topics.keys() - self._declared.keys():
+            self._declared[name] = self._declare(name)
+        self._topics = {topic.name: topic for topic in about.topics}
+        if self._token is None:
+            self._token = self._session.liveliness().declare_token(self._device.key(PRESENT))
+        log.info("the board %s %s is present: %s", about.name, about.version, ", ".join(self._topics) or "no topics")
+
+    def _declare(self, name: str) -> list[Any]:
+        """Hear commands and calls on a topic, within jobs and outside."""
+        keys = (self._device.key(name), f"aira/agent/{self._device.agent.lower()}/liability/*/topic{name}")
+        # What this session puts on the topic of a job is said of a call that it has taken.
+        origin = zenoh.Locality.REMOTE
+        return [
+            *(self._session.declare_subscriber(key, self._heard_command, allowed_origin=origin) for key in keys),
+            *(self._session.declare_queryable(key, self._heard_call) for key in keys),
+        ]
+
+    def _be_absent(self) -> None:
+        token, self._token = self._token, None
+        if token is not None:
+            token.undeclare()
+
+    def _heard_event(self, sample: zenoh.Sample) -> None:
+        self._line.do(partial(self._jobs.take_event, str(sample.key_expr)))
+
+    def _heard_command(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            given = payload_type(str(sample.encoding))
+            self._line.do(partial(self._command, str(sample.key_expr), sample.payload.to_bytes(), given))
+
+    def _command(self, key: str, payload: bytes, given: PayloadType) -> None:
+        topic, _ = self._place(key)
+        if topic is None:
+            return
+        now = time.monotonic()
+        payload = converted(payload, given, self._topics[topic].type)
+        try:
+            self._line.dialect.submit(Command(topic, payload, now + self._patience), now)
+        except UnfitMessage as error:
+            log.warning("%s", error)
+
+    def _heard_call(self, query: zenoh.Query) -> None:
+        self._line.do(partial(self._call, query))
+
+    def _call(self, query: zenoh.Query) -> None:
+        """A call, which is answered at its end."""
+        key = str(query.key_expr)
+        topic, job = self._place(key)
+        if topic is None:
+            query.drop()  # type: ignore[no-untyped-call]
+            return
+        payload = b"" if query.payload is None else query.payload.to_bytes()
+        payload = converted(payload, payload_type(str(query.encoding or "")), self._topics[topic].type)
+        now = time.monotonic()
+        command = Command(topic, payload, now + _seconds(query, self._patience))
+        try:
+            self._line.dialect.submit(command, now)
+        except UnfitMessage as error:
+            _refuse(query, "unfit", str(error))
+            return
+        self._asked[command] = query
+        if job:
+            self._put(key, payload, self._topics[topic].type.zenoh_encoding)
+
+    def _place(self, key: str) -> tuple[str | None, str]:
+        """The topic that a key names, and the job if it is one of a job; which is now the one that goes on."""
+        try:
+            parsed = parse_key(key)
+        except InvalidKey as error:
+            log.info("%s", error)
+            return None, ""
+        if not isinstance(parsed, LiabilityTopicKey | DeviceTopicKey) or parsed.topic not in self._topics:
+            return None, ""
+        if isinstance(parsed, DeviceTopicKey):
+            return parsed.topic, ""
+        self._jobs.begin(parsed.liability)
+        return parsed.topic, parsed.liability
+
+    def _said(self, topic: BoardTopic, payload: bytes) -> None:
+        if topic.flow is Flow.ASKS:
+            self._ask(topic, payload)
+            return
+        job = self._jobs.current
+        name, agent = topic.name, self._device.agent
+        key = str(LiabilityTopicKey(agent, job, name)) if job else self._device.key(name)
+        self._put(key, payload, topic.type.zenoh_encoding)
+
+    def _ask(self, topic: BoardTopic, payload: bytes) -> None:
+        """The board asks; the first who answers in the mesh is heard."""
+
+        def answered(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                answer = reply.ok.payload.to_bytes()
+                self._line.do(lambda: self._line.dialect.answer(topic, answer, time.monotonic()))
+
+        self._session.get(self._device.key(topic.name), answered, payload=payload)
+
+    def _ended(self, ended: Ended) -> None:
+        query = self._asked.pop(ended.command, None)
+        if ended.ending is Ending.FAILED:
+            log.warning("%s: %s (%s)", ended.command.topic, ended.detail, ended.reason)
+        if query is None:
+            return
+        if ended.ending is Ending.FAILED:
+            _refuse(query, ended.reason, ended.detail)
+            return
+        encoding = ended.type.zenoh_encoding if ended.type is not None else ""
+        with query:
+            query.reply(str(query.key_expr), ended.payload, encoding=encoding, attachment=ended.ending.value)
+
+    def _asked_about(self, query: zenoh.Query) -> None:
+        self._line.do(partial(self._tell_about, query))
+
+    def _tell_about(self, query: zenoh.Query) -> None:
+        about, dialect = self._line.dialect.about, self._line.dialect
+        facts = {
+            "name": about.name if about is not None else "",
+            "version": about.version if about is not None else "",
+            "present": about is not None,
+            "port": str(self._line.name),
+            "job": self._jobs.current,
+            "topics": [
+                {"name": topic.name, "flow": topic.flow.value, "type": topic.type.schema_name or topic.type.encoding}
+                for topic in self._topics.values()
+            ],
+            "counters": vars(dialect.counters),
+        }
+        with query:
+            query.reply(str(query.key_expr), msgspec.json.encode(facts), encoding="application/json")
+
+    def _put(self, key: str, payload: bytes, encoding: str) -> None:
+        self._session.put(key, payload, encoding=encoding, congestion_control=zenoh.CongestionControl.DROP)
+
+
+def _refuse(query: zenoh.Query, reason: str, detail: str) -> None:
+    assert reason in REASONS
+    with query:
+        query.reply_err(msgspec.json.encode({"reason": reason, "detail": detail}), encoding="application/json")
+
+
+def _seconds(query: zenoh.Query, otherwise: float) -> float:
+    """For how long who asks wants to wait: the parameter `timeout`."""
+    try:
+        seconds = float(query.parameters.get("timeout") or otherwise)
+    except ValueError:
+        return otherwise
+    return min(max(seconds, 0.0), LONGEST_PATIENCE)

@@ -1,0 +1,30 @@
+"""Blink with arguments: the objective says which lamp. Another colour is a failed job, and the person is refunded."""
+
+from pathlib import Path
+
+from bridges.serial import Device
+from mesh import Agent, JobFailed
+from mesh.work.run import Run
+from schemas import Demand, String, Verified, cid_of_file
+
+LAMPS = ("red", "blue")
+
+agent = Agent(cid_of_file(Path(__file__).with_name("model.md")))
+board = Device(agent)
+
+
+@agent.on_demand
+async def offer(demand: Verified[Demand]) -> None:
+    await agent.offer(demand)
+
+
+@agent.on("/blink", String)
+async def blink(job: Run, colour: String) -> None:
+    if colour.data not in LAMPS:
+        raise JobFailed(f"there is no {colour.data} lamp")
+    answer = await board.call("/blink_led", colour, job=job)
+    print(f"the {colour.data} lamp has blinked ({answer.ending.value})", flush=True)
+
+
+if __name__ == "__main__":
+    agent.run()

@@ -1,0 +1,204 @@
+"""`aira edge` as a process of its own, a simulated board at one side and the mesh at the other."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import pytest
+
+from bridges.serial.device import Device
+from bridges.serial.dialect import Ending
+from bridges.serial.errors import CallInDoubt, CallNotDone, CallRefused
+from mesh.recording import open_objective
+from schemas import Empty, String
+from tests.support.boards import COUNTER, ROSSERIAL_ECHO, board, edge
+from tests.support.commands import aira
+from tests.support.market import founded, place
+from tests.support.objectives import objective
+from tests.support.waiting import until, until_found
+
+if TYPE_CHECKING:
+    from bridges.serial.boards import SimulatedBoard
+    from mesh.work.run import Run
+    from tests.support.market import Place
+    from tests.support.routers import EmbeddedRouter
+
+__all__ = ["founded", "place"]
+
+LONG = 60.0
+MEGABYTES = 40
+"""What an edge agent may have resident."""
+
+
+def resident(pid: int) -> float:
+    """Megabytes of memory that a process has now."""
+    found = re.search(r"VmRSS:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
+    assert found
+    return int(found[1]) / 1024
+
+
+def is_at_work(uno: SimulatedBoard) -> bool:
+    """Whether the counter is within /slow."""
+    return bool(uno.changes(13)) and uno.changes(13)[-1].high
+
+
+async def test_a_call_over_the_mesh_comes_back_with_what_the_board_answered(place: Place) -> None:
+    with board(COUNTER) as uno, edge(uno.port, place.address("robot"), place.endpoint) as process:
+        async with place.agent("robot") as robot:
+            device = Device(robot)
+            answer = await device.call("/add", 5)
+            assert (answer.value, answer.ending) == (5, Ending.DONE)
+            with pytest.raises(CallRefused, match="that is no integer"):
+                await device.call("/add", "five")
+            with pytest.raises(CallRefused, match=r"1\d\d bytes"):
+                await device.call("/add", {"a": "x" * 100})
+            assert resident(process.pid) < MEGABYTES
+
+
+async def test_what_a_board_says_is_heard_under_its_agent(place: Place) -> None:
+    with board(COUNTER) as uno, edge(uno.port, place.address("robot"), place.endpoint, "--name", "uno"):
+        async with place.agent("robot") as robot:
+            device = Device(robot, "uno")
+            async with device.listen("/added") as said:
+                await device.call("/add", 5)
+                async with asyncio.timeout(LONG):
+                    assert await anext(said) == 5
+
+
+async def test_the_edge_agent_tells_what_device_it_serves(place: Place) -> None:
+    address = place.address("robot")
+    with board(COUNTER) as uno, edge(uno.port, address, place.endpoint):
+        async with place.agent("robot") as robot:
+            await until_found(Device(robot).is_present, what="the board", seconds=LONG)
+            session = robot.parts.network.session
+            [reply] = session.get(f"aira/agent/{address.lower()}/device/board/about")
+            assert reply.ok is not None
+            facts: dict[str, Any] = msgspec.json.decode(reply.ok.payload.to_bytes())
+    assert (facts["name"], facts["version"], facts["present"]) == ("counter", "1.0", True)
+    assert {"name": "/add", "flow": "hears", "type": "json"} in facts["topics"]
+
+
+async def test_a_device_that_is_not_there_is_a_call_that_was_not_done(place: Place) -> None:
+    async with place.agent("robot") as robot:
+        with pytest.raises(CallNotDone, match="absent"):
+            await Device(robot, patience=0.5).call("/add", 5)
+
+
+async def test_presence_follows_the_cable(place: Place) -> None:
+    with board(COUNTER) as uno, edge(uno.port, place.address("robot"), place.endpoint):
+        async with place.agent("robot") as robot:
+            device = Device(robot)
+            await until_found(device.is_present, what="the board", seconds=LONG)
+            uno.unplug()
+
+            async def is_absent() -> bool:
+                return not await device.is_present()
+
+            await until_found(is_absent, what="its absence", seconds=LONG)
+            uno.plug()
+            assert (await device.call("/add", 1)).value == 1
+
+
+async def test_a_job_goes_on_when_the_cable_is_in_again(place: Place) -> None:
+    robot = place.agent("robot")
+    device = Device(robot, patience=LONG)
+
+    @robot.on_demand
+    async def offer(demand: Any) -> None:
+        await robot.offer(demand)
+
+    @robot.on("/work")
+    async def work(job: Run, message: object) -> None:
+        await device.call("/slow", 1, job=job)
+
+    source = place.save(objective(("/work", Empty()), ("/work", Empty()), ("/work", Empty())))
+    with board(COUNTER) as uno, edge(uno.port, place.address("robot"), place.endpoint):
+        async with place.at_work(robot) as person:
+            contract = await person.demand(source, cost=1)
+            await until(lambda: is_at_work(uno), what="the job", seconds=LONG)
+            await asyncio.to_thread(uno.unplug)
+            await asyncio.to_thread(uno.plug)
+            assert (await contract.outcome()).success
+            recording = await contract.recording()
+            assert (await Device(robot).call("/sum")).value == 3
+    topics = [message.topic for message in open_objective(recording).messages()]
+    assert topics.count("/slow") == 3
+
+
+async def test_a_job_whose_board_was_reset_fails_and_never_hangs(place: Place) -> None:
+    robot = place.agent("robot")
+    device = Device(robot, patience=LONG)
+
+    @robot.on_demand
+    async def offer(demand: Any) -> None:
+        await robot.offer(demand)
+
+    @robot.on("/work")
+    async def work(job: Run, message: object) -> None:
+        await device.call("/slow", 1, job=job)
+
+    source = place.save(objective(("/work", Empty())))
+    with board(COUNTER) as uno, edge(uno.port, place.address("robot"), place.endpoint) as process:
+        async with place.at_work(robot) as person:
+            contract = await person.demand(source, cost=1)
+            await until(lambda: is_at_work(uno), what="the job", seconds=LONG)
+            await asyncio.to_thread(uno.reset)
+            assert not (await contract.outcome()).success
+            recording = await contract.recording()
+        assert "restarted" in process.log()
+    [note] = [message.payload for message in open_objective(recording).messages() if message.topic == "/aira/note"]
+    assert "(doubt)" in String.decode(note).data
+
+
+async def test_two_boards_of_two_agents_do_not_hear_each_other(place: Place) -> None:
+    with (
+        board(COUNTER) as first,
+        board(ROSSERIAL_ECHO) as second,
+        edge(first.port, place.address("robot"), place.endpoint),
+        edge(second.port, place.address("person"), place.endpoint, "--protocol", "rosserial"),
+    ):
+        async with place.agent("robot") as robot, place.agent("person") as person:
+            assert (await Device(robot).call("/add", 5)).value == 5
+            told = await Device(person).call("/hear", String("hello"))
+            assert (told.value, told.ending) == (None, Ending.READ)
+            assert (await Device(person).call("/twice", b"")).ending is Ending.DONE
+            with pytest.raises((CallRefused, CallInDoubt)):
+                await Device(robot, patience=2.0).call("/hear", String("hello"))
+
+
+def test_an_edge_agent_imports_no_chain_and_no_event_loop() -> None:
+    code = (
+        "import sys, bridges.serial.cli, bridges.serial.serving, bridges.serial.calling, bridges.serial.rosserial;"
+        "print(sorted({'web3', 'eth_account', 'eth_abi', 'asyncio', 'aiohttp', 'mcap'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_it_ends_by_a_signal_also_without_a_board(router: EmbeddedRouter, how: signal.Signals, tmp_path: Path) -> None:
+    with edge(tmp_path / "tty", "0x" + "11" * 20, router.endpoint) as process:
+        code, _ = process.end(how)
+        assert code == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("ttyACM0", "--agent", "0x" + "11" * 20), "names no serial port"),
+        (("/dev/ttyACM0", "--agent", "robot"), "robot"),
+        (("/dev/ttyACM0", "--agent", "0x" + "11" * 20, "--name", "a/b"), "a name has letters"),
+    ],
+)
+def test_what_can_not_be_is_one_clear_line(arguments: tuple[str, ...], said: str) -> None:
+    done = aira("edge", *arguments, "--connect", "tcp/127.0.0.1:1", "--connect-timeout", "0.1")
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr

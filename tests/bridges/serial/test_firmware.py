@@ -1,0 +1,172 @@
+"""The firmware libraries on a simulated Uno, over a line that is clean or is not."""
+
+from __future__ import annotations
+
+import json
+import select
+
+import pytest
+
+from bridges.serial.boards import SimulatedBoard
+from bridges.serial.calling import CallingDialect
+from bridges.serial.dialect import Counters, Ended, Ending, Gone, Logged, Ready, Said
+from bridges.serial.firmware import size_of
+from bridges.serial.frames import Deframer, Frame, Kind, encode
+from bridges.serial.ports import Port
+from bridges.serial.rosserial import RosserialDialect
+from schemas.payloads import String
+from tests.support.boards import COUNTER, ECHO, ROSSERIAL_ECHO, board, firmware
+from tests.support.lines import Talk
+
+BAUD = 57_600
+FLASH, RAM = 3000, 500
+"""Bytes that an echo may take on an Uno."""
+
+
+def calling(uno: SimulatedBoard) -> Talk:
+    return Talk(uno, CallingDialect(baud=BAUD, session=1234), baud=BAUD)
+
+
+def rosserial(uno: SimulatedBoard) -> Talk:
+    return Talk(uno, RosserialDialect(baud=BAUD, parameters={"loud": 7}), baud=BAUD)
+
+
+def test_an_echo_takes_little_of_an_uno() -> None:
+    flash, ram = size_of(firmware(ECHO))
+    assert flash <= FLASH
+    assert ram <= RAM
+
+
+def test_a_thousand_calls_are_done_once_each_over_a_line_that_damages_one_byte_in_a_hundred() -> None:
+    with board(COUNTER) as uno, calling(uno) as talk:
+        uno.disturb(0.01, seed=3)
+        for number in range(1, 1001):
+            ended = talk.call("/add", b"1")
+            assert (ended.ending, ended.payload) == (Ending.DONE, str(number).encode())
+        assert talk.dialect.counters.damaged > 0
+        assert talk.dialect.counters.repeated > 0
+
+
+def test_values_of_all_types_cross_both_ways() -> None:
+    with board(COUNTER) as uno, calling(uno) as talk:
+        for given in (b'[-70000,-1.5,true,"abc"]', b'[200,0.25,false,""]', b'[-5,1e+30,true,"0123456789"]'):
+            ended = talk.call("/values", given)
+            assert ended.ending is Ending.DONE
+            integer, real, *rest = _json(given)
+            told = _json(ended.payload)
+            assert [told[0], *told[2:]] == [integer, *rest]
+            assert told[1] == pytest.approx(real)
+        refused = talk.call("/values", b'[1,2,3,"x"]')
+        assert (refused.reason, refused.detail) == ("refused", "[integer, real, boolean, text] is wanted")
+
+
+def test_a_call_that_takes_long_is_done_once_and_events_say_so() -> None:
+    with board(COUNTER) as uno, calling(uno) as talk:
+        assert talk.call("/slow", b"5").payload == b"5"
+        assert talk.call("/sum").payload == b"5"
+        assert [each.payload for each in talk.happened if isinstance(each, Said)] == [b"5"]
+
+
+def test_a_call_during_which_the_board_reads_nothing_is_done_once_and_the_next_one_too() -> None:
+    with board(COUNTER) as uno, calling(uno) as talk:
+        assert talk.call("/block", b"5").payload == b"5"
+        assert talk.dialect.counters.repeated > 0
+        assert talk.call("/add", b"1").payload == b"6"
+
+
+def test_a_board_that_runs_on_while_the_cable_is_out_finishes_the_call_once() -> None:
+    with board(COUNTER) as uno, calling(uno) as talk:
+        talk.submit("/slow", b"5")
+        talk.next(Said)
+        uno.unplug()
+        talk.next(Gone)
+        uno.plug()
+        ended = talk.next(Ended)
+        assert (ended.ending, ended.payload) == (Ending.DONE, b"5")
+        assert talk.call("/sum").payload == b"5"
+
+
+def test_a_call_during_which_the_board_is_reset_is_in_doubt_and_later_ones_are_done() -> None:
+    with board(COUNTER) as uno, calling(uno) as talk:
+        talk.submit("/slow", b"5")
+        talk.submit("/add", b"2")
+        talk.next(Said)
+        uno.reset()
+        assert talk.next(Ended).reason == "doubt"
+        ended = talk.next(Ended)
+        assert (ended.ending, ended.payload) == (Ending.DONE, b"2")
+
+
+def test_a_board_that_nobody_has_opened_a_session_with_takes_no_call() -> None:
+    line = Deframer(Counters())
+    with board(COUNTER) as uno:
+        port = Port(uno.port, baud=BAUD)
+        uno.wait_until(lambda: "opened" in uno.said, what="the opening")
+        port.write(b"\0" + encode(Frame(Kind.CALL, 1, 0, b"\x05")))
+        frames: list[Frame] = []
+        while not any(frame.sequence == 1 for frame in frames):
+            assert select.select([port], [], [], 30)[0]
+            frames += line.feed(port.read())
+        port.close()
+        assert frames[-1].kind is Kind.BOARD
+        with calling(uno) as talk:
+            assert talk.call("/sum").payload == b"0"
+
+
+def test_a_board_that_opening_resets_is_found() -> None:
+    with SimulatedBoard(firmware(COUNTER), resets=True) as uno, calling(uno) as talk:
+        assert talk.call("/add", b"1").payload == b"1"
+
+
+def test_rosserial_commands_queue_here_and_all_of_them_run() -> None:
+    with board(ROSSERIAL_ECHO) as uno, rosserial(uno) as talk:
+        for _ in range(12):
+            talk.submit("/work")
+        assert [talk.next(Ended).ending for _ in range(12)] == [Ending.READ] * 12
+        levels = [change.high for change in uno.changes(13)]
+        assert levels[levels.index(True) :] == [True, False] * 12
+
+
+def test_rosserial_services_parameters_and_logs_are_spoken() -> None:
+    with board(ROSSERIAL_ECHO) as uno, rosserial(uno) as talk:
+        assert talk.call("/twice").ending is Ending.DONE
+        talk.submit("/ask")
+        assert talk.next(Said).payload == String("loud").encode()
+        assert talk.next(Logged).text == "asked"
+
+
+def test_the_longest_string_reaches_a_rosserial_board() -> None:
+    with board(ROSSERIAL_ECHO) as uno, rosserial(uno) as talk:
+        longest = String("x" * 111).encode()
+        talk.submit("/hear", longest)
+        assert talk.next(Said).payload == longest
+        assert talk.call("/hear", String("x" * 112).encode()).reason == "unfit"
+
+
+def test_a_rosserial_board_that_was_reset_is_found_again() -> None:
+    with board(ROSSERIAL_ECHO) as uno, rosserial(uno) as talk:
+        uno.unplug()
+        talk.next(Gone)
+        uno.reset()
+        uno.plug()
+        talk.next(Ready)
+        assert talk.call("/hear", String("again").encode()).ending is Ending.READ
+
+
+def test_no_damaged_message_of_a_rosserial_board_is_taken_for_a_whole_one() -> None:
+    with board(ROSSERIAL_ECHO) as uno, rosserial(uno) as talk:
+        uno.disturb(0.01, seed=5)
+        texts = [String(f"message {number:03}").encode() for number in range(100)]
+        for text in texts:
+            talk.submit("/hear", text)
+        for _ in texts:
+            talk.next(Ended)
+        said = [each.payload for each in talk.happened if isinstance(each, Said)]
+        assert set(said) <= set(texts)
+        assert len(said) > 30
+        assert talk.dialect.counters.damaged > 0
+
+
+def _json(data: bytes) -> list[object]:
+    values: list[object] = json.loads(data)
+    return values

@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+import pytest
+
+from bridges.serial.errors import LineError, PortMissing
+from bridges.serial.ports import Port, PortName
+from mesh.errors import InputError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def test_a_port_is_found_by_its_path(tmp_path: Path) -> None:
+    path = tmp_path / "tty"
+    with pytest.raises(PortMissing):
+        PortName(str(path)).find()
+    path.touch()
+    assert PortName(str(path)).find() == path
+
+
+def test_a_usb_device_that_is_not_plugged_in_is_missing() -> None:
+    with pytest.raises(PortMissing, match="no such device"):
+        PortName("usb:dead:beef").find()
+
+
+@pytest.mark.parametrize("text", ["", "ttyUSB0", "usb:2341", "usb:23410043", "COM3"])
+def test_what_names_no_port_is_refused(text: str) -> None:
+    with pytest.raises(InputError):
+        PortName(text)
+
+
+def test_a_file_that_is_no_terminal_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.touch()
+    with pytest.raises(LineError):
+        Port(path, baud=57_600)
+
+
+def test_a_port_is_for_one_process_alone_and_tells_when_it_is_pulled_out(tmp_path: Path) -> None:
+    master, slave = os.openpty()
+    path = PortName(os.ttyname(slave)).find()
+    os.close(slave)
+    port = Port(path, baud=57_600)
+    with pytest.raises(LineError):
+        Port(path, baud=57_600)
+    assert port.write(b"abc") == 3
+    assert os.read(master, 10) == b"abc"
+    os.write(master, b"xyz")
+    assert port.read() == b"xyz"
+    os.close(master)
+    with pytest.raises(LineError):
+        port.read()
+    port.close()

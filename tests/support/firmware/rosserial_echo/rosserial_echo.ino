@@ -1,0 +1,48 @@
+// rosserial: says on `said` what it hears on `hear`; `LOUD` is a parameter, `twice` a service, `work` takes 300 ms.
+#include <MiniRosserial.h>
+
+#ifndef BAUD
+#define BAUD 57600
+#endif
+
+void hear(const uint8_t *data, uint16_t size);
+void work(const uint8_t *data, uint16_t size);
+uint16_t twice(const uint8_t *data, uint16_t size, uint8_t *answer);
+void ask(const uint8_t *data, uint16_t size);
+
+const mini::Topic topics[] = {
+    mini::says("said", mini::STRING),
+    mini::hears("hear", mini::STRING, hear),
+    mini::hears("work", mini::EMPTY, work),
+    mini::hears("ask", mini::EMPTY, ask),
+    mini::serves("twice", {"std_srvs/Empty", "d41d8cd98f00b204e9800998ecf8427e"}, twice),
+};
+mini::Node node(Serial, topics);
+
+void hear(const uint8_t *data, uint16_t size) { node.publish(0, data, size); }
+
+void work(const uint8_t *data, uint16_t size) {
+  digitalWrite(13, HIGH);
+  delay(150);
+  digitalWrite(13, LOW);
+  delay(150);
+}
+
+uint16_t twice(const uint8_t *data, uint16_t size, uint8_t *answer) {
+  digitalWrite(12, HIGH);
+  digitalWrite(12, LOW);
+  return 0;
+}
+
+void ask(const uint8_t *data, uint16_t size) {
+  node.publish(0, node.parameter("~loud", 0) == 7 ? "loud" : "quiet");
+  node.log(mini::WARN, "asked");
+}
+
+void setup() {
+  pinMode(13, OUTPUT);
+  pinMode(12, OUTPUT);
+  Serial.begin(BAUD);
+}
+
+void loop() { node.spin(); }

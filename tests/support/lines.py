@@ -1,0 +1,72 @@
+"""A line to a simulated board, served by a thread, for tests that talk to firmware without a mesh."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from typing import TYPE_CHECKING, Self, TypeVar
+
+from bridges.serial.dialect import Command, Ended, Ending, Ready
+from bridges.serial.errors import UnfitMessage
+from bridges.serial.line import Line
+from bridges.serial.ports import PortName
+
+if TYPE_CHECKING:
+    from bridges.serial.boards import SimulatedBoard
+    from bridges.serial.dialect import Dialect, Happening
+
+SECONDS = 60.0
+
+H = TypeVar("H")
+
+
+class Talk:
+    """`with Talk(board, dialect, baud=57600) as talk`: opened, and the board is ready."""
+
+    def __init__(self, board: SimulatedBoard, dialect: Dialect, *, baud: int) -> None:
+        self.dialect = dialect
+        self.happened: list[Happening] = []
+        self._arrived: queue.SimpleQueue[Happening] = queue.SimpleQueue()
+        self.line = Line(PortName(str(board.port)), dialect, baud=baud, deliver=self._arrived.put)
+        self._thread = threading.Thread(target=self.line.run, name="line", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        self.next(Ready)
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.line.stop()
+        self._thread.join(SECONDS)
+
+    def next(self, kind: type[H], *, seconds: float = SECONDS) -> H:
+        """The next happening of this kind; those before it are in `happened`."""
+        deadline = time.monotonic() + seconds
+        while True:
+            try:
+                happening = self._arrived.get(timeout=max(0.0, deadline - time.monotonic()))
+            except queue.Empty:
+                raise AssertionError(f"no {kind.__name__} within {seconds:g} s; {self.dialect.counters}") from None
+            self.happened.append(happening)
+            if isinstance(happening, kind):
+                return happening
+
+    def submit(self, topic: str, payload: bytes = b"", *, seconds: float = SECONDS) -> Command:
+        """Have the board do something, in its turn."""
+        command = Command(topic, payload, time.monotonic() + seconds)
+        self.line.do(lambda: self._submit(command))
+        return command
+
+    def _submit(self, command: Command) -> None:
+        try:
+            self.dialect.submit(command, time.monotonic())
+        except UnfitMessage as error:
+            self._arrived.put(Ended(command, Ending.FAILED, reason="unfit", detail=str(error)))
+
+    def call(self, topic: str, payload: bytes = b"") -> Ended:
+        """Have the board do something, and wait for the end of it."""
+        command = self.submit(topic, payload)
+        while (ended := self.next(Ended)).command is not command:
+            pass
+        return ended
