@@ -6,24 +6,33 @@ from typing import Final
 
 import click
 
-import mesh
 from mesh.cli.lazy import LazyGroup
 
 COMMANDS: Final = {
-    "account": ("mesh.cli.account", "make and look at accounts"),
-    "chain": ("mesh.cli.chain", "a chain for development"),
+    "account": ("mesh.cli.account", "make, import and look at accounts"),
+    "board": ("bridges.serial.board_cli", "run firmware on a board that is not there"),
+    "bridge": ("mesh.cli.bridge", "doors to other networks: IPFS"),
+    "chain": ("mesh.cli.chain", "a chain to develop on, and the contracts on any chain"),
     "cid": ("mesh.cli.cid", "print the CIDv0 of files"),
     "demand": ("mesh.cli.demand", "ask for a job and wait for its result"),
     "demo": ("mesh.cli.demo", "one job from demand to payment, in one process"),
+    "edge": ("bridges.serial.cli", "bring a device on a serial line into the mesh"),
+    "identity": ("mesh.cli.identity", "certificates: who belongs to a site"),
+    "liability": ("mesh.cli.liability", "look at contracts, follow them, call them off"),
+    "lighthouse": ("mesh.cli.lighthouse", "make markets, look at them, become a provider"),
+    "objective": ("mesh.cli.objective", "make, show, check, fetch objectives and recordings"),
     "provider": ("mesh.cli.provider", "match the orders of a lighthouse"),
+    "replay": ("mesh.cli.replay", "play a recording again onto keys of the mesh"),
     "router": ("mesh.cli.router", "a Zenoh router for a mesh"),
     "settings": ("mesh.cli.settings", "show the settings in force"),
     "up": ("mesh.cli.up", "router, chain and provider in one process, for development"),
+    "verify": ("mesh.cli.verify", "check a recording against its objective and its contract"),
+    "xrt": ("mesh.cli.xrt", "balances, allowances and transfers of XRT and other tokens"),
 }
 """Name → (module that holds the command under the name `command`, one line of help)."""
 
 
 @click.group(cls=LazyGroup, commands=COMMANDS, context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(mesh.__version__, prog_name="aira")
+@click.version_option(package_name="aira-mesh", prog_name="aira")
 def main() -> None:
     """AIRA mesh: robots and people trade work without a middleman. `aira demo` shows all of it."""

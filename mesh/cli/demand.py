@@ -13,6 +13,7 @@ import msgspec
 from mesh.cli.options import with_settings
 from mesh.errors import ConfigurationError, InputError
 from mesh.running import run_to_end
+from mesh.settings import CHAIN_SETTINGS, NETWORK_SETTINGS
 from schemas import InvalidCid, parse_cid
 
 if TYPE_CHECKING:
@@ -39,17 +40,12 @@ if TYPE_CHECKING:
 @click.option("--out", type=click.Path(path_type=Path), help="file to write the recording to")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object at the end")
 @with_settings(
-    "connect",
-    "data_dir",
-    "web3_http_provider",
-    "ens_contract",
-    "factory_contract",
+    *NETWORK_SETTINGS,
     "lighthouse_contract",
     "erc20_token",
-    "generation",
     "keyfile",
     "keyfile_password_file",
-    "poll_interval",
+    *CHAIN_SETTINGS,
 )
 def command(settings: Settings, **order: Any) -> None:
     """Publish a Demand, wait for the contract, the work and the payment. Ctrl-C stops waiting; the contract goes on."""

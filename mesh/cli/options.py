@@ -15,7 +15,7 @@ from mesh.settings import MEANING, Settings, load
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-SEVERAL = frozenset({"connect", "listen"})
+SEVERAL = frozenset({"connect", "link", "listen", "ipfs_public_providers", "ipfs_swarm_connect"})
 PORT = click.IntRange(0, 65_535)
 BLOCK_TIME = click.FloatRange(0.01, 86_400)
 """Seconds."""

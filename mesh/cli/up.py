@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 from contextlib import AsyncExitStack
-from typing import TYPE_CHECKING
 
 import click
 
 from mesh.cli.options import BLOCK_TIME, PORT, with_settings
 from mesh.running import run_until_stopped
-
-if TYPE_CHECKING:
-    from mesh.settings import Settings
+from mesh.settings import Settings
 
 
 @click.command("up")
@@ -32,17 +30,21 @@ def command(settings: Settings, port: int, block_time: float) -> None:
 
 async def _serve(settings: Settings, port: int, block_time: float) -> None:
     from mesh.demo.development import serve_chain
+    from mesh.identity.routers import check_loopback
     from mesh.market.provider import Provider
     from mesh.network import Endpoints, Network
 
+    check_loopback(settings.listen)
     async with AsyncExitStack() as stack:
         network = await stack.enter_async_context(Network(Endpoints(listen=settings.listen, mode="router")))
         served = await stack.enter_async_context(
             serve_chain(settings, host="127.0.0.1", port=port, block_time=block_time)
         )
         chain = await stack.enter_async_context(served.market.chain(served.url, "provider"))
-        provider = await stack.enter_async_context(
-            Provider(network.session, chain, served.market.deployment.lighthouse_name)
-        )
-        click.echo(f"router      {', '.join(settings.listen)}\n{served.describe()}\nprovider    {provider.address}")
-        await provider.run()
+        # Each generation has its own name for the lighthouse, and so its own keys.
+        markets = [Settings(generation=3).lighthouse_contract, Settings(generation=5).lighthouse_contract]
+        providers = [await stack.enter_async_context(Provider(network.session, chain, name)) for name in markets]
+        tasks = await stack.enter_async_context(asyncio.TaskGroup())
+        for market, provider in zip(markets, providers, strict=True):
+            tasks.create_task(provider.run(), name=f"provider of {market}")
+        click.echo(f"router      {', '.join(settings.listen)}\n{served.describe()}\nprovider    {providers[0].address}")

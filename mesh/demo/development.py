@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import secrets
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from mesh.chain import serve_embedded, write_keyfile
-from mesh.demo.market import ROLES, Market, found_market
+from mesh.chain import NoContracts, serve_embedded, write_keyfile
+from mesh.demo.anvil import serve_anvil
+from mesh.demo.market import ROLES, Market, find_market, found_market
 from mesh.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -24,39 +25,98 @@ class DevelopmentChain:
     """A served chain: where it is, what is on it, and the folder of the keyfiles and their password."""
 
     url: str
+    """JSON-RPC over HTTP; over a WebSocket it is at the same port."""
+
+    engine: str
+    """What runs it, for people to read."""
+
     market: Market
     keys: Path
+
+    @property
+    def ws_url(self) -> str:
+        """The same for clients that subscribe to events, e.g. `ws://127.0.0.1:8545`."""
+        return self.url.replace("http", "ws", 1)
 
     def describe(self) -> str:
         """What a person needs to use it, a line each."""
         deployment = self.market.deployment
         lines = [
             f"chain       {self.url}",
+            f"websocket   {self.ws_url}",
+            f"engine      {self.engine}",
             f"lighthouse  {deployment.lighthouse_name}",
             *(f"{role:<11} {self.keys / role}.json  {self.market.accounts[role].address}" for role in ROLES[1:]),
             f"password    {self.keys / 'password'}",
         ]
         return "\n".join(lines)
 
+    def facts(self) -> dict[str, Any]:
+        """The same for programs, with the contracts' addresses."""
+        deployment = self.market.deployment
+        accounts = {
+            role: {"address": account.address, "keyfile": str(self.keys / f"{role}.json")}
+            for role, account in self.market.accounts.items()
+        }
+        return {
+            "chain": self.url,
+            "webSocket": self.ws_url,
+            "engine": self.engine,
+            "ens": deployment.ens,
+            "factory": deployment.factory,
+            "xrt": deployment.xrt,
+            "lighthouse": deployment.lighthouse,
+            "lighthouseName": deployment.lighthouse_name,
+            "accounts": accounts,
+            "passwordFile": str(self.keys / "password"),
+        }
+
 
 @asynccontextmanager
 async def serve_chain(
-    settings: Settings, *, host: str, port: int, block_time: float | None
+    settings: Settings,
+    *,
+    host: str,
+    port: int,
+    block_time: float | None,
+    anvil: Path | None = None,
+    state: Path | None = None,
 ) -> AsyncIterator[DevelopmentChain]:
-    """Serve an embedded chain with a market on it; `block_time` in seconds. Everything on it is gone at the end.
+    """Serve a chain with a market on it: by the program `anvil`, embedded without one. `block_time` in seconds.
 
-    Raises `ConfigurationError` when the port is taken or the keyfiles can't be written.
+    Everything on it is gone at the end, unless anvil keeps it in the file `state`. Raises `ConfigurationError` when the
+    port is taken, the keyfiles can't be written or the state can't be used; `NodeEnded` when anvil ends by itself.
     """
     keys = settings.state_directory / "development"
-    async with serve_embedded(host, port, block_time=block_time) as served:
-        market = await found_market(served.node.provider, served.node.funded_keys)
+    async with AsyncExitStack() as stack:
+        if anvil is None:
+            served = await stack.enter_async_context(serve_embedded(host, port, block_time=block_time))
+            url, funded, engine = served.url, served.node.funded_keys, "embedded"
+            market = await found_market(served.node.provider, funded)
+        else:
+            node = await stack.enter_async_context(
+                serve_anvil(anvil, host=host, port=port, block_time=block_time, state=state)
+            )
+            url, funded, engine = node.url, node.funded_keys, f"anvil ({anvil})"
+            market = await _market_of(node.url, funded, state)
         try:
-            await asyncio.to_thread(_write_keyfiles, keys, served.node.funded_keys)
+            await asyncio.to_thread(_write_keyfiles, keys, funded)
         except OSError as error:
             raise ConfigurationError(
                 f"can't write keyfiles to {keys}: {error.strerror}", hint="name another folder with --data-dir"
             ) from None
-        yield DevelopmentChain(url=served.url, market=market, keys=keys)
+        yield DevelopmentChain(url=url, engine=engine, market=market, keys=keys)
+
+
+async def _market_of(url: str, keys: tuple[bytes, ...], state: Path | None) -> Market:
+    """The market on a chain that may have one from an earlier time, founded where the chain is new."""
+    try:
+        found = await find_market(url, keys)
+    except NoContracts:
+        raise ConfigurationError(
+            f"the chain in {state} has no market on it, and is not new", hint="name another file, or remove it"
+        ) from None
+    return found or await found_market(url, keys)
 
 
 def _write_keyfiles(folder: Path, private_keys: tuple[bytes, ...]) -> None:

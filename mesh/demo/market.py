@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from mesh.chain import XRT, Account, Chain, Deployment, DeploymentPlan, Timing, deploy
+from mesh.chain import XRT, Account, Chain, Deployment, DeploymentPlan, NoContracts, Node, Timing, deploy, namehash
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,6 +31,36 @@ class Market:
     def chain(self, endpoint: str | AsyncBaseProvider, role: str) -> Chain:
         """The chain as `role` uses it, not yet open."""
         return Chain(endpoint, account=self.accounts[role], ens=self.deployment.ens, timing=TIMING)
+
+
+async def find_market(endpoint: str, keys: Sequence[bytes]) -> Market | None:
+    """The market that an earlier `found_market` made with the same keys; None if nobody ever sent anything.
+
+    Raises `NoContracts` for a chain on which something else, or only a part of a market, was made.
+    """
+    accounts = {role: Account.from_key(key) for role, key in zip(ROLES, keys, strict=False)}
+    async with Node(endpoint, timing=TIMING) as node:
+        if not await node.web3.eth.get_transaction_count(node.checksum(accounts["provider"].address)):
+            return None
+        async with Chain(node, account=accounts["provider"]) as chain:
+            root = namehash("3.robonomics.eth")
+            resolver = await node.read(node.contract("ENSRegistry", chain.ens).functions.resolver(root))
+            made = next(iter(await chain.lighthouses()), None)
+            if made is None or accounts["provider"].address not in (await chain.lighthouse(made.lighthouse)).stakes:
+                raise NoContracts("lighthouse with a provider", chain.chain_id)
+            return Market(
+                deployment=Deployment(
+                    ens=chain.ens,
+                    resolver=str(resolver),
+                    xrt=chain.xrt,
+                    factory=chain.factory,
+                    lighthouse=made.lighthouse,
+                    lighthouse_name=f"{made.name}.lighthouse.3.robonomics.eth",
+                    block_number=await chain.block_number(),
+                    gas_used=0,
+                ),
+                accounts=accounts,
+            )
 
 
 async def found_market(endpoint: str | AsyncBaseProvider, keys: Sequence[bytes]) -> Market:

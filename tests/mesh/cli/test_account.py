@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 import json
+import os
+import pty
+import select
+import signal
 import stat
+import subprocess
+import time
 from typing import TYPE_CHECKING
 
 import pytest
 from click.testing import CliRunner
 
-from mesh.chain import Account, WrongPassword
+from mesh.chain import XRT, Account, WrongPassword
 from mesh.cli import main
+from tests.mesh.cli.chains import PASSWORD, columns, write_quick_keyfile
+from tests.support.commands import AIRA
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from click.testing import Result
+
+    from tests.mesh.cli.chains import Town
 
 
 def account(*arguments: str | Path) -> Result:
@@ -119,3 +129,168 @@ def test_what_is_no_keyfile_is_one_clear_line(tmp_path: Path, content: str | Non
     assert done.exit_code == 2
     assert words in done.stderr.splitlines()[0]
     assert done.stdout == ""
+
+
+KEY = "4c0883a69102937d6231471b5dbb6204fe5129617082792ae468d01a3f362318"
+ADDRESS = "0x2c7536E3605D9C16a7a3D7b1898e529396a65c23"
+
+
+def imported(folder: Path, *arguments: str | Path, given: str | None = None) -> Result:
+    """`aira account import` to `key.json` in a folder, with the password in `password` there."""
+    words = ["account", "import", folder / "key.json", "--password-file", folder / "password", *arguments]
+    return CliRunner().invoke(main, [str(word) for word in words], input=given)
+
+
+def assert_imported(folder: Path, done: Result) -> None:
+    """The key is in the keyfile, under the password, and nowhere in what was printed."""
+    assert (done.exit_code, done.stdout, done.stderr) == (0, f"{ADDRESS}\n", "")
+    account = Account.from_keyfile(folder / "key.json", folder / "password")
+    assert account.address == ADDRESS
+    assert KEY not in (folder / "key.json").read_text()
+    assert stat.S_IMODE((folder / "key.json").stat().st_mode) == 0o600
+
+
+def test_new_and_show_speak_json(made: tuple[Path, Path, Result], tmp_path: Path) -> None:
+    address = made[2].stdout.strip()
+    assert json.loads(account("show", made[0], "--json").stdout) == {"address": address, "keyfile": str(made[0])}
+    told = json.loads(account("new", tmp_path / "key.json", "--password-file", made[1], "--json").stdout)
+    assert told == {"address": account("show", told["keyfile"]).stdout.strip(), "keyfile": str(tmp_path / "key.json")}
+
+
+def test_show_is_of_the_settings_account_unless_a_keyfile_is_given(made: tuple[Path, Path, Result]) -> None:
+    assert account("show", "--keyfile", made[0]).stdout == made[2].stdout
+    done = account("show")
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert done.stderr.startswith("aira: no account is named, and keyfile is not set\n")
+
+
+def test_show_asks_the_chain_for_what_the_account_holds(town: Town) -> None:
+    person = town.people["person"]
+    said = columns(town.aira("account", "show", "--balance", AIRA_KEYFILE_PASSWORD_FILE="").stdout)
+    assert said["address"] == person.address
+    assert said["XRT"] == "1,000"
+    assert said["ETH"].startswith("999,999.9")
+    assert said["order nonce"] == "0"
+    told = town.told("account", "show", person.keyfile, "--balance", AIRA_KEYFILE="")
+    assert told == {
+        "address": person.address,
+        "wei": str(town.ask("person", lambda chain: chain.eth_balance())),
+        "wn": str(1_000 * XRT),
+        "nonce": 0,
+    }
+
+
+@pytest.mark.parametrize("given", [KEY, f"0x{KEY}\n", f"  {KEY.upper()} \r\nnotes"])
+def test_a_private_key_is_imported_from_the_standard_input(tmp_path: Path, given: str) -> None:
+    assert_imported(tmp_path, imported(tmp_path, given=given))
+
+
+def test_a_private_key_is_imported_from_a_file(tmp_path: Path) -> None:
+    (tmp_path / "secret").write_text(f"0x{KEY}\n")
+    assert_imported(tmp_path, imported(tmp_path, "--private-key-file", tmp_path / "secret"))
+
+
+def test_another_keyfile_is_imported_under_a_new_password(tmp_path: Path) -> None:
+    old, old_password = write_quick_keyfile(tmp_path / "old.json", bytes.fromhex(KEY)), tmp_path / "old-password"
+    old_password.write_text(f"{PASSWORD}\n")
+    (tmp_path / "password").write_text("a new one\n")
+    assert_imported(tmp_path, imported(tmp_path, "--from-keyfile", old, "--from-password-file", old_password))
+
+
+def test_the_password_of_the_other_keyfile_may_come_from_the_standard_input(tmp_path: Path) -> None:
+    old = write_quick_keyfile(tmp_path / "old.json", bytes.fromhex(KEY))
+    done = imported(tmp_path, "--from-keyfile", old, given=f"{PASSWORD}\n")
+    assert_imported(tmp_path, done)
+    (tmp_path / "key.json").unlink()
+    done = imported(tmp_path, "--from-keyfile", old, given="guessed\n")
+    assert (done.exit_code, "does not open it" in done.stderr) == (2, True)
+    assert "guessed" not in done.output
+
+
+@pytest.mark.parametrize("given", ["", "\n", "a key", KEY[:-1], KEY + "00", "0" * 64, "g" + KEY[1:], "0x" + "é" * 64])
+def test_what_is_no_private_key_is_refused_without_showing_it(tmp_path: Path, given: str) -> None:
+    done = imported(tmp_path, given=given)
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert done.stderr.startswith("aira: ")
+    assert len(done.stderr.splitlines()) <= 2
+    assert "private key" in done.stderr.splitlines()[0]
+    assert not given.strip() or given.strip() not in done.output
+    assert not (tmp_path / "key.json").exists()
+
+
+def test_a_key_is_not_taken_as_an_argument(tmp_path: Path) -> None:
+    for written in (KEY, "0x" + KEY):
+        done = account("import", tmp_path / written, "--password-file", tmp_path / "password")
+        assert (done.exit_code, KEY in done.output) == (2, False)
+        assert "looks like a private key" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_import_overwrites_nothing_and_asks_for_nothing_then(tmp_path: Path) -> None:
+    (tmp_path / "key.json").write_text("mine")
+    done = imported(tmp_path)
+    assert (done.exit_code, "exists already" in done.stderr) == (2, True)
+    assert (tmp_path / "key.json").read_text() == "mine"
+
+
+def test_a_key_has_one_source(tmp_path: Path) -> None:
+    both = imported(tmp_path, "--private-key-file", tmp_path / "a", "--from-keyfile", tmp_path / "b")
+    assert (both.exit_code, "not from both" in both.stderr) == (2, True)
+    lone = imported(tmp_path, "--from-password-file", tmp_path / "a", given=KEY)
+    assert (lone.exit_code, "goes with --from-keyfile" in lone.stderr) == (2, True)
+
+
+def test_a_missing_source_is_one_clear_line(tmp_path: Path) -> None:
+    for option in ("--private-key-file", "--from-keyfile"):
+        done = imported(tmp_path, option, tmp_path / "missing", given="x")
+        assert done.exit_code == 2
+        assert "No such file" in done.stderr.splitlines()[0]
+
+
+class Typing:
+    """`aira account import` on a terminal of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        self._terminal, inside = pty.openpty()
+        command = (*AIRA, "account", "import", folder / "key.json", "--password-file", folder / "password")
+        self._process = subprocess.Popen(
+            [str(word) for word in command], stdin=inside, stdout=inside, stderr=inside, start_new_session=True
+        )
+        os.close(inside)
+        self.shown = ""
+
+    def until(self, words: str) -> None:
+        deadline = time.monotonic() + 60
+        while words not in self.shown:
+            assert time.monotonic() < deadline, self.shown
+            if select.select([self._terminal], [], [], 0.1)[0]:
+                try:
+                    self.shown += os.read(self._terminal, 4096).decode()
+                except OSError:
+                    return
+
+    def type(self, text: str) -> None:
+        os.write(self._terminal, text.encode())
+
+    def end(self) -> int:
+        self.until("the end of the terminal")
+        os.close(self._terminal)
+        return self._process.wait(60)
+
+
+def test_a_key_that_is_typed_is_not_shown(tmp_path: Path) -> None:
+    typing = Typing(tmp_path)
+    typing.until("private key: ")
+    typing.type(f"{KEY}\n")
+    assert typing.end() == 0
+    assert ADDRESS in typing.shown
+    assert KEY not in typing.shown
+
+
+def test_ctrl_c_at_the_question_ends_it(tmp_path: Path) -> None:
+    typing = Typing(tmp_path)
+    typing.until("private key: ")
+    typing._process.send_signal(signal.SIGINT)
+    assert typing.end() == 130
+    assert "Traceback" not in typing.shown
+    assert list(tmp_path.iterdir()) == []

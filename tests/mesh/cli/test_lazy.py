@@ -17,6 +17,14 @@ from tests.support.commands import run
 if TYPE_CHECKING:
     import click
 
+GROUPS = {
+    "account": ("new", "import", "show"),
+    "chain": ("up", "deploy", "status"),
+    "liability": ("show", "list", "watch", "cancel"),
+    "lighthouse": ("create", "list", "info", "join", "leave"),
+    "xrt": ("balance", "allowance", "approve", "transfer"),
+}
+
 
 def test_help_lists_every_command_without_importing_any() -> None:
     program = (
@@ -25,12 +33,13 @@ def test_help_lists_every_command_without_importing_any() -> None:
         "print([module for module, _ in COMMANDS.values() if module in sys.modules])"
     )
     lines = run(sys.executable, "-c", program).stdout.splitlines()
+    width = max(map(len, COMMANDS))
     for name, (_, meaning) in COMMANDS.items():
-        assert f"  {name:<8}  {meaning}" in lines
+        assert f"  {name:<{width}}  {meaning}" in lines
     assert lines[-1] == "[]"
 
 
-@pytest.mark.parametrize("name", [*COMMANDS, "account new", "account show", "chain up"])
+@pytest.mark.parametrize("name", [*COMMANDS, *(f"{group} {name}" for group, names in GROUPS.items() for name in names)])
 def test_every_command_says_what_it_does(name: str) -> None:
     done = CliRunner().invoke(main, [*name.split(), "--help"])
     assert done.exit_code == 0
@@ -39,6 +48,13 @@ def test_every_command_says_what_it_does(name: str) -> None:
 
 def test_the_version_is_the_packages() -> None:
     assert CliRunner().invoke(main, ["--version"]).stdout == f"aira, version {mesh.__version__}\n"
+
+
+@pytest.mark.parametrize(("group", "names"), GROUPS.items())
+def test_a_group_lists_its_commands_with_a_whole_line_each(group: str, names: tuple[str, ...]) -> None:
+    lines = CliRunner().invoke(main, [group, "--help"]).stdout.partition("Commands:\n")[2].splitlines()
+    assert [line.split()[0] for line in lines] == sorted(names)
+    assert not [line for line in lines if line.endswith("...")]
 
 
 @pytest.mark.parametrize(("typed", "meant"), [("dmeo", "demo"), ("demnd", "demand"), ("providr", "provider")])

@@ -36,7 +36,8 @@ async def test_its_keyfiles_are_those_of_people_with_money_and_outlive_it(tmp_pa
 
 def assert_described(served: DevelopmentChain) -> None:
     lines = served.describe().splitlines()
-    assert lines[0] == f"chain       {served.url}"
+    port = served.url.rpartition(":")[2]
+    assert lines[:2] == [f"chain       {served.url}", f"websocket   ws://127.0.0.1:{port}"]
     for role in ("robot", "person"):
         assert f"{role:<11} {served.keys / role}.json  {served.market.accounts[role].address}" in lines
     assert lines[-1] == f"password    {served.keys / 'password'}"

@@ -1,0 +1,15 @@
+"""`aira chain`: a chain for development, the contracts on any other, and what there is on one."""
+
+from __future__ import annotations
+
+from mesh.cli.lazy import LazyGroup
+
+command = LazyGroup(
+    "chain",
+    help="A chain to develop on, and the network's contracts on any chain.",
+    commands={
+        "deploy": ("mesh.cli.chain.deploy", "put the contracts on a chain"),
+        "status": ("mesh.cli.chain.status", "show the node, the contracts and the account's money"),
+        "up": ("mesh.cli.chain.up", "serve a chain with the contracts, for development"),
+    },
+)

@@ -1,0 +1,20 @@
+"""`aira lighthouse`: markets and their providers."""
+
+from __future__ import annotations
+
+from mesh.cli.lazy import LazyGroup
+
+command = LazyGroup(
+    "lighthouse",
+    help="""Lighthouses, the markets: make one, look at them, become a provider of one.
+
+    Stakes are in XRT (1.5), or with the ending wn in its smallest unit (1500000000wn). A lighthouse is named by its
+    label (airalab), its ENS name or its address.""",
+    commands={
+        "create": ("mesh.cli.lighthouse.create", "make a lighthouse"),
+        "info": ("mesh.cli.lighthouse.info", "show one: its terms, its providers, whose turn it is"),
+        "join": ("mesh.cli.lighthouse.join", "stake, and be a provider"),
+        "leave": ("mesh.cli.lighthouse.leave", "take the stake back, or a part of it"),
+        "list": ("mesh.cli.lighthouse.list", "list all lighthouses"),
+    },
+)

@@ -1,0 +1,130 @@
+"""`aira xrt`: tokens, XRT or any other ERC-20."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from mesh.cli.opening import for_reading, for_signing, patience, reading, signing
+from mesh.cli.printing import print_facts, print_json, say, with_json
+from mesh.cli.tokens import FACTORY, account_of, check_enough, spender_of, unit_of
+from mesh.running import run_to_end
+
+if TYPE_CHECKING:
+    from mesh.chain import Chain
+    from mesh.cli.amounts import Unit
+    from mesh.settings import Settings
+
+with_token = click.option("--token", help="ENS name or address of another ERC-20, in whose own units amounts are [XRT]")
+
+
+@click.group("xrt")
+def command() -> None:
+    """Tokens: XRT, which stakes and fees are paid in, or any other ERC-20.
+
+    An AMOUNT alone counts whole tokens: 1.5 is one and a half XRT. With the ending wn (10^-9 XRT), or units for any
+    token, it counts the smallest unit: 1500000000wn is the same. JSON has the smallest unit, as text.
+    """
+
+
+@command.command("balance", short_help="show what an account holds")
+@click.argument("account", required=False)
+@with_token
+@with_json
+@for_reading()
+def balance(settings: Settings, **what: Any) -> None:
+    """Show what ACCOUNT (an address or ENS name; by default the settings' account) holds."""
+    run_to_end(lambda: _balance(settings, **what))
+
+
+async def _balance(settings: Settings, *, account: str | None, token: str | None, as_json: bool) -> None:
+    async with reading(settings) as chain:
+        owner = await account_of(chain, settings, account)
+        unit = await unit_of(chain, token)
+        amount = await chain.balance_of(owner, token=token)
+        if as_json:
+            print_json({"account": owner, **await _about(chain, token, unit), "balance": str(amount)})
+        else:
+            say(unit.show(amount))
+
+
+@command.command("allowance", short_help="show what somebody may take from an account")
+@click.argument("spender", default=FACTORY)
+@click.option("--owner", help="address or ENS name of who allows it [the settings' account]")
+@with_token
+@with_json
+@for_reading()
+def allowance(settings: Settings, **what: Any) -> None:
+    """Show what SPENDER may take from the account: `factory` (the default), a lighthouse's name, or an address."""
+    run_to_end(lambda: _allowance(settings, **what))
+
+
+async def _allowance(settings: Settings, *, spender: str, owner: str | None, token: str | None, as_json: bool) -> None:
+    async with reading(settings) as chain:
+        whose, by = await account_of(chain, settings, owner), await spender_of(chain, spender)
+        unit = await unit_of(chain, token)
+        amount = await chain.allowance(whose, by, token=token)
+        if as_json:
+            about = await _about(chain, token, unit)
+            print_json({"owner": whose, "spender": by, **about, "allowance": str(amount)})
+        else:
+            say(unit.show(amount))
+
+
+@command.command("approve", short_help="let somebody take up to an amount")
+@click.argument("spender")
+@click.argument("amount")
+@with_token
+@with_json
+@for_signing()
+def approve(settings: Settings, **what: Any) -> None:
+    """Let SPENDER take up to AMOUNT from the account, instead of what it might take before; 0 takes it back.
+
+    SPENDER is `factory` (which takes costs and fees), a lighthouse's name (stakes), an ENS name or an address.
+    """
+    run_to_end(lambda: _approve(settings, **what))
+
+
+async def _approve(settings: Settings, *, spender: str, amount: str, token: str | None, as_json: bool) -> None:
+    async with signing(settings) as chain:
+        unit = await unit_of(chain, token)
+        value, by = unit.parse(amount), await spender_of(chain, spender)
+        with patience():
+            tx = await chain.approve(by, value, token=token)
+        if as_json:
+            print_json({"spender": by, **await _about(chain, token, unit), "allowance": str(value), "tx": tx})
+        else:
+            print_facts({"spender": by, "may take": unit.show(value), "transaction": tx})
+
+
+@command.command("transfer", short_help="send an amount")
+@click.argument("to")
+@click.argument("amount")
+@with_token
+@with_json
+@for_signing()
+def transfer(settings: Settings, **what: Any) -> None:
+    """Send AMOUNT from the account to TO, an address or ENS name."""
+    run_to_end(lambda: _transfer(settings, **what))
+
+
+async def _transfer(settings: Settings, *, to: str, amount: str, token: str | None, as_json: bool) -> None:
+    async with signing(settings) as chain:
+        unit = await unit_of(chain, token)
+        value, recipient = unit.parse(amount), await chain.resolve(to)
+        await check_enough(chain, unit, value, token=token)
+        with patience():
+            tx = await chain.transfer(recipient, value, token=token)
+        left = await chain.balance_of(token=token)
+        if as_json:
+            about = await _about(chain, token, unit)
+            print_json({"to": recipient, **about, "amount": str(value), "balance": str(left), "tx": tx})
+        else:
+            print_facts({"sent": unit.show(value), "to": recipient, "left": unit.show(left), "transaction": tx})
+
+
+async def _about(chain: Chain, token: str | None, unit: Unit) -> dict[str, Any]:
+    """The token, for programs."""
+    address = chain.xrt if token is None else await chain.resolve(token)
+    return {"token": address, "symbol": unit.symbol, "decimals": unit.decimals}

@@ -1,0 +1,219 @@
+"""`aira chain deploy` and `aira chain status`."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.chain import XRT, Account, Chain, Sender, new_private_key
+from mesh.chain.artifacts import load_artifact
+from mesh.chain.recognition import is_code_of
+from mesh.cli.chain.deploy import DEPLOYMENT_GAS
+from tests.mesh.cli.chains import Town, columns, refused, write_quick_keyfile
+from tests.support.commands import aira
+from tests.support.nodes import Anvil
+from tests.support.ports import free_port
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+DEPLOY = ("chain", "deploy", "--lighthouse", "first", "--minimal-stake", "2.5", "--timeout-blocks", "7")
+
+
+@pytest.fixture
+def desert(tmp_path: Path) -> Iterator[Town]:
+    """A served chain on which nothing was deployed."""
+    with Town(tmp_path, is_deployed=False) as place:
+        yield place
+
+
+def test_a_deployment_says_all_addresses_and_can_be_used_with_the_settings_that_it_prints(
+    desert: Town, tmp_path: Path
+) -> None:
+    done = desert.aira(*DEPLOY)
+    assert done.exit_code == 0, done.output
+    facts, _, options = done.stdout.partition("\nsettings of those who use it:\n\n")
+    said = columns(facts)
+    gas = int(said["gas used"].replace(",", ""))
+    assert 0.8 * DEPLOYMENT_GAS < gas < DEPLOYMENT_GAS, "what is asked for before the beginning is right"
+    (tmp_path / "aira.toml").write_text(options)
+    settings = tomllib.loads(options)
+    assert settings["ens_contract"] == said["ENS registry"]
+    assert settings["web3_http_provider"] == desert.url
+    variables = {"AIRA_CONFIG": str(tmp_path / "aira.toml"), "AIRA_WEB3_HTTP_PROVIDER": desert.url}
+    status = columns(desert.aira("chain", "status", **variables).stdout)
+    assert status["factory"] == said["factory"]
+    assert status["XRT"] == said["XRT"]
+    assert status["lighthouse"] == said["lighthouse"]
+    assert status["account"].endswith(" ETH, 1,000,000 XRT")
+    market = desert.told("lighthouse", "info", **variables)
+    assert (market["minimalStake"], market["timeoutBlocks"]) == (str(5 * XRT // 2), 7)
+
+
+def test_a_second_deployment_has_to_be_asked_for(desert: Town) -> None:
+    first = desert.told(*DEPLOY, by="provider")
+    hint = refused(desert.aira(*DEPLOY, by="provider"), 2, f"has the contracts already (factory {first['factory']})")
+    assert "--again" in hint
+    second = desert.told(*DEPLOY, "--again", by="provider")
+    assert second["factory"] != first["factory"]
+    assert second["settings"]["ens_contract"] == second["ens"] != first["ens"]
+    told = desert.told("chain", "status", AIRA_ENS_CONTRACT=second["ens"])
+    assert (told["factory"], told["isOurCode"]) == (second["factory"], True)
+
+
+def test_an_account_that_can_not_pay_for_all_of_it_deploys_nothing(desert: Town, tmp_path: Path) -> None:
+    key = new_private_key()
+    keyfile = write_quick_keyfile(tmp_path / "poor.json", key)
+    address = Account.from_key(key).address
+
+    async def give() -> None:
+        async with desert.chain("person").node as node:
+            await Sender(node, desert.people["person"].account).send(to=address, data=b"", value=10**15)
+
+    desert.run(give())
+    hint = refused(desert.aira(*DEPLOY, AIRA_KEYFILE=str(keyfile)), 1, f"{address} has 0.001 ETH")
+    assert "send ETH" in hint
+    assert columns(desert.aira("chain", "status").stdout)["block"].startswith("1, ")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--lighthouse", "Bad Name"), "can't be the name of a lighthouse"),
+        (("--minimal-stake", "0"), "a minimal stake of 0 XRT"),
+        (("--minimal-stake", "much"), "'much' is not an amount"),
+    ],
+)
+def test_what_the_factory_would_refuse_at_the_end_is_refused_before_the_beginning(
+    desert: Town, options: tuple[str, str], words: str
+) -> None:
+    refused(desert.aira(*DEPLOY, *options), 2, words)
+    assert columns(desert.aira("chain", "status").stdout)["block"].startswith("0, ")
+
+
+def test_a_deployment_needs_an_account_and_a_node(desert: Town) -> None:
+    refused(desert.aira(*DEPLOY, AIRA_KEYFILE=""), 2, "this needs an account")
+    nowhere = f"http://127.0.0.1:{free_port()}"
+    refused(desert.aira(*DEPLOY, AIRA_WEB3_HTTP_PROVIDER=nowhere), 1, "no Ethereum node answers")
+
+
+def test_status_of_a_chain_without_contracts_tells_of_the_node_and_what_is_missing(desert: Town) -> None:
+    done = desert.aira("chain", "status")
+    assert done.exit_code == 1
+    said = columns(done.stdout)
+    assert said["node"].startswith(desert.url)
+    assert said["block"].startswith("0, ")
+    assert said["account"] == f"{desert.people['person'].address}  1,000,000 ETH"
+    assert "factory" not in said
+    line, hint = done.stderr.splitlines()
+    assert "has no ENS registry" in line
+    assert "aira chain deploy" in hint
+
+
+def test_status_shows_the_node_the_contracts_and_the_account(town: Town) -> None:
+    said = columns(town.aira("chain", "status").stdout)
+    deployment = town.deployment
+    assert said["node"] == f"{town.url}  aira-embedded/py-evm"
+    assert said["base fee"].endswith(" gwei")
+    assert said["contracts"] == "this project's, by their code"
+    assert (said["ENS registry"], said["factory"], said["XRT"]) == (deployment.ens, deployment.factory, deployment.xrt)
+    assert said["lighthouse"] == f"{deployment.lighthouse}  airalab.lighthouse.3.robonomics.eth"
+    assert said["account"].startswith(town.people["person"].address)
+    assert said["account"].endswith(" ETH, 1,000 XRT")
+
+
+def test_status_for_programs_has_the_same(town: Town) -> None:
+    told = town.told("chain", "status")
+    assert (told["node"], told["isOurCode"], told["wn"]) == (town.url, True, str(1_000 * XRT))
+    assert told["chainId"] == town.ask("person", _chain_id)
+    without = town.told("chain", "status", AIRA_KEYFILE="")
+    assert (without["account"], without["wei"], without["wn"]) == (None, None, None)
+
+
+async def _chain_id(chain: Chain) -> int:
+    return chain.chain_id
+
+
+def test_status_bears_a_lighthouse_that_is_not_there(town: Town) -> None:
+    said = columns(town.aira("chain", "status", "--lighthouse-contract", "nowhere").stdout)
+    assert said["lighthouse"] == "none of that name  nowhere"
+    assert town.told("chain", "status", "--lighthouse-contract", "nowhere")["lighthouse"] is None
+
+
+def test_contracts_with_other_code_are_not_called_ours(town: Town) -> None:
+    told = town.told("chain", "status", AIRA_FACTORY_CONTRACT=town.deployment.lighthouse)
+    assert told["isOurCode"] is False
+
+
+def test_code_is_ours_with_any_immutables_and_with_no_other_difference(town: Town) -> None:
+    code = bytes(town.ask("person", _factory_code))
+    runtime = load_artifact("Factory").runtime
+    assert code != runtime
+    assert is_code_of("Factory", code)
+    assert is_code_of("Factory", runtime)
+    same = next(at for at in range(100, len(code)) if code[at])
+    assert not is_code_of("Factory", code[:same] + bytes([code[same] ^ 1]) + code[same + 1 :])
+    assert not is_code_of("Factory", code[:-1])
+    assert not is_code_of("XRT", code)
+
+
+async def _factory_code(chain: Chain) -> bytes:
+    return bytes(await chain.node.web3.eth.get_code(chain.node.checksum(chain.factory)))
+
+
+def test_contracts_can_be_deployed_to_a_node_of_others(tmp_path: Path) -> None:
+    with Anvil() as node:
+        keyfile = write_quick_keyfile(tmp_path / "deployer.json", node.private_keys[3])
+        (tmp_path / "password").write_text("open sesame\n")
+        variables = {
+            "AIRA_WEB3_HTTP_PROVIDER": node.url,
+            "AIRA_KEYFILE": str(keyfile),
+            "AIRA_KEYFILE_PASSWORD_FILE": str(tmp_path / "password"),
+            "AIRA_DATA_DIR": str(tmp_path / "state"),
+        }
+        done = aira(*DEPLOY, "--json", **variables)
+        assert done.returncode == 0, done.stderr
+        told = json.loads(done.stdout)
+        status = aira("chain", "status", "--json", **variables, AIRA_ENS_CONTRACT=told["ens"])
+        assert json.loads(status.stdout)["isOurCode"] is True
+
+
+ON_A_CHAIN = [
+    ("account", "show", "--balance"),
+    ("xrt", "balance"),
+    ("xrt", "allowance"),
+    ("xrt", "approve", "factory", "1"),
+    ("xrt", "transfer", "0x00000000000000000000000000000000000000AA", "1"),
+    ("lighthouse", "list"),
+    ("lighthouse", "info"),
+    ("lighthouse", "create", "new"),
+    ("lighthouse", "join", "1"),
+    ("lighthouse", "leave"),
+    ("liability", "list"),
+    ("liability", "show", "0x00000000000000000000000000000000000000AA"),
+    ("liability", "watch"),
+    ("liability", "watch", "0x00000000000000000000000000000000000000AA"),
+    ("liability", "cancel", "0x00000000000000000000000000000000000000AA"),
+]
+
+
+def test_a_chain_without_the_contracts_is_one_clear_line_in_every_command(desert: Town) -> None:
+    for command in ON_A_CHAIN:
+        hint = refused(desert.aira(*command), 1, "has no ENS registry")
+        assert "aira chain deploy" in hint, command
+
+
+@pytest.mark.parametrize("command", [ON_A_CHAIN[0], ON_A_CHAIN[8], ON_A_CHAIN[12], ("chain", "status")])
+def test_a_node_that_is_not_there_is_one_clear_line(town: Town, command: tuple[str, ...]) -> None:
+    nowhere = f"http://127.0.0.1:{free_port()}"
+    hint = refused(town.aira(*command, AIRA_WEB3_HTTP_PROVIDER=nowhere), 1, f"no Ethereum node answers at {nowhere}")
+    assert "aira chain up" in hint
+
+
+def test_what_is_no_node_is_one_clear_line(town: Town) -> None:
+    refused(town.aira("xrt", "balance", AIRA_WEB3_HTTP_PROVIDER="localhost"), 2, "'localhost' is not the address of")
+    refused(town.aira("xrt", "balance", AIRA_ENS_CONTRACT="0x12"), 2, "'0x12' is not an address")

@@ -1,0 +1,207 @@
+"""`aira chain up`, as a process of its own, by anvil and embedded."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import socket
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from click.testing import CliRunner
+from web3.types import RPCEndpoint
+
+from mesh.chain import XRT, Chain
+from mesh.cli import main
+from mesh.demo.development import serve_chain
+from mesh.settings import Settings
+from tests.mesh.cli.chains import columns, refused
+from tests.support.commands import AIRA, SOON, Serving, aira
+from tests.support.peers import require
+from tests.support.ports import answers, free_port
+
+if TYPE_CHECKING:
+    from click.testing import Result
+
+NOBODY = "0x00000000000000000000000000000000000000AA"
+
+
+def up(folder: Path, *options: str | Path, port: int, says: str = "password ", **variables: str) -> Serving:
+    arguments = ("chain", "up", "--port", str(port), "--data-dir", folder, *options)
+    return Serving(*AIRA, *arguments, says=says, variables=variables)
+
+
+def failing(*options: str | Path, **variables: str) -> Result:
+    return CliRunner().invoke(main, ["chain", "up", *map(str, options)], env=dict(variables))
+
+
+def child_of(pid: int) -> int:
+    """The one process that a process has started."""
+    (child,) = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return int(child)
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+@pytest.fixture
+def on_path(tmp_path: Path) -> dict[str, str]:
+    """Variables with which anvil is on the path."""
+    folder = tmp_path / "programs"
+    folder.mkdir()
+    (folder / "anvil").symlink_to(require("anvil"))
+    return {"PATH": f"{folder}:{os.environ['PATH']}"}
+
+
+def test_anvil_is_taken_where_it_is_on_the_path_and_stopped_with_the_command(
+    tmp_path: Path, on_path: dict[str, str]
+) -> None:
+    port = free_port()
+    with up(tmp_path, port=port, **on_path) as server:
+        said = columns(server.log())
+        assert said["engine"].startswith("anvil (")
+        assert said["chain"] == f"http://127.0.0.1:{port}"
+        anvil = child_of(server.pid)
+        keys = tmp_path / "development"
+        person = {
+            "AIRA_WEB3_HTTP_PROVIDER": said["chain"],
+            "AIRA_KEYFILE": str(keys / "person.json"),
+            "AIRA_KEYFILE_PASSWORD_FILE": str(keys / "password"),
+            "AIRA_DATA_DIR": str(tmp_path / "person"),
+        }
+        assert "anvil/" in aira("chain", "status", **person).stdout
+        assert aira("xrt", "transfer", NOBODY, "1.5", **person).returncode == 0
+        assert aira("xrt", "balance", **person).stdout == "998.5 XRT\n"
+        code, seconds = server.end(signal.SIGINT)
+        assert (code, seconds < SOON) == (0, True), server.log()
+        assert "Traceback" not in server.log()
+    assert not is_alive(anvil)
+    assert not answers(port)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a process with its parent")
+def test_anvil_does_not_outlive_a_command_that_is_killed(tmp_path: Path) -> None:
+    port = free_port()
+    with up(tmp_path, "--anvil", require("anvil"), port=port) as server:
+        anvil = child_of(server.pid)
+        server.kill()
+        deadline = time.monotonic() + 30
+        while is_running(anvil):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+    assert not answers(port)
+
+
+def test_a_crash_of_anvil_is_told_and_ends_the_command(tmp_path: Path) -> None:
+    with up(tmp_path, "--anvil", require("anvil"), port=free_port()) as server:
+        os.kill(child_of(server.pid), signal.SIGKILL)
+        deadline = time.monotonic() + 30
+        while is_running(server.pid):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        assert "aira: anvil ended by itself, by signal 9\n" in server.log()
+        assert "Traceback" not in server.log()
+        assert server._running().wait(30) == 1
+
+
+def is_running(pid: int) -> bool:
+    """Whether a process has not ended; one that has is a zombie until its parent looks."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_the_chain_is_kept_in_a_file(tmp_path: Path) -> None:
+    options = ("--anvil", require("anvil"), "--state", tmp_path / "chain.json", "--json")
+    told = []
+    for _ in range(2):
+        with up(tmp_path, *options, port=0, says="passwordFile") as server:
+            told.append(json.loads(server.log().splitlines()[0]))
+            status = aira("chain", "status", "--json", AIRA_WEB3_HTTP_PROVIDER=told[-1]["chain"])
+            told[-1]["block"] = json.loads(status.stdout)["blockNumber"]
+            code, _ = server.end(signal.SIGTERM)
+            assert code == 0
+    where = ("chain", "webSocket")
+    first, second = ({name: fact for name, fact in facts.items() if name not in where} for facts in told)
+    assert first == second
+
+
+def test_the_embedded_chain_is_taken_where_there_is_no_anvil(tmp_path: Path) -> None:
+    with up(tmp_path, "--json", port=0, says="passwordFile", PATH="/nowhere:/usr/bin:/bin") as server:
+        told = json.loads(server.log().splitlines()[0])
+        assert told["engine"] == "embedded"
+        assert set(told["accounts"]) == {"provider", "robot", "person"}
+        keyfile = Path(told["accounts"]["robot"]["keyfile"])
+        assert keyfile.is_file()
+        status = aira("chain", "status", "--json", AIRA_WEB3_HTTP_PROVIDER=told["chain"])
+        assert json.loads(status.stdout)["factory"] == told["factory"]
+
+
+def test_the_embedded_chain_can_be_asked_for(tmp_path: Path, on_path: dict[str, str]) -> None:
+    with up(tmp_path, "--engine", "embedded", port=0, **on_path) as server:
+        assert columns(server.log())["engine"] == "embedded"
+
+
+def test_anvil_that_is_not_there_is_one_clear_line(tmp_path: Path) -> None:
+    hint = refused(failing("--engine", "anvil", PATH=str(tmp_path)), 2, "anvil is not on the path")
+    assert "--engine embedded" in hint
+    refused(failing("--anvil", tmp_path / "anvil"), 2, "is not a program that can be run")
+
+
+def test_the_embedded_chain_can_not_be_kept(tmp_path: Path) -> None:
+    state = ("--state", tmp_path / "chain.json")
+    assert "--anvil FILE" in refused(failing(*state, PATH=str(tmp_path)), 2, "only anvil can keep the chain in a file")
+    refused(failing(*state, "--engine", "embedded"), 2, "the embedded chain was asked for")
+
+
+@pytest.mark.parametrize("engine", ["anvil", "embedded"])
+def test_a_taken_port_is_one_clear_line(tmp_path: Path, engine: str, on_path: dict[str, str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        done = failing("--engine", engine, "--port", str(port), "--data-dir", tmp_path, **on_path)
+        hint = refused(done, 2, f"can't listen on 127.0.0.1:{port}: Address already in use")
+        assert "choose another port" in hint
+
+
+def test_a_state_that_is_none_is_one_clear_line(tmp_path: Path) -> None:
+    (tmp_path / "state.json").write_text("garbage")
+    options = ("--anvil", require("anvil"), "--state", tmp_path / "state.json", "--port", "0", "--data-dir", tmp_path)
+    refused(failing(*options), 2, "holds no chain of anvil")
+
+
+async def test_a_transaction_that_is_not_mined_can_be_left_and_is_not_sent_twice(tmp_path: Path) -> None:
+    settings = Settings(data_dir=str(tmp_path))
+    anvil = require("anvil")
+    async with serve_chain(settings, host="127.0.0.1", port=0, block_time=None, anvil=anvil) as served:
+        keys = tmp_path / "development"
+        person = {
+            "AIRA_WEB3_HTTP_PROVIDER": served.url,
+            "AIRA_KEYFILE": str(keys / "person.json"),
+            "AIRA_KEYFILE_PASSWORD_FILE": str(keys / "password"),
+            "AIRA_DATA_DIR": str(tmp_path / "person"),
+            "AIRA_POLL_INTERVAL": "0.1",
+        }
+        command = ("xrt", "transfer", NOBODY, "2")
+        async with Chain(served.url) as chain:
+            await chain.node.web3.provider.make_request(RPCEndpoint("evm_setAutomine"), [False])
+            says = "waiting until the transaction is mined"
+            async with Serving(*AIRA, *command, says=says, variables=person) as waiting:
+                code, seconds = await asyncio.to_thread(waiting.end, signal.SIGINT)
+                assert (code, seconds < SOON) == (130, True), waiting.log()
+                assert "Traceback" not in waiting.log()
+            assert await chain.balance_of(NOBODY) == 0
+            await chain.node.web3.provider.make_request(RPCEndpoint("evm_setAutomine"), [True])
+            done = await asyncio.to_thread(aira, *command, **person)
+            assert done.returncode == 0, done.stderr
+            assert await chain.balance_of(NOBODY) == 2 * XRT

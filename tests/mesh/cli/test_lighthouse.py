@@ -1,0 +1,168 @@
+"""`aira lighthouse`."""
+
+from __future__ import annotations
+
+from itertools import count
+
+import pytest
+
+from mesh.chain import XRT
+from tests.mesh.cli.chains import Town, columns, refused
+
+_numbers = count(1)
+
+
+@pytest.fixture
+def market(town: Town) -> str:
+    """A lighthouse of this test's own: two XRT at least, ten blocks."""
+    name = f"market-{next(_numbers)}"
+    town.ask("provider", lambda chain: chain.create_lighthouse(minimal_stake=2 * XRT, timeout_blocks=10, name=name))
+    return name
+
+
+def test_a_new_lighthouse_is_told_of_and_listed(town: Town) -> None:
+    made = town.told("lighthouse", "create", "brand-new", "--minimal-stake", "2.5", "--timeout-blocks", "7")
+    assert (made["name"], made["timeoutBlocks"]) == ("brand-new.lighthouse.3.robonomics.eth", 7)
+    listed = town.told("lighthouse", "list")
+    assert listed[0]["lighthouse"] == town.deployment.lighthouse
+    assert listed[-1] == {
+        "lighthouse": made["lighthouse"],
+        "name": "brand-new",
+        "minimalStake": "2500000000",
+        "timeoutBlocks": 7,
+        "keepAliveBlock": 0,
+        "current": None,
+        "marker": 0,
+        "quota": 0,
+        "providers": [],
+    }
+
+
+def test_creating_says_what_was_made(town: Town) -> None:
+    said = columns(town.aira("lighthouse", "create", "spoken", "--minimal-stake", "5wn").stdout)
+    assert said["name"] == "spoken.lighthouse.3.robonomics.eth"
+    assert (said["minimal stake"], said["timeout"]) == ("0.000000005 XRT", "25 blocks")
+
+
+def test_the_list_has_a_line_for_each_since_a_block(town: Town, market: str) -> None:
+    head, first, *rest = town.aira("lighthouse", "list").stdout.splitlines()
+    assert head.split() == ["NAME", "ADDRESS", "MINIMAL", "STAKE", "TIMEOUT", "PROVIDERS", "STAKED"]
+    assert first.split() == ["airalab", town.deployment.lighthouse, "1", "XRT", "5", "blocks", "1", "100", "XRT"]
+    assert rest[-1].split()[0] == market
+    block = town.ask("person", lambda chain: chain.block_number())
+    since = town.aira("lighthouse", "list", "--from-block", str(block)).stdout
+    assert [line.split()[0] for line in since.splitlines()] == ["NAME", market]
+    done = town.aira("lighthouse", "list", "--from-block", str(block + 1))
+    assert done.stdout == f"no lighthouse was made here since block {block + 1:,}\n"
+
+
+def test_joining_approves_what_is_missing_and_leaving_gives_it_back(town: Town, market: str) -> None:
+    person = town.people["person"].address
+    before = town.ask("person", lambda chain: chain.balance_of())
+    said = columns(town.aira("lighthouse", "join", market, "5").stdout)
+    assert (said["stake"], said["a turn"]) == ("5 XRT", "2 transactions")
+    assert town.ask("person", lambda chain: chain.balance_of()) == before - 5 * XRT
+    more = town.told("lighthouse", "join", market, "1000000000wn")
+    assert (more["stake"], more["quota"], more["isProvider"]) == (str(6 * XRT), 3, True)
+    less = town.told("lighthouse", "leave", market, "2")
+    assert (less["provider"], less["stake"], less["quota"]) == (person, str(4 * XRT), 2)
+    said = columns(town.aira("lighthouse", "leave", market).stdout)
+    assert said["stake"] == "0 XRT"
+    assert said["provider"] == f"{person}  (no more)"
+    assert town.ask("person", lambda chain: chain.balance_of()) == before
+
+
+def test_taking_off_so_much_that_too_little_remains_takes_all(town: Town, market: str) -> None:
+    town.told("lighthouse", "join", market, "3")
+    told = town.told("lighthouse", "leave", market, "2")
+    assert (told["stake"], told["isProvider"]) == ("0", False)
+
+
+def test_info_shows_providers_and_whose_turn_it_is(town: Town, market: str) -> None:
+    people = [town.people[role].address for role in ("robot", "person")]
+    for role, stake in (("robot", "4"), ("person", "10")):
+        town.told("lighthouse", "join", market, stake, by=role)
+    told = town.told("lighthouse", "info", market)
+    assert [provider["provider"] for provider in told["providers"]] == people
+    assert [provider["quota"] for provider in told["providers"]] == [2, 5]
+    assert (told["current"], told["marker"], told["quota"]) == (people[0], 1, 2)
+    assert [provider["maySend"] for provider in told["providers"]] == [True, False]
+    said = town.aira("lighthouse", "info", market).stdout
+    assert columns(said)["turn"] == f"{people[0]}  (1 of 2), 2 transactions left"
+    lines = [line.split() for line in said.splitlines()[-2:]]
+    assert lines == [
+        ["1", people[0], "4", "XRT", "2", "transactions", "yes"],
+        ["2", people[1], "10", "XRT", "5", "transactions", "no"],
+    ]
+    town.mine(25)
+    assert [provider["maySend"] for provider in town.told("lighthouse", "info", market)["providers"]] == [True, True]
+
+
+def test_info_is_by_default_of_the_settings_lighthouse(town: Town) -> None:
+    said = columns(town.aira("lighthouse", "info").stdout)
+    assert (said["lighthouse"], said["name"]) == (town.deployment.lighthouse, "airalab.lighthouse.3.robonomics.eth")
+    assert said["minimal stake"] == "1 XRT"
+
+
+def test_info_of_an_empty_lighthouse_says_how_to_join(town: Town, market: str) -> None:
+    assert "aira lighthouse join" in columns(town.aira("lighthouse", "info", market).stdout)["providers"]
+
+
+def test_a_taken_name_is_one_clear_line(town: Town) -> None:
+    done = town.aira("lighthouse", "create", "airalab")
+    assert refused(done, 1, "airalab.lighthouse.3.robonomics.eth is taken") == "choose another name"
+
+
+@pytest.mark.parametrize("name", ["Airalab", "a b", "a.b", "", "a" * 33])
+def test_a_name_that_can_not_be_is_one_clear_line(town: Town, name: str) -> None:
+    refused(town.aira("lighthouse", "create", name), 2, "can't be the name of a lighthouse")
+
+
+@pytest.mark.parametrize("stake", ["0", "0wn", str(2**128) + "wn"])
+def test_a_minimal_stake_that_can_not_be_is_one_clear_line(town: Town, stake: str) -> None:
+    refused(town.aira("lighthouse", "create", "staked", "--minimal-stake", stake), 2, "a minimal stake of")
+
+
+def test_a_stake_below_the_minimum_is_one_clear_line(town: Town, market: str) -> None:
+    hint = refused(town.aira("lighthouse", "join", market, "1.5"), 2, "1.5 XRT is below the minimum of 2 XRT")
+    assert hint == "stake 2 XRT or more"
+    refused(town.aira("lighthouse", "join", market, "0"), 2, "nothing can't be added")
+
+
+def test_a_stake_that_the_account_does_not_have_is_one_clear_line(town: Town, market: str) -> None:
+    refused(town.aira("lighthouse", "join", market, "3", by="stranger"), 1, "has 0 XRT, and 3 XRT are needed")
+
+
+def test_leaving_without_a_stake_is_one_clear_line(town: Town, market: str) -> None:
+    refused(town.aira("lighthouse", "leave", market), 1, f"has no stake at {market}")
+
+
+def test_taking_off_more_than_is_staked_is_one_clear_line(town: Town, market: str) -> None:
+    town.told("lighthouse", "join", market, "3")
+    refused(town.aira("lighthouse", "leave", market, "3.5"), 2, "3.5 XRT can't be taken off a stake of 3 XRT")
+
+
+def test_an_unknown_lighthouse_is_one_clear_line(town: Town) -> None:
+    for command in (("info", "nowhere"), ("join", "nowhere", "1"), ("leave", "nowhere")):
+        refused(town.aira("lighthouse", *command), 1, "'nowhere.lighthouse.3.robonomics.eth' is not known")
+
+
+def test_what_is_no_lighthouse_is_one_clear_line(town: Town) -> None:
+    address = town.deployment.xrt
+    for command in (("info", address), ("join", address, "1"), ("leave", address)):
+        refused(town.aira("lighthouse", *command), 1, f"{address} is not a lighthouse of this factory")
+
+
+def test_without_a_name_the_settings_lighthouse_is_joined_and_left(town: Town, market: str) -> None:
+    at = ("--lighthouse-contract", market)
+    assert town.told("lighthouse", "join", "4", *at)["name"] == market
+    assert town.told("lighthouse", "leave", "2", *at)["stake"] == str(2 * XRT)
+    assert town.told("lighthouse", "leave", *at)["stake"] == "0"
+
+
+def test_words_in_a_wrong_order_or_number_are_one_clear_line(town: Town, market: str) -> None:
+    hint = refused(town.aira("lighthouse", "join", "20", market), 2, f"'{market}' is not an amount")
+    assert hint == f"the lighthouse comes first: {market} 20"
+    assert f"join {market} 20" in refused(town.aira("lighthouse", "join", market), 2, "a VALUE is missing")
+    refused(town.aira("lighthouse", "join", market, "much"), 2, "'much' is not an amount")
+    refused(town.aira("lighthouse", "leave", market, "1", "2"), 2, "too many words")

@@ -1,0 +1,146 @@
+"""`aira xrt`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.chain import XRT, Account, new_private_key
+from mesh.chain.artifacts import load_artifact
+from tests.mesh.cli.chains import MONEY, Town, columns, refused, write_quick_keyfile
+from tests.support.ports import free_port
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+NOBODY = "0x00000000000000000000000000000000000000AA"
+
+
+def held(town: Town, who: str) -> int:
+    return town.ask("provider", lambda chain: chain.balance_of(who))
+
+
+@pytest.fixture
+def poor(town: Town, tmp_path: Path) -> dict[str, str]:
+    """The variables of somebody without ETH."""
+    keyfile = write_quick_keyfile(tmp_path / "poor.json", new_private_key())
+    return {"AIRA_KEYFILE": str(keyfile)}
+
+
+def test_the_balance_is_that_of_the_settings_account_and_needs_no_password(town: Town) -> None:
+    address = town.people["robot"].address
+    done = town.aira("xrt", "balance", by="robot", AIRA_KEYFILE_PASSWORD_FILE="")
+    assert (done.exit_code, done.stdout) == (0, "1,000 XRT\n")
+    assert town.told("xrt", "balance", address, by="person") == {
+        "account": address,
+        "token": town.deployment.xrt,
+        "symbol": "XRT",
+        "decimals": 9,
+        "balance": str(MONEY),
+    }
+
+
+def test_a_transfer_is_in_xrt_unless_its_ending_says_wn(town: Town) -> None:
+    before = held(town, town.people["person"].address)
+    done = columns(town.aira("xrt", "transfer", NOBODY, "1.5").stdout)
+    assert (done["sent"], done["to"]) == ("1.5 XRT", NOBODY)
+    assert done["transaction"].startswith("0x")
+    told = town.told("xrt", "transfer", NOBODY, "7wn")
+    assert (told["amount"], told["balance"]) == ("7", str(before - 1_500_000_007))
+    assert held(town, NOBODY) == 1_500_000_007
+
+
+def test_an_allowance_is_by_default_the_factorys_and_can_be_given_and_taken_back(town: Town) -> None:
+    assert town.told("xrt", "allowance")["spender"] == town.deployment.factory
+    done = columns(town.aira("xrt", "approve", "airalab", "2.5").stdout)
+    assert (done["spender"], done["may take"]) == (town.deployment.lighthouse, "2.5 XRT")
+    assert town.aira("xrt", "allowance", "airalab").stdout == "2.5 XRT\n"
+    person = town.people["person"].address
+    told = town.told("xrt", "allowance", "airalab.lighthouse.5.robonomics.eth", "--owner", person, by="robot")
+    assert (told["owner"], told["allowance"]) == (person, str(5 * XRT // 2))
+    assert town.told("xrt", "approve", "airalab", "0")["allowance"] == "0"
+    assert town.aira("xrt", "allowance", "airalab").stdout == "0 XRT\n"
+
+
+def test_another_token_counts_in_its_own_units(town: Town) -> None:
+    token = town.run(_deploy_token(town))
+    assert town.aira("xrt", "balance", "--token", token, by="provider").stdout == "123.45 XRT\n"
+    assert town.told("xrt", "balance", NOBODY, "--token", token, by="provider")["token"] == token
+
+
+async def _deploy_token(town: Town) -> str:
+    """Another ERC-20, with the same code as XRT."""
+    async with town.chain("provider") as chain:
+        artifact = load_artifact("XRT")
+        contract = chain.node.web3.eth.contract(abi=artifact.abi, bytecode=artifact.bytecode)
+        data = bytes.fromhex(contract.constructor(123_450_000_000).data_in_transaction[2:])
+        receipt = await chain._signing().send(to=None, data=data)
+        assert receipt.contract is not None
+        return receipt.contract
+
+
+def test_more_than_there_is_is_refused_before_anything_is_sent(town: Town) -> None:
+    done = town.aira("xrt", "transfer", NOBODY, "5000")
+    hint = refused(done, 1, " XRT, and 5,000 XRT are needed")
+    assert hint == "send it what is missing, or give a smaller amount"
+
+
+@pytest.mark.parametrize("amount", ["1,5", "lots", "1.0000000001", "5 ETH"])
+def test_what_is_no_amount_is_one_clear_line(town: Town, amount: str) -> None:
+    assert "1.5" in refused(town.aira("xrt", "transfer", NOBODY, amount), 2, repr(amount))
+
+
+@pytest.mark.parametrize("address", ["0x709", "robot", "0x70997970c51812dc3A010C7d01b50e0d17dc79C8"])
+def test_what_is_no_address_is_one_clear_line(town: Town, address: str) -> None:
+    refused(town.aira("xrt", "transfer", address, "1"), 2, repr(address))
+
+
+def test_an_unknown_name_is_one_clear_line(town: Town) -> None:
+    refused(town.aira("xrt", "balance", "no.3.robonomics.eth"), 1, "'no.3.robonomics.eth' is not known on this chain")
+    refused(town.aira("xrt", "allowance", "nowhere"), 1, "'nowhere.lighthouse.3.robonomics.eth' is not known")
+
+
+@pytest.mark.parametrize("what", ["lighthouse", "person"])
+def test_what_is_no_token_is_one_clear_line(town: Town, what: str) -> None:
+    address = town.deployment.lighthouse if what == "lighthouse" else town.people["person"].address
+    refused(town.aira("xrt", "balance", "--token", address), 1, f"{address} is no token")
+
+
+def test_an_account_without_eth_is_told_so(town: Town, poor: dict[str, str]) -> None:
+    hint = refused(town.aira("xrt", "approve", "factory", "1", **poor), 1, "has 0 ")
+    assert "send ETH to the account" in hint
+
+
+def test_an_account_without_xrt_is_told_so(town: Town, poor: dict[str, str]) -> None:
+    refused(town.aira("xrt", "transfer", NOBODY, "1", **poor), 1, "has 0 XRT, and 1 XRT are needed")
+
+
+def test_no_account_is_one_clear_line(town: Town) -> None:
+    assert "--keyfile" in refused(town.aira("xrt", "balance", AIRA_KEYFILE=""), 2, "no account is named")
+    refused(town.aira("xrt", "transfer", NOBODY, "1", AIRA_KEYFILE=""), 2, "this needs an account")
+
+
+def test_an_absent_keyfile_and_a_wrong_password_are_one_clear_line(town: Town, tmp_path: Path) -> None:
+    absent = str(tmp_path / "absent.json")
+    for command in (("balance",), ("transfer", NOBODY, "1")):
+        hint = refused(town.aira("xrt", *command, AIRA_KEYFILE=absent), 2, "can't read the keyfile")
+        assert hint == "make one with `aira account new`"
+    (tmp_path / "wrong").write_text("guessed\n")
+    done = town.aira("xrt", "transfer", NOBODY, "1", AIRA_KEYFILE_PASSWORD_FILE=str(tmp_path / "wrong"))
+    refused(done, 2, "does not open it")
+    assert "guessed" not in done.output
+
+
+def test_no_node_is_one_clear_line(town: Town) -> None:
+    nowhere = f"http://127.0.0.1:{free_port()}"
+    refused(town.aira("xrt", "balance", AIRA_WEB3_HTTP_PROVIDER=nowhere), 1, f"no Ethereum node answers at {nowhere}")
+
+
+def test_what_was_received_can_be_sent_on(town: Town, tmp_path: Path) -> None:
+    key = new_private_key()
+    address = Account.from_key(key).address
+    keyfile = write_quick_keyfile(tmp_path / "new.json", key)
+    town.ask("provider", lambda chain: chain.send_eth(address, 10**18))
+    assert town.aira("xrt", "transfer", address, "3").exit_code == 0
+    assert town.told("xrt", "transfer", NOBODY, "1", AIRA_KEYFILE=str(keyfile))["balance"] == str(2 * XRT)

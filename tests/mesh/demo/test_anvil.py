@@ -1,0 +1,174 @@
+"""Anvil as a part of this program: started, watched, stopped, its chain kept."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import stat
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.chain import XRT, Account, Chain, EmbeddedChain, Node, Sender
+from mesh.demo.anvil import STOP_SECONDS, NodeEnded, find_anvil, serve_anvil
+from mesh.demo.development import serve_chain
+from mesh.demo.market import ALLOWANCE
+from mesh.errors import ConfigurationError
+from mesh.settings import Settings
+from tests.support.peers import require
+from tests.support.ports import answers, free_port
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+NOBODY = "0x00000000000000000000000000000000000000AA"
+
+
+@pytest.fixture
+def program() -> Path:
+    """The real anvil."""
+    return require("anvil")
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+async def test_it_serves_for_the_body_and_is_gone_after_it(program: Path) -> None:
+    async with serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=None) as node:
+        pid, port = node.pid, int(node.url.rpartition(":")[2])
+        for url in (node.url, node.url.replace("http", "ws", 1)):
+            async with Node(url) as client:
+                assert await client.block_number() == 0
+        async with EmbeddedChain() as embedded:
+            assert node.funded_keys == embedded.funded_keys, "the accounts are the same whatever runs the chain"
+        asked = time.monotonic()
+    assert time.monotonic() - asked < STOP_SECONDS / 2, "it was asked to end, not killed"
+    assert not is_alive(pid)
+    assert not answers(port)
+
+
+async def test_blocks_come_by_time_where_that_is_asked_for(program: Path) -> None:
+    async with (
+        asyncio.timeout(30),
+        serve_anvil(program, host="127.0.0.1", port=0, block_time=0.1, state=None) as node,
+        Node(node.url) as client,
+    ):
+        while await client.block_number() < 3:
+            await asyncio.sleep(0.02)
+
+
+async def test_an_end_of_its_own_ends_the_body_with_what_it_said(program: Path) -> None:
+    async def serve() -> None:
+        async with serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=None) as node:
+            os.kill(node.pid, signal.SIGKILL)
+            await asyncio.Event().wait()
+
+    with pytest.raises(NodeEnded, match=r"^anvil ended by itself, by signal 9$") as ended:
+        await asyncio.wait_for(serve(), 30)
+    assert ended.value.code == -9
+
+
+async def test_a_start_that_fails_says_why(tmp_path: Path) -> None:
+    broken = tmp_path / "anvil"
+    broken.write_text("#!/bin/sh\necho 'the disk is on fire'\nexit 3\n")
+    broken.chmod(stat.S_IRWXU)
+    with pytest.raises(NodeEnded, match=r"^anvil ended by itself, with exit code 3$") as ended:
+        async with serve_anvil(broken, host="127.0.0.1", port=0, block_time=None, state=None):
+            pytest.fail("it serves")
+    assert ended.value.hint == "the disk is on fire"
+
+
+async def test_one_that_is_cancelled_while_it_starts_leaves_no_process(tmp_path: Path) -> None:
+    slow = tmp_path / "anvil"
+    slow.write_text(f"#!/bin/sh\necho $$ > {tmp_path}/pid\nexec sleep 600\n")
+    slow.chmod(stat.S_IRWXU)
+
+    async def serve() -> None:
+        async with serve_anvil(slow, host="127.0.0.1", port=0, block_time=None, state=None):
+            pytest.fail("it serves")
+
+    serving = asyncio.create_task(serve())
+    async with asyncio.timeout(30):
+        while not (await asyncio.to_thread(_pid_in, tmp_path / "pid")):
+            await asyncio.sleep(0.01)
+    pid = _pid_in(tmp_path / "pid")
+    serving.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await serving
+    assert not is_alive(pid)
+
+
+def _pid_in(path: Path) -> int:
+    text = path.read_text().strip() if path.exists() else ""
+    return int(text or 0)
+
+
+async def test_a_taken_port_is_one_clear_line(program: Path) -> None:
+    async with serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=None) as node:
+        port = int(node.url.rpartition(":")[2])
+        with pytest.raises(ConfigurationError, match=rf"^can't listen on 127.0.0.1:{port}: Address already in use$"):
+            async with serve_anvil(program, host="127.0.0.1", port=port, block_time=None, state=None):
+                pytest.fail("it serves")
+
+
+@pytest.mark.parametrize("content", [b"garbage", b"[]", b"{}", b"\xff"])
+async def test_a_state_that_is_none_is_one_clear_line_and_stays_as_it_is(
+    program: Path, tmp_path: Path, content: bytes
+) -> None:
+    state = tmp_path / "state.json"
+    state.write_bytes(content)
+    with pytest.raises(ConfigurationError, match="holds no chain of anvil"):
+        async with serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=state):
+            pytest.fail("it serves")
+    assert state.read_bytes() == content
+
+
+async def test_a_market_is_kept_with_all_that_happened_on_it(program: Path, tmp_path: Path) -> None:
+    settings, state = Settings(data_dir=str(tmp_path)), tmp_path / "new" / "state.json"
+    port = free_port()
+    async with serve_chain(
+        settings, host="127.0.0.1", port=port, block_time=None, anvil=program, state=state
+    ) as served:
+        async with served.market.chain(served.url, "person") as chain:
+            await chain.transfer(NOBODY, 7 * XRT)
+            head = await chain.node.web3.eth.get_block("latest")
+        first = served
+    async with serve_chain(settings, host="127.0.0.1", port=port, block_time=None, anvil=program, state=state) as again:
+        assert again.facts() == first.facts()
+        async with Chain(again.url) as chain:
+            assert await chain.balance_of(NOBODY) == 7 * XRT
+            assert await chain.balance_of(again.market.accounts["person"].address) == ALLOWANCE - 7 * XRT
+            assert (await chain.node.web3.eth.get_block(head["number"]))["hash"] == head["hash"]
+            assert list((await chain.lighthouse("airalab")).stakes) == [again.market.accounts["provider"].address]
+
+
+async def test_a_kept_chain_without_a_market_is_not_built_upon(program: Path, tmp_path: Path) -> None:
+    state = tmp_path / "state.json"
+    async with (
+        serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=state) as node,
+        Node(node.url) as client,
+    ):
+        await Sender(client, Account.from_key(node.funded_keys[0])).send(to=NOBODY, data=b"", value=1)
+    with pytest.raises(ConfigurationError, match=r"state\.json has no market on it, and is not new$"):
+        async with serve_chain(
+            Settings(data_dir=str(tmp_path)), host="127.0.0.1", port=0, block_time=None, anvil=program, state=state
+        ):
+            pytest.fail("it serves")
+
+
+def test_it_is_found_on_the_path_or_where_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert find_anvil(None) is None
+    program = tmp_path / "anvil"
+    program.write_text("#!/bin/sh\n")
+    with pytest.raises(ConfigurationError, match="is not a program that can be run"):
+        find_anvil(program)
+    program.chmod(stat.S_IRWXU)
+    assert find_anvil(None) == find_anvil(program) == program
