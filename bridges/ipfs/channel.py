@@ -1,0 +1,243 @@
+"""The bridge of one lighthouse between the mesh's keys and the IPFS topic of its name."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import re
+import secrets
+import time
+from contextlib import AsyncExitStack
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
+
+import zenoh
+
+from bridges.ipfs.carrying import MARK, ToIpfs, ToMesh
+from bridges.ipfs.link import Link
+from bridges.ipfs.memory import Side
+from bridges.ipfs.presence import Presence
+from bridges.ipfs.status import BridgeStatus, status_key
+from bridges.ipfs.traffic import LIMIT, Fate, Traffic
+from mesh.errors import ClosedError, InvalidMessage
+from mesh.network import Pump
+from mesh.network.crossing import call_in_loop
+from schemas import lighthouse_selector
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import TracebackType
+
+    from bridges.ipfs.daemon import Daemon
+    from bridges.ipfs.dialects import Event
+    from bridges.ipfs.gate import Gate, Passenger
+    from bridges.ipfs.journal import Journal
+    from mesh.network import Network
+
+log = logging.getLogger(__name__)
+
+LOOK: Final = 1.0
+"""Seconds between two looks at what was left to other bridges."""
+LOOKING_UP: Final = 256
+"""Messages that wait for their ENS names at most."""
+_NAMED: Final = re.compile(rb"\.(?:eth|sid|test)\"", re.IGNORECASE)
+"""A message that holds an ENS name has this somewhere."""
+
+
+class Sample(NamedTuple):
+    """What came on the mesh; `marked` if a bridge has put it."""
+
+    key: str
+    payload: bytes
+    marked: bool
+
+
+class ChannelBridge:
+    """Carries messages both ways: `async with ChannelBridge(...) as bridge`, then `run`.
+
+    `gate` checks what passes for `lighthouse` (ENS name); `journal` is this bridge's own memory; `neighbours` are swarm
+    addresses to keep the daemon connected to; `address` is the bridge's name on the mesh, by default a new one;
+    `carried` is told of each message that this bridge has put on a side.
+
+    Network, daemon and journal stay the caller's to close.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        daemon: Daemon,
+        gate: Gate,
+        journal: Journal,
+        *,
+        lighthouse: str,
+        neighbours: tuple[str, ...] = (),
+        address: str | None = None,
+        limit: int = LIMIT,
+        carried: Callable[[Side, Passenger], None] = lambda side, passenger: None,
+    ) -> None:
+        self.lighthouse: Final = lighthouse.lower()
+        self.address: Final = (address or f"0x{secrets.token_hex(20)}").lower()
+        self._network = network
+        self._daemon = daemon
+        self._gate = gate
+        self._journal = journal
+        self.link: Final = Link(daemon, self.lighthouse, neighbours=neighbours)
+        self.traffic: Final = Traffic(time.monotonic, journal, limit=limit)
+        self._to_ipfs = ToIpfs(self.link, self.traffic, carried)
+        self._to_mesh = ToMesh(network, self.traffic, carried)
+        self._looking_up: set[asyncio.Task[None]] = set()
+        self._stack: AsyncExitStack | None = None
+
+    async def __aenter__(self) -> Self:
+        if self._stack is not None:
+            raise ClosedError("this bridge is open already")
+        session = self._network.session
+        async with AsyncExitStack() as stack:
+            self._pump: Pump[Sample] = await stack.enter_async_context(
+                Pump(session, lighthouse_selector(self.lighthouse), _read)
+            )
+            # After the subscription: who sees the bridge's token can be sure to be heard.
+            self._presence = await stack.enter_async_context(
+                Presence(session, self.lighthouse, self.address, self.traffic, wake=self._wake)
+            )
+            loop = asyncio.get_running_loop()
+            queryable: Any = session.declare_queryable(
+                status_key(self.address, self.lighthouse), lambda query: call_in_loop(loop, self._answer, query)
+            )
+            stack.callback(lambda: None if session.is_closed() else queryable.undeclare())
+            self._stack = stack.pop_all()
+        self._restore()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        stack, self._stack = self._stack, None
+        for task in self._looking_up:
+            task.cancel()
+        if stack is not None:
+            await stack.aclose()
+
+    async def run(self) -> None:
+        """Carry until cancelled. What waits then is in the journal."""
+        if self._stack is None:
+            raise ClosedError("the bridge is not open", hint="use it inside `async with`")
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._take_from_mesh(), name=f"mesh → bridge {self.lighthouse}")
+            tasks.create_task(self.link.run(self._take_from_ipfs, self._link_changed), name=f"IPFS → {self.lighthouse}")
+            tasks.create_task(self._to_ipfs.run(), name=f"bridge → IPFS {self.lighthouse}")
+            tasks.create_task(self._to_mesh.run(), name=f"bridge → mesh {self.lighthouse}")
+            tasks.create_task(self._look_after_left(), name=f"left over {self.lighthouse}")
+
+    def status(self) -> BridgeStatus:
+        """How it is now."""
+        own, others = self.traffic.own, self.traffic.others
+        return BridgeStatus(
+            bridge=self.address,
+            lighthouse=self.lighthouse,
+            state=self._state(),
+            carries=own is not None and all(own < other for other in others),
+            api=self._daemon.api,
+            daemon=str(self._daemon.version or ""),
+            dialect=self._daemon.dialect,
+            ipfs_peers=self.link.listeners,
+            mesh_peers=tuple(sorted(f"{key.role} {key.agent}" for key in self._presence.present)),
+            losses=self.link.losses,
+            last_error=self.link.error,
+            to_ipfs=self.traffic.way(Side.IPFS, per_second=self._to_ipfs.rate.per_second()),
+            to_mesh=self.traffic.way(Side.MESH, per_second=self._to_mesh.rate.per_second()),
+        )
+
+    def _state(self) -> str:
+        if not self._network.connected:
+            return "no router"
+        if not self.link.up:
+            return "no daemon"
+        return "connected" if self.link.listeners else "alone"
+
+    async def _take_from_mesh(self) -> None:
+        dropped = 0
+        async for sample in self._pump:
+            if (lost := self._pump.dropped - dropped) > 0:
+                dropped += lost
+                self.traffic.dropped[Side.IPFS]["unseen"] += lost
+                log.warning("%s: %d messages of the mesh came too fast and are lost", self.lighthouse, lost)
+            await self._take(sample.payload, Side.MESH, key=sample.key, by_bridge=sample.marked)
+
+    async def _take_from_ipfs(self, event: Event | None) -> None:
+        if event is None:
+            self._refuse(Side.IPFS, InvalidMessage("line", "the daemon's line can't be read"))
+        else:
+            await self._take(event.data, Side.IPFS, echo=event.sender == self.link.identity)
+
+    async def _take(
+        self, payload: bytes, side: Side, *, key: str | None = None, echo: bool = False, by_bridge: bool = False
+    ) -> None:
+        self.traffic.counts[side.other]["received"] += 1
+        if not _NAMED.search(payload):
+            await self._pass(payload, side, key=key, echo=echo, by_bridge=by_bridge)
+        elif len(self._looking_up) >= LOOKING_UP:
+            self._refuse(side, InvalidMessage("name", "too many messages wait for their names"))
+        else:  # others overtake a message whose names are looked up
+            task = asyncio.create_task(self._pass(payload, side, key=key, echo=echo, by_bridge=by_bridge))
+            self._looking_up.add(task)
+            task.add_done_callback(self._looking_up.discard)
+
+    async def _pass(self, payload: bytes, side: Side, *, key: str | None, echo: bool, by_bridge: bool) -> None:
+        try:
+            passenger = await self._gate.admit(payload, key=key)
+        except InvalidMessage as error:
+            self._refuse(side, error)
+            return
+        fate = self.traffic.seen(passenger, side, echo=echo, by_bridge=by_bridge)
+        if fate is Fate.ACCEPTED:
+            self._wake()
+        elif fate is Fate.NO_ROOM:
+            log.warning("%s: no room for %s towards %s", self.lighthouse, passenger.key, side.other.value)
+
+    def _refuse(self, side: Side, error: InvalidMessage) -> None:
+        self.traffic.invalid[side.other][error.reason] += 1
+        log.debug("%s: from %s: %s", self.lighthouse, side.value, error)
+
+    def _wake(self) -> None:
+        self._to_ipfs.wake()
+        self._to_mesh.wake()
+
+    async def _look_after_left(self) -> None:
+        while True:
+            await asyncio.sleep(LOOK)
+            if (count := self.traffic.look_after_left()) > 0:
+                log.warning("%s: %d messages that other bridges did not carry", self.lighthouse, count)
+                self._wake()
+
+    def _link_changed(self) -> None:
+        if not self.link.up:
+            self._presence.hide()
+            return
+        self._presence.show(deaf=not self.link.listeners)
+        if self.link.listeners and self.traffic.to[Side.IPFS].say_again():
+            self._wake()
+
+    def _restore(self) -> None:
+        for fingerprint, age in self._journal.known():
+            for side in Side:
+                self.traffic.memory.note(fingerprint, side, age=age)
+        for side, waiting in self._journal.left_over():
+            waiting.since = time.monotonic()
+            self.traffic.restore(waiting, side)
+        self._wake()
+
+    def _answer(self, query: zenoh.Query) -> None:
+        with query:
+            if self._stack is not None:
+                query.reply(
+                    status_key(self.address, self.lighthouse), self.status().encode(), encoding="application/json"
+                )
+
+
+def _read(sample: zenoh.Sample) -> Sample | None:
+    """What the pump's thread makes of a sample. Why a provider rejects an order has no place on the legacy channel."""
+    key = str(sample.key_expr)
+    if sample.kind != zenoh.SampleKind.PUT or key.split("/")[2:3] == ["reject"]:
+        return None
+    attachment = sample.attachment
+    return Sample(key, sample.payload.to_bytes(), attachment is not None and attachment.to_bytes() == MARK)

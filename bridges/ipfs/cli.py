@@ -1,0 +1,96 @@
+"""`aira bridge ipfs`: the door to the legacy network."""
+
+from __future__ import annotations
+
+import logging
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+import msgspec
+
+from mesh.cli.options import with_settings
+from mesh.errors import ConfigurationError
+from mesh.running import run_until_stopped
+from mesh.settings import CHAIN_SETTINGS, NETWORK_SETTINGS
+
+if TYPE_CHECKING:
+    from mesh.chain import Chain
+    from mesh.settings import Settings
+
+log = logging.getLogger(__name__)
+
+
+@click.command("ipfs")
+@click.option("--api", help="the daemon's RPC, a multiaddr or a URL; the same as --ipfs-http-provider")
+@click.option("--lighthouse", "lighthouses", multiple=True, metavar="NAME", help="several channels: name each")
+@with_settings(
+    *NETWORK_SETTINGS,
+    "ipfs_http_provider",
+    "ipfs_authorization_file",
+    "ipfs_gateway",
+    "ipfs_public_providers",
+    "ipfs_swarm_connect",
+    "lighthouse_contract",
+    "objective_size_limit",
+    "content_limit",
+    "fetch_timeout",
+    "keyfile",
+    *CHAIN_SETTINGS,
+)
+def command(settings: Settings, api: str | None, lighthouses: tuple[str, ...]) -> None:
+    """Carry messages and content between the mesh and the legacy network on IPFS. Ctrl-C ends it.
+
+    The daemon needs PubSub; it may come later, and come back. Several bridges may serve one lighthouse, each with a
+    --data-dir of its own: one carries, the others stand by. Without a node of the chain (--web3-http-provider "") no
+    ENS name in a message is looked up, and deadlines are not checked.
+    """
+    if api:
+        settings = msgspec.structs.replace(settings, ipfs_http_provider=api)
+    run_until_stopped(lambda: _serve(settings, lighthouses))
+
+
+def _address(settings: Settings) -> str | None:
+    """As whom the bridge shows itself: the holder of its certificate, or of the keyfile, or nobody in particular."""
+    from mesh.cli.opening import own_address
+
+    if not settings.tls_certificate:
+        return own_address(settings)
+    from mesh.identity.certificates import facts_of, read_certificate
+
+    path = Path(settings.tls_certificate).expanduser()
+    return facts_of(read_certificate(path), path).holder.address
+
+
+async def _serve(settings: Settings, lighthouses: tuple[str, ...]) -> None:
+    from bridges.ipfs.addresses import base_url
+
+    try:
+        from bridges.ipfs.service import IpfsBridge
+    except ModuleNotFoundError as error:
+        raise ConfigurationError(
+            f"the IPFS bridge needs {error.name}, which is not installed", hint="pip install 'aira-mesh[ipfs]'"
+        ) from error
+    from mesh.agent.parts import endpoints_of
+    from mesh.network import Network
+
+    base_url(settings.ipfs_http_provider)  # before anything is waited for
+    async with AsyncExitStack() as stack:
+        chain = await _chain(settings, stack)
+        network = await stack.enter_async_context(Network(endpoints_of(settings)))
+        bridge = await stack.enter_async_context(
+            IpfsBridge(network, settings, lighthouses=lighthouses, chain=chain, address=_address(settings))
+        )
+        for channel in bridge.channels:
+            click.echo(f"bridge {channel.address} carries {channel.lighthouse} to and from {bridge.daemon.api}")
+        await bridge.run()
+
+
+async def _chain(settings: Settings, stack: AsyncExitStack) -> Chain | None:
+    """The chain, if the settings name one."""
+    from mesh.agent.parts import chain_of
+
+    if not settings.web3_http_provider.strip() and not settings.web3_ws_provider.strip():
+        return None
+    return await stack.enter_async_context(chain_of(settings, None))

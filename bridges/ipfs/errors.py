@@ -1,0 +1,66 @@
+"""What can go wrong between the mesh and IPFS."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from mesh.errors import AiraError, RemoteError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+class IpfsError(RemoteError):
+    """An IPFS daemon or gateway failed or is not there; `api` is its address."""
+
+    def __init__(self, api: str, why: str, *, hint: str = "") -> None:
+        super().__init__(f"IPFS at {api}: {why}", hint=hint)
+        self.api = api
+        self.why = why
+
+
+class DaemonUnreachable(IpfsError):
+    """The daemon does not answer, or broke off in the middle; it may be there again later."""
+
+    def __init__(self, api: str, why: str) -> None:
+        super().__init__(api, why, hint="is the daemon running, and is this the address of its RPC?")
+
+
+class DaemonRefused(IpfsError):
+    """The daemon answered a call with an error: `status` is HTTP's, `why` the daemon's own words."""
+
+    def __init__(self, api: str, status: int, why: str, *, hint: str = "") -> None:
+        super().__init__(api, why, hint=hint)
+        self.status = status
+
+
+class AccessDenied(DaemonRefused):
+    """The daemon wants other credentials."""
+
+    def __init__(self, api: str, status: int, why: str) -> None:
+        super().__init__(api, status, why, hint="put the value of the Authorization header into a file and name it")
+
+
+class PubSubDisabled(DaemonRefused):
+    """The daemon runs without PubSub."""
+
+    def __init__(self, api: str, status: int, why: str) -> None:
+        super().__init__(
+            api, status, why, hint="ipfs config --json Pubsub.Enabled true; old ones: --enable-pubsub-experiment"
+        )
+
+
+class NoPeers(DaemonRefused):
+    """Nobody whom the daemon knows listens to the topic. Keep the message and publish it later."""
+
+
+class JournalFailed(AiraError):
+    """A bridge can't read or write what it must remember."""
+
+    def __init__(self, path: Path, why: str) -> None:
+        super().__init__(
+            f"the journal {path} can't be used: {why}",
+            hint="free some space; if it is damaged, stop the bridge and delete it: messages may then cross once more",
+        )
+        self.path = path
+        self.why = why

@@ -1,0 +1,167 @@
+"""All of the IPFS bridge as the settings describe it, for one process."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Self
+
+from bridges.ipfs.channel import ChannelBridge
+from bridges.ipfs.content import ContentBridge
+from bridges.ipfs.daemon import Daemon
+from bridges.ipfs.gate import Gate
+from bridges.ipfs.gateway import Gateway
+from bridges.ipfs.journal import Journal
+from bridges.ipfs.memory import Side
+from bridges.ipfs.sources import Sources
+from mesh.content import Exchange, Store
+from mesh.errors import ChainError, ClosedError, ConfigurationError
+from schemas import Demand, Result, decode
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from bridges.ipfs.gate import Passenger
+    from mesh.chain import Chain
+    from mesh.network import Network
+    from mesh.settings import Settings
+
+log = logging.getLogger(__name__)
+
+
+class IpfsBridge:
+    """The channels of `lighthouses` (ENS names) and the content: `async with IpfsBridge(...) as bridge`, then `run`.
+
+    With `chain` (open, for reading) ENS names in messages are looked up, orders must be of the lighthouse's address,
+    and those whose deadline has passed do not cross. `address` is the bridge's name on the mesh, by default a new one
+    for each channel. Network and chain stay the caller's to close.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        settings: Settings,
+        *,
+        lighthouses: tuple[str, ...] = (),
+        chain: Chain | None = None,
+        address: str | None = None,
+    ) -> None:
+        self._network = network
+        self._settings = settings
+        self._lighthouses = lighthouses or (settings.lighthouse_contract,)
+        self._chain = chain
+        self._address = address
+        self._head = 0
+        self._stack: AsyncExitStack | None = None
+        self.channels: tuple[ChannelBridge, ...] = ()
+        self.daemon: Final = Daemon(settings.ipfs_http_provider, authorization=_authorization(settings))
+
+    async def __aenter__(self) -> Self:
+        if self._stack is not None:
+            raise ClosedError("this bridge is open already")
+        async with AsyncExitStack() as stack:
+            await stack.enter_async_context(self.daemon)
+            self.content = await self._open_content(stack)
+            self.channels = tuple([await self._open_channel(stack, name) for name in self._lighthouses])
+            self._stack = stack.pop_all()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        stack, self._stack = self._stack, None
+        if stack is not None:
+            await stack.aclose()
+
+    async def run(self) -> None:
+        """Carry messages and content until cancelled."""
+        if self._stack is None:
+            raise ClosedError("the bridge is not open", hint="use it inside `async with`")
+        async with asyncio.TaskGroup() as tasks:
+            for channel in self.channels:
+                tasks.create_task(channel.run(), name=f"bridge of {channel.lighthouse}")
+            if self._chain is not None:
+                tasks.create_task(self._follow_head(self._chain), name="bridge: the latest block")
+
+    @property
+    def _directory(self) -> Path:
+        return self._settings.state_directory / "bridge" / "ipfs"
+
+    async def _open_content(self, stack: AsyncExitStack) -> ContentBridge:
+        settings = self._settings
+        store = await asyncio.to_thread(
+            Store, self._directory / "content", limit=settings.objective_size_limit, quota=settings.content_limit
+        )
+        stack.callback(store.close)
+        exchange = await stack.enter_async_context(Exchange(self._network.session, store))
+        gateways = [Gateway(settings.ipfs_gateway)] if settings.ipfs_gateway else []
+        for gateway in gateways:
+            await stack.enter_async_context(gateway)
+        providers = tuple(Daemon(api) for api in settings.ipfs_public_providers)
+        for provider in providers:
+            await stack.enter_async_context(provider)
+        return await stack.enter_async_context(
+            ContentBridge(
+                self._network.session,
+                store,
+                exchange,
+                Sources(self.daemon, *gateways),
+                self.daemon,
+                providers=providers,
+                size_limit=settings.objective_size_limit,
+                timeout=settings.fetch_timeout,
+            )
+        )
+
+    async def _open_channel(self, stack: AsyncExitStack, lighthouse: str) -> ChannelBridge:
+        name, chain = lighthouse.lower(), self._chain
+        gate = Gate(
+            name,
+            address=None if chain is None else await chain.resolve(name),
+            resolver=None if chain is None else chain.resolve,
+            head=lambda: self._head,
+        )
+        return await stack.enter_async_context(
+            ChannelBridge(
+                self._network,
+                self.daemon,
+                gate,
+                stack.enter_context(Journal(self._directory / f"{name}.sqlite")),
+                lighthouse=name,
+                neighbours=self._settings.ipfs_swarm_connect,
+                address=self._address,
+                carried=self._carried,
+            )
+        )
+
+    def _carried(self, side: Side, passenger: Passenger) -> None:
+        """Content goes the way of the messages that name it."""
+        match decode(passenger.payload):
+            case Demand(objective=cid) | Result(result=cid):
+                if side is Side.IPFS:
+                    self.content.add_soon(cid)
+                else:
+                    self.content.fetch_soon(cid)
+
+    async def _follow_head(self, chain: Chain) -> None:
+        while True:
+            try:
+                self._head = await chain.block_number()
+            except ChainError as error:
+                log.warning("the bridge does not know the latest block: %s", error)
+            await asyncio.sleep(max(self._settings.poll_interval, 1.0))
+
+
+def _authorization(settings: Settings) -> str:
+    if not settings.ipfs_authorization_file:
+        return ""
+    path = Path(settings.ipfs_authorization_file).expanduser()
+    try:
+        value = path.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigurationError(f"can't read the IPFS credentials in {path}: {error}") from None
+    if not value.isascii() or not value.isprintable():
+        raise ConfigurationError(f"{path} holds no value of a header", hint="one line, such as Bearer … or Basic …")
+    return value

@@ -1,0 +1,80 @@
+"""Bridges for tests, with all that they stand on."""
+
+from __future__ import annotations
+
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from bridges.ipfs import ChannelBridge, Daemon, Gate, Journal
+from mesh.background import Background
+from mesh.network import Channel, Endpoints, Network, Pump
+from tests.support.orders import LIGHTHOUSE
+from tests.support.waiting import until_found
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    import zenoh
+
+
+@asynccontextmanager
+async def bridging(endpoint: str, api: str, topic: str, journal: Path, **options: Any) -> AsyncIterator[ChannelBridge]:
+    """A bridge at work between the router at `endpoint` and the daemon at `api`."""
+    async with AsyncExitStack() as stack:
+        network = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,))))
+        daemon = await stack.enter_async_context(Daemon(api))
+        notes = stack.enter_context(Journal(journal))
+        bridge = ChannelBridge(network, daemon, Gate(topic, address=LIGHTHOUSE), notes, lighthouse=topic, **options)
+        await stack.enter_async_context(bridge)
+        tasks = await stack.enter_async_context(Background())
+        tasks.start(bridge.run(), "bridge of the test")
+        yield bridge
+
+
+@dataclass
+class Mesh:
+    """Somebody on the mesh's side: `heard` is every sample, with its key, however often it came."""
+
+    network: Network
+    channel: Channel
+    heard: list[tuple[str, bytes]] = field(default_factory=list)
+
+    @property
+    def payloads(self) -> list[bytes]:
+        """What was heard, without the keys."""
+        return [payload for _, payload in self.heard]
+
+
+@asynccontextmanager
+async def on_mesh(endpoint: str, topic: str) -> AsyncIterator[Mesh]:
+    """A client of the router that listens to all of a market."""
+
+    def read(sample: zenoh.Sample) -> tuple[str, bytes]:
+        return str(sample.key_expr), sample.payload.to_bytes()
+
+    async with (
+        Network(Endpoints(connect=(endpoint,))) as network,
+        Channel(network.session, topic, address=LIGHTHOUSE) as channel,
+        Pump(network.session, f"aira/{topic}/**", read) as pump,
+        Background() as tasks,
+    ):
+        mesh = Mesh(network, channel)
+
+        async def listen() -> None:
+            async for heard in pump:
+                mesh.heard.append(heard)
+
+        tasks.start(listen(), "hears the mesh")
+        yield mesh
+
+
+async def until_seen(mesh: Mesh, *addresses: str) -> None:
+    """Return when these bridges (or any one) have shown that they are there: from then on they hear the mesh."""
+
+    async def are_there() -> bool:
+        present = {key.agent for key in await mesh.channel.present() if key.role == "bridge"}
+        return bool(present) and present.issuperset(addresses)
+
+    await until_found(are_there, what="the bridge's token", seconds=60)

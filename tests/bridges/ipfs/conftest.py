@@ -1,0 +1,82 @@
+"""Two daemons of a kind in one swarm, for all tests of a run; tests use topics of their own."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass
+from itertools import count
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.bridges.ipfs.legacy import Bare
+from tests.support.ipfs import JsIpfs, Kubo, LibraryNode
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterator
+
+KINDS: dict[str, type[JsIpfs | Kubo]] = {"js-ipfs": JsIpfs, "kubo": Kubo}
+_topics = count(1)
+
+
+@dataclass(frozen=True)
+class Swarm:
+    """Two daemons; `b` knows `a`, once `join` was awaited."""
+
+    a: JsIpfs | Kubo
+    b: JsIpfs | Kubo
+
+    async def join(self) -> None:
+        """Connect them, which lasts until one of them stops."""
+        async with Bare(self.b.api) as client:
+            await client.call("swarm/connect", ("arg", self.a.swarm_address))
+
+
+@pytest.fixture(scope="session", params=KINDS)
+def kind(request: pytest.FixtureRequest) -> type[JsIpfs | Kubo]:
+    """What the daemons are: js-ipfs, and a current Kubo where `AIRA_KUBO` names one."""
+    return KINDS[request.param]
+
+
+@pytest.fixture(scope="session")
+def shared_swarm(kind: type[JsIpfs | Kubo]) -> Iterator[Swarm]:
+    """Two daemons that no test stops."""
+    with ExitStack() as stack:
+        with ThreadPoolExecutor(2) as starting:
+            a, b = starting.map(lambda daemon: stack.enter_context(daemon), (kind(), kind()))
+        yield Swarm(a, b)
+
+
+@pytest.fixture
+async def swarm(shared_swarm: Swarm) -> Swarm:
+    """The two daemons, connected."""
+    await shared_swarm.join()
+    return shared_swarm
+
+
+@pytest.fixture(scope="session")
+def library() -> Iterator[LibraryNode]:
+    """A Kubo library node, connected to nobody."""
+    with LibraryNode() as node:
+        yield node
+
+
+@pytest.fixture
+def topic() -> str:
+    """A lighthouse's name that no other test uses."""
+    return f"market{next(_topics)}.lighthouse.3.robonomics.eth"
+
+
+@pytest.fixture
+async def alice(swarm: Swarm) -> AsyncIterator[Bare]:
+    """A legacy client of daemon A."""
+    async with Bare(swarm.a.api) as client:
+        yield client
+
+
+@pytest.fixture
+async def bob(swarm: Swarm) -> AsyncIterator[Bare]:
+    """A legacy client of daemon B."""
+    async with Bare(swarm.b.api) as client:
+        yield client

@@ -1,0 +1,188 @@
+"""The bridge between real daemons, a library node and a router."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import AsyncExitStack
+from typing import TYPE_CHECKING
+
+import pytest
+
+from bridges.ipfs.carrying import MARK
+from bridges.ipfs.writing import legacy_json
+from mesh.network import message_key
+from schemas import OrderFeedback, TransactionFeedback, encode
+from tests.bridges.ipfs.bridges import Mesh, bridging, on_mesh, until_seen
+from tests.support.orders import LIGHTHOUSE, STRANGER, demand, offer, result
+from tests.support.waiting import until, until_found
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from bridges.ipfs import ChannelBridge
+    from schemas import Message
+    from tests.bridges.ipfs.conftest import Swarm
+    from tests.bridges.ipfs.legacy import Bare
+    from tests.support.ipfs import LibraryNode
+    from tests.support.routers import EmbeddedRouter
+
+SECONDS = 60.0
+MANY = 1000
+
+
+@pytest.fixture
+async def mesh(router: EmbeddedRouter, topic: str) -> AsyncIterator[Mesh]:
+    async with on_mesh(router.endpoint, topic) as mesh:
+        yield mesh
+
+
+@pytest.fixture
+async def bridge(
+    router: EmbeddedRouter, swarm: Swarm, topic: str, tmp_path: Path, mesh: Mesh, bob: Bare
+) -> AsyncIterator[ChannelBridge]:
+    """A bridge at daemon A; Bob listens at daemon B, and each side knows of the other."""
+    await bob.listen(topic)
+    async with bridging(router.endpoint, swarm.a.api, topic, tmp_path / "one.sqlite") as bridge:
+        await meet(bridge, bob, mesh, topic)
+        yield bridge
+
+
+async def meet(bridge: ChannelBridge, legacy: Bare, mesh: Mesh, topic: str) -> None:
+    await until(lambda: bridge.link.listeners, what="a listener on IPFS", seconds=SECONDS)
+    await until_found(lambda: legacy.peers(topic), what="the bridge's daemon", seconds=SECONDS)
+    await until_seen(mesh, bridge.address)
+
+
+async def bring_in(library: LibraryNode, swarm: Swarm, topic: str) -> None:
+    """The library node stands beside the daemons."""
+    for daemon in (swarm.a, swarm.b):
+        await asyncio.to_thread(library.connect, daemon.swarm_address)
+    await asyncio.to_thread(library.subscribe, topic)
+    await until_found(lambda: asyncio.to_thread(library.peers, topic), seconds=SECONDS)
+
+
+async def test_a_legacy_clients_message_comes_to_the_mesh_on_its_key(
+    bridge: ChannelBridge, mesh: Mesh, bob: Bare, topic: str
+) -> None:
+    order = demand()
+    await bob.publish(topic, legacy_json(order))
+    await until(lambda: mesh.heard, seconds=SECONDS)
+    assert mesh.heard == [(message_key(topic, order), encode(order))]
+
+
+async def test_a_message_of_the_mesh_comes_to_legacy_clients_as_they_write_it(
+    bridge: ChannelBridge, mesh: Mesh, bob: Bare, topic: str, library: LibraryNode, swarm: Swarm
+) -> None:
+    await bring_in(library, swarm, topic)
+    await until(lambda: len(bridge.link.listeners) == 2, what="the library node", seconds=SECONDS)
+    order = offer()
+    mesh.channel.publish(order)
+    await until(lambda: bob.heard, seconds=SECONDS)
+    await until_found(lambda: asyncio.to_thread(library.heard, topic), seconds=SECONDS)
+    assert bob.heard == [legacy_json(order)]
+    assert await asyncio.to_thread(library.heard, topic) == [legacy_json(order)]
+
+
+async def test_a_library_nodes_message_comes_to_the_mesh(
+    bridge: ChannelBridge, mesh: Mesh, topic: str, library: LibraryNode, swarm: Swarm
+) -> None:
+    await bring_in(library, swarm, topic)
+    await until(lambda: len(bridge.link.listeners) == 2, what="the library node", seconds=SECONDS)
+    order = demand()
+    await asyncio.to_thread(library.publish, topic, legacy_json(order))
+    await until(lambda: mesh.heard, seconds=SECONDS)
+    assert mesh.payloads == [encode(order)]
+
+
+async def test_results_and_both_feedbacks_pass_too(bridge: ChannelBridge, mesh: Mesh, bob: Bare, topic: str) -> None:
+    messages: list[Message] = [
+        result(),
+        OrderFeedback(order="ab" * 32, accepted=1, signature="cd" * 65),
+        TransactionFeedback(tx="ef" * 32),
+    ]
+    for message in messages:
+        await bob.publish(topic, legacy_json(message))
+    await until(lambda: len(mesh.heard) == 3, seconds=SECONDS)
+    keys = [key.removeprefix(f"aira/{topic}/").split("/")[:2] for key, _ in mesh.heard]
+    assert keys == [["result", LIGHTHOUSE.lower()], ["feedback", "ab" * 32], ["pending", "ef" * 32]]
+    mesh.channel.put(f"aira/{topic}/pending/{'12' * 32}", encode(TransactionFeedback(tx="12" * 32)))
+    mesh.channel.put(f"aira/{topic}/feedback/{'ab' * 32}/{'34' * 32}", encode(_feedback(2)))
+    await until(lambda: len(bob.heard) == 5, seconds=SECONDS)
+    assert bob.heard[3:] == [legacy_json(TransactionFeedback(tx="12" * 32)), legacy_json(_feedback(2))]
+
+
+async def test_invalid_messages_are_dropped_with_their_reason_counted(
+    bridge: ChannelBridge, mesh: Mesh, bob: Bare, topic: str
+) -> None:
+    good, forged = demand(), legacy_json(demand()).replace(b'"cost":42', b'"cost":1e3')
+    elsewhere, other = demand(lighthouse="0x" + "11" * 20), demand(signer=STRANGER)
+    for payload in (b"hello", b"{}", forged, legacy_json(elsewhere), legacy_json(good)):
+        await bob.publish(topic, payload)
+    await until(lambda: mesh.heard, seconds=SECONDS)
+    assert mesh.payloads == [encode(good)]
+    assert bridge.status().to_mesh.invalid == {"not-json": 1, "unknown-kind": 1, "field": 1, "lighthouse": 1}
+    mesh.channel.put(message_key(topic, good), encode(other))
+    mesh.channel.put(f"aira/{topic}/something/else", b"rubbish")
+    mesh.channel.publish(other)
+    await until(lambda: len(bob.heard) == 6, seconds=SECONDS)
+    assert bob.heard[5:] == [legacy_json(other)]
+    assert bridge.status().to_ipfs.invalid == {"key": 1, "not-json": 1}
+
+
+async def test_nothing_comes_back_to_where_it_came_from(
+    bridge: ChannelBridge, mesh: Mesh, bob: Bare, topic: str
+) -> None:
+    order, answer = demand(), offer()
+    await bob.publish(topic, legacy_json(order))
+    mesh.channel.publish(answer)
+    await until(lambda: len(bob.heard) == 2 and len(mesh.heard) == 2, seconds=SECONDS)
+    await until(lambda: bridge.status().to_mesh.known == 1 and bridge.status().to_ipfs.known == 1, seconds=SECONDS)
+    mesh.channel.publish(answer)  # as its sender does until it has an effect
+    await bob.publish(topic, legacy_json(order))
+    await until(lambda: bridge.status().to_mesh.known == 2 and bridge.status().to_ipfs.known == 2, seconds=SECONDS)
+    assert sorted(bob.heard) == sorted([legacy_json(order), legacy_json(answer), legacy_json(order)])
+    assert sorted(mesh.payloads) == sorted([encode(order), encode(answer), encode(answer)])
+
+
+async def test_what_another_bridge_has_brought_is_not_brought_back(
+    bridge: ChannelBridge, mesh: Mesh, bob: Bare, topic: str
+) -> None:
+    brought, own = demand(), demand()
+    mesh.network.session.put(message_key(topic, brought), encode(brought), attachment=MARK)
+    mesh.channel.publish(own)
+    await until(lambda: bob.heard, seconds=SECONDS)
+    assert bob.heard == [legacy_json(own)]
+    assert bridge.status().to_ipfs.accepted == 1
+
+
+@pytest.mark.parametrize("together", [True, False], ids=["at one daemon", "at two daemons"])
+async def test_a_thousand_messages_each_way_through_two_bridges_none_lost_and_none_twice(
+    router: EmbeddedRouter, swarm: Swarm, topic: str, tmp_path: Path, mesh: Mesh, bob: Bare, together: bool
+) -> None:
+    await bob.listen(topic)
+    apis = (swarm.a.api, swarm.a.api if together else swarm.b.api)
+    out = [demand(cost=number) for number in range(MANY)]
+    back = [offer(cost=number) for number in range(MANY)]
+    async with AsyncExitStack() as stack:
+        for number, api in enumerate(apis):
+            one = bridging(router.endpoint, api, topic, tmp_path / f"{number}.sqlite")
+            bridge = await stack.enter_async_context(one)
+            await meet(bridge, bob, mesh, topic)
+
+        async def publish() -> None:
+            for order in back:
+                await bob.publish(topic, legacy_json(order))
+
+        legacy = asyncio.create_task(publish())
+        for order in out:
+            mesh.channel.publish(order)
+            await asyncio.sleep(0.002)
+        await legacy
+        await until(lambda: len(mesh.heard) >= 2 * MANY and len(bob.heard) >= 2 * MANY, seconds=3 * SECONDS)
+    assert sorted(bob.heard) == sorted([legacy_json(order) for order in out + list[object](back)])  # type: ignore[arg-type]
+    assert sorted(mesh.payloads) == sorted([encode(order) for order in out + list[object](back)])  # type: ignore[arg-type]
+
+
+def _feedback(accepted: int) -> OrderFeedback:
+    return OrderFeedback(order="ab" * 32, accepted=accepted, signature="cd" * 65)

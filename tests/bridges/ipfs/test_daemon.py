@@ -1,0 +1,120 @@
+"""The client of a daemon's RPC, on real daemons."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+import pytest
+
+from bridges.ipfs import Daemon, DaemonRefused, DaemonUnreachable, NoPeers
+from bridges.ipfs.daemon import SETTINGS
+from mesh.errors import ClosedError
+from schemas import CHUNK_SIZE, cid_of_bytes
+from tests.support.ports import free_port
+from tests.support.waiting import until_found
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from tests.bridges.ipfs.conftest import Swarm
+    from tests.bridges.ipfs.legacy import Bare
+
+DATA = bytes(range(256)) + b'{"tx":"\n"}'
+
+
+@pytest.fixture
+async def daemon(swarm: Swarm) -> AsyncIterator[Daemon]:
+    async with Daemon(swarm.a.api) as daemon:
+        await daemon.greet()
+        yield daemon
+
+
+async def test_a_daemon_says_what_and_who_it_is(daemon: Daemon, swarm: Swarm) -> None:
+    assert daemon.version
+    assert daemon.version.version
+    assert daemon.dialect == "multibase"
+    identity = await daemon.identity()
+    assert identity.id == swarm.a.peer_id
+    assert swarm.a.swarm_address in (identity.addresses or [])
+    assert swarm.b.peer_id in await daemon.neighbours()
+
+
+async def test_what_is_published_reaches_a_client_of_another_daemon_byte_for_byte(
+    daemon: Daemon, bob: Bare, topic: str
+) -> None:
+    await bob.listen(topic)
+    await until_found(lambda: daemon.listeners(topic), seconds=30)
+    await daemon.publish(topic, DATA)
+    await until_found(lambda: _heard(bob, 1), seconds=30)
+    assert bob.heard == [DATA]
+
+
+async def test_a_subscription_hears_a_client_of_another_daemon_and_its_own(
+    daemon: Daemon, bob: Bare, swarm: Swarm, topic: str
+) -> None:
+    async with asyncio.timeout(60), daemon.subscribe(topic) as events:
+        await until_found(lambda: bob.peers(topic), seconds=30)
+        await bob.publish(topic, DATA)
+        event = await anext(events)
+        assert event is not None
+        assert (event.sender, event.data) == (swarm.b.peer_id, DATA)
+        await daemon.publish(topic, b"mine")
+        own = await anext(events)
+        assert own is not None
+        assert (own.sender, own.data) == (swarm.a.peer_id, b"mine")
+
+
+async def test_a_js_daemon_says_that_nobody_listens(daemon: Daemon, topic: str) -> None:
+    assert await daemon.listeners(topic) == []
+    assert daemon.version
+    if daemon.version.js_core:
+        with pytest.raises(NoPeers) as nobody:
+            await daemon.publish(topic, b"hello")
+        assert nobody.value.status == 500
+    else:
+        await daemon.publish(topic, b"hello")
+
+
+@pytest.mark.parametrize("size", [0, 1, CHUNK_SIZE + 1])
+async def test_a_file_is_added_under_the_name_that_the_mesh_gives_it(daemon: Daemon, tmp_path: Path, size: int) -> None:
+    file = tmp_path / "file"
+    file.write_bytes(b"x" * size)
+    assert await daemon.add(file) == cid_of_bytes(b"x" * size)
+
+
+async def test_a_block_is_had_from_another_node_of_the_swarm_and_can_be_pinned(daemon: Daemon, bob: Bare) -> None:
+    content = b"of bob's own" * 1000
+    name = (await bob.call("add", *SETTINGS, content=content))["Hash"]
+    block = await daemon.block(name, limit=20_000, timeout=30)
+    assert content in block
+    await daemon.pin(name, timeout=30)
+    with pytest.raises(DaemonRefused, match="more than 100 bytes"):
+        await daemon.block(name, limit=100)
+
+
+async def test_a_block_that_nobody_has_is_given_up_after_its_time(daemon: Daemon) -> None:
+    with pytest.raises((DaemonUnreachable, DaemonRefused)):
+        await daemon.block(cid_of_bytes(b"nobody has this"), limit=1000, timeout=0.5)
+
+
+async def test_a_call_that_the_daemon_does_not_know_is_refused_in_its_words(daemon: Daemon) -> None:
+    with pytest.raises(DaemonRefused, match=r".") as refused:
+        await daemon.connect("/ip4/127.0.0.1/tcp/1/p2p/nonsense")
+    assert refused.value.why
+
+
+async def test_a_daemon_that_is_not_there_is_unreachable() -> None:
+    async with Daemon(f"/ip4/127.0.0.1/tcp/{free_port()}") as daemon:
+        with pytest.raises(DaemonUnreachable):
+            await daemon.greet()
+
+
+async def test_a_client_is_used_inside_its_with() -> None:
+    with pytest.raises(ClosedError):
+        await Daemon("http://127.0.0.1:5001").greet()
+
+
+async def _heard(client: Bare, count: int) -> bool:
+    return len(client.heard) >= count

@@ -1,0 +1,209 @@
+"""What a bridge bears: daemons and routers that go and come, nobody who listens, its own end, another one's end."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+import pytest
+
+from bridges.ipfs import Journal
+from bridges.ipfs.writing import legacy_json
+from mesh.errors import ConfigurationError
+from schemas import TransactionFeedback, encode
+from tests.bridges.ipfs.bridges import bridging, on_mesh, until_seen
+from tests.bridges.ipfs.legacy import Bare
+from tests.support.orders import demand, offer
+from tests.support.waiting import until, until_found
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterator
+    from pathlib import Path
+
+    from bridges.ipfs import ChannelBridge
+    from tests.bridges.ipfs.bridges import Mesh
+    from tests.bridges.ipfs.conftest import Swarm
+    from tests.support.ipfs import JsIpfs, Kubo
+    from tests.support.routers import EmbeddedRouter
+
+SECONDS = 90.0
+
+
+@pytest.fixture
+def mortal(kind: type[JsIpfs | Kubo]) -> Iterator[JsIpfs | Kubo]:
+    """A daemon of this test's own, not running yet."""
+    with ExitStack() as stack:
+        daemon = kind()
+        stack.callback(daemon.close)
+        yield daemon
+
+
+@pytest.fixture
+async def mesh(router: EmbeddedRouter, topic: str) -> AsyncIterator[Mesh]:
+    async with on_mesh(router.endpoint, topic) as mesh:
+        yield mesh
+
+
+async def test_a_daemon_that_comes_late_goes_and_comes_back_costs_nothing_that_was_accepted(
+    mortal: JsIpfs | Kubo, swarm: Swarm, bob: Bare, mesh: Mesh, router: EmbeddedRouter, topic: str, tmp_path: Path
+) -> None:
+    await bob.listen(topic)
+    orders = [demand(cost=number) for number in range(60)]
+    neighbours = (swarm.b.swarm_address,)
+    async with bridging(router.endpoint, mortal.api, topic, tmp_path / "journal", neighbours=neighbours) as bridge:
+        await until_seen(mesh, bridge.address)
+        for order in orders[:20]:
+            mesh.channel.publish(order)
+        await until(lambda: bridge.status().to_ipfs.waiting == 20, seconds=SECONDS)
+        assert bridge.status().state == "no daemon"
+        assert mortal.api in bridge.status().last_error
+
+        await asyncio.to_thread(mortal.start)
+        await until(lambda: len(bob.heard) == 20, what="what waited for the daemon", seconds=SECONDS)
+        assert (bridge.status().state, bridge.status().last_error) == ("connected", "")
+
+        for order in orders[20:40]:
+            mesh.channel.publish(order)
+            if order is orders[30]:
+                await asyncio.to_thread(mortal.kill)
+        await until(lambda: bridge.status().state == "no daemon", seconds=SECONDS)
+        for order in orders[40:]:
+            mesh.channel.publish(order)
+        await asyncio.to_thread(mortal.start)
+        await until(lambda: len(set(bob.heard)) == 60, what="what was accepted meanwhile", seconds=SECONDS)
+        assert bridge.status().losses == 1
+
+        await bob.publish(topic, legacy_json(answer := offer()))
+        await until(lambda: encode(answer) in mesh.payloads, seconds=SECONDS)
+    # The one message that was on its way when the daemon died may have gone out; nobody can know.
+    assert len(bob.heard) - 1 - len(set(bob.heard[:-1])) <= 1
+
+
+async def test_what_nobody_hears_goes_out_once_when_somebody_comes(
+    mortal: JsIpfs | Kubo, swarm: Swarm, bob: Bare, mesh: Mesh, router: EmbeddedRouter, topic: str, tmp_path: Path
+) -> None:
+    await asyncio.to_thread(mortal.start)
+    orders = [demand(cost=number) for number in range(5)]
+    async with bridging(router.endpoint, mortal.api, topic, tmp_path / "journal") as bridge:
+        await until(lambda: bridge.status().state == "alone", seconds=SECONDS)
+        await until_seen(mesh, bridge.address)
+        for order in orders:
+            mesh.channel.publish(order)
+        await until(lambda: bridge.status().to_ipfs.unheard == 5, seconds=SECONDS)
+        await bob.listen(topic)
+        await bob.call("swarm/connect", ("arg", mortal.swarm_address))
+        await until(lambda: len(bob.heard) >= 5, seconds=SECONDS)
+        await until(lambda: bridge.status().to_ipfs.unheard == bridge.status().to_ipfs.waiting == 0, seconds=SECONDS)
+        mesh.channel.publish(last := offer())
+        await until(lambda: legacy_json(last) in bob.heard, seconds=SECONDS)
+    assert bob.heard == [*map(legacy_json, orders), legacy_json(last)]
+
+
+async def test_a_bridge_that_starts_again_carries_what_waited_and_nothing_twice(
+    mortal: JsIpfs | Kubo, swarm: Swarm, bob: Bare, mesh: Mesh, router: EmbeddedRouter, topic: str, tmp_path: Path
+) -> None:
+    await bob.listen(topic)
+    known, waited = demand(), demand()
+    journal = tmp_path / "journal"
+    async with bridging(router.endpoint, swarm.a.api, topic, journal) as bridge:
+        await ready(bridge, mesh)
+        mesh.channel.publish(known)
+        await until(lambda: bob.heard, seconds=SECONDS)
+    async with bridging(router.endpoint, mortal.api, topic, journal) as bridge:  # whose daemon does not run
+        await until_seen(mesh, bridge.address)
+        mesh.channel.publish(waited)
+        mesh.channel.publish(known)  # as its sender does until it has an effect
+        await until(lambda: bridge.status().to_ipfs.known == 1, seconds=SECONDS)
+        assert bridge.status().to_ipfs.waiting == 1
+    async with bridging(router.endpoint, swarm.a.api, topic, journal) as bridge:
+        await ready(bridge, mesh)
+        await until(lambda: len(bob.heard) == 2, seconds=SECONDS)
+        mesh.channel.publish(waited)
+        mesh.channel.publish(known)
+        await until(lambda: bridge.status().to_ipfs.known >= 2, seconds=SECONDS)
+        mesh.channel.publish(last := offer())
+        await until(lambda: len(bob.heard) >= 3, seconds=SECONDS)
+    assert bob.heard == [legacy_json(order) for order in (known, waited, last)]
+
+
+async def test_another_bridge_carries_at_once_when_the_first_one_loses_its_daemon(
+    mortal: JsIpfs | Kubo, swarm: Swarm, bob: Bare, mesh: Mesh, router: EmbeddedRouter, topic: str, tmp_path: Path
+) -> None:
+    await bob.listen(topic)
+    await asyncio.to_thread(mortal.start)
+    await bob.call("swarm/connect", ("arg", mortal.swarm_address))
+    async with bridging(router.endpoint, mortal.api, topic, tmp_path / "one") as first:
+        await ready(first, mesh)
+        async with bridging(router.endpoint, swarm.a.api, topic, tmp_path / "two") as second:
+            await ready(second, mesh)
+            await until(lambda: first.traffic.others and second.traffic.others, seconds=SECONDS)
+            assert (first.status().carries, second.status().carries) == (True, False)
+            await until_passed_on(mortal.api, topic, second)
+            mesh.channel.publish(one := demand())
+            await until(lambda: second.status().to_ipfs.left == 1, seconds=SECONDS)
+            await asyncio.to_thread(mortal.kill)
+            await until(lambda: second.status().carries, seconds=SECONDS)
+            mesh.channel.publish(two := demand())
+            await until(lambda: legacy_json(two) in bob.heard, seconds=SECONDS)
+            assert [heard for heard in bob.heard if b"tx" not in heard] == [legacy_json(one), legacy_json(two)]
+            assert second.status().to_ipfs.carried == 1
+
+
+async def test_what_comes_from_ipfs_waits_for_the_router(
+    swarm: Swarm, bob: Bare, router: EmbeddedRouter, topic: str, tmp_path: Path
+) -> None:
+    async with bridging(router.endpoint, swarm.a.api, topic, tmp_path / "journal") as bridge:
+        await until_found(lambda: bob.peers(topic), seconds=SECONDS)
+        await asyncio.to_thread(router.stop)
+        await until(lambda: bridge.status().state == "no router", seconds=SECONDS)
+        await bob.publish(topic, legacy_json(order := demand()))
+        await until(lambda: bridge.status().to_mesh.waiting == 1, seconds=SECONDS)
+        await asyncio.to_thread(router.start)
+        async with on_mesh(router.endpoint, topic) as mesh:
+            await until(lambda: bridge.status().to_mesh.carried == 1, seconds=SECONDS)
+            await until_seen(mesh, bridge.address)
+            await bob.publish(topic, legacy_json(later := offer()))
+            await until(lambda: encode(later) in mesh.payloads, seconds=SECONDS)
+        assert bridge.status().to_mesh.accepted == 2
+        assert order.signature
+
+
+async def test_a_full_outbox_accepts_nothing_more_and_counts_it(
+    mortal: JsIpfs | Kubo, mesh: Mesh, router: EmbeddedRouter, topic: str, tmp_path: Path
+) -> None:
+    async with bridging(router.endpoint, mortal.api, topic, tmp_path / "journal", limit=3) as bridge:
+        await until_seen(mesh, bridge.address)
+        for number in range(5):
+            mesh.channel.publish(demand(cost=number))
+        await until(lambda: bridge.status().to_ipfs.received == 5, seconds=SECONDS)
+        assert bridge.status().to_ipfs.waiting == 3
+        assert bridge.status().to_ipfs.dropped == {"no-room": 2}
+
+
+async def test_a_journal_is_one_bridges_own(tmp_path: Path) -> None:
+    with (
+        Journal(tmp_path / "journal.sqlite"),
+        pytest.raises(ConfigurationError, match="another bridge") as refused,
+        Journal(tmp_path / "journal.sqlite"),
+    ):
+        pass
+    assert "--data-dir" in refused.value.hint
+
+
+async def until_passed_on(api: str, topic: str, bridge: ChannelBridge) -> None:
+    """Return when what the daemon at `api` says comes to `bridge` through others, which takes them a heartbeat."""
+    async with Bare(api) as client:
+
+        async def comes() -> bool:
+            await client.publish(topic, legacy_json(TransactionFeedback(tx=secrets.token_hex(32))))
+            await asyncio.sleep(0.1)
+            return bridge.status().to_mesh.received > 0
+
+        await until_found(comes, seconds=SECONDS)
+
+
+async def ready(bridge: ChannelBridge, mesh: Mesh) -> None:
+    await until(lambda: bridge.status().state == "connected", seconds=SECONDS)
+    await until_seen(mesh, bridge.address)

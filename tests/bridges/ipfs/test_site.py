@@ -1,0 +1,53 @@
+"""The bridge on a locked site: it may do what its role is for, and nothing keeps it from that."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from bridges.ipfs import ChannelBridge, Daemon, Gate, Journal
+from bridges.ipfs.writing import legacy_json
+from mesh.background import Background
+from mesh.identity.roster import Member
+from mesh.network import Channel, Network
+from schemas import Offer, verify_message
+from tests.bridges.ipfs.old_daemon import OldDaemon
+from tests.support.orders import LIGHTHOUSE, PERSON, ROBOT, demand, offer
+from tests.support.sites import MARKET, Site
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SECONDS = 60.0
+BRIDGE = "0x" + "ab" * 20
+
+
+async def test_a_bridge_with_its_role_carries_both_ways_on_a_locked_site(tmp_path: Path) -> None:
+    site = Site(tmp_path)
+    door = site.enlist(Member(address=BRIDGE, name="door", roles=("bridge",)))
+    human = site.enlist(Member(address=PERSON.address, name="human", roles=("person",)))
+    async with OldDaemon() as here, OldDaemon() as there:
+        here.others, there.others = [there], [here]
+        with site.open_router("wheel"), Journal(tmp_path / "journal") as journal:
+            async with (
+                Network(site.client(door)) as network,
+                Network(site.client(human)) as person,
+                Channel(person.session, MARKET, address=LIGHTHOUSE) as channel,
+                channel.subscribe(Offer) as offers,
+                Daemon(here.api) as daemon,
+                ChannelBridge(
+                    network, daemon, Gate(MARKET, address=LIGHTHOUSE), journal, lighthouse=MARKET, address=BRIDGE
+                ) as bridge,
+                Background() as tasks,
+            ):
+                tasks.start(bridge.run(), "bridge of the test")
+                await until(lambda: bridge.status().carries, seconds=SECONDS)
+                channel.publish(order := demand())
+                await until(lambda: bridge.status().to_ipfs.carried == 1, seconds=SECONDS)
+                async with Daemon(there.api) as legacy:
+                    await legacy.greet()
+                    await legacy.publish(MARKET, legacy_json(answer := offer()))
+                    heard = await anext(offers)
+                assert heard == verify_message(answer)
+                assert heard.signer == ROBOT.address
+                assert order.signature
