@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from schemas.loading import on_demand
+
 if TYPE_CHECKING:
     from mesh.agent import Agent, Contract, JobFailed, Phase
     from mesh.settings import Settings
@@ -17,17 +19,12 @@ _HOMES = {
     "Phase": "mesh.agent",
     "Settings": "mesh.settings",
 }
+_load = on_demand(__name__, _HOMES)
 
 
 def __getattr__(name: str) -> Any:
     """Load what is asked for: an edge agent must not pay for the parts that it does not use."""
-    if name == "__version__":
-        return _version()
-    if name not in _HOMES:
-        raise AttributeError(f"module 'mesh' has no attribute {name!r}")
-    from importlib import import_module
-
-    return getattr(import_module(_HOMES[name]), name)
+    return _version() if name == "__version__" else _load(name)
 
 
 def _version() -> str:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
+
+from schemas.loading import on_demand
 
 if TYPE_CHECKING:
     from schemas.address import (
@@ -174,17 +176,8 @@ _HOMES: Final = {
 }
 """The module of each name, which is loaded when the name is asked for."""
 
-
-def __getattr__(name: str) -> Any:
-    """Load what is asked for: a device's agent speaks of keys and payloads, and must not pay for signatures."""
-    if name not in _HOMES:
-        raise AttributeError(f"module 'schemas' has no attribute {name!r}")
-    from importlib import import_module
-
-    value = getattr(import_module(_HOMES[name]), name)
-    globals()[name] = value
-    return value
-
+# A device's agent speaks of keys and payloads, and must not pay for signatures.
+__getattr__ = on_demand(__name__, _HOMES)
 
 __all__ = [
     "CHUNK_SIZE",

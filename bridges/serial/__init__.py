@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
+
+from schemas.loading import on_demand
 
 if TYPE_CHECKING:
     from bridges.serial.boards import BoardFailed, PinChange, SimulatedBoard
@@ -15,34 +17,27 @@ if TYPE_CHECKING:
     from bridges.serial.rosserial import RosserialDialect
 
 _HOMES: Final = {
-    "Answer": "device",
-    "BoardFailed": "boards",
-    "CallFailed": "errors",
-    "CallInDoubt": "errors",
-    "CallNotDone": "errors",
-    "CallRefused": "errors",
-    "CallingDialect": "calling",
-    "Device": "device",
-    "DeviceId": "edge",
-    "Edge": "edge",
-    "Ending": "dialect",
-    "LineError": "errors",
-    "PinChange": "boards",
-    "PortMissing": "errors",
-    "PortName": "ports",
-    "RosserialDialect": "rosserial",
-    "SimulatedBoard": "boards",
+    "Answer": "bridges.serial.device",
+    "BoardFailed": "bridges.serial.boards",
+    "CallFailed": "bridges.serial.errors",
+    "CallInDoubt": "bridges.serial.errors",
+    "CallNotDone": "bridges.serial.errors",
+    "CallRefused": "bridges.serial.errors",
+    "CallingDialect": "bridges.serial.calling",
+    "Device": "bridges.serial.device",
+    "DeviceId": "bridges.serial.edge",
+    "Edge": "bridges.serial.edge",
+    "Ending": "bridges.serial.dialect",
+    "LineError": "bridges.serial.errors",
+    "PinChange": "bridges.serial.boards",
+    "PortMissing": "bridges.serial.errors",
+    "PortName": "bridges.serial.ports",
+    "RosserialDialect": "bridges.serial.rosserial",
+    "SimulatedBoard": "bridges.serial.boards",
 }
 
-
-def __getattr__(name: str) -> Any:
-    """Load what is asked for: an edge agent runs in a few tens of megabytes and pays only for what it uses."""
-    if name not in _HOMES:
-        raise AttributeError(f"module 'bridges.serial' has no attribute {name!r}")
-    from importlib import import_module
-
-    return getattr(import_module(f"bridges.serial.{_HOMES[name]}"), name)
-
+# An edge agent runs in a few tens of megabytes and pays only for what it uses.
+__getattr__ = on_demand(__name__, _HOMES)
 
 __all__ = [
     "Answer",

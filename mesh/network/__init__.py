@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
+
+from schemas.loading import on_demand
 
 if TYPE_CHECKING:
     from mesh.network.addressing import message_key, verified_key
@@ -17,33 +19,26 @@ if TYPE_CHECKING:
     from mesh.network.verification import Door, Statistics
 
 _HOMES: Final = {
-    "Channel": "channel",
-    "Door": "verification",
-    "Endpoints": "endpoints",
-    "Network": "session",
-    "NetworkChange": "session",
-    "NotAdmitted": "errors",
-    "Pump": "pump",
-    "ServiceFailed": "services",
-    "Services": "services",
-    "Statistics": "verification",
-    "Subscription": "subscription",
-    "Tls": "tls",
-    "call": "services",
-    "free_endpoint": "endpoints",
-    "message_key": "addressing",
-    "verified_key": "addressing",
+    "Channel": "mesh.network.channel",
+    "Door": "mesh.network.verification",
+    "Endpoints": "mesh.network.endpoints",
+    "Network": "mesh.network.session",
+    "NetworkChange": "mesh.network.session",
+    "NotAdmitted": "mesh.network.errors",
+    "Pump": "mesh.network.pump",
+    "ServiceFailed": "mesh.network.services",
+    "Services": "mesh.network.services",
+    "Statistics": "mesh.network.verification",
+    "Subscription": "mesh.network.subscription",
+    "Tls": "mesh.network.tls",
+    "call": "mesh.network.services",
+    "free_endpoint": "mesh.network.endpoints",
+    "message_key": "mesh.network.addressing",
+    "verified_key": "mesh.network.addressing",
 }
 
-
-def __getattr__(name: str) -> Any:
-    """Load what is asked for: an edge agent opens a session and needs no event loop for it."""
-    if name not in _HOMES:
-        raise AttributeError(f"module 'mesh.network' has no attribute {name!r}")
-    from importlib import import_module
-
-    return getattr(import_module(f"mesh.network.{_HOMES[name]}"), name)
-
+# An edge agent opens a session and needs no event loop for it.
+__getattr__ = on_demand(__name__, _HOMES)
 
 __all__ = [
     "Channel",
