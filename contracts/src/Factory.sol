@@ -21,9 +21,10 @@ import {XRT} from "./XRT.sol";
 contract Factory is RobonomicsErrors, LighthouseNames, Emission, ILighthouseFactory, ILiabilityFactory {
     using Orders for Order;
 
-    /// Tell the two kinds of clones apart.
+    /// Tells liabilities from lighthouses.
     bytes32 private constant LIABILITY = bytes32(uint256(1));
-    bytes32 private constant LIGHTHOUSE = bytes32(uint256(2));
+    /// Tells lighthouses from liabilities, and from those of other chains: orders name their lighthouse, and no chain.
+    bytes32 private immutable _lighthouseKind = keccak256(abi.encode(2, block.chainid));
 
     /// @notice Blocks after a liability's creation until its promisee may have the money back.
     uint256 public immutable refundDelay;
@@ -34,8 +35,11 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission, ILighthouseFact
 
     /// @notice Generation 5: the nonce that an account's next order is signed with.
     mapping(address account => uint256) public nonceOf;
-    /// @notice Generation 3: whether an order has made its liability. Generation 5 is guarded by nonces: always false.
-    mapping(bytes32 hash => bool) public isHashConsumed;
+    /// Generation 3: who used a hash first. Anybody can sign the terms of another's order, nonce and all, and must not
+    /// use up the other's order by that.
+    mapping(bytes32 hash => address signer) private _firstUser;
+    /// The others, by the hash of both.
+    mapping(bytes32 hashAndSigner => bool) private _isUsed;
 
     event NewLiability(address indexed liability);
     event NewLighthouse(address indexed lighthouse, string name);
@@ -63,7 +67,7 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission, ILighthouseFact
         if (timeoutInBlocks == 0 || timeoutInBlocks > type(uint32).max) revert InvalidTimeout(timeoutInBlocks);
         _requireFree(name);
         bytes memory arguments = abi.encodePacked(uint128(minimalStake), uint32(timeoutInBlocks), name);
-        lighthouse = Clone.create(lighthouseCode, LIGHTHOUSE, arguments);
+        lighthouse = Clone.create(lighthouseCode, _lighthouseKind, arguments);
         _give(name, lighthouse);
         // slither-disable-next-line reentrancy-events (the registry is chosen by who deploys)
         emit NewLighthouse(lighthouse, name);
@@ -137,13 +141,24 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission, ILighthouseFact
     /// @notice Whether this factory made the lighthouse.
     function isLighthouse(address account) public view returns (bool isClone) {
         // slither-disable-next-line unused-return (the clone's arguments are not asked for)
-        (isClone,) = Clone.read(account, LIGHTHOUSE);
+        (isClone,) = Clone.read(account, _lighthouseKind);
     }
 
     /// @notice Whether this factory made the liability.
     function isLiability(address account) public view returns (bool isClone) {
         // slither-disable-next-line unused-return (the clone's arguments are not asked for)
         (isClone,) = Clone.read(account, LIABILITY);
+    }
+
+    /// @notice Generation 3: whether an order with this hash has made its liability, whoever has signed it. Generation 5
+    /// is guarded by nonces: always false.
+    function isHashConsumed(bytes32 hash) external view returns (bool) {
+        return _firstUser[hash] != address(0);
+    }
+
+    /// @notice Generation 3: whether the order of `signer` with this hash has made its liability.
+    function isOrderUsed(bytes32 hash, address signer) external view returns (bool) {
+        return _firstUser[hash] == signer ? signer != address(0) : _isUsed[keccak256(abi.encode(hash, signer))];
     }
 
     /// @notice Gas that is counted for a liability: nothing before its end.
@@ -191,10 +206,21 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission, ILighthouseFact
         } else {
             hash = order.hashThird();
             signer = order.recover(hash);
-            if (isHashConsumed[hash]) revert OrderUsed(hash);
-            isHashConsumed[hash] = true;
+            _useHash(hash, signer);
         }
         emit HashConsumed(hash);
+    }
+
+    /// The first signer of a hash costs one slot, as a mere flag would.
+    function _useHash(bytes32 hash, address signer) private {
+        address first = _firstUser[hash];
+        if (first == address(0)) {
+            _firstUser[hash] = signer;
+            return;
+        }
+        bytes32 key = keccak256(abi.encode(hash, signer));
+        if (first == signer || _isUsed[key]) revert OrderUsed(hash);
+        _isUsed[key] = true;
     }
 
     /// Takes what the liability costs into the factory and pays the provider's fee. Each gives what it has signed for,

@@ -110,38 +110,55 @@ abstract contract Turns is LighthouseErrors {
         _store(turn);
     }
 
-    /// The last provider fills the gap. Where it was the gap's turn, or the last one's, it is now the turn of who is
-    /// there.
+    /// Nobody jumps the queue when a provider leaves. In his own turn it passes to the next one, and the silence so far
+    /// still counts: who leaves and comes back can't keep the others waiting.
     function _leave(address provider) internal {
         uint256 index = indexOf[provider];
         uint256 last = _providers.length;
-        address moved = _providers[last - 1];
-        _providers[index - 1] = moved;
-        indexOf[moved] = index;
+        for (uint256 place = index; place < last; ++place) _put(_providers[place], place);
         _providers.pop();
         delete indexOf[provider];
         delete stakes[provider];
         emit Offline(provider);
-        Turn memory turn = _load();
-        // slither-disable-next-line incorrect-equality (places in a list)
-        if (turn.marker == index) {
-            _restart(index < last ? index : 1);
-        // slither-disable-next-line incorrect-equality (places in a list)
-        } else if (turn.marker == last) {
-            turn.marker = index;
-            _store(turn);
+        if (last == 1) {
+            _turn = 0;
+            return;
         }
+        Turn memory turn = _load();
+        if (turn.marker < index) return;
+        // slither-disable-next-line incorrect-equality (places in a list)
+        if (turn.marker == index) _begin(turn, index < last ? index : 1);
+        else --turn.marker;
+        _store(turn);
     }
 
+    /// Who comes waits until each of the others has had a turn: his place is the one before that whose turn it is.
     function _enter(address provider) private {
+        Turn memory turn = _load();
+        uint256 last = _providers.length + 1;
+        uint256 index = turn.marker > 1 ? turn.marker : last;
         _providers.push(provider);
-        indexOf[provider] = _providers.length;
+        for (uint256 place = last; place > index; --place) _put(_providers[place - 2], place);
+        _put(provider, index);
         emit Online(provider);
-        if (_providers.length == 1) _restart(1);
+        if (last == 1) {
+            _begin(turn, 1);
+            turn.keepAliveBlock = block.number;
+        } else if (index < last) {
+            ++turn.marker;
+        }
+        _store(turn);
+    }
+
+    /// The provider's place is now `index`, counted from 1.
+    function _put(address provider, uint256 index) private {
+        _providers[index - 1] = provider;
+        indexOf[provider] = index;
     }
 
     function _take(Turn memory turn) private {
         uint256 index = indexOf[msg.sender];
+        // slither-disable-next-line incorrect-equality (0 is no place in the list)
         if (index == 0) revert NotAProvider(msg.sender);
         if (!_mayTake(turn, index)) revert NotYourTurn(turn.provider, turn.quota);
         _begin(turn, index);
@@ -161,17 +178,6 @@ abstract contract Turns is LighthouseErrors {
         turn.provider = _providers[index - 1];
         turn.quota = quotaOf(turn.provider);
         emit Current(turn.provider, turn.quota);
-    }
-
-    function _restart(uint256 index) private {
-        if (_providers.length == 0) {
-            _turn = 0;
-            return;
-        }
-        Turn memory turn = _load();
-        _begin(turn, index);
-        turn.keepAliveBlock = block.number;
-        _store(turn);
     }
 
     function _load() private view returns (Turn memory) {

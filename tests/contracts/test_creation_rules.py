@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from eth_abi.abi import encode
 from msgspec.structs import replace
 
-from schemas import ZERO_ADDRESS, message_hash, order_abi
+from schemas import ZERO_ADDRESS, keccak256, message_hash, order_abi
 from tests.contracts.market import FUNDS, OTHER
 from tests.contracts.suite import XRT
 
@@ -97,6 +98,37 @@ def test_used_hashes_are_kept_for_generation_3(market: Market) -> None:
     for order in (demand, offer):
         known = market.suite.factory.functions.isHashConsumed(message_hash(order)).call()
         assert known == (market.generation == 3)
+
+
+def test_a_stranger_does_not_use_up_anothers_order(third: Market) -> None:
+    """Who signs another's terms himself, nonce and all, and an offer to himself, uses an order of his own."""
+    victim, offer = third.pair()
+    copied = third.outsider.signer.sign(replace(victim, signature=""))
+    assert message_hash(copied) == message_hash(victim)
+    own = third.creation(copied, third.offer(by=third.outsider))
+    third.suite.send(own, third.provider)
+    used = third.suite.factory.functions.isOrderUsed
+    assert [used(message_hash(victim), person.address).call() for person in (third.outsider, third.promisee)] == [
+        True,
+        False,
+    ]
+    third.suite.send(third.creation(victim, offer), third.provider)
+    assert used(message_hash(victim), third.promisee.address).call()
+    for order, signer in ((copied, third.outsider), (victim, third.promisee)):
+        again = third.creation(order, third.offer())
+        assert third.refusal(again) == ("OrderUsed", message_hash(order)), signer
+    assert not used(message_hash(victim), third.promisor.address).call()
+    assert not used(bytes(32), ZERO_ADDRESS).call()
+
+
+def test_lighthouses_of_two_chains_never_have_one_address(market: Market) -> None:
+    """Orders name no chain, but their lighthouse, whose address has the number of its chain in it."""
+    suite, address = market.suite, market.lighthouse.address
+    code = bytes(suite.web3.eth.get_code(address))
+    creation = bytes.fromhex(f"61{len(code):04x}3d81600a3d39f3") + code
+    made_by = bytes.fromhex(suite.factory.address[2:])
+    salt = keccak256(encode(["uint256", "uint256"], [2, suite.web3.eth.chain_id]))
+    assert keccak256(b"\xff" + made_by + salt + keccak256(creation))[12:] == bytes.fromhex(address[2:])
 
 
 def test_generation_5_counts_nonces(market: Market) -> None:

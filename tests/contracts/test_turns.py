@@ -181,6 +181,60 @@ def test_a_lighthouse_goes_on_when_a_provider_leaves(market: Market, leaver: int
     assert set(seen) == set(people)
 
 
+@pytest.mark.parametrize("passed", [0, 1, 2])
+def test_who_comes_waits_until_each_of_the_others_has_had_a_turn(market: Market, passed: int) -> None:
+    turns = Round(market, [1, 1, 1])
+    people = list(turns.providers[:3])
+    for person in people[:passed]:
+        turns.send(person)
+    newcomer = turns.providers[3]
+    turns.suite.join(turns.lighthouse, newcomer, XRT)
+    people = people[passed:] + people[:passed] + [newcomer]
+    for person in people * 2:
+        assert turns.may_send(*people) == [person is other for other in people]
+        turns.send(person)
+
+
+@pytest.mark.parametrize("leaver", [0, 1, 2, 3])
+@pytest.mark.parametrize("passed", [0, 1, 2, 3])
+def test_nobody_jumps_the_queue_when_a_provider_leaves(market: Market, leaver: int, passed: int) -> None:
+    turns = Round(market, [1, 1, 1, 1])
+    people = list(turns.providers[:4])
+    for person in people[:passed]:
+        turns.send(person)
+    gone = people[leaver]
+    turns.suite.send(turns.lighthouse.functions.withdraw(XRT), gone)
+    people = [person for person in people[passed:] + people[:passed] if person is not gone]
+    for person in people:
+        assert turns.read("current") == person.address
+        turns.send(person)
+
+
+def test_leaving_in_ones_turn_is_no_sign_of_life(market: Market) -> None:
+    turns = Round(market, [1, 1, 1])
+    first, second, third = turns.providers[:3]
+    alive = turns.read("keepAliveBlock")
+    turns.suite.chain.mine(TIMEOUT)
+    turns.suite.send(turns.lighthouse.functions.withdraw(XRT), first)
+    assert (turns.read("current"), turns.read("keepAliveBlock")) == (second.address, alive)
+    assert turns.may_send(second, third) == [True, True]
+
+
+@pytest.mark.parametrize("working", [False, True], ids=["silent", "working"])
+def test_two_who_leave_and_come_back_do_not_keep_another_from_its_turn(market: Market, working: bool) -> None:
+    turns = Round(market, [1, 1, 1])
+    one, honest, two = turns.providers[:3]
+    for leaver in [one, two] * 3:
+        if turns.may_send(honest) == [True]:
+            return
+        if working and turns.may_send(leaver) == [True]:
+            turns.send(leaver)
+        turns.suite.chain.mine(TIMEOUT - 5)
+        turns.suite.send(turns.lighthouse.functions.withdraw(XRT), leaver)
+        turns.suite.join(turns.lighthouse, leaver, XRT)
+    raise AssertionError("the honest provider never had a turn")
+
+
 def test_a_provider_can_come_back(market: Market) -> None:
     turns = Round(market, [1, 1])
     first = turns.providers[0]
