@@ -132,7 +132,7 @@ async def over_bridge(
         person = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,))))
         channel = await stack.enter_async_context(Channel(person.session, LIGHTHOUSE, address=ADDRESS))
         journal = stack.enter_context(Journal(folder / "journal.sqlite"))
-        bridge = ChannelBridge(network, here, Gate(LIGHTHOUSE, address=ADDRESS), journal, lighthouse=LIGHTHOUSE)
+        bridge = ChannelBridge(network, here, Gate(LIGHTHOUSE, address=lambda: ADDRESS), journal, lighthouse=LIGHTHOUSE)
         await stack.enter_async_context(bridge)
         tasks = await stack.enter_async_context(Background())
         tasks.start(listen(there, LIGHTHOUSE, ear, ready), "listens")

@@ -9,6 +9,7 @@ from bridges.ipfs.errors import (
     IpfsError,
     JournalFailed,
     NoPeers,
+    Overtaken,
     PubSubDisabled,
 )
 from bridges.ipfs.gate import Gate
@@ -27,6 +28,7 @@ __all__ = [
     "Journal",
     "JournalFailed",
     "NoPeers",
+    "Overtaken",
     "PubSubDisabled",
     "status_key",
 ]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import zenoh
 
-from bridges.ipfs.errors import DaemonRefused, DaemonUnreachable, NoPeers
+from bridges.ipfs.errors import DaemonRefused, DaemonUnreachable, NoPeers, Overtaken
 from bridges.ipfs.memory import Side
 from bridges.ipfs.status import Rate
 from mesh.network import NetworkChange
@@ -69,7 +69,7 @@ class ToIpfs:
             try:
                 await self._publish(waiting)
                 attempts = 0
-            except (NoPeers, DaemonUnreachable) as error:
+            except (NoPeers, Overtaken, DaemonUnreachable) as error:
                 await self._pause(error)
             except (DaemonRefused, ValueError) as error:
                 attempts += 1
@@ -92,7 +92,7 @@ class ToIpfs:
         self._told(Side.IPFS, waiting.passenger)
 
     async def _pause(self, error: Exception) -> None:
-        if not isinstance(error, NoPeers):  # which is no fault of anybody's
+        if not isinstance(error, NoPeers | Overtaken):  # which are no fault of anybody's
             self._link.error = str(error)
         await asyncio.sleep(PAUSE)
 

@@ -16,6 +16,7 @@ from bridges.ipfs.carrying import MARK, ToIpfs, ToMesh
 from bridges.ipfs.link import Link
 from bridges.ipfs.memory import Side
 from bridges.ipfs.presence import Presence
+from bridges.ipfs.report import figures_of, news
 from bridges.ipfs.status import BridgeStatus, status_key
 from bridges.ipfs.traffic import LIMIT, Fate, Traffic
 from mesh.errors import ClosedError, InvalidMessage
@@ -32,11 +33,14 @@ if TYPE_CHECKING:
     from bridges.ipfs.gate import Gate, Passenger
     from bridges.ipfs.journal import Journal
     from mesh.network import Network
+    from schemas.status import ContentFigures
 
 log = logging.getLogger(__name__)
 
 LOOK: Final = 1.0
 """Seconds between two looks at what was left to other bridges."""
+REPORT: Final = 60.0
+"""Seconds between two lines of the log with what was done meanwhile."""
 LOOKING_UP: Final = 256
 """Messages that wait for their ENS names at most."""
 _NAMED: Final = re.compile(rb"\.(?:eth|sid|test)\"", re.IGNORECASE)
@@ -56,9 +60,14 @@ class ChannelBridge:
 
     `gate` checks what passes for `lighthouse` (ENS name); `journal` is this bridge's own memory; `neighbours` are swarm
     addresses to keep the daemon connected to; `address` is the bridge's name on the mesh, by default a new one;
-    `carried` is told of each message that this bridge has put on a side.
+    `carried` is told of each message that this bridge has put on a side; `content` gives the figures of what this one
+    does with content. What was done is logged every `report` seconds in which something was.
 
     Network, daemon and journal stay the caller's to close.
+
+    A message that was accepted is carried, and once: it waits in the journal until the daemon has taken it. When the
+    daemon dies in the middle of a call nobody can know whether that one message went out, and it is published again;
+    what a daemon took in its very last moment may be lost with it, until its sender sends it again.
     """
 
     def __init__(
@@ -73,6 +82,8 @@ class ChannelBridge:
         address: str | None = None,
         limit: int = LIMIT,
         carried: Callable[[Side, Passenger], None] = lambda side, passenger: None,
+        content: Callable[[], ContentFigures | None] = lambda: None,
+        report: float = REPORT,
     ) -> None:
         self.lighthouse: Final = lighthouse.lower()
         self.address: Final = (address or f"0x{secrets.token_hex(20)}").lower()
@@ -84,7 +95,10 @@ class ChannelBridge:
         self.traffic: Final = Traffic(time.monotonic, journal, limit=limit)
         self._to_ipfs = ToIpfs(self.link, self.traffic, carried)
         self._to_mesh = ToMesh(network, self.traffic, carried)
-        self._looking_up: set[asyncio.Task[None]] = set()
+        self._content = content
+        self._report_interval = report
+        self._began = time.monotonic()
+        self._looking_up = asyncio.Semaphore(LOOKING_UP)
         self._stack: AsyncExitStack | None = None
 
     async def __aenter__(self) -> Self:
@@ -112,8 +126,6 @@ class ChannelBridge:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         stack, self._stack = self._stack, None
-        for task in self._looking_up:
-            task.cancel()
         if stack is not None:
             await stack.aclose()
 
@@ -122,11 +134,13 @@ class ChannelBridge:
         if self._stack is None:
             raise ClosedError("the bridge is not open", hint="use it inside `async with`")
         async with asyncio.TaskGroup() as tasks:
+            self._tasks = tasks
             tasks.create_task(self._take_from_mesh(), name=f"mesh → bridge {self.lighthouse}")
             tasks.create_task(self.link.run(self._take_from_ipfs, self._link_changed), name=f"IPFS → {self.lighthouse}")
             tasks.create_task(self._to_ipfs.run(), name=f"bridge → IPFS {self.lighthouse}")
             tasks.create_task(self._to_mesh.run(), name=f"bridge → mesh {self.lighthouse}")
             tasks.create_task(self._look_after_left(), name=f"left over {self.lighthouse}")
+            tasks.create_task(self._report(), name=f"report of {self.lighthouse}")
 
     def status(self) -> BridgeStatus:
         """How it is now."""
@@ -145,6 +159,8 @@ class ChannelBridge:
             last_error=self.link.error,
             to_ipfs=self.traffic.way(Side.IPFS, per_second=self._to_ipfs.rate.per_second()),
             to_mesh=self.traffic.way(Side.MESH, per_second=self._to_mesh.rate.per_second()),
+            content=self._content(),
+            uptime=round(time.monotonic() - self._began, 1),
         )
 
     def _state(self) -> str:
@@ -160,7 +176,6 @@ class ChannelBridge:
             if (lost := self._pump.dropped - dropped) > 0:
                 dropped += lost
                 self.traffic.dropped[Side.IPFS]["unseen"] += lost
-                log.warning("%s: %d messages of the mesh came too fast and are lost", self.lighthouse, lost)
             await self._take(sample.payload, Side.MESH, key=sample.key, by_bridge=sample.marked)
 
     async def _take_from_ipfs(self, event: Event | None) -> None:
@@ -175,12 +190,13 @@ class ChannelBridge:
         self.traffic.counts[side.other]["received"] += 1
         if not _NAMED.search(payload):
             await self._pass(payload, side, key=key, echo=echo, by_bridge=by_bridge)
-        elif len(self._looking_up) >= LOOKING_UP:
+        elif self._looking_up.locked():
             self._refuse(side, InvalidMessage("name", "too many messages wait for their names"))
         else:  # others overtake a message whose names are looked up
-            task = asyncio.create_task(self._pass(payload, side, key=key, echo=echo, by_bridge=by_bridge))
-            self._looking_up.add(task)
-            task.add_done_callback(self._looking_up.discard)
+            await self._looking_up.acquire()
+            looking_up = self._pass(payload, side, key=key, echo=echo, by_bridge=by_bridge)
+            task = self._tasks.create_task(looking_up, name="names of a message")
+            task.add_done_callback(lambda _: self._looking_up.release())
 
     async def _pass(self, payload: bytes, side: Side, *, key: str | None, echo: bool, by_bridge: bool) -> None:
         try:
@@ -188,11 +204,8 @@ class ChannelBridge:
         except InvalidMessage as error:
             self._refuse(side, error)
             return
-        fate = self.traffic.seen(passenger, side, echo=echo, by_bridge=by_bridge)
-        if fate is Fate.ACCEPTED:
+        if self.traffic.seen(passenger, side, echo=echo, by_bridge=by_bridge) is Fate.ACCEPTED:
             self._wake()
-        elif fate is Fate.NO_ROOM:
-            log.warning("%s: no room for %s towards %s", self.lighthouse, passenger.key, side.other.value)
 
     def _refuse(self, side: Side, error: InvalidMessage) -> None:
         self.traffic.invalid[side.other][error.reason] += 1
@@ -208,6 +221,18 @@ class ChannelBridge:
             if (count := self.traffic.look_after_left()) > 0:
                 log.warning("%s: %d messages that other bridges did not carry", self.lighthouse, count)
                 self._wake()
+
+    async def _report(self) -> None:
+        """Say what was done, not each message: a flood must not become one of the log. Losses are warnings."""
+        before: dict[str, int] = {}
+        while True:
+            await asyncio.sleep(self._report_interval)
+            self._journal.tidy()
+            now = figures_of(status := self.status())
+            if said := news(before, now):
+                level = logging.WARNING if ".dropped." in said else logging.INFO
+                log.log(level, "%s: state=%s carries=%s %s", self.lighthouse, status.state, status.carries, said)
+            before = now
 
     def _link_changed(self) -> None:
         if not self.link.up:

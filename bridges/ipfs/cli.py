@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from contextlib import AsyncExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import click
 import msgspec
 
 from mesh.cli.options import with_settings
-from mesh.errors import ConfigurationError
+from mesh.errors import ConfigurationError, NetworkUnavailable
 from mesh.running import run_until_stopped
 from mesh.settings import CHAIN_SETTINGS, NETWORK_SETTINGS
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from mesh.chain import Chain
+    from mesh.network import Network
     from mesh.settings import Settings
 
 log = logging.getLogger(__name__)
+
+AGAIN: Final = 1.0
+"""Seconds between two attempts to reach a router, each of which lasts as long as the settings say."""
 
 
 @click.command("ipfs")
@@ -42,9 +49,9 @@ log = logging.getLogger(__name__)
 def command(settings: Settings, api: str | None, lighthouses: tuple[str, ...]) -> None:
     """Carry messages and content between the mesh and the legacy network on IPFS. Ctrl-C ends it.
 
-    The daemon needs PubSub; it may come later, and come back. Several bridges may serve one lighthouse, each with a
-    --data-dir of its own: one carries, the others stand by. Without a node of the chain (--web3-http-provider "") no
-    ENS name in a message is looked up, and deadlines are not checked.
+    The daemon needs PubSub; it, the router and the node of the chain may come later, and come back. Several bridges may
+    serve one lighthouse, each with a --data-dir of its own: one carries, the others stand by. Until the node is there,
+    or without one (--web3-http-provider ""), no ENS name in a message is looked up, and deadlines are not checked.
     """
     if api:
         settings = msgspec.structs.replace(settings, ipfs_http_provider=api)
@@ -72,13 +79,11 @@ async def _serve(settings: Settings, lighthouses: tuple[str, ...]) -> None:
         raise ConfigurationError(
             f"the IPFS bridge needs {error.name}, which is not installed", hint="pip install 'aira-mesh[ipfs]'"
         ) from error
-    from mesh.agent.parts import endpoints_of
-    from mesh.network import Network
 
     base_url(settings.ipfs_http_provider)  # before anything is waited for
     async with AsyncExitStack() as stack:
-        chain = await _chain(settings, stack)
-        network = await stack.enter_async_context(Network(endpoints_of(settings)))
+        chain = _chain(settings)
+        network = await _network(settings, stack)
         bridge = await stack.enter_async_context(
             IpfsBridge(network, settings, lighthouses=lighthouses, chain=chain, address=_address(settings))
         )
@@ -87,10 +92,27 @@ async def _serve(settings: Settings, lighthouses: tuple[str, ...]) -> None:
         await bridge.run()
 
 
-async def _chain(settings: Settings, stack: AsyncExitStack) -> Chain | None:
-    """The chain, if the settings name one."""
+async def _network(settings: Settings, stack: AsyncExitStack) -> Network:
+    """The session, as soon as there is a router."""
+    from mesh.agent.parts import endpoints_of
+    from mesh.network import Network
+
+    said = False
+    while True:
+        try:
+            return await stack.enter_async_context(Network(endpoints_of(settings)))
+        except NetworkUnavailable as error:
+            if not said:
+                log.warning("the bridge waits for a router: %s", error)
+            said = True
+            await asyncio.sleep(AGAIN)
+
+
+def _chain(settings: Settings) -> Callable[[], Chain] | None:
+    """What makes a client of the chain, if the settings name one. Raises `ConfigurationError`."""
     from mesh.agent.parts import chain_of
 
     if not settings.web3_http_provider.strip() and not settings.web3_ws_provider.strip():
         return None
-    return await stack.enter_async_context(chain_of(settings, None))
+    chain_of(settings, None)  # that the settings can't be meant is told at once
+    return lambda: chain_of(settings, None)

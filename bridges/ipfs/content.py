@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING, Any, Final, Self
 
-import msgspec
 import zenoh
 
+from bridges.ipfs.adding import add_as_named
 from bridges.ipfs.errors import IpfsError
 from mesh.content import ContentUnavailable
 from mesh.content.serving import CID_SELECTOR, HOLDER
 from mesh.errors import AiraError, ClosedError, InvalidKey
 from mesh.network.crossing import call_in_loop
 from schemas import CidKey, InputError, parse_block, parse_key
+from schemas.status import ContentFigures
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine
@@ -35,27 +36,11 @@ ANSWERS: Final = 32
 TRANSFERS: Final = 8
 """Files on their way at once because a message names them; the others wait."""
 WAITING: Final = 4096
-"""Files that wait for that; of more it is only logged that they were passed over."""
+"""Files that wait for that; more are passed over, and count as failed."""
 FRUITLESS: Final = 10.0
 """Seconds for which a block that IPFS did not give is not asked for again."""
 REMEMBERED: Final = 65_536
 """Blocks of which it is remembered that they are parts, or that IPFS did not give them."""
-
-
-class ContentFigures(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
-    """What was done so far."""
-
-    fetched: int
-    """Files fetched from IPFS and kept."""
-    answered: int
-    """Blocks of IPFS given to who asked for them in the mesh."""
-    added: int
-    """Files of the mesh added to IPFS."""
-    renamed: int
-    """Files to which the daemon gave another name than ours: they were made with other settings."""
-    pinned: int
-    failed: int
-    """Files that could be had from neither side, or not added."""
 
 
 class ContentBridge:
@@ -95,7 +80,7 @@ class ContentBridge:
         self._transfers = asyncio.Semaphore(TRANSFERS)
         self._adding: set[str] = set()
         self._open = False
-        self._fetched = self._answered = self._added = self._renamed = self._pinned = self._failed = 0
+        self._counts = Counter[str]()
 
     async def __aenter__(self) -> Self:
         if self._open:
@@ -141,20 +126,18 @@ class ContentBridge:
             path = await self._exchange.fetch(cid, size_limit=self._size_limit, timeout=self._timeout)
         finally:
             self._adding.discard(cid)
-        name = await self._daemon.add(path, timeout=self._timeout)
-        if name == cid:
-            self._added += 1
-        else:
-            self._renamed += 1
-            log.warning(
-                "IPFS calls %s %s: it was made with other settings, and is not found there by its name", cid, name
-            )
+        try:
+            size = (await asyncio.to_thread(path.stat)).st_size
+            as_file = await add_as_named(self._daemon, self._store, path, cid, timeout=self._timeout)
+        except OSError as error:  # the store had to make room meanwhile
+            raise ContentUnavailable(cid, f"it can't be read: {error.strerror}") from error
+        self._counts.update(added=1, added_bytes=size, by_blocks=0 if as_file else 1)
         for provider in self._providers:
             try:
-                await provider.pin(name, timeout=self._timeout)
-                self._pinned += 1
+                await provider.pin(cid, timeout=self._timeout)
+                self._counts["pinned"] += 1
             except IpfsError as error:
-                log.warning("%s is not pinned: %s", name, error)
+                log.warning("%s is not pinned: %s", cid, error)
 
     def fetch_soon(self, cid: str) -> None:
         """As `fetch`, without waiting; what fails is logged and counted."""
@@ -166,20 +149,24 @@ class ContentBridge:
 
     def figures(self) -> ContentFigures:
         """What was done so far."""
+        counts = self._counts
         return ContentFigures(
-            fetched=self._fetched,
-            answered=self._answered,
-            added=self._added,
-            renamed=self._renamed,
-            pinned=self._pinned,
-            failed=self._failed,
+            fetched=counts["fetched"],
+            fetched_bytes=self._sources.bytes,
+            lies=self._sources.lies.total(),
+            answered=counts["answered"],
+            added=counts["added"],
+            added_bytes=counts["added_bytes"],
+            by_blocks=counts["by_blocks"],
+            pinned=counts["pinned"],
+            failed=counts["failed"],
         )
 
     async def _fetch(self, cid: str) -> Path:
         path = await self._sources.fetch(
             self._store, cid, size_limit=self._size_limit, timeout=self._timeout, patience=PATIENCE
         )
-        self._fetched += 1
+        self._counts["fetched"] += 1
         return path
 
     async def _try_to_fetch(self, cid: str) -> None:
@@ -187,7 +174,7 @@ class ContentBridge:
             async with self._transfers:
                 await self.fetch(cid)
         except AiraError as error:
-            self._failed += 1
+            self._counts["failed"] += 1
             log.info("not fetched from IPFS: %s", error)
 
     async def _try_to_add(self, cid: str) -> None:
@@ -195,12 +182,13 @@ class ContentBridge:
             async with self._transfers:
                 await self.add(cid)
         except AiraError as error:
-            self._failed += 1
+            self._counts["failed"] += 1
             log.warning("not added to IPFS: %s", error)
 
     def _start(self, work: Coroutine[Any, Any, None], name: str) -> None:
         if not self._open or len(self._tasks) >= WAITING:
-            log.warning("too much at once: no %s", name)
+            self._counts["failed"] += 1
+            log.debug("too much at once: no %s", name)
             work.close()
             return
         task = asyncio.create_task(work, name=name)
@@ -230,7 +218,7 @@ class ContentBridge:
                     _remember(self._fruitless, cid, asyncio.get_running_loop().time())
                     return
                 query.reply(query.key_expr, block, encoding=zenoh.Encoding.APPLICATION_OCTET_STREAM)
-                self._answered += 1
+                self._counts["answered"] += 1
             self._keep(cid, block)
         finally:
             self._answering -= 1

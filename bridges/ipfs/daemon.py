@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Final, Self, TypeVar
 
@@ -11,7 +12,7 @@ import msgspec
 
 from bridges.ipfs.addresses import base_url, without_credentials
 from bridges.ipfs.dialects import Dialect, Event, Multibase, Version, dialect_of
-from bridges.ipfs.errors import AccessDenied, DaemonRefused, DaemonUnreachable, NoPeers, PubSubDisabled
+from bridges.ipfs.errors import AccessDenied, DaemonRefused, DaemonUnreachable, NoPeers, Overtaken, PubSubDisabled
 from bridges.ipfs.lines import lines_of
 from mesh.errors import ClosedError
 
@@ -25,13 +26,20 @@ T = TypeVar("T")
 CALL_TIMEOUT: Final = 15.0
 """Seconds for a call that only asks or tells."""
 CONNECT_TIMEOUT: Final = 5.0
-SOON: Final = aiohttp.ClientTimeout(total=CALL_TIMEOUT, connect=CONNECT_TIMEOUT)
 LONGEST_LINE: Final = 2 * 1024 * 1024
 """Bytes of the longest line of a subscription: PubSub's own limit of 1 MiB, in base64 and with its envelope."""
 LONGEST_ANSWER: Final = 4 * 1024 * 1024
 LONGEST_REASON: Final = 300
-SETTINGS: Final = (("cid-version", "0"), ("raw-leaves", "false"), ("chunker", "size-262144"), ("hash", "sha2-256"))
-"""How files have been chunked and named since 2015. Never left to the daemon: its own are about to change."""
+SETTINGS: Final = (
+    ("cid-version", "0"),
+    ("raw-leaves", "false"),
+    ("chunker", "size-262144"),
+    ("hash", "sha2-256"),
+    ("max-file-links", "174"),
+    ("trickle", "false"),
+)
+"""How files have been chunked and named since 2015. Never left to the daemon: its own are about to change, and a
+Kubo of 2025 and later may be configured otherwise. Daemons that do not know one of them pass it over."""
 
 
 class _Refusal(msgspec.Struct):
@@ -64,13 +72,16 @@ class _SwarmPeers(msgspec.Struct):
 class Daemon:
     """The daemon at `api` (a multiaddr or a URL): `async with Daemon(api) as daemon`, then `greet`.
 
-    `authorization` is the value of the `Authorization` header that a protected API wants. Opening asks nothing of the
-    daemon, which may come later. Every call raises `DaemonUnreachable` when it is not there or does not answer within
-    its time, `DaemonRefused` with its own words when it says no, and `ClosedError` outside `async with`.
+    `authorization` is the value of the `Authorization` header that a protected API wants; `patience` is the time in
+    seconds for a call that only asks or tells. Opening asks nothing of the daemon, which may come later. Every call
+    raises `DaemonUnreachable` when it is not there or does not answer within its time, `DaemonRefused` with its own
+    words when it says no, and `ClosedError` outside `async with`.
     """
 
-    def __init__(self, api: str, *, authorization: str = "") -> None:
+    def __init__(self, api: str, *, authorization: str = "", patience: float = CALL_TIMEOUT) -> None:
         self._base = base_url(api)
+        self._patience = patience
+        self._publishing = asyncio.Lock()
         self.api: Final = without_credentials(self._base)
         self._headers = {"Authorization": authorization} if authorization else {}
         self._http: aiohttp.ClientSession | None = None
@@ -107,13 +118,15 @@ class Daemon:
         return await self._ask("id", Identity)
 
     async def publish(self, topic: str, data: bytes) -> None:
-        """Publish `data` on `topic`.
+        """Publish `data` on `topic`, one after the other, whatever the topics.
 
         Raises `NoPeers` when the daemon says that nobody would hear it. Others do not say so: see `listeners`.
+        Raises `Overtaken` when it is to be published again: a Kubo since 0.40 numbers a message first and checks it
+        later, and takes none that is checked after one with a higher number.
         """
         more, content = self._dialect.publication(data)
         form = None if content is None else _form(content)
-        async with self._post("pubsub/pub", ("arg", self._dialect.topic(topic)), *more, body=form):
+        async with self._publishing, self._post("pubsub/pub", ("arg", self._dialect.topic(topic)), *more, body=form):
             pass
 
     @asynccontextmanager
@@ -123,9 +136,8 @@ class Daemon:
         The subscription stands when the body begins. Its iterator raises `DaemonUnreachable` when the daemon breaks it
         off; there is no other end.
         """
-        forever = aiohttp.ClientTimeout(total=None, connect=CONNECT_TIMEOUT)
         arguments = (("arg", self._dialect.topic(topic)), *self._dialect.subscription)
-        async with self._post("pubsub/sub", *arguments, timeout=forever) as answer:
+        async with self._post("pubsub/sub", *arguments, timeout=math.inf) as answer:
             yield self._events(answer)
 
     async def listeners(self, topic: str) -> list[str]:
@@ -152,16 +164,28 @@ class Daemon:
             )
         return added.name
 
+    async def put_block(self, data: bytes) -> None:
+        """Give the daemon a block of a file with a CIDv0, not pinned.
+
+        A daemon finds its blocks by their hash, so that one in which `format` has gone the way of all deprecated
+        options gives it another name, and has it under the right one too.
+        """
+        await self._ask("block/put", msgspec.Raw, ("format", "v0"), ("mhtype", "sha2-256"), body=_form(data))
+
     async def pin(self, cid: str, *, timeout: float = CALL_TIMEOUT) -> None:
         """Have the daemon fetch a file and keep it. `timeout` in seconds is for all of it."""
         await self._ask("pin/add", msgspec.Raw, ("arg", cid), timeout=timeout)
+
+    async def unpin(self, cid: str) -> None:
+        """Let the daemon forget a file that was pinned, when it next tidies up."""
+        await self._ask("pin/rm", msgspec.Raw, ("arg", cid))
 
     async def block(self, cid: str, *, limit: int, timeout: float = CALL_TIMEOUT) -> bytes:
         """A block by its name, unchecked, as the daemon has it or finds it within `timeout` seconds.
 
         Raises `DaemonRefused` when it does not find it or it is of more than `limit` bytes.
         """
-        async with self._post("block/get", ("arg", cid), timeout=aiohttp.ClientTimeout(total=timeout)) as answer:
+        async with self._post("block/get", ("arg", cid), timeout=timeout) as answer:
             return await self._read(answer, limit)
 
     async def _events(self, answer: aiohttp.ClientResponse) -> AsyncIterator[Event | None]:
@@ -184,10 +208,9 @@ class Daemon:
         kind: type[T],
         *arguments: tuple[str, str],
         body: aiohttp.FormData | None = None,
-        timeout: float = CALL_TIMEOUT,
+        timeout: float | None = None,
     ) -> T:
-        limits = aiohttp.ClientTimeout(total=timeout, connect=CONNECT_TIMEOUT)
-        async with self._post(call, *arguments, body=body, timeout=limits) as answer:
+        async with self._post(call, *arguments, body=body, timeout=timeout) as answer:
             content = await self._read(answer, LONGEST_ANSWER)
         try:
             return msgspec.json.decode(content, type=kind)
@@ -200,14 +223,21 @@ class Daemon:
         call: str,
         *arguments: tuple[str, str],
         body: aiohttp.FormData | None = None,
-        timeout: aiohttp.ClientTimeout = SOON,
+        timeout: float | None = None,
     ) -> AsyncGenerator[aiohttp.ClientResponse]:
-        """The answer to a call, if it is a good one. Errors of the body are the body's."""
+        """The answer to a call, if it is a good one. Errors of the body are the body's.
+
+        `timeout` is in seconds for all of it, by default the daemon's patience; one that is infinite is for the body
+        only: a frozen daemon still takes connections, and never begins to answer.
+        """
         if self._http is None:
             raise ClosedError("the client of the IPFS daemon is not open", hint="use it inside `async with`")
         url = f"{self._base}/api/v0/{call}"
+        total = self._patience if timeout is None else timeout
+        limits = aiohttp.ClientTimeout(total=None if total == math.inf else total, connect=CONNECT_TIMEOUT)
         try:
-            answer = await self._http.post(url, params=arguments, data=body, timeout=timeout, allow_redirects=False)
+            async with asyncio.timeout(self._patience if total == math.inf else None):
+                answer = await self._http.post(url, params=arguments, data=body, timeout=limits, allow_redirects=False)
         except (aiohttp.ClientError, TimeoutError) as error:
             raise DaemonUnreachable(self.api, f"{call}: {_words(error)}") from error
         async with answer:
@@ -236,6 +266,8 @@ class Daemon:
             return AccessDenied(self.api, status, why)
         if "InsufficientPeers" in why:
             return NoPeers(self.api, status, why)
+        if "validation ignored" in why:
+            return Overtaken(self.api, status, why)
         if "pubsub" in why.lower() and "not enabled" in why.lower():
             return PubSubDisabled(self.api, status, why)
         return DaemonRefused(self.api, status, why)

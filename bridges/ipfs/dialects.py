@@ -17,6 +17,10 @@ import msgspec
 _NUMBERS: Final = re.compile(r"(\d+)\.(\d+)")
 _MULTIBASE_SINCE_GO: Final = (0, 11)
 _MULTIBASE_SINCE_JS: Final = (0, 13)
+_KUBO_SINCE: Final = (0, 14)
+"""The first go-ipfs that is called Kubo."""
+_NOT_TOLD: Final = (9999, 0)
+"""A version that can't be read is taken for a new one."""
 
 
 class Version(msgspec.Struct, frozen=True):
@@ -28,7 +32,9 @@ class Version(msgspec.Struct, frozen=True):
     js_interface: str = msgspec.field(default="", name="interface-ipfs-core")
 
     def __str__(self) -> str:
-        return f"{'js-ipfs' if self.js_core or self.js_interface else 'go-ipfs'} {self.version or 'unknown'}"
+        if self.js_core or self.js_interface:
+            return f"js-ipfs {self.version or 'unknown'}"
+        return f"{'go-ipfs' if _numbers(self.version) < _KUBO_SINCE else 'kubo'} {self.version or 'unknown'}"
 
 
 class Event(NamedTuple):
@@ -135,7 +141,7 @@ def dialect_of(version: Version) -> Dialect:
 
 def _numbers(text: str) -> tuple[int, int]:
     found = _NUMBERS.search(text)
-    return (int(found[1]), int(found[2])) if found else _MULTIBASE_SINCE_JS
+    return (int(found[1]), int(found[2])) if found else _NOT_TOLD
 
 
 def _read(line: bytes) -> _Line:

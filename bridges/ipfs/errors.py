@@ -38,7 +38,13 @@ class AccessDenied(DaemonRefused):
     """The daemon wants other credentials."""
 
     def __init__(self, api: str, status: int, why: str) -> None:
-        super().__init__(api, status, why, hint="put the value of the Authorization header into a file and name it")
+        super().__init__(
+            api,
+            status,
+            why,
+            hint="name a file with the value of the Authorization header (--ipfs-authorization-file); it must open"
+            " version, id, pubsub, swarm, add, block and pin below /api/v0/",
+        )
 
 
 class PubSubDisabled(DaemonRefused):
@@ -52,6 +58,10 @@ class PubSubDisabled(DaemonRefused):
 
 class NoPeers(DaemonRefused):
     """Nobody whom the daemon knows listens to the topic. Keep the message and publish it later."""
+
+
+class Overtaken(DaemonRefused):
+    """The daemon has checked a later message of its own first, and so takes this one for a replay: publish it again."""
 
 
 class JournalFailed(AiraError):

@@ -45,19 +45,25 @@ class Passenger(NamedTuple):
     payload: bytes
     legacy: bytes
 
+    @property
+    def kind(self) -> str:
+        """What it is, as its key says: demand, offer, result, feedback or pending."""
+        return self.key.split("/", 3)[2]
+
 
 class Gate:
     """The checks of one lighthouse's market: `await gate.admit(payload)`.
 
-    `lighthouse` is the ENS name; `address`, where it is known, must be the orders' lighthouse; `resolver` looks up the
-    ENS names that messages may hold; `head` tells the latest block, or 0 when it isn't known (no deadline is checked).
+    `lighthouse` is the ENS name; `address` tells what must be the orders' lighthouse, None while that isn't known;
+    `resolver` looks up the ENS names that messages may hold; `head` tells the latest block, or 0 when it isn't known
+    (no deadline is checked).
     """
 
     def __init__(
         self,
         lighthouse: str,
         *,
-        address: str | None = None,
+        address: Callable[[], str | None] = lambda: None,
         resolver: Resolver | None = None,
         head: Callable[[], int] = lambda: 0,
     ) -> None:
@@ -107,7 +113,7 @@ class Gate:
     def _check_order(self, order: SignedMessage) -> None:
         if isinstance(order, Result):
             return
-        if self._address is not None and order.lighthouse != self._address:
+        if (address := self._address()) is not None and order.lighthouse != address:
             raise InvalidMessage("lighthouse", f"made for {order.lighthouse}, not for this market")
         if order.deadline <= self._head():
             raise InvalidMessage("deadline", f"block {order.deadline} has passed")

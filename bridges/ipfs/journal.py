@@ -71,6 +71,10 @@ class Journal:
         """The message will not be carried."""
         self._do("DELETE FROM waiting WHERE fingerprint = ?", fingerprint)
 
+    def tidy(self) -> None:
+        """Forget what crossed so long ago that it may cross again."""
+        self._do("DELETE FROM crossed WHERE at < ?", time.time() - LASTS)
+
     def known(self) -> Iterator[tuple[bytes, float]]:
         """The messages that have crossed, oldest first, and how many seconds ago."""
         now = time.time()
@@ -93,7 +97,7 @@ class Journal:
         self._base = sqlite3.connect(self._path, isolation_level=None, check_same_thread=False)
         try:
             self._base.executescript("PRAGMA journal_mode=WAL; PRAGMA synchronous=NORMAL;" + _TABLES)
-            self._do("DELETE FROM crossed WHERE at < ?", time.time() - LASTS)
+            self.tidy()
         except sqlite3.Error as error:
             self._base.close()
             raise JournalFailed(self._path, str(error)) from error

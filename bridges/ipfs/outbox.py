@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from bridges.ipfs.gate import Passenger
     from bridges.ipfs.turns import Turn
 
@@ -126,12 +124,6 @@ class Outbox:
         for fingerprint in late:
             self._take(self._left.pop(fingerprint))
         return len(late)
-
-    def all(self) -> Iterator[Waiting]:
-        """Everything that is kept."""
-        yield from self._mine.values()
-        yield from self._left.values()
-        yield from self._unheard.values()
 
     def _take(self, waiting: Waiting) -> None:
         waiting.left_to = None

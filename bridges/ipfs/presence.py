@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 TIMEOUT: Final = 5.0
 """Seconds to ask who is there."""
 LIMIT: Final = 65_536
-"""Tokens that are read at most."""
+"""Tokens that are read, and agents that are known, at most."""
 
 
 class Presence:
@@ -98,7 +98,8 @@ class Presence:
     def _joined(self, key: str) -> None:
         turn = turn_of(key)
         if turn is None:
-            self.present.update(_presence(key))
+            if len(self.present) < LIMIT:
+                self.present.update(_presence(key))
         elif turn.bridge != self._bridge:
             self._traffic.joined(turn)
 

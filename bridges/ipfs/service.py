@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
@@ -14,13 +13,16 @@ from bridges.ipfs.daemon import Daemon
 from bridges.ipfs.gate import Gate
 from bridges.ipfs.gateway import Gateway
 from bridges.ipfs.journal import Journal
+from bridges.ipfs.market import Markets
 from bridges.ipfs.memory import Side
 from bridges.ipfs.sources import Sources
 from mesh.content import Exchange, Store
-from mesh.errors import ChainError, ClosedError, ConfigurationError
+from mesh.errors import ClosedError, ConfigurationError
 from schemas import Demand, Result, decode
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from contextlib import AbstractAsyncContextManager
     from types import TracebackType
 
     from bridges.ipfs.gate import Passenger
@@ -28,15 +30,14 @@ if TYPE_CHECKING:
     from mesh.network import Network
     from mesh.settings import Settings
 
-log = logging.getLogger(__name__)
-
 
 class IpfsBridge:
     """The channels of `lighthouses` (ENS names) and the content: `async with IpfsBridge(...) as bridge`, then `run`.
 
-    With `chain` (open, for reading) ENS names in messages are looked up, orders must be of the lighthouse's address,
-    and those whose deadline has passed do not cross. `address` is the bridge's name on the mesh, by default a new one
-    for each channel. Network and chain stay the caller's to close.
+    With `chain`, which makes a client of it that is not open yet, ENS names in messages are looked up, orders must be
+    of the lighthouse's address, and those whose deadline has passed do not cross: from the moment on when its node was
+    reached. `address` is the bridge's name on the mesh, by default a new one for each channel. The network stays the
+    caller's to close.
     """
 
     def __init__(
@@ -45,15 +46,14 @@ class IpfsBridge:
         settings: Settings,
         *,
         lighthouses: tuple[str, ...] = (),
-        chain: Chain | None = None,
+        chain: Callable[[], AbstractAsyncContextManager[Chain]] | None = None,
         address: str | None = None,
     ) -> None:
         self._network = network
         self._settings = settings
-        self._lighthouses = lighthouses or (settings.lighthouse_contract,)
-        self._chain = chain
+        self._lighthouses = tuple(name.lower() for name in lighthouses or (settings.lighthouse_contract,))
+        self._markets = chain and Markets(chain, self._lighthouses, interval=max(settings.poll_interval, 1.0))
         self._address = address
-        self._head = 0
         self._stack: AsyncExitStack | None = None
         self.channels: tuple[ChannelBridge, ...] = ()
         self.daemon: Final = Daemon(settings.ipfs_http_provider, authorization=_authorization(settings))
@@ -82,8 +82,8 @@ class IpfsBridge:
         async with asyncio.TaskGroup() as tasks:
             for channel in self.channels:
                 tasks.create_task(channel.run(), name=f"bridge of {channel.lighthouse}")
-            if self._chain is not None:
-                tasks.create_task(self._follow_head(self._chain), name="bridge: the latest block")
+            if self._markets is not None:
+                tasks.create_task(self._markets.run(), name="bridge: the chain")
 
     @property
     def _directory(self) -> Path:
@@ -116,24 +116,29 @@ class IpfsBridge:
         )
 
     async def _open_channel(self, stack: AsyncExitStack, lighthouse: str) -> ChannelBridge:
-        name, chain = lighthouse.lower(), self._chain
-        gate = Gate(
-            name,
-            address=None if chain is None else await chain.resolve(name),
-            resolver=None if chain is None else chain.resolve,
-            head=lambda: self._head,
-        )
         return await stack.enter_async_context(
             ChannelBridge(
                 self._network,
                 self.daemon,
-                gate,
-                stack.enter_context(Journal(self._directory / f"{name}.sqlite")),
-                lighthouse=name,
+                self._gate(lighthouse),
+                stack.enter_context(Journal(self._directory / f"{lighthouse}.sqlite")),
+                lighthouse=lighthouse,
                 neighbours=self._settings.ipfs_swarm_connect,
                 address=self._address,
                 carried=self._carried,
+                content=self.content.figures,
             )
+        )
+
+    def _gate(self, lighthouse: str) -> Gate:
+        markets = self._markets
+        if markets is None:
+            return Gate(lighthouse)
+        return Gate(
+            lighthouse,
+            address=lambda: markets.address(lighthouse),
+            resolver=markets.resolve,
+            head=lambda: markets.head,
         )
 
     def _carried(self, side: Side, passenger: Passenger) -> None:
@@ -144,14 +149,6 @@ class IpfsBridge:
                     self.content.add_soon(cid)
                 else:
                     self.content.fetch_soon(cid)
-
-    async def _follow_head(self, chain: Chain) -> None:
-        while True:
-            try:
-                self._head = await chain.block_number()
-            except ChainError as error:
-                log.warning("the bridge does not know the latest block: %s", error)
-            await asyncio.sleep(max(self._settings.poll_interval, 1.0))
 
 
 def _authorization(settings: Settings) -> str:

@@ -40,8 +40,8 @@ class Sources:
         self._sources = sources
         self.lies: Final = Counter[str]()
         """Answers of each source that did not hash to the name asked for."""
-        self.blocks = 0
         self.bytes = 0
+        """Of all blocks that were given and are what they should be."""
 
     async def block(self, cid: str, *, timeout: float) -> bytes:
         """The block of that name, checked. `timeout` is in seconds, for each source.
@@ -56,7 +56,6 @@ class Sources:
                 reasons.append(str(error))
                 continue
             if is_block(cid, block):
-                self.blocks += 1
                 self.bytes += len(block)
                 return block
             self.lies[source.api] += 1
@@ -105,4 +104,4 @@ class Sources:
         block = await asyncio.to_thread(assembly.local, place)
         if block is None:
             block = await self.block(place.cid, timeout=patience)
-        return await asyncio.to_thread(assembly.put, place, block)
+        return await asyncio.to_thread(assembly.put_checked, place, block)

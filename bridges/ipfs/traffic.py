@@ -7,15 +7,13 @@ this bridge or, when another one has the better turn, left to it until it is see
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping  # msgspec reads the annotations
 from enum import Enum
 from typing import TYPE_CHECKING, Final, Protocol
-
-import msgspec
 
 from bridges.ipfs.memory import Memory, Side
 from bridges.ipfs.outbox import Outbox, Waiting
 from bridges.ipfs.turns import Turn, first_before
+from schemas.status import Way
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -35,27 +33,6 @@ class Fate(Enum):
     """It is on the other side, or waits to get there."""
     NO_ROOM = "no room"
     """It was not accepted: the outbox is full."""
-
-
-class Way(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
-    """One direction in figures. Counts are since the bridge started; `per_second` is over the last ten seconds."""
-
-    received: int
-    invalid: Mapping[str, int]
-    """Not let through, by reason."""
-    known: int
-    """Let through and on the far side already: echoes, repetitions, what another bridge brought."""
-    accepted: int
-    carried: int
-    """Carried by this bridge."""
-    left: int
-    """Carried by another one."""
-    dropped: Mapping[str, int]
-    """Lost, by reason: `no-room`, `refused` by the far side, `unseen` for a reader that was too slow, `unheard`."""
-    waiting: int
-    left_waiting: int
-    unheard: int
-    per_second: float
 
 
 class Notes(Protocol):
@@ -83,6 +60,7 @@ class Traffic:
         """Counts of the direction towards each side."""
         self.invalid: Final = {side: Counter[str]() for side in Side}
         self.dropped: Final = {side: Counter[str]() for side in Side}
+        self.kinds: Final = {side: Counter[str]() for side in Side}
         self.own: Turn | None = None
         self._others: set[Turn] = set()
 
@@ -103,6 +81,7 @@ class Traffic:
             self.dropped[to]["no-room"] += 1
             return Fate.NO_ROOM
         self.counts[to]["accepted"] += 1
+        self.kinds[to][passenger.kind] += 1
         self._notes.wait(to, waiting)
         return Fate.ACCEPTED
 
@@ -110,6 +89,7 @@ class Traffic:
         """This bridge has put the message on `side`. If nobody `heard` it, it is kept to be said again."""
         fingerprint = waiting.passenger.fingerprint
         self.counts[side]["carried"] += 1
+        self.counts[side]["bytes"] += len(waiting.passenger.legacy if side is Side.IPFS else waiting.passenger.payload)
         self.to[side].arrived(fingerprint, now=self._clock())
         self._note(fingerprint, side)
         if not heard and not self.to[side].said_to_nobody(waiting):
@@ -180,6 +160,8 @@ class Traffic:
             left_waiting=outbox.left,
             unheard=outbox.unheard,
             per_second=round(per_second, 2),
+            kinds=dict(self.kinds[to]),
+            bytes=counts["bytes"],
         )
 
     def _note_arrival(self, fingerprint: bytes, side: Side, *, echo: bool) -> None:

@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import urllib.request
+from abc import abstractmethod
 from base64 import b64decode
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,15 +22,18 @@ if TYPE_CHECKING:
 KUBO_NODE = Path(__file__).with_name("kubo_node.py")
 
 
-class JsIpfs(Server):
-    """A js-ipfs daemon: the HTTP RPC at `api` (below it `/api/v0/…`), the swarm at `swarm_address`."""
+class IpfsDaemon(Server):
+    """A daemon with the HTTP RPC at `api` (below it `/api/v0/…`) and the swarm at `swarm_address`."""
 
-    name = "js-ipfs"
+    peer: str
+    """Its name among the peers."""
+    ports: Sequence[str] = ("API", "Gateway", "Swarm")
+    """What it listens on."""
 
     def __init__(self) -> None:
-        self._script: Path = require("js-ipfs")
+        self._program: Path = require(self.peer)
         super().__init__()
-        self._ports = {name: free_port() for name in ("API", "Gateway", "RPC", "Swarm", "WebSocket")}
+        self._ports = {name: free_port() for name in self.ports}
         self.api = f"http://127.0.0.1:{self._ports['API']}"
 
     @property
@@ -46,19 +50,25 @@ class JsIpfs(Server):
     def command(self) -> Sequence[str | Path]:
         if not self._config_file.exists():
             self._make_repository()
-        # A killed one leaves it behind, and the next one refuses to start.
-        shutil.rmtree(self._config_file.with_name("repo.lock"), ignore_errors=True)
-        return self._jsipfs("daemon")
+        return self._run("daemon")
 
     def is_ready(self) -> bool:
         return "Daemon is ready" in self.log()
 
+    @abstractmethod
+    def configure(self, config: dict[str, Any]) -> None:
+        """Change the configuration that `init --profile test` made to that of a node alone on loopback."""
+
+    @abstractmethod
+    def _run(self, *arguments: str) -> list[str | Path]:
+        """The program with these arguments, on this node's repository."""
+
+    def _multiaddr(self, port: str) -> str:
+        return f"/ip4/127.0.0.1/tcp/{self._ports[port]}"
+
     @property
     def _config_file(self) -> Path:
         return self.folder / "repo" / "config"
-
-    def _jsipfs(self, *arguments: str) -> list[str | Path]:
-        return ["env", f"IPFS_PATH={self.folder / 'repo'}", "node", self._script, *arguments]
 
     def _read_config(self) -> dict[str, Any]:
         config: dict[str, Any] = json.loads(self._config_file.read_text())
@@ -66,7 +76,7 @@ class JsIpfs(Server):
 
     def _make_repository(self) -> None:
         made = subprocess.run(
-            self._jsipfs("init", "--profile", "test"),
+            self._run("init", "--profile", "test"),
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,
@@ -76,72 +86,70 @@ class JsIpfs(Server):
         if made.returncode != 0:
             raise ServerFailed(self.name, "made no repository", made.stdout + made.stderr)
         config = self._read_config()
+        self.configure(config)
+        self._config_file.write_text(json.dumps(config))
+
+
+class JsIpfs(IpfsDaemon):
+    """A js-ipfs daemon, as legacy pages embedded it."""
+
+    name = peer = "js-ipfs"
+    ports = ("API", "Gateway", "RPC", "Swarm", "WebSocket")
+
+    def command(self) -> Sequence[str | Path]:
+        # A killed one leaves it behind, and the next one refuses to start.
+        shutil.rmtree(self._config_file.with_name("repo.lock"), ignore_errors=True)
+        return super().command()
+
+    def configure(self, config: dict[str, Any]) -> None:
         config["Addresses"].update(
-            API=f"/ip4/127.0.0.1/tcp/{self._ports['API']}",
-            Gateway=f"/ip4/127.0.0.1/tcp/{self._ports['Gateway']}",
-            RPC=f"/ip4/127.0.0.1/tcp/{self._ports['RPC']}",
-            Swarm=[
-                f"/ip4/127.0.0.1/tcp/{self._ports['Swarm']}",
-                f"/ip4/127.0.0.1/tcp/{self._ports['WebSocket']}/ws",
-            ],
+            API=self._multiaddr("API"),
+            Gateway=self._multiaddr("Gateway"),
+            RPC=self._multiaddr("RPC"),
+            Swarm=[self._multiaddr("Swarm"), f"{self._multiaddr('WebSocket')}/ws"],
             Delegates=[],
         )
         config["Bootstrap"] = []
         config["Discovery"] = {"MDNS": {"Enabled": False}, "webRTCStar": {"Enabled": False}}
-        self._config_file.write_text(json.dumps(config))
+
+    def _run(self, *arguments: str) -> list[str | Path]:
+        return ["env", f"IPFS_PATH={self.folder / 'repo'}", "node", self._program, *arguments]
 
 
-class Kubo(Server):
-    """A current Kubo daemon, with what `JsIpfs` has. Where none is named by `AIRA_KUBO` the test is skipped."""
+class Kubo(IpfsDaemon):
+    """A current Kubo daemon. Where none is named by `AIRA_KUBO` the test is skipped."""
 
-    name = "kubo"
-
-    def __init__(self) -> None:
-        self._program: Path = require("kubo")
-        super().__init__()
-        self._ports = {name: free_port() for name in ("API", "Gateway", "Swarm")}
-        self.api = f"http://127.0.0.1:{self._ports['API']}"
-        self.gateway = f"http://127.0.0.1:{self._ports['Gateway']}"
+    name = peer = "kubo"
 
     @property
-    def peer_id(self) -> str:
-        """The node's identity in the swarm."""
-        identity: str = json.loads((self.folder / "repo" / "config").read_text())["Identity"]["PeerID"]
-        return identity
+    def gateway(self) -> str:
+        """The URL of its read-only gateway."""
+        return f"http://127.0.0.1:{self._ports['Gateway']}"
 
-    @property
-    def swarm_address(self) -> str:
-        """The address under which other nodes connect to this one."""
-        return f"/ip4/127.0.0.1/tcp/{self._ports['Swarm']}/p2p/{self.peer_id}"
+    def configure(self, config: dict[str, Any]) -> None:
+        """Name all that would reach beyond loopback, whatever the profile of this version leaves on.
 
-    def command(self) -> Sequence[str | Path]:
-        if not (self.folder / "repo" / "config").exists():
-            self._make_repository()
-        return self._ipfs("daemon")
-
-    def is_ready(self) -> bool:
-        return "Daemon is ready" in self.log()
-
-    def _ipfs(self, *arguments: str) -> list[str | Path]:
-        return ["env", f"IPFS_PATH={self.folder / 'repo'}", "IPFS_TELEMETRY=off", self._program, *arguments]
-
-    def _make_repository(self) -> None:
-        addresses = {
-            "API": f"/ip4/127.0.0.1/tcp/{self._ports['API']}",
-            "Gateway": f"/ip4/127.0.0.1/tcp/{self._ports['Gateway']}",
-            "Swarm": [f"/ip4/127.0.0.1/tcp/{self._ports['Swarm']}"],
+        The file is changed and not `ipfs config` asked, which refuses what its version does not know. With AutoConf
+        off nothing may be left at `auto`.
+        """
+        config["Addresses"] = {
+            "API": self._multiaddr("API"),
+            "Gateway": self._multiaddr("Gateway"),
+            "Swarm": [self._multiaddr("Swarm")],
         }
-        for arguments in (
-            ("init", "--profile", "test"),
-            ("config", "--json", "Pubsub.Enabled", "true"),
-            ("config", "--json", "Addresses", json.dumps(addresses)),
-            ("config", "--json", "Bootstrap", "[]"),
-        ):
-            made = subprocess.run(
-                self._ipfs(*arguments), capture_output=True, text=True, timeout=START_SECONDS, check=False
-            )
-            if made.returncode != 0:
-                raise ServerFailed(self.name, f"refused {arguments}", made.stdout + made.stderr)
+        config["Bootstrap"] = []
+        config["Discovery"] = {"MDNS": {"Enabled": False}}
+        config["Routing"] = {"Type": "none"}
+        config["Provide"] = {"Enabled": False}
+        config["AutoConf"] = {"Enabled": False}
+        config["AutoTLS"] = {"Enabled": False}
+        config["DNS"] = {"Resolvers": {}}
+        config.setdefault("Ipns", {})["DelegatedPublishers"] = []
+        config.setdefault("Swarm", {})["DisableNatPortMap"] = True
+        config["Pubsub"] = {"Enabled": True}
+
+    def _run(self, *arguments: str) -> list[str | Path]:
+        return ["env", f"IPFS_PATH={self.folder / 'repo'}", "IPFS_TELEMETRY=off", self._program, *arguments]
 
 
 class LibraryNode(Server):

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from bridges.ipfs import ChannelBridge, Daemon, Gate, Journal
+from bridges.ipfs.daemon import CALL_TIMEOUT
 from mesh.background import Background
 from mesh.network import Channel, Endpoints, Network, Pump
 from tests.support.orders import LIGHTHOUSE
@@ -20,13 +21,17 @@ if TYPE_CHECKING:
 
 
 @asynccontextmanager
-async def bridging(endpoint: str, api: str, topic: str, journal: Path, **options: Any) -> AsyncIterator[ChannelBridge]:
+async def bridging(
+    endpoint: str, api: str, topic: str, journal: Path, *, patience: float = CALL_TIMEOUT, **options: Any
+) -> AsyncIterator[ChannelBridge]:
     """A bridge at work between the router at `endpoint` and the daemon at `api`."""
     async with AsyncExitStack() as stack:
         network = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,))))
-        daemon = await stack.enter_async_context(Daemon(api))
+        daemon = await stack.enter_async_context(Daemon(api, patience=patience))
         notes = stack.enter_context(Journal(journal))
-        bridge = ChannelBridge(network, daemon, Gate(topic, address=LIGHTHOUSE), notes, lighthouse=topic, **options)
+        bridge = ChannelBridge(
+            network, daemon, Gate(topic, address=lambda: LIGHTHOUSE), notes, lighthouse=topic, **options
+        )
         await stack.enter_async_context(bridge)
         tasks = await stack.enter_async_context(Background())
         tasks.start(bridge.run(), "bridge of the test")

@@ -21,12 +21,17 @@ from tests.support.ports import free_port
 if TYPE_CHECKING:
     from types import TracebackType
 
+    from aiohttp.typedefs import Handler
+
 TEXT = "application/json"
 DISABLED = "experimental pubsub feature not enabled. Run daemon with --enable-pubsub-experiment to use."
 
 
 class OldDaemon:
     """One daemon at `api`. `others` are its swarm; `pubsub` is the flag with which it was started."""
+
+    version = "0.4.18"
+    disabled = DISABLED
 
     def __init__(self, *, pubsub: bool = True, authorization: str = "") -> None:
         self.port = free_port()
@@ -44,7 +49,11 @@ class OldDaemon:
         return f"Qm{self._identity.hex()}"
 
     async def __aenter__(self) -> Self:
-        app = web.Application(middlewares=[self._guard])
+        @web.middleware
+        async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
+            return await self.guard(request, handler)
+
+        app = web.Application(middlewares=[guard])
         app.router.add_route("*", "/api/v0/version", self._version)
         app.router.add_route("*", "/api/v0/id", self._id)
         app.router.add_route("*", "/api/v0/pubsub/pub", self._pub)
@@ -62,33 +71,44 @@ class OldDaemon:
 
     def deliver(self, topic: str, data: bytes, sender: OldDaemon, sequence: int) -> None:
         """A message of the swarm has come."""
-        event = {
+        for queue in self._subscribers.get(topic, []):
+            queue.put_nowait(json.dumps(self.event(topic, data, sender, sequence)).encode() + b"\n")
+
+    def event(self, topic: str, data: bytes, sender: OldDaemon, sequence: int) -> dict[str, object]:
+        """A line of a subscription."""
+        return {
             "from": b64encode(sender._identity).decode(),
             "data": b64encode(data).decode(),
             "seqno": b64encode(sequence.to_bytes(8, "big")).decode(),
             "topicIDs": [topic],
         }
-        for queue in self._subscribers.get(topic, []):
-            queue.put_nowait(json.dumps(event).encode() + b"\n")
 
-    @web.middleware
-    async def _guard(self, request: web.Request, handler: web.Handler) -> web.StreamResponse:  # type: ignore[name-defined]
+    def topic_of(self, request: web.Request) -> str:
+        """The topic that a call names."""
+        (topic,) = request.query.getall("arg")
+        return topic
+
+    async def guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Answer who may ask."""
         if self._authorization and request.headers.get("Authorization") != self._authorization:
             return web.Response(status=401, text="Unauthorized")
+        return await self.answer(request, handler)
+
+    async def answer(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Answer what the daemon was started for."""
         if not self._pubsub and "/pubsub/" in request.path:
-            return self._refuse(DISABLED)
-        answer: web.StreamResponse = await handler(request)
-        return answer
+            return self._refuse(self.disabled)
+        return await handler(request)
 
     async def _version(self, request: web.Request) -> web.Response:
         return web.json_response(
-            {"Version": "0.4.18", "Commit": "aefc746", "Repo": "7", "System": "amd64/linux", "Golang": "go1.11.1"}
+            {"Version": self.version, "Commit": "", "Repo": "7", "System": "amd64/linux", "Golang": "go1.11.1"}
         )
 
     async def _id(self, request: web.Request) -> web.Response:
-        return web.json_response({"ID": self.peer_id, "Addresses": None, "AgentVersion": "go-ipfs/0.4.18/"})
+        return web.json_response({"ID": self.peer_id, "Addresses": None, "AgentVersion": f"go-ipfs/{self.version}/"})
 
-    async def _pub(self, request: web.Request) -> web.Response:
+    async def _pub(self, request: web.Request) -> web.StreamResponse:
         topic, *messages = request.query.getall("arg")
         if not messages:
             return self._refuse('argument "data" is required')
@@ -99,7 +119,7 @@ class OldDaemon:
         return web.Response(text="", content_type=TEXT)
 
     async def _sub(self, request: web.Request) -> web.StreamResponse:
-        (topic,) = request.query.getall("arg")
+        topic = self.topic_of(request)
         answer = web.StreamResponse(
             headers={"Content-Type": TEXT, "X-Chunked-Output": "1", "Trailer": "X-Stream-Error"}
         )
@@ -116,7 +136,7 @@ class OldDaemon:
             self._subscribers[topic].remove(queue)
 
     async def _peers(self, request: web.Request) -> web.Response:
-        (topic,) = request.query.getall("arg")
+        topic = self.topic_of(request)
         return web.json_response({"Strings": [other.peer_id for other in self.others if other._subscribers.get(topic)]})
 
     def _refuse(self, why: str) -> web.Response:

@@ -7,11 +7,15 @@ import signal
 from typing import TYPE_CHECKING
 
 from bridges.ipfs.writing import legacy_json
+from mesh.identity.roster import Member
+from mesh.network import Channel, Network
 from schemas import encode
 from tests.bridges.ipfs.bridges import on_mesh, until_seen
 from tests.support.commands import AIRA, Serving, aira
-from tests.support.orders import demand, offer
+from tests.support.orders import PERSON, demand, offer
 from tests.support.ports import free_port
+from tests.support.sites import MARKET as SITE_MARKET
+from tests.support.sites import Site
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
@@ -23,6 +27,7 @@ if TYPE_CHECKING:
     from tests.support.routers import EmbeddedRouter
 
 MARKET = "airalab.lighthouse.3.robonomics.eth"
+BRIDGE = "0x" + "ab" * 20
 OTHER = "other.lighthouse.3.robonomics.eth"
 
 
@@ -44,12 +49,57 @@ def test_the_bridge_runs_without_a_daemon_says_so_and_ends_by_a_signal(router: E
     api = f"/ip4/127.0.0.1/tcp/{free_port()}"
     line = command(router, tmp_path, "--api", api, "--lighthouse", MARKET, "--lighthouse", OTHER)
     with Serving(*line, says="Cannot connect") as bridge:
-        said = bridge.log()
-        assert f"carries {MARKET} to and from http://127.0.0.1:" in said
-        assert f"carries {OTHER}" in said
         code, _ = bridge.end(signal.SIGTERM)
+        said = bridge.log()
+    assert f"carries {MARKET} to and from http://127.0.0.1:" in said
+    assert f"carries {OTHER}" in said
     assert code == 0
-    assert "Traceback" not in bridge.log()
+    assert "Traceback" not in said
+
+
+def test_the_bridge_comes_up_without_the_chains_node_and_says_what_it_does_not_check(
+    router: EmbeddedRouter, tmp_path: Path
+) -> None:
+    line = command(router, tmp_path, "--api", f"/ip4/127.0.0.1/tcp/{free_port()}", "--lighthouse", MARKET)
+    node = ("--web3-http-provider", f"http://127.0.0.1:{free_port()}", "--ens-contract", f"0x{'12' * 20}")
+    with Serving(*line, *node, says="are not checked until the chain's node is there") as bridge:
+        assert f"carries {MARKET}" in bridge.log()
+        code, _ = bridge.end(signal.SIGTERM)
+        said = bridge.log()
+    assert code == 0
+    assert said.count("are not checked") == 1
+    assert "Traceback" not in said
+
+
+async def test_the_bridge_waits_for_a_router(router: EmbeddedRouter, tmp_path: Path) -> None:
+    await asyncio.to_thread(router.stop)
+    line = command(router, tmp_path, "--api", f"/ip4/127.0.0.1/tcp/{free_port()}", "--lighthouse", MARKET)
+    waiting = Serving(*line, "--connect-timeout", "1", says="waits for a router")
+    async with waiting as bridge:
+        await asyncio.to_thread(router.start)
+        await until(lambda: f"carries {MARKET}" in bridge.log(), seconds=60)
+        assert bridge.log().count("waits for a router") == 1
+
+
+async def test_on_a_locked_site_the_bridge_is_the_holder_of_its_certificate(tmp_path: Path) -> None:
+    site = Site(tmp_path)
+    door = site.enlist(Member(address=BRIDGE, name="door", roles=("bridge",)))
+    human = site.enlist(Member(address=PERSON.address, name="human", roles=("person",)))
+    where = ("--connect", site.endpoint, "--data-dir", tmp_path, "--api", f"/ip4/127.0.0.1/tcp/{free_port()}")
+    chain = ("--web3-http-provider", "", "--web3-ws-provider", "", "--lighthouse", SITE_MARKET)
+    identity = ("--tls-ca", door.ca, "--tls-certificate", door.certificate, "--tls-key", door.key)
+    with site.open_router("wheel"):
+        line = (*AIRA, "bridge", "ipfs", *where, *chain, *identity)
+        async with (
+            Serving(*line, says=f"bridge {BRIDGE} carries {SITE_MARKET}"),
+            Network(site.client(human)) as network,
+            Channel(network.session, SITE_MARKET) as channel,
+        ):
+
+            async def is_seen() -> bool:
+                return any(key.role == "bridge" and key.agent == BRIDGE for key in await channel.present())
+
+            await until_found(is_seen, what="the bridge's token", seconds=60)
 
 
 async def test_a_bridge_that_was_killed_goes_on_and_carries_nothing_twice(

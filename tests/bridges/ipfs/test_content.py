@@ -20,6 +20,9 @@ from bridges.ipfs.sources import Source, Sources
 from mesh.content import ContentTooLarge, ContentUnavailable, Exchange, Store
 from mesh.network import Endpoints, Network
 from schemas import CHUNK_SIZE, MAX_LINKS, blocks_of_stream, cid_of_bytes
+from tests.bridges.ipfs.legacy import Bare
+from tests.mesh.content.trees import chunked
+from tests.support.ipfs import Kubo
 from tests.support.ports import free_port
 from tests.support.waiting import until
 
@@ -28,7 +31,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tests.bridges.ipfs.conftest import Swarm
-    from tests.bridges.ipfs.legacy import Bare
     from tests.support.routers import EmbeddedRouter
 
 SECONDS = 90.0
@@ -136,21 +138,32 @@ async def test_what_is_made_in_the_mesh_is_added_under_its_name_and_pinned_by_fu
         cid = await asyncio.to_thread(person.store.put_bytes, content)
         await bridge.content.add(cid)
         figures = bridge.content.figures()
-        assert (figures.added, figures.renamed, figures.pinned) == (1, 0, 1)
+        assert (figures.added, figures.by_blocks, figures.pinned) == (1, 0, 1)
         pins = await bob.call("pin/ls", ("arg", cid), ("type", "recursive"))
         assert cid in json.dumps(pins)
 
 
-async def test_a_file_that_the_daemon_names_otherwise_is_counted(
+async def test_a_file_that_the_daemon_would_name_otherwise_is_given_to_it_block_by_block(
     swarm: Swarm, bob: Bare, router: EmbeddedRouter, tmp_path: Path
 ) -> None:
     content = content_of(50_000, str(tmp_path))
-    other = (("cid-version", "0"), ("raw-leaves", "false"), ("chunker", "size-10000"), ("hash", "sha2-256"))
-    cid = (await bob.call("add", *other, content=content))["Hash"]
-    async with door(router.endpoint, swarm.a.api, tmp_path / "bridge") as bridge:
-        await bridge.content.fetch(cid)
+    blocks = {block.cid: block.data for block in chunked(content, 10_000)}
+    cid = next(reversed(blocks))
+    assert cid != cid_of_bytes(content)
+    async with (
+        gateway(blocks) as address,
+        Gateway(address) as source,
+        door(router.endpoint, swarm.a.api, tmp_path / "bridge") as bridge,
+    ):
+        await Sources(source).fetch(bridge.store, cid, size_limit=2**20, timeout=SECONDS, patience=10.0)
         await bridge.content.add(cid)
-        assert bridge.content.figures().renamed == 1
+        figures = bridge.content.figures()
+        assert (figures.added, figures.by_blocks, figures.added_bytes) == (1, 1, len(content))
+        assert await bob.cat(cid) == content
+        async with Bare(swarm.a.api) as client:
+            pins = json.dumps(await client.call("pin/ls", ("type", "recursive")))
+        assert cid in pins
+        assert cid_of_bytes(content) not in pins
 
 
 @asynccontextmanager
@@ -192,6 +205,17 @@ async def test_a_gateway_serves_where_there_is_no_daemon(router: EmbeddedRouter,
     ):
         path = await robot.exchange.fetch(cid_of_bytes(content), timeout=SECONDS)
         assert path.read_bytes() == content
+
+
+async def test_a_kubos_own_gateway_is_a_source(swarm: Swarm, bob: Bare, tmp_path: Path) -> None:
+    if not isinstance(swarm.b, Kubo):
+        pytest.skip("the gateway of a js-ipfs gives no blocks")
+    content = content_of(CHUNK_SIZE + 1, str(tmp_path))
+    cid = (await bob.call("add", *SETTINGS, content=content))["Hash"]
+    async with Gateway(swarm.b.gateway) as source:
+        with Store(tmp_path / "store") as store:
+            path = await Sources(source).fetch(store, cid, size_limit=2**20, timeout=SECONDS, patience=10.0)
+            assert path.read_bytes() == content
 
 
 async def test_a_gateway_that_lies_is_not_believed(router: EmbeddedRouter, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 from typing import TYPE_CHECKING
 
 import pytest
@@ -109,6 +110,15 @@ async def test_a_daemon_that_is_not_there_is_unreachable() -> None:
     async with Daemon(f"/ip4/127.0.0.1/tcp/{free_port()}") as daemon:
         with pytest.raises(DaemonUnreachable):
             await daemon.greet()
+
+
+async def test_a_daemon_that_takes_a_connection_and_never_begins_to_answer_is_unreachable(topic: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as frozen:  # nobody accepts; the kernel does
+        api = f"http://127.0.0.1:{frozen.getsockname()[1]}"
+        async with asyncio.timeout(60), Daemon(api, patience=0.5) as daemon:
+            with pytest.raises(DaemonUnreachable, match="pubsub/sub"):
+                async with daemon.subscribe(topic):
+                    pass
 
 
 async def test_a_client_is_used_inside_its_with() -> None:

@@ -25,6 +25,12 @@ def test_a_daemons_version_tells_its_dialect(version: Version, name: str) -> Non
     assert dialect_of(version).name == name
 
 
+def test_a_daemon_is_called_what_it_was_called_then() -> None:
+    assert str(Version(version="0.13.1")) == "go-ipfs 0.13.1"
+    assert str(Version(version="0.44.0-dev")) == "kubo 0.44.0-dev"
+    assert str(Version(version="0.18.1", js_core="0.18.1")) == "js-ipfs 0.18.1"
+
+
 def test_multibase_writes_topics_as_base64url_without_padding() -> None:
     assert Multibase().topic("a.lighthouse") == "uYS5saWdodGhvdXNl"
     assert Multibase().topic("topic?>") == "udG9waWM_Pg"

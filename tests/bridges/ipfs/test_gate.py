@@ -60,7 +60,7 @@ async def test_a_message_belongs_on_its_own_key_only() -> None:
 
 
 async def test_an_order_of_another_market_or_of_the_past_does_not_pass() -> None:
-    gate = Gate(MARKET, address=LIGHTHOUSE, head=lambda: 100)
+    gate = Gate(MARKET, address=lambda: LIGHTHOUSE, head=lambda: 100)
     assert await reason(gate, encode(demand(lighthouse="0x" + "11" * 20))) == "lighthouse"
     assert await reason(gate, encode(demand(deadline=100))) == "deadline"
     await gate.admit(encode(demand(deadline=101)))
@@ -79,7 +79,7 @@ async def test_names_are_looked_up_where_somebody_can_and_stay_in_what_is_writte
     order = replace(demand(), **named)
     signed = PERSON.sign(resolve_names(order, {MARKET: LIGHTHOUSE, named["token"]: TOKEN}))
     order = replace(signed, **named)
-    passenger = await Gate(MARKET, address=LIGHTHOUSE, resolver=resolve).admit(legacy_json(order))
+    passenger = await Gate(MARKET, address=lambda: LIGHTHOUSE, resolver=resolve).admit(legacy_json(order))
     assert passenger.key == message_key(MARKET, signed)
     assert MARKET.encode() in passenger.payload
     assert MARKET.encode() in passenger.legacy

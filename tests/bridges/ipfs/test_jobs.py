@@ -45,8 +45,7 @@ async def bridge(place: Place, swarm: Swarm) -> AsyncIterator[IpfsBridge]:
     settings = replace(place.settings("bridge"), ipfs_http_provider=swarm.a.api)
     async with (
         Network(Endpoints(connect=(place.endpoint,))) as network,
-        place.chain("provider") as chain,
-        IpfsBridge(network, settings, chain=chain) as bridge,
+        IpfsBridge(network, settings, chain=lambda: place.chain("provider")) as bridge,
         Background() as tasks,
     ):
         tasks.start(bridge.run(), "bridge of the test")

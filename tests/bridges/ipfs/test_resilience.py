@@ -81,6 +81,33 @@ async def test_a_daemon_that_comes_late_goes_and_comes_back_costs_nothing_that_w
     assert len(bob.heard) - 1 - len(set(bob.heard[:-1])) <= 1
 
 
+async def test_a_daemon_that_is_frozen_is_lost_and_taken_up_again_when_it_goes_on(
+    mortal: JsIpfs | Kubo, swarm: Swarm, bob: Bare, mesh: Mesh, router: EmbeddedRouter, topic: str, tmp_path: Path
+) -> None:
+    await bob.listen(topic)
+    await asyncio.to_thread(mortal.start)
+    one, two, answer = demand(), demand(), offer()
+    await bob.call("swarm/connect", ("arg", mortal.swarm_address))
+    async with bridging(router.endpoint, mortal.api, topic, tmp_path / "journal", patience=3.0) as bridge:
+        await ready(bridge, mesh)
+        mesh.channel.publish(one)
+        await until(lambda: bob.heard, seconds=SECONDS)
+        mortal.pause()
+        try:
+            await until(lambda: bridge.status().state == "no daemon", seconds=SECONDS)
+            mesh.channel.publish(two)
+            await until(lambda: bridge.status().to_ipfs.waiting == 1, seconds=SECONDS)
+            # It still takes connections, and answers nothing.
+            await until(lambda: mortal.api in bridge.status().last_error, seconds=SECONDS)
+        finally:
+            mortal.resume()
+        await until(lambda: legacy_json(two) in bob.heard, seconds=SECONDS)
+        await until_found(lambda: bob.peers(topic), seconds=SECONDS)
+        await bob.publish(topic, legacy_json(answer))
+        await until(lambda: encode(answer) in mesh.payloads, seconds=SECONDS)
+        assert bridge.status().losses >= 1
+
+
 async def test_what_nobody_hears_goes_out_once_when_somebody_comes(
     mortal: JsIpfs | Kubo, swarm: Swarm, bob: Bare, mesh: Mesh, router: EmbeddedRouter, topic: str, tmp_path: Path
 ) -> None:

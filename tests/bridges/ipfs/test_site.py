@@ -36,7 +36,12 @@ async def test_a_bridge_with_its_role_carries_both_ways_on_a_locked_site(tmp_pat
                 channel.subscribe(Offer) as offers,
                 Daemon(here.api) as daemon,
                 ChannelBridge(
-                    network, daemon, Gate(MARKET, address=LIGHTHOUSE), journal, lighthouse=MARKET, address=BRIDGE
+                    network,
+                    daemon,
+                    Gate(MARKET, address=lambda: LIGHTHOUSE),
+                    journal,
+                    lighthouse=MARKET,
+                    address=BRIDGE,
                 ) as bridge,
                 Background() as tasks,
             ):

@@ -62,7 +62,7 @@ def bridge(time: Time, notes: Notes, own: Turn | None = None, *others: Turn, **o
 
 
 def message() -> Passenger:
-    return Passenger(next(_numbers).to_bytes(16, "big"), "key", b"payload", b"legacy")
+    return Passenger(next(_numbers).to_bytes(16, "big"), "aira/market/demand/model/hash", b"payload", b"legacy")
 
 
 def carry(traffic: Traffic, side: Side, *, heard: bool = True) -> list[bytes]:

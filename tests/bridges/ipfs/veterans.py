@@ -70,12 +70,6 @@ class Veteran(Bare):
         name: str = (await self.call("add", *ADDED, content=content))["Hash"]
         return name
 
-    async def cat(self, name: str) -> bytes:
-        """The file of that name."""
-        async with self._http.post(f"{self._api}/api/v0/cat", params={"arg": name}) as answer:
-            assert answer.status == 200, await answer.text()
-            return await answer.read()
-
     def _order(self, fee: str, terms: dict[str, Any]) -> dict[str, Any]:
         order = terms | {"validator": NOBODY, fee: 0, "nonce": secrets.token_hex(32)}
         # An offer is hashed with the two the other way round.
