@@ -10,7 +10,7 @@ import click
 from mesh.errors import AiraError
 from mesh.running import INTERRUPTED, fail
 
-HELP = "lines to type: adc CHANNEL MILLIVOLTS, noise RATE, unplug, plug, reset, quit"
+HELP = "lines to type: adc 0-7 MILLIVOLTS, noise 0-1, unplug, plug, reset, quit"
 
 
 @click.group("board")
@@ -47,5 +47,7 @@ def _show(line: str) -> None:
     match line.split():
         case ["pin", pin, level, microseconds]:
             click.echo(f"{int(microseconds) / 1e6:10.3f} s  pin {pin:>2}  {'high' if level == '1' else 'low'}")
+        case ["unknown", *words]:
+            click.echo(f"{' '.join(words)!r} is nothing a board understands; {HELP}", err=True)
         case ["port" | "opened" | "closed" | "unplugged" | "crashed", *_]:
             click.echo(line)

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
 from bridges.serial.errors import ConfigurationError
-from mesh.errors import RemoteError
+from mesh.errors import InputError, RemoteError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -28,6 +28,19 @@ HEADER: Final = Path("/usr/include/simavr/sim_avr.h")
 START: Final = 30.0
 """Seconds that a board has to come up."""
 STOP: Final = 5.0
+AVR: Final = 83
+"""What an ELF file calls the processor (EM_AVR)."""
+
+
+class NoFirmware(InputError):
+    """A file is not what a board runs."""
+
+    def __init__(self, path: Path, why: str) -> None:
+        super().__init__(
+            f"{path} is no firmware for an Uno: {why}",
+            hint="`python -m bridges.serial.firmware SKETCH -o FOLDER` makes an ELF file of a sketch",
+        )
+        self.path = path
 
 
 class BoardFailed(RemoteError):
@@ -66,11 +79,25 @@ def simulator() -> Path:
     return program
 
 
+def check_firmware(path: Path) -> None:
+    """Raise `NoFirmware` for a file that is no ELF file with code for an AVR."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(20)
+    except OSError as error:
+        raise NoFirmware(path, error.strerror or str(error)) from None
+    if not head.startswith(b"\x7fELF"):
+        raise NoFirmware(path, "it is no ELF file")
+    if int.from_bytes(head[18:20], "little") != AVR:
+        raise NoFirmware(path, "it is for another processor")
+
+
 class SimulatedBoard:
     """A board with the firmware `elf`: `with SimulatedBoard(elf) as board`; then `board.port` can be opened.
 
     `port` stays the same when the cable is pulled and plugged in again. With `resets`, opening the port resets the
-    board, as it does a real Uno. Leaving `with` ends it.
+    board, as it does a real Uno. Leaving `with` ends it. Entering it raises `NoFirmware`, `ConfigurationError` where
+    the simulator can't be had, and `BoardFailed`.
     """
 
     def __init__(self, elf: Path, *, resets: bool = False, watch: Callable[[str], object] | None = None) -> None:
@@ -88,9 +115,11 @@ class SimulatedBoard:
         self._process: subprocess.Popen[str] | None = None
 
     def __enter__(self) -> Self:
+        check_firmware(self._elf)
+        program = simulator()
         self._folder = tempfile.TemporaryDirectory(prefix="aira-board-")
         self.port = Path(self._folder.name) / "tty"
-        command = [str(simulator()), str(self._elf), str(self.port), *(["reset"] if self._resets else [])]
+        command = [str(program), str(self._elf), str(self.port), *(["reset"] if self._resets else [])]
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, bufsize=1
         )
@@ -120,11 +149,6 @@ class SimulatedBoard:
                     stream.close()
         if self._folder is not None:
             self._folder.cleanup()
-
-    @property
-    def pid(self) -> int:
-        """The simulator's process id."""
-        return self._running().pid
 
     def apply(self, channel: int, millivolts: int) -> None:
         """Put a voltage, 0 to 5000 mV, on the analog input A0 to A7 with that number."""

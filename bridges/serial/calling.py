@@ -17,15 +17,13 @@ from bridges.serial.dialect import (
     About,
     BoardTopic,
     Command,
-    Counters,
     Ended,
     Ending,
     Flow,
     Gone,
-    Happening,
+    Host,
     Ready,
     Said,
-    Waiting,
 )
 from bridges.serial.errors import UnfitMessage
 from bridges.serial.frames import BOARD_ID, SEQUENCES, Deframer, Frame, Kind
@@ -43,11 +41,11 @@ LOST: Final = 5.0
 """Seconds without a word after which it is taken for gone."""
 
 
-class CallingDialect:
+class CallingDialect(Host):
     """Own frames on a line of `baud` bits per second; `session` is a number from 1 to 65535 of this host's own."""
 
     def __init__(self, *, baud: int, session: int) -> None:
-        self.counters = Counters()
+        super().__init__()
         self._asker = Asker(self.counters, baud=baud)
         self._session = session
         self._deframer = Deframer(self.counters)
@@ -57,12 +55,10 @@ class CallingDialect:
         self._board: BoardWord | None = None
         self._listed: list[BoardTopic] = []
         self._call: Question | None = None
-        self._waiting = Waiting()
         self._asked = 0
         self._called = 0
         self._event_sequence: int | None = None
         self._heard = 0.0
-        self._happened: list[Happening] = []
 
     @property
     def about(self) -> About | None:
@@ -101,8 +97,7 @@ class CallingDialect:
 
     def pass_time(self, now: float) -> None:
         """Give up what is late, repeat what is not answered, look after a quiet board."""
-        for command in self._waiting.expired(now):
-            self._fail(command, "expired", "the board was not there, or other calls were before it")
+        self._expire(now)
         call = self._call
         if call is not None and call.command is not None and call.command.deadline <= now:
             self._give_up(call.command, now)
@@ -123,21 +118,12 @@ class CallingDialect:
         self._waiting.add(command)
         self._next(now)
 
-    def withdraw(self, command: Command) -> None:
-        """It is not begun if it has not been."""
-        self._waiting.remove(command)
-
     def answer(self, topic: BoardTopic, payload: bytes, now: float) -> None:
         """These boards ask nothing."""
 
     def outgoing(self) -> bytes:
         """What to send now, once."""
         return self._asker.outgoing()
-
-    def happenings(self) -> list[Happening]:
-        """What has happened since the last call."""
-        happened, self._happened = self._happened, []
-        return happened
 
     def _take(self, frame: Frame, now: float) -> None:
         if frame.kind is Kind.EVENT:
@@ -221,7 +207,7 @@ class CallingDialect:
             assert self._about is not None
             topic = self._about.find(command.topic, Flow.HEARS)
             if topic is None:
-                self._fail(command, "unknown-topic", "the board has no such topic to be called")
+                self._fail(command, "unfit", "the board has no such topic to be called")
                 continue
             try:
                 payload = to_board(topic.name, topic.type, command.payload)
@@ -258,9 +244,6 @@ class CallingDialect:
         self._call = None
         self._happened.append(ended)
         self._next(now)
-
-    def _fail(self, command: Command, reason: str, detail: str) -> None:
-        self._happened.append(Ended(command, Ending.FAILED, reason=reason, detail=detail))
 
     def _event(self, frame: Frame) -> None:
         if self._event_sequence is not None:

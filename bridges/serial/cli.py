@@ -16,6 +16,15 @@ if TYPE_CHECKING:
     from mesh.settings import Settings
 
 
+def _renaming(context: click.Context, option: click.Parameter, given: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
+    """The pairs of TOPIC=NAME."""
+    pairs = tuple(text.partition("=")[::2] for text in given)
+    for text, (topic, name) in zip(given, pairs, strict=True):
+        if not topic.startswith("/") or not name.startswith("/"):
+            raise click.BadParameter(f"{text!r} is not TOPIC=NAME, each with a / before it")
+    return pairs
+
+
 def _parameter(context: click.Context, option: click.Parameter, given: tuple[str, ...]) -> dict[str, object]:
     """The values of NAME=VALUE: numbers where they are some, and lists where there are commas."""
     parameters: dict[str, object] = {}
@@ -64,6 +73,14 @@ def _number(text: str) -> int | float | str:
     callback=_parameter,
     help="a parameter that a rosserial sketch may ask for; several values with commas",
 )
+@click.option(
+    "--map",
+    "renamed",
+    multiple=True,
+    metavar="TOPIC=NAME",
+    callback=_renaming,
+    help="what the board's topic, or all beneath it, is called in the mesh: /led=/left/led, /=/left",
+)
 @with_settings(*NETWORK_SETTINGS)
 def command(
     settings: Settings,
@@ -74,14 +91,19 @@ def command(
     baud: int,
     patience: float,
     parameters: dict[str, object],
+    renamed: tuple[tuple[str, str], ...],
 ) -> None:
     """Bring the device at PORT into the mesh. Ctrl-C ends it.
 
     PORT is a path (/dev/ttyACM0, or one under /dev/serial/by-id, which stays the same), or a USB id
     (usb:2341:0043, with a serial number behind it if there are several). A port that is not there, or goes away, is
     waited for.
+
+    A command on a topic of a job reaches all of the agent's devices that have a topic of that name; --map gives those
+    of this device other names.
     """
     from bridges.serial.edge import DeviceId
+    from bridges.serial.names import Names
     from bridges.serial.serving import serve
     from mesh.network.endpoints import Endpoints
 
@@ -96,6 +118,7 @@ def command(
             baud=baud,
             patience=patience,
             parameters=parameters,
+            names=Names(renamed),
         )
     except AiraError as error:
         fail(error)

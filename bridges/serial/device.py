@@ -125,7 +125,7 @@ class Device:
     async def _call(self, topic: str, key: str, payload: bytes, encoding: str, seconds: float) -> Answer:
         asking = zenoh.CancellationToken()
         ask = partial(self._session.get, payload=payload, encoding=encoding, timeout=seconds + GRACE)
-        selector = f"{key}?timeout={seconds:.3f}"
+        selector = f"{key}?timeout={seconds:.3f};device={self.name}"
         try:
             reply = await asyncio.to_thread(lambda: next(iter(ask(selector, cancellation_token=asking)), None))
         finally:

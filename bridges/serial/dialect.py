@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Final, Protocol
 
-from bridges.serial.errors import UnfitMessage
+from bridges.serial.errors import BoardBusy
 
 if TYPE_CHECKING:
     from schemas.payloads import PayloadType
@@ -171,10 +171,7 @@ class Dialect(Protocol):
         """It is `now`."""
 
     def submit(self, command: Command, now: float) -> None:
-        """Have the board do something, in its turn; the end is told by `Ended`. Raises `UnfitMessage`."""
-
-    def withdraw(self, command: Command) -> None:
-        """Nobody waits for it any more: it is not begun if it has not been."""
+        """Have the board do something, in its turn; the end is told by `Ended`. Raises `UnfitMessage`, `BoardBusy`."""
 
     def answer(self, topic: BoardTopic, payload: bytes, now: float) -> None:
         """Answer what the board asked."""
@@ -192,29 +189,15 @@ class Waiting:
     def __init__(self) -> None:
         self._commands: list[Command] = []
 
-    def __len__(self) -> int:
-        return len(self._commands)
-
     def add(self, command: Command) -> None:
-        """Put it at the end. Raises `UnfitMessage` if too many wait."""
+        """Put it at the end. Raises `BoardBusy` if too many wait."""
         if len(self._commands) >= QUEUED:
-            raise UnfitMessage(command.topic, f"{QUEUED} commands wait for the board already")
+            raise BoardBusy(command.topic, QUEUED)
         self._commands.append(command)
-
-    def put_back(self, command: Command) -> None:
-        """It is the next one again."""
-        self._commands.insert(0, command)
 
     def take(self) -> Command | None:
         """The next one, or None."""
         return self._commands.pop(0) if self._commands else None
-
-    def remove(self, command: Command) -> bool:
-        """Whether it waited; it does no more."""
-        if command in self._commands:
-            self._commands.remove(command)
-            return True
-        return False
 
     def expired(self, now: float) -> list[Command]:
         """Take out those whose deadline has passed."""
@@ -226,3 +209,25 @@ class Waiting:
     def due(self) -> float:
         """When the first of them expires."""
         return min((command.deadline for command in self._commands), default=float("inf"))
+
+
+class Host:
+    """What the host's side of any protocol has: commands that wait for their turn, and what has happened."""
+
+    def __init__(self) -> None:
+        self.counters = Counters()
+        self._waiting = Waiting()
+        self._happened: list[Happening] = []
+
+    def happenings(self) -> list[Happening]:
+        """What has happened since the last call, in order."""
+        happened, self._happened = self._happened, []
+        return happened
+
+    def _expire(self, now: float) -> None:
+        """Give up the commands that have waited too long."""
+        for command in self._waiting.expired(now):
+            self._fail(command, "expired", "the board was not there, or busy with others before it")
+
+    def _fail(self, command: Command, reason: str, detail: str) -> None:
+        self._happened.append(Ended(command, Ending.FAILED, reason=reason, detail=detail))

@@ -25,6 +25,15 @@ class UnfitMessage(InputError):
         self.topic = topic
 
 
+class BoardBusy(RemoteError):
+    """More commands wait for the board than are kept."""
+
+    def __init__(self, topic: str, waiting: int) -> None:
+        super().__init__(f"a message for {topic} is not sent: {waiting} commands wait for the board already")
+        self.topic = topic
+        self.waiting = waiting
+
+
 class CallFailed(AiraError):
     """A call of a device did not end well; `reason` is a short machine-readable word, one of `REASONS`."""
 
@@ -50,7 +59,6 @@ class CallInDoubt(CallFailed):
 REASONS: dict[str, type[CallFailed]] = {
     "refused": CallRefused,
     "unfit": CallRefused,
-    "unknown-topic": CallRefused,
     "absent": CallNotDone,
     "expired": CallNotDone,
     "full": CallNotDone,
@@ -60,6 +68,7 @@ REASONS: dict[str, type[CallFailed]] = {
 
 __all__ = [
     "REASONS",
+    "BoardBusy",
     "CallFailed",
     "CallInDoubt",
     "CallNotDone",

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+STRANGE: Final = 5.0
+"""Seconds on an open port without a board that answers, after which that is said."""
 LOOKED_FOR: Final = 0.25
 """Seconds between two looks for a port that is not there."""
 
@@ -45,6 +47,8 @@ class Line:
         self._backlog = bytearray()
         self._look = 0.0
         self._complaint = ""
+        self._strange = float("inf")
+        self._bytes = 0
 
     def do(self, wish: Callable[[], object]) -> None:
         """Have something done on the line's thread soon; from any thread."""
@@ -86,7 +90,7 @@ class Line:
             del self._backlog[: self._port.write(bytes(self._backlog))]
         if self._wait():
             assert self._port is not None
-            self.dialect.receive(self._port.read(), time.monotonic())
+            self._receive(self._port.read())
         while True:
             try:
                 wish = self._wishes.get_nowait()
@@ -96,10 +100,28 @@ class Line:
         now = time.monotonic()
         if self.dialect.due <= now:
             self.dialect.pass_time(now)
+        if self._strange <= now:
+            self._wonder()
+
+    def _receive(self, data: bytes) -> None:
+        self._bytes += len(data)
+        self.dialect.receive(data, time.monotonic())
+
+    def _wonder(self) -> None:
+        """Nobody has answered for a while on an open port: say so once, with what may be wrong."""
+        self._strange = float("inf")
+        if self.dialect.about is None:
+            came = f"{self._bytes} bytes have come, which make no sense" if self._bytes else "nothing has come"
+            log.warning(
+                "no board answers on %s at %d baud (%s): do --baud and --protocol fit the firmware?",
+                self.name,
+                self._baud,
+                came,
+            )
 
     def _wait(self) -> bool:
         """Wait; whether bytes have come."""
-        due = self.dialect.due if self._port is not None else min(self.dialect.due, self._look)
+        due = min(self.dialect.due, self._strange if self._port is not None else self._look)
         timeout = None if due == float("inf") else max(0.0, due - time.monotonic())
         if not self._wishes.empty():
             timeout = 0.0
@@ -122,6 +144,7 @@ class Line:
         self._complaint = ""
         self._backlog.clear()
         log.info("%s is open at %d baud", self.name, self._baud)
+        self._strange, self._bytes = time.monotonic() + STRANGE, 0
         self.dialect.opened(time.monotonic())
 
     def _lose(self, error: LineError) -> None:

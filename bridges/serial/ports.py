@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import re
+import termios
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -59,12 +61,10 @@ class Port:
         self.path = path
         try:
             self._serial = serial.Serial(str(path), baud, timeout=0, exclusive=True)
-        except serial.SerialException as error:
-            if isinstance(error.errno, int) and not path.exists():
+        except (OSError, ValueError) as error:  # pyserial's own are among them
+            if not path.exists():
                 raise PortMissing(str(path), "it has gone") from None
-            raise LineError(f"can't open {path}: {error}", hint="may you use it, and does nobody else?") from None
-        except (OSError, ValueError) as error:
-            raise LineError(f"can't open {path}: {error}") from None
+            raise LineError(f"can't open {path} at {baud} baud: {_reason(error)}") from None
 
     def fileno(self) -> int:
         """The file descriptor, for select."""
@@ -95,6 +95,20 @@ class Port:
         """Give it back."""
         with contextlib.suppress(OSError):  # a port that was pulled out can't be given back
             self._serial.close()
+
+
+def _reason(error: OSError | ValueError) -> str:
+    """Why a port can't be opened; pyserial says it in longer ways."""
+    below = error.__context__
+    number = below.args[0] if isinstance(below, termios.error) else getattr(error, "errno", None)
+    match number:
+        case errno.EACCES | errno.EPERM:
+            return "no permission; on Debian, be in the group dialout"
+        case errno.EAGAIN | errno.EBUSY:
+            return "another process uses it"
+        case errno.ENOTTY | errno.EISDIR | errno.ENODEV:
+            return "it is no serial port"
+    return os.strerror(number) if number else str(error)
 
 
 def _usb_ports() -> Iterable[serial.tools.list_ports_common.ListPortInfo]:

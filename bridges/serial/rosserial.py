@@ -15,16 +15,14 @@ from bridges.serial import roswire
 from bridges.serial.announcements import Announcements
 from bridges.serial.dialect import (
     Command,
-    Counters,
     Ended,
     Ending,
     Flow,
     Gone,
-    Happening,
+    Host,
     Logged,
     Ready,
     Said,
-    Waiting,
 )
 from bridges.serial.errors import UnfitMessage
 from bridges.serial.rostypes import known_type
@@ -65,13 +63,13 @@ class _Under:
         self.answer: bytes | None = None
 
 
-class RosserialDialect:
+class RosserialDialect(Host):
     """rosserial on a line of `baud` bits per second. `parameters` are what a sketch may ask for, by name."""
 
     def __init__(
         self, *, baud: int, parameters: Mapping[str, object] | None = None, clock: Callable[[], float] = time.time
     ) -> None:
-        self.counters = Counters()
+        super().__init__()
         self._announced = Announcements(roswire.longest_frame(baud))
         self._last: tuple[int, int] | None = None
         self._parameters = dict(parameters or {})
@@ -83,9 +81,7 @@ class RosserialDialect:
         self._settled: float | None = None
         self._answering = 0
         self._under: _Under | None = None
-        self._waiting = Waiting()
         self._out = bytearray()
-        self._happened: list[Happening] = []
 
     @property
     def about(self) -> About | None:
@@ -125,8 +121,7 @@ class RosserialDialect:
 
     def pass_time(self, now: float) -> None:
         """Give up what is late, ask a quiet board for its topics, end an introduction."""
-        for command in self._waiting.expired(now):
-            self._fail(command, "expired", "the board was not there, or other commands were before it")
+        self._expire(now)
         if self._settled is not None and self._settled <= now:
             self._settle(now)
         under = self._under
@@ -149,10 +144,6 @@ class RosserialDialect:
         self._waiting.add(command)
         self._next(now)
 
-    def withdraw(self, command: Command) -> None:
-        """It is not begun if it has not been."""
-        self._waiting.remove(command)
-
     def answer(self, topic: BoardTopic, payload: bytes, now: float) -> None:
         """Answer what the board asked, within what it can take."""
         answering = self._announced.answers(topic)
@@ -166,11 +157,6 @@ class RosserialDialect:
         out = bytes(self._out)
         self._out.clear()
         return out
-
-    def happenings(self) -> list[Happening]:
-        """What has happened since the last call."""
-        happened, self._happened = self._happened, []
-        return happened
 
     def _take(self, message: Message, now: float) -> None:
         try:
@@ -258,9 +244,6 @@ class RosserialDialect:
         kind = under.topic.type if under.answer is not None else None
         self._happened.append(Ended(under.command, ending, under.answer or b"", kind, reason, detail))
         self._next(now)
-
-    def _fail(self, command: Command, reason: str, detail: str) -> None:
-        self._happened.append(Ended(command, Ending.FAILED, reason=reason, detail=detail))
 
     def _leave(self, why: str) -> None:
         """The board is not ready any more. What was under way is in doubt, what waits goes on waiting."""

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from bridges.serial.dialect import Dialect
+    from bridges.serial.names import Names
     from mesh.network.endpoints import Endpoints
 
 log = logging.getLogger(__name__)
@@ -44,6 +45,7 @@ def serve(
     baud: int,
     patience: float,
     parameters: Mapping[str, object],
+    names: Names,
 ) -> None:
     """Serve a board until Ctrl-C or SIGTERM. On the main thread of a process of its own.
 
@@ -54,7 +56,7 @@ def serve(
     device.key("/present")
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(INTERRUPTED))
     with Opening(endpoints).run() as session:
-        edge = Edge(session, device, name, dialect, baud=baud, patience=patience)
+        edge = Edge(session, device, name, dialect, baud=baud, patience=patience, names=names)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda number, frame: edge.stop())
         print(f"edge of {device.agent}: {device.name} on {name}, {protocol}, Zenoh id {session.zid()}", flush=True)

@@ -1,11 +1,13 @@
 """Asks the air pollution sensor what is in the air, and prints what it says."""
 
+import argparse
 import asyncio
 import secrets
+from functools import partial
 from pathlib import Path
 
 from mesh import Agent
-from mesh.recording import open_objective
+from mesh.recording import Played, open_objective, pack
 from mesh.running import run_to_end
 from schemas import ZERO_ADDRESS, Demand, Result, String, Verified, cid_of_file
 
@@ -38,20 +40,33 @@ async def question() -> Demand:
     )
 
 
-async def ask() -> None:
+async def answer() -> Played:
+    """Ask until somebody answers; the measurement, of the file that the Result names."""
+    cid = None
+    while cid is None:  # a sensor that is not there yet does not hear what was said before
+        agent.channel.publish(agent.parts.signer.sign(await question()))
+        try:
+            cid = await asyncio.wait_for(answers.get(), 5)
+        except TimeoutError:
+            print("nobody answers yet", flush=True)
+    recording = await agent.parts.exchange.fetch(cid, size_limit=1 << 20, timeout=30)
+    return next(iter(open_objective(recording).messages()))
+
+
+async def ask(times: int, out: Path | None) -> None:
+    said = []
     async with agent:
-        cid = None
-        while cid is None:  # a sensor that is not there yet does not hear what was said before
-            agent.channel.publish(agent.parts.signer.sign(await question()))
-            try:
-                cid = await asyncio.wait_for(answers.get(), 5)
-            except TimeoutError:
-                print("nobody answers yet", flush=True)
-        recording = await agent.parts.exchange.fetch(cid, size_limit=1 << 20, timeout=30)
-        message = next(iter(open_objective(recording).messages()))
-        for gas, volts in zip(GASES, String.decode(message.payload).data.split(), strict=True):
-            print(f"{gas:<10}{volts} V")
+        for _ in range(times):
+            said.append(await answer())
+            for gas, volts in zip(GASES, String.decode(said[-1].payload).data.split(), strict=True):
+                print(f"{gas:<10}{volts} V", flush=True)
+    if out is not None:
+        pack(said, out)
 
 
 if __name__ == "__main__":
-    run_to_end(ask)
+    parser = argparse.ArgumentParser(description="Ask the air pollution sensor.")
+    parser.add_argument("--times", type=int, default=1, help="how often to ask")
+    parser.add_argument("--out", type=Path, help="recording of all answers to write, for plot.py")
+    given = parser.parse_args()
+    run_to_end(partial(ask, given.times, given.out))

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import asyncio
 import sys
 from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.support.commands import run
+from mesh.recording import open_objective
+from tests.support.commands import AIRA, Serving, run
 from tests.support.lessons import EXAMPLES, PROTOCOLS, as_role, at_work, market
+from tests.support.objectives import objective
+from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 __all__ = ["market"]
+
+PLOT = EXAMPLES / "air_pollution" / "plot.py"
 
 VOLTS = {"dust": 0.5, "CO": 1.0, "LPG": 1.5, "methane": 2.0, "smoke": 2.5, "hydrogen": 3.0}
 
@@ -22,12 +28,42 @@ VOLTS = {"dust": 0.5, "CO": 1.0, "LPG": 1.5, "methane": 2.0, "smoke": 2.5, "hydr
 def test_who_asks_for_nothing_is_told_what_the_sensors_measure(
     protocol: str, market: dict[str, str], tmp_path: Path
 ) -> None:
-    with at_work("air_pollution", "air", protocol, market) as uno:
+    out, png = tmp_path / "air.mcap", tmp_path / "air.png"
+    watching = {"AIRA_CONNECT": market["AIRA_CONNECT"]}
+    with (
+        at_work("air_pollution", "air", protocol, market) as uno,
+        Serving(*AIRA, "watch", says="watching", variables=watching) as watch,
+    ):
         for channel, volts in enumerate(VOLTS.values()):
             uno.apply(channel, int(volts * 1000))
-        done = run(sys.executable, EXAMPLES / "air_pollution" / "person.py", **as_role("person", market))
+        person = EXAMPLES / "air_pollution" / "person.py"
+        done = run(sys.executable, person, "--times", "2", "--out", out, **as_role("person", market))
+        asyncio.run(until(lambda: "done, for 0x" in watch.log(), what="the Result in `aira watch`", seconds=30))
     assert done.returncode == 0, done.stdout + done.stderr
     told = dict(line.rsplit(maxsplit=2)[:2] for line in done.stdout.splitlines() if line.endswith(" V"))
     assert told.keys() == VOLTS.keys()
     for gas, volts in VOLTS.items():
         assert float(told[gas]) == pytest.approx(volts, abs=0.02)
+    assert [message.topic for message in open_objective(out).messages()] == ["/measurements"] * 2
+    drawn = run(sys.executable, PLOT, out, "-o", png)
+    assert drawn.stdout == f"{png}: 2 measurements\n", drawn.stderr
+    assert png.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
+
+
+@pytest.mark.parametrize(
+    ("messages", "said"),
+    [
+        ([("/other", "0.1 0.2")], "there are no measurements to draw"),
+        ([("/measurements", "0.1 0.2")], "'0.1 0.2' is no measurement: 6 numbers are one"),
+        ([("/measurements", "a b c d e f")], "is no measurement"),
+    ],
+)
+def test_a_recording_without_measurements_is_one_clear_line(
+    messages: list[tuple[str, str]], said: str, tmp_path: Path
+) -> None:
+    recording = tmp_path / "other.mcap"
+    recording.write_bytes(objective(*messages))
+    done = run(sys.executable, PLOT, recording, "-o", tmp_path / "air.png")
+    assert done.returncode == 2
+    assert said in done.stderr.splitlines()[0]
+    assert "Traceback" not in done.stderr

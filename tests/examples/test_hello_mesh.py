@@ -57,7 +57,7 @@ def test_the_flow_of_the_readme_ends_paid(market: dict[str, str], tmp_path: Path
         Serving(sys.executable, EXAMPLE / "agent.py", says="watching", variables=watching) as greeter,
         Serving(sys.executable, EXAMPLE / "robot.py", says="account 0x", variables=as_role("robot", market)) as robot,
     ):
-        order = ("--cost", "1000", "--model", model, "--objective", EXAMPLE / "blink.mcap", "--out", out)
+        order = ("--cost", "1000wn", "--model", model, "--objective", EXAMPLE / "blink.mcap", "--out", out)
         variables = (f"{name}={value}" for name, value in as_role("person", market).items())
         done = run("env", *variables, *AIRA, "demand", *order)
         person, contract, outcome, kept = done.stdout.splitlines()

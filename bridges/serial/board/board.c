@@ -4,7 +4,7 @@
 //
 // LINK is made to point to the terminal; with `reset` each opening of the terminal resets the board, as a real one does.
 // Told on stdin:  adc CHANNEL MILLIVOLTS | noise RATE SEED | unplug | plug | reset | quit
-// Says on stdout: port PATH | pin NUMBER LEVEL MICROSECONDS | opened | closed | unplugged | crashed
+// Says on stdout: port PATH | pin NUMBER LEVEL MICROSECONDS | opened | closed | unplugged | crashed | unknown LINE
 #define _GNU_SOURCE
 #include <errno.h>
 #include <fcntl.h>
@@ -191,11 +191,12 @@ static void look_at_terminal(struct board *board) {
 
 static void obey(struct board *board, char *line) {
   unsigned channel, millivolts;
+  double noise;
   line[strcspn(line, "\n")] = 0;
-  if (sscanf(line, "adc %u %u", &channel, &millivolts) == 2 && channel < 8) {
+  if (sscanf(line, "adc %u %u", &channel, &millivolts) == 2 && channel < 8 && millivolts <= 5000) {
     avr_raise_irq(avr_io_getirq(board->avr, AVR_IOCTL_ADC_GETIRQ, ADC_IRQ_ADC0 + channel), millivolts);
-  } else if (sscanf(line, "noise %lf %u", &board->noise, &board->seed) >= 1) {
-    // taken
+  } else if (sscanf(line, "noise %lf %u", &noise, &board->seed) >= 1 && noise >= 0 && noise <= 1) {
+    board->noise = noise;
   } else if (!strcmp(line, "unplug")) {
     unplug(board);
   } else if (!strcmp(line, "plug")) {
@@ -205,7 +206,7 @@ static void obey(struct board *board, char *line) {
   } else if (!strcmp(line, "quit")) {
     stopped = 1;
   } else if (*line) {
-    fprintf(stderr, "board: unknown: %s\n", line);
+    printf("unknown %s\n", line);
   }
 }
 

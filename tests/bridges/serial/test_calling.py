@@ -6,8 +6,8 @@ import msgspec
 import pytest
 
 from bridges.serial.calling import LOST, CallingDialect
-from bridges.serial.dialect import Command, Counters, Ended, Ending, Flow, Gone, Ready, Said
-from bridges.serial.errors import UnfitMessage
+from bridges.serial.dialect import QUEUED, Command, Counters, Ended, Ending, Flow, Gone, Ready, Said
+from bridges.serial.errors import BoardBusy, UnfitMessage
 from bridges.serial.frames import BOARD_ID, Deframer, Frame, Kind, encode
 
 SESSION = 7
@@ -242,10 +242,9 @@ def test_a_board_that_makes_no_sense_is_not_taken_for_one(payload: bytes) -> Non
     assert bench.dialect.counters.refused == 1
 
 
-def test_a_withdrawn_call_is_not_begun(bench: Bench) -> None:
-    bench.call(payload=b"1")
-    second = bench.call(payload=b"2")
-    [first] = bench.heard()
-    bench.dialect.withdraw(second)
-    bench.say(Kind.DONE, first.sequence, 0)
-    assert bench.heard() == []
+def test_calls_beyond_those_that_are_kept_are_refused_and_none_of_the_others_is_lost(bench: Bench) -> None:
+    for _ in range(QUEUED + 1):  # one is under way
+        bench.call()
+    with pytest.raises(BoardBusy):
+        bench.call()
+    assert bench.ended() == []

@@ -16,17 +16,14 @@ import pytest
 from bridges.serial.device import Device
 from bridges.serial.dialect import Ending
 from bridges.serial.errors import CallInDoubt, CallNotDone, CallRefused
-from mesh.recording import open_objective
-from schemas import Empty, String
+from schemas import String
 from tests.support.boards import COUNTER, ROSSERIAL_ECHO, board, edge
 from tests.support.commands import aira
 from tests.support.market import founded, place
-from tests.support.objectives import objective
+from tests.support.ports import free_port
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
-    from bridges.serial.boards import SimulatedBoard
-    from mesh.work.run import Run
     from tests.support.market import Place
     from tests.support.routers import EmbeddedRouter
 
@@ -42,11 +39,6 @@ def resident(pid: int) -> float:
     found = re.search(r"VmRSS:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
     assert found
     return int(found[1]) / 1024
-
-
-def is_at_work(uno: SimulatedBoard) -> bool:
-    """Whether the counter is within /slow."""
-    return bool(uno.changes(13)) and uno.changes(13)[-1].high
 
 
 async def test_a_call_over_the_mesh_comes_back_with_what_the_board_answered(place: Place) -> None:
@@ -106,57 +98,6 @@ async def test_presence_follows_the_cable(place: Place) -> None:
             assert (await device.call("/add", 1)).value == 1
 
 
-async def test_a_job_goes_on_when_the_cable_is_in_again(place: Place) -> None:
-    robot = place.agent("robot")
-    device = Device(robot, patience=LONG)
-
-    @robot.on_demand
-    async def offer(demand: Any) -> None:
-        await robot.offer(demand)
-
-    @robot.on("/work")
-    async def work(job: Run, message: object) -> None:
-        await device.call("/slow", 1, job=job)
-
-    source = place.save(objective(("/work", Empty()), ("/work", Empty()), ("/work", Empty())))
-    with board(COUNTER) as uno, edge(uno.port, place.address("robot"), place.endpoint):
-        async with place.at_work(robot) as person:
-            contract = await person.demand(source, cost=1)
-            await until(lambda: is_at_work(uno), what="the job", seconds=LONG)
-            await asyncio.to_thread(uno.unplug)
-            await asyncio.to_thread(uno.plug)
-            assert (await contract.outcome()).success
-            recording = await contract.recording()
-            assert (await Device(robot).call("/sum")).value == 3
-    topics = [message.topic for message in open_objective(recording).messages()]
-    assert topics.count("/slow") == 3
-
-
-async def test_a_job_whose_board_was_reset_fails_and_never_hangs(place: Place) -> None:
-    robot = place.agent("robot")
-    device = Device(robot, patience=LONG)
-
-    @robot.on_demand
-    async def offer(demand: Any) -> None:
-        await robot.offer(demand)
-
-    @robot.on("/work")
-    async def work(job: Run, message: object) -> None:
-        await device.call("/slow", 1, job=job)
-
-    source = place.save(objective(("/work", Empty())))
-    with board(COUNTER) as uno, edge(uno.port, place.address("robot"), place.endpoint) as process:
-        async with place.at_work(robot) as person:
-            contract = await person.demand(source, cost=1)
-            await until(lambda: is_at_work(uno), what="the job", seconds=LONG)
-            await asyncio.to_thread(uno.reset)
-            assert not (await contract.outcome()).success
-            recording = await contract.recording()
-        assert "restarted" in process.log()
-    [note] = [message.payload for message in open_objective(recording).messages() if message.topic == "/aira/note"]
-    assert "(doubt)" in String.decode(note).data
-
-
 async def test_two_boards_of_two_agents_do_not_hear_each_other(place: Place) -> None:
     with (
         board(COUNTER) as first,
@@ -182,6 +123,21 @@ def test_an_edge_agent_imports_no_chain_and_no_event_loop() -> None:
     assert done.stdout.strip() == "[]"
 
 
+async def test_a_board_that_does_not_understand_is_said_once_with_what_to_look_at(place: Place) -> None:
+    options = ("--protocol", "rosserial")
+    with board(COUNTER) as uno, edge(uno.port, place.address("robot"), place.endpoint, *options) as process:
+        await until(lambda: "do --baud and --protocol fit" in process.log(), what="the hint", seconds=LONG)
+        assert process.log().count("no board answers on") == 1
+
+
+def test_an_edge_agent_without_a_router_is_one_clear_line() -> None:
+    nowhere = f"tcp/127.0.0.1:{free_port()}"
+    done = aira("edge", "/dev/ttyACM0", "--agent", "0x" + "11" * 20, "--connect", nowhere, "--connect-timeout", "0.2")
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[0].startswith(f"aira: no Zenoh router at {nowhere}")
+    assert len(done.stderr.splitlines()) == 2
+
+
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
 def test_it_ends_by_a_signal_also_without_a_board(router: EmbeddedRouter, how: signal.Signals, tmp_path: Path) -> None:
     with edge(tmp_path / "tty", "0x" + "11" * 20, router.endpoint) as process:
@@ -195,6 +151,9 @@ def test_it_ends_by_a_signal_also_without_a_board(router: EmbeddedRouter, how: s
         (("ttyACM0", "--agent", "0x" + "11" * 20), "names no serial port"),
         (("/dev/ttyACM0", "--agent", "robot"), "robot"),
         (("/dev/ttyACM0", "--agent", "0x" + "11" * 20, "--name", "a/b"), "a name has letters"),
+        (("/dev/ttyACM0", "--agent", "0x" + "11" * 20, "--baud", "9"), "--baud"),
+        (("/dev/ttyACM0", "--agent", "0x" + "11" * 20, "--map", "led=/lamp"), "not TOPIC=NAME"),
+        (("/dev/ttyACM0", "--agent", "0x" + "11" * 20, "--map", "/a=/b", "--map", "/a=/c"), "two names"),
     ],
 )
 def test_what_can_not_be_is_one_clear_line(arguments: tuple[str, ...], said: str) -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import logging
 import select
+import time
 
 import pytest
 
 from bridges.serial.boards import SimulatedBoard
 from bridges.serial.calling import CallingDialect
-from bridges.serial.dialect import Counters, Ended, Ending, Gone, Logged, Ready, Said
+from bridges.serial.dialect import Counters, Ended, Ending, Flow, Gone, Logged, Ready, Said
 from bridges.serial.firmware import size_of
 from bridges.serial.frames import Deframer, Frame, Kind, encode
 from bridges.serial.ports import Port
@@ -118,13 +120,18 @@ def test_a_board_that_opening_resets_is_found() -> None:
         assert talk.call("/add", b"1").payload == b"1"
 
 
+def flashes(uno: SimulatedBoard) -> list[bool]:
+    """How the lamp has changed since it was first lit."""
+    levels = [change.high for change in uno.changes(13)]
+    return levels[levels.index(True) :] if True in levels else []
+
+
 def test_rosserial_commands_queue_here_and_all_of_them_run() -> None:
     with board(ROSSERIAL_ECHO) as uno, rosserial(uno) as talk:
         for _ in range(12):
             talk.submit("/work")
         assert [talk.next(Ended).ending for _ in range(12)] == [Ending.READ] * 12
-        levels = [change.high for change in uno.changes(13)]
-        assert levels[levels.index(True) :] == [True, False] * 12
+        uno.wait_until(lambda: flashes(uno) == [True, False] * 12, what="twelve flashes")
 
 
 def test_rosserial_services_parameters_and_logs_are_spoken() -> None:
@@ -133,6 +140,36 @@ def test_rosserial_services_parameters_and_logs_are_spoken() -> None:
         talk.submit("/ask")
         assert talk.next(Said).payload == String("loud").encode()
         assert talk.next(Logged).text == "asked"
+
+
+def test_what_a_rosserial_board_asks_is_answered() -> None:
+    with board(ROSSERIAL_ECHO) as uno, rosserial(uno) as talk:
+        talk.submit("/inquire")
+        asked = talk.next(Said)
+        assert (asked.topic.name, asked.topic.flow, asked.payload) == (
+            "/weather",
+            Flow.ASKS,
+            String("how is it?").encode(),
+        )
+        answer = String("it rains").encode()
+        talk.line.do(lambda: talk.dialect.answer(asked.topic, answer, time.monotonic()))
+        assert talk.next(Said).payload == answer
+
+
+def test_what_a_rosserial_board_sends_on_an_id_that_it_has_not_announced_is_counted_and_its_logs_are_text() -> None:
+    with board(ROSSERIAL_ECHO) as uno, rosserial(uno) as talk:
+        talk.submit("/garble")
+        logged = talk.next(Logged)
+        assert (logged.level, logged.text) == (logging.ERROR, "\ufffd(hot\ufffd")
+        assert talk.dialect.counters.stray == 1
+        assert talk.call("/hear", String("still here").encode()).ending is Ending.READ
+
+
+def test_a_message_that_a_rosserial_board_has_not_announced_never_reaches_it() -> None:
+    with board(ROSSERIAL_ECHO) as uno, rosserial(uno) as talk:
+        refused = talk.call("/unknown", b"")
+        assert (refused.ending, refused.reason) == (Ending.FAILED, "unfit")
+        assert talk.call("/hear", String("still here").encode()).ending is Ending.READ
 
 
 def test_the_longest_string_reaches_a_rosserial_board() -> None:

@@ -35,8 +35,9 @@ def test_what_names_no_port_is_refused(text: str) -> None:
 def test_a_file_that_is_no_terminal_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.touch()
-    with pytest.raises(LineError):
-        Port(path, baud=57_600)
+    for each in (path, tmp_path):
+        with pytest.raises(LineError, match=r"it is no serial port$"):
+            Port(each, baud=57_600)
 
 
 def test_a_port_is_for_one_process_alone_and_tells_when_it_is_pulled_out(tmp_path: Path) -> None:
@@ -44,7 +45,7 @@ def test_a_port_is_for_one_process_alone_and_tells_when_it_is_pulled_out(tmp_pat
     path = PortName(os.ttyname(slave)).find()
     os.close(slave)
     port = Port(path, baud=57_600)
-    with pytest.raises(LineError):
+    with pytest.raises(LineError, match=r"another process uses it$"):
         Port(path, baud=57_600)
     assert port.write(b"abc") == 3
     assert os.read(master, 10) == b"abc"

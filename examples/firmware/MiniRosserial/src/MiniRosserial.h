@@ -16,7 +16,7 @@ const uint16_t BUFFER = 280;
 // ros_lib says 20 ms and was seen to take 123 bytes at 57600 baud, which are 21.4.
 const unsigned long FRAME_MS = 22, SYNC_MS = 2500, LOST_MS = 11000;
 
-enum Special : uint16_t { PUBLISHER = 0, SUBSCRIBER = 1, SERVICE = 2, PARAMETER = 6, LOG = 7, TIME = 10, STOP = 11 };
+enum Special : uint16_t { PUBLISHER = 0, SUBSCRIBER = 1, SERVICE = 2, CLIENT = 4, PARAMETER = 6, LOG = 7, TIME = 10, STOP = 11 };
 enum Level : uint8_t { DEBUG, INFO, WARN, ERROR, FATAL };
 
 struct Type {
@@ -35,10 +35,13 @@ struct Topic {
   Type type;
   Handler handler;
   Service service;
+  bool asks;
 };
-inline Topic hears(const char *name, Type type, Handler handler) { return {name, type, handler, nullptr}; }
-inline Topic says(const char *name, Type type) { return {name, type, nullptr, nullptr}; }
-inline Topic serves(const char *name, Type type, Service service) { return {name, type, nullptr, service}; }
+inline Topic hears(const char *name, Type type, Handler handler) { return {name, type, handler, nullptr, false}; }
+inline Topic says(const char *name, Type type) { return {name, type, nullptr, nullptr, false}; }
+inline Topic serves(const char *name, Type type, Service service) { return {name, type, nullptr, service, false}; }
+// `publish` asks, and the handler gets the answer, if somebody gives one.
+inline Topic asks(const char *name, Type type, Handler answered) { return {name, type, answered, nullptr, true}; }
 
 class Node {
  public:
@@ -147,7 +150,10 @@ class Node {
 
   void announce(uint8_t index) {
     const Topic &topic = topics_[index];
-    if (topic.service) {
+    if (topic.asks) {
+      announce(CLIENT + PUBLISHER, 125 + index, topic);
+      announce(CLIENT + SUBSCRIBER, 100 + index, topic);
+    } else if (topic.service) {
       announce(SERVICE + PUBLISHER, 125 + index, topic);
       announce(SERVICE + SUBSCRIBER, 100 + index, topic);
     } else if (topic.handler) {

@@ -1,0 +1,208 @@
+"""Jobs that boards do: what reaches which board, and what the recordings have of it."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+from bridges.serial.device import Device
+from mesh.agent import Agent
+from mesh.chain import Account, Chain
+from mesh.recording import open_objective
+from schemas import Empty, String, cid_of_bytes
+from schemas.values import decode_value
+from tests.support.bags import Bag, Sent, string
+from tests.support.boards import COUNTER, ROSSERIAL_ECHO, board, edge
+from tests.support.market import QUICK, founded, obliging, place
+from tests.support.objectives import objective
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from bridges.serial.boards import SimulatedBoard
+    from mesh.work.run import Run
+    from tests.support.market import Place
+
+__all__ = ["founded", "place"]
+
+LONG = 60.0
+
+
+def is_at_work(uno: SimulatedBoard) -> bool:
+    """Whether the counter is within /slow."""
+    return bool(uno.changes(13)) and uno.changes(13)[-1].high
+
+
+def counting(robot: Agent) -> Agent:
+    """A robot that has its board count one, slowly, for each message on /work."""
+    device = Device(robot, patience=LONG)
+
+    @robot.on("/work")
+    async def work(job: Run, message: object) -> None:
+        await device.call("/slow", 1, job=job)
+
+    return obliging(robot)
+
+
+def recorded(recording: Path, topic: str) -> list[Any]:
+    """What a recording has on a topic."""
+    messages = open_objective(recording).messages()
+    return [decode_value(message.payload, message.type) for message in messages if message.topic == topic]
+
+
+async def test_a_job_goes_on_when_the_cable_is_in_again_and_its_recording_shows_the_gap(place: Place) -> None:
+    robot = counting(place.agent("robot"))
+    source = place.save(objective(("/work", Empty()), ("/work", Empty()), ("/work", Empty())))
+    with board(COUNTER) as uno, edge(uno.port, place.address("robot"), place.endpoint):
+        async with place.at_work(robot) as person:
+            contract = await person.demand(source, cost=1)
+            await until(lambda: is_at_work(uno), what="the job", seconds=LONG)
+            await asyncio.to_thread(uno.unplug)
+            await asyncio.to_thread(uno.plug)
+            assert (await contract.outcome()).success
+            recording = await contract.recording()
+            assert (await Device(robot).call("/sum")).value == 3
+    assert len(recorded(recording, "/slow")) == 3
+    assert recorded(recording, "/aira/device/board") == [String("absent: the line is closed"), String("present")]
+
+
+async def test_a_job_whose_board_was_reset_fails_and_never_hangs(place: Place) -> None:
+    robot = counting(place.agent("robot"))
+    source = place.save(objective(*[("/work", Empty())] * 5))  # enough to be in time on a slow machine
+    with board(COUNTER) as uno, edge(uno.port, place.address("robot"), place.endpoint) as process:
+        async with place.at_work(robot) as person:
+            contract = await person.demand(source, cost=1)
+            await until(lambda: is_at_work(uno), what="the job", seconds=LONG)
+            await asyncio.to_thread(uno.reset)
+            assert not (await contract.outcome()).success
+            recording = await contract.recording()
+        assert "restarted" in process.log()
+    [note] = recorded(recording, "/aira/note")
+    assert "(doubt)" in note.data
+    assert recorded(recording, "/aira/device/board")[0] == String("absent: the board was restarted")
+
+
+async def test_a_ros_bag_is_an_objective_for_a_board(place: Place) -> None:
+    robot = obliging(place.agent("robot"))
+    device = Device(robot, patience=LONG)
+
+    @robot.on("/work", String)
+    async def work(job: Run, number: String) -> None:
+        await device.call("/add", int(number.data), job=job)
+
+    bag = Bag([Sent("/work", string(str(number)), number * 10**6) for number in (2, 3)], compression="lz4")
+    source = place.save(bag.encode(), "objective.bag")
+    with board(COUNTER) as uno, edge(uno.port, place.address("robot"), place.endpoint):
+        async with place.at_work(robot) as person:
+            contract = await person.demand(source, cost=1)
+            assert (await contract.outcome()).success
+            recording = await contract.recording()
+            assert (await device.call("/sum")).value == 5
+    assert recorded(recording, "/work") == [String("2"), String("3")]
+    assert recorded(recording, "/added") == [2, 3]
+
+
+async def test_of_devices_with_the_same_topics_a_call_reaches_the_one_that_it_names(place: Place) -> None:
+    robot = obliging(place.agent("robot"))
+    left, right = Device(robot, "left", patience=LONG), Device(robot, "right", patience=LONG)
+    address = place.address("robot")
+
+    @robot.on("/work")
+    async def work(job: Run, message: object) -> None:
+        await left.call("/add", 5, job=job)
+        await right.call("/add", 7, job=job)
+
+    source = place.save(objective(("/work", Empty())))
+    with (
+        board(COUNTER) as one,
+        board(COUNTER) as other,
+        edge(one.port, address, place.endpoint, "--name", "left"),
+        edge(other.port, address, place.endpoint, "--name", "right"),
+    ):
+        async with place.at_work(robot) as person:
+            contract = await person.demand(source, cost=1)
+            assert (await contract.outcome()).success
+            recording = await contract.recording()
+            assert (await left.call("/sum")).value == 5
+            assert (await right.call("/sum")).value == 7
+    assert recorded(recording, "/add") == [5, 7]
+    assert sorted(recorded(recording, "/added")) == [5, 7]
+
+
+async def test_a_command_in_a_job_reaches_only_the_device_whose_topics_are_called_so(place: Place) -> None:
+    robot = obliging(place.agent("robot"))
+    left, right = Device(robot, "left", patience=LONG), Device(robot, "right", patience=LONG)
+    address = place.address("robot")
+
+    @robot.on("/work")
+    async def work(job: Run, message: object) -> None:
+        await left.call("/left/sum", job=job)
+        await right.call("/right/sum", job=job)
+        job.publish("/left/add", 5)
+
+    source = place.save(objective(("/work", Empty())))
+    with (
+        board(COUNTER) as one,
+        board(COUNTER) as other,
+        edge(one.port, address, place.endpoint, "--name", "left", "--map", "/=/left"),
+        edge(other.port, address, place.endpoint, "--name", "right", "--map", "/=/right"),
+    ):
+        async with place.at_work(robot) as person:
+            contract = await person.demand(source, cost=1)
+            assert (await contract.outcome()).success
+            assert (await left.call("/left/sum")).value == 5
+            assert (await right.call("/right/sum")).value == 0
+
+
+@asynccontextmanager
+async def second_robot(place: Place, account: Account, model: str) -> AsyncIterator[Agent]:
+    """A robot beside the market's own, not yet running."""
+    settings = place.settings("second")
+    async with Chain(place.node.provider, account=account, ens=place.market.deployment.ens, timing=QUICK) as chain:
+        yield Agent(model, settings=settings, account=account, chain=chain)
+
+
+async def test_two_boards_do_jobs_of_one_market_at_the_same_time(place: Place) -> None:
+    other_model = cid_of_bytes(b"what the second robot of the test can do")
+    counting_began, talking_began = asyncio.Event(), asyncio.Event()
+    first = obliging(place.agent("robot"))
+    counter = Device(first, patience=LONG)
+
+    @first.on("/work")
+    async def work(job: Run, message: object) -> None:
+        counting_began.set()
+        await talking_began.wait()
+        await counter.call("/slow", 1, job=job)
+
+    account = Account.from_key(place.node.funded_keys[4])
+    async with second_robot(place, account, other_model) as second:
+        talker = Device(second, patience=LONG)
+
+        @second.on("/say", String)
+        async def say(job: Run, text: String) -> None:
+            talking_began.set()
+            await counting_began.wait()
+            await talker.call("/hear", text, job=job)
+
+        obliging(second)
+        numbers = place.save(objective(("/work", Empty()), ("/work", Empty())), "numbers.mcap")
+        words = place.save(objective(("/say", String("hello")), ("/say", String("world"))), "words.mcap")
+        with (
+            board(COUNTER) as uno,
+            board(ROSSERIAL_ECHO) as other,
+            edge(uno.port, place.address("robot"), place.endpoint),
+            edge(other.port, account.address, place.endpoint, "--protocol", "rosserial"),
+        ):
+            async with place.at_work(first, second) as person:
+                contracts = await asyncio.gather(
+                    person.demand(numbers, cost=1), person.demand(words, cost=1, model=other_model)
+                )
+                outcomes = await asyncio.gather(*(contract.outcome() for contract in contracts))
+                assert all(outcome.success for outcome in outcomes)
+                counted, heard = [await contract.recording() for contract in contracts]
+    assert (recorded(counted, "/slow"), recorded(counted, "/hear")) == ([1, 1], [])
+    assert recorded(heard, "/hear") == recorded(heard, "/said") == [String("hello"), String("world")]
+    assert recorded(heard, "/slow") == recorded(heard, "/added") == []
