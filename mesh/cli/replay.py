@@ -88,7 +88,8 @@ async def _replay(settings: Settings, asked: Replay) -> None:
     given = None if asked.to is None else await asyncio.to_thread(destination_of, settings, asked.to)
     async with opened_store(settings) as store:
         path, own = await _source(settings, store, asked)
-        recording = await asyncio.to_thread(open_objective, path, GENEROUS)
+        with progress(f"reading {path.name}") as tell:
+            recording = await asyncio.to_thread(open_objective, path, GENEROUS, progress=tell)
         destination = given or own
         if destination is None:
             raise InputError("a file says nothing of where it is to be played", hint="name a device or a key with --to")

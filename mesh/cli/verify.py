@@ -13,6 +13,7 @@ from mesh.cli.holdings import MESH, fetch, opened_store, readable
 from mesh.cli.opening import reading
 from mesh.cli.options import with_settings
 from mesh.cli.printing import plural, print_facts, print_json, print_table, visible, with_json
+from mesh.cli.progress import progress
 from mesh.errors import AiraError, InputError
 from mesh.evidence import Claim, Verdict, check_end, verify
 from mesh.running import run_to_end
@@ -102,15 +103,17 @@ async def _verdict(settings: Settings, claim: Claim, files: Files, message: byte
     async with opened_store(settings) as store:
         objective = readable(files.objective) if files.objective else await fetch(settings, store, claim.objective)
         result = readable(files.result) if files.result else await fetch(settings, store, claim.result)
-        return await asyncio.to_thread(
-            verify,
-            claim,
-            objective=objective,
-            result=result,
-            message=message,
-            objective_cid="" if files.objective else claim.objective,
-            result_cid="" if files.result else claim.result,
-        )
+        with progress("verifying") as tell:
+            return await asyncio.to_thread(
+                verify,
+                claim,
+                objective=objective,
+                result=result,
+                message=message,
+                objective_cid="" if files.objective else claim.objective,
+                result_cid="" if files.result else claim.result,
+                progress=tell,
+            )
 
 
 def _print(claim: Claim, verdict: Verdict) -> None:

@@ -1,123 +1,112 @@
 """Reading ROS 1 bags, version 2.0, of unknown origin: closed or cut between two records, indexed or not.
 
 Records are read front to back and their index is not used, since it may say anything. A bag has no checksums of its
-own. Source: the ROS bag format, version 2.0.
+own.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import IntEnum
 from functools import partial
-from struct import Struct
-from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple
+from typing import TYPE_CHECKING, BinaryIO, Final
 
-from mesh.recording.cursor import Cursor, text_of
-from mesh.recording.errors import CorruptRecording, NotARecording, RecordingTooLarge
-from mesh.recording.source import Block, Channel, Record, Segment, Source, check_window, load, survey
-from schemas.payloads import PayloadType
+from mesh.recording.bag_records import (
+    CONNECTION,
+    Op,
+    Part,
+    channel_of,
+    fields_of,
+    number_of,
+    parts,
+    parts_in,
+    record_of,
+)
+from mesh.recording.cursor import text_of
+from mesh.recording.errors import CorruptRecording, RecordingTooLarge
+from mesh.recording.source import (
+    Block,
+    Channel,
+    Expanding,
+    Record,
+    Segment,
+    Source,
+    check_counts,
+    check_definitions,
+    check_window,
+    load,
+    survey,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from mesh.content import Progress
     from mesh.recording.limits import Limits
+    from mesh.recording.source import Look
 
-MAGIC: Final = b"#ROSBAG V2.0\n"
-
-_LENGTH: Final = Struct("<I")
-_TIME: Final = Struct("<II")
-_HEADER: Final = 64 << 10
-"""Bytes of the longest record header taken; what is long is in the data of a record."""
-_SECOND: Final = 10**9
+_RUN: Final = 1 << 20
+"""Bytes of messages outside chunks that are taken as one block."""
 
 
-class _Op(IntEnum):
-    """The kinds of records."""
-
-    MESSAGE = 2
-    BAG = 3
-    INDEX = 4
-    CHUNK = 5
-    CHUNK_INFO = 6
-    CONNECTION = 7
-
-
-_CONNECTION: Final = bytes([_Op.CONNECTION])
-_IN_CHUNKS: Final = frozenset({_CONNECTION, bytes([_Op.MESSAGE])})
-
-
-class Part(NamedTuple):
-    """A record: the fields of its header, where it begins, and where its data is."""
-
-    fields: dict[bytes, bytes]
-    begin: int
-    offset: int
-    length: int
-
-    @property
-    def opcode(self) -> int:
-        """What kind of record it is; -1 if it does not say."""
-        value = self.fields.get(b"op", b"")
-        return value[0] if len(value) == 1 else -1
-
-
-def open_bag(path: Path, size: int, limits: Limits) -> Source:
-    """Check the whole of a bag of `size` bytes.
+def open_bag(
+    path: Path, size: int, limits: Limits, *, look: Look | None = None, progress: Progress | None = None
+) -> Source:
+    """Check the whole of a bag of `size` bytes; `look` is shown every message, `progress` told of bytes.
 
     Raises `CorruptRecording`, `RecordingTooLarge`, and `NotARecording` if it is no bag, or an encrypted one.
     """
     with path.open("rb") as file:
-        expanded = 0
-        for number, part in enumerate(parts(path, file, size)):
-            if number > 2 * limits.messages:
-                raise RecordingTooLarge(path, f"more than {2 * limits.messages} records")
-            if part.opcode == _Op.CHUNK:
-                expanded += _chunk_block(path, part, limits).size
-            if expanded > limits.expanded:
-                raise RecordingTooLarge(path, f"its chunks expand to more than the {limits.expanded} bytes allowed")
-        reading = _Reading(path, file, limits)
-        for part in parts(path, file, size):
+        reading = _Reading(path, file, limits, look)
+        for part in _outline(path, file, size, limits):
             reading.take(part)
+            if progress is not None:
+                progress(part.offset, size)
     check_window(path, reading.segments, limits)
     records = partial(_records_in, path)
     return Source(path, "bag", size, reading.channels, tuple(reading.segments), {}, records)
 
 
-def parts(path: Path, file: BinaryIO, size: int) -> Iterator[Part]:
-    """The records of a bag, front to back; their data is not read. Raises `CorruptRecording` where it is cut."""
-    file.seek(0)
-    if file.read(len(MAGIC)) != MAGIC:
-        raise NotARecording(path, "it does not begin as a bag does")
-    position = len(MAGIC)
-    while position < size:
-        file.seek(position)
-        length = _length(path, file.read(_LENGTH.size))
-        if length > min(_HEADER, size - position):
-            raise CorruptRecording(path, f"a record header of {length} bytes at byte {position}")
-        fields = fields_of(path, file.read(length))
-        offset = position + length + 2 * _LENGTH.size
-        part = Part(fields, position, offset, _length(path, file.read(_LENGTH.size)))
-        if part.length > size - offset:
-            raise CorruptRecording(path, f"it is cut off: a record at byte {position} goes beyond the end")
-        _check_first(path, part, size)
-        yield part
-        position = offset + part.length
+def _outline(path: Path, file: BinaryIO, size: int, limits: Limits) -> list[Block | Part]:
+    """The blocks of messages and the connections of a bag in its order; what is too large is refused here.
+
+    Messages outside chunks are one block as long as they lie side by side.
+    """
+    found: list[Block | Part] = []
+    expanding, defined = Expanding(path, limits), 0
+    for number, part in enumerate(parts(path, file, size)):
+        if number > limits.messages // 2:  # one takes as long as several in a chunk
+            raise RecordingTooLarge(path, f"more than {limits.messages // 2} records outside its chunks")
+        match part.opcode:
+            case Op.CHUNK:
+                block = _chunk_block(path, part, limits)
+                expanding.add(block)
+                found.append(block)
+            case Op.MESSAGE:
+                _add_message(path, found, part, limits)
+            case Op.CONNECTION:
+                defined += part.offset - part.begin
+                check_definitions(path, limits, channels=0, size=defined)
+                found.append(part)
+            case Op.BAG | Op.INDEX | Op.CHUNK_INFO:
+                pass
+            case opcode:
+                raise CorruptRecording(path, f"a record of the unknown kind {opcode}")
+        check_counts(path, limits, records=0, blocks=len(found))
+    return found
 
 
-def fields_of(path: Path, header: bytes) -> dict[bytes, bytes]:
-    """The fields of a record header, or of a connection: each `name=value` after its length."""
-    position, end, fields = 0, len(header), {}
-    while position < end:
-        length = int.from_bytes(header[position : position + 4], "little")
-        position += 4 + length
-        if position > end:
-            raise CorruptRecording(path, f"a field of {length} bytes goes beyond the end of its record")
-        name, equals, value = header[position - length : position].partition(b"=")
-        if not equals:
-            raise CorruptRecording(path, "a field of a record has no name")
-        fields[name] = value
-    return fields
+def _add_message(path: Path, found: list[Block | Part], part: Part, limits: Limits) -> None:
+    """Take note of a message outside any chunk."""
+    whole = part.offset + part.length - part.begin
+    if whole > limits.record:
+        raise RecordingTooLarge(path, f"a message of {whole} bytes")
+    last = found[-1] if found else part
+    beside = isinstance(last, Block) and not last.compression and last.offset + last.stored == part.begin
+    if isinstance(last, Block) and beside and last.stored + whole <= _RUN:
+        found[-1] = Block(last.offset, last.stored + whole, last.size + whole)
+    else:
+        found.append(Block(part.begin, whole, whole))
 
 
 @dataclass
@@ -125,148 +114,68 @@ class _Reading:
     path: Path
     file: BinaryIO
     limits: Limits
+    look: Look | None
     channels: dict[int, Channel] = field(default_factory=dict)
     segments: list[Segment] = field(default_factory=list)
     _defined: int = 0
-    _messages: int = 0
+    _records: int = 0
     _blocks: int = 0
-    _connections: int = 0
     _said: dict[int, tuple[dict[bytes, bytes], bytes]] = field(default_factory=dict)
 
-    def take(self, part: Part) -> None:
-        """Read one record of the file. Messages are checked and counted, and their places kept."""
-        match part.opcode:
-            case _Op.CHUNK:
-                block = _chunk_block(self.path, part, self.limits)
-                self._take_block(block)
-            case _Op.MESSAGE:
-                whole = part.offset + part.length - part.begin
-                if whole > self.limits.record:
-                    raise RecordingTooLarge(self.path, f"a message of {whole} bytes")
-                self._take_block(Block(part.begin, whole, whole))
-            case _Op.CONNECTION:
-                self.file.seek(part.offset)
-                self._connect(part, self.file.read(min(part.length, self.limits.definitions + 1)))
-            case _Op.BAG | _Op.INDEX | _Op.CHUNK_INFO:
-                pass
-            case opcode:
-                raise CorruptRecording(self.path, f"a record of the unknown kind {opcode}")
+    def take(self, part: Block | Part) -> None:
+        """Read a block of messages, which are checked and counted, or a connection outside any."""
+        if isinstance(part, Block):
+            self._take_block(part)
+            return
+        self.file.seek(part.offset)
+        self._connect(part, self.file.read(min(part.length, self.limits.definitions + 1)))
 
     def _take_block(self, block: Block) -> None:
         data = load(self.path, self.file, block)
         segment = survey(self.path, self._blocks, block, records=self._checked(data))
         self._blocks += 1
-        if segment is None:
-            return
-        self.segments.append(segment)
-        self._messages += segment.count
-        if self._messages > self.limits.messages:
-            raise RecordingTooLarge(self.path, f"more than {self.limits.messages} messages")
+        if segment is not None:
+            self.segments.append(segment)
 
     def _checked(self, data: bytes) -> Iterator[Record]:
-        for part in _parts_in(self.path, data):
-            if part.fields[b"op"] == _CONNECTION:
+        look, most = self.look, self.limits.messages
+        for part in parts_in(self.path, data):
+            self._records += 1
+            if self._records > most:
+                check_counts(self.path, self.limits, records=self._records, blocks=0)
+            if part.fields[b"op"] == CONNECTION:
                 self._connect(part, data[part.offset : part.offset + part.length])
                 continue
-            record = _record_of(self.path, part, data)
-            if record.channel not in self.channels:
+            record = record_of(self.path, part, data)
+            channel = self.channels.get(record.channel)
+            if channel is None:
                 raise CorruptRecording(self.path, f"a message of connection {record.channel}, which is not there")
+            if look is not None:
+                look(channel, record.payload)
             yield record
 
     def _connect(self, part: Part, data: bytes) -> None:
-        self._connections += 1
-        if self._connections > self.limits.messages:
-            raise RecordingTooLarge(self.path, f"more than {self.limits.messages} records besides its messages")
-        number = _number(self.path, part, b"conn")
-        if self._said.get(number) == (part.fields, data):
+        number = number_of(self.path, part, b"conn")
+        if self._said.get(number) == (part.fields, data):  # every chunk may repeat them
             return
+        self._defined += part.offset - part.begin + len(data)
+        count = len(self.channels) + (number not in self.channels)
+        check_definitions(self.path, self.limits, channels=count, size=self._defined)
         self._said[number] = part.fields, data
-        channel = _channel_of(self.path, part, fields_of(self.path, data))
-        if self.channels.setdefault(number, channel) is not channel:
-            if self.channels[number] != channel:
-                raise CorruptRecording(self.path, f"two different connections have the number {number}")
-            return
-        self._defined += len(data)
-        if self._defined > self.limits.definitions or len(self.channels) > self.limits.channels:
-            raise RecordingTooLarge(
-                self.path, f"{len(self.channels)} connections, {self._defined} bytes of definitions"
-            )
-
-
-def _parts_in(path: Path, data: bytes) -> Iterator[Part]:
-    """The records in the decompressed data of a chunk."""
-    position, end = 0, len(data)
-    while position < end:
-        header = position + 4
-        offset = header + int.from_bytes(data[position:header], "little") + 4
-        if offset > end:
-            raise CorruptRecording(path, "it is cut off in a chunk")
-        fields = fields_of(path, data[header : offset - 4])
-        length = int.from_bytes(data[offset - 4 : offset], "little")
-        if length > end - offset or fields.get(b"op") not in _IN_CHUNKS:
-            raise CorruptRecording(path, "a chunk holds what is neither a whole message nor a connection")
-        yield Part(fields, position, offset, length)
-        position = offset + length
+        channel = channel_of(self.path, part, fields_of(self.path, data))
+        if self.channels.setdefault(number, channel) != channel:
+            raise CorruptRecording(self.path, f"two different connections have the number {number}")
 
 
 def _records_in(path: Path, data: bytes) -> Iterator[Record]:
-    for part in _parts_in(path, data):
-        if part.fields[b"op"] != _CONNECTION:
-            yield _record_of(path, part, data)
-
-
-def _record_of(path: Path, part: Part, data: bytes) -> Record:
-    """The message of a record; bags hold one time for it, and no sequence number."""
-    time = part.fields.get(b"time", b"")
-    if len(time) != _TIME.size:
-        raise CorruptRecording(path, "a message without a time")
-    seconds, nanoseconds = _TIME.unpack(time)
-    when = seconds * _SECOND + nanoseconds
-    payload = data[part.offset : part.offset + part.length]
-    return Record(_number(path, part, b"conn"), 0, when, when, payload)
-
-
-def _channel_of(path: Path, part: Part, connection: dict[bytes, bytes]) -> Channel:
-    kind = text_of(path, connection.get(b"type", b""))
-    definition = connection.get(b"message_definition", b"")
-    topic = part.fields.get(b"topic") or connection.get(b"topic", b"")
-    if not topic or not kind:
-        raise CorruptRecording(path, "a connection without topic or type")
-    metadata = {
-        text_of(path, name): text_of(path, value)
-        for name, value in connection.items()
-        if name not in (b"type", b"message_definition")
-    }
-    return Channel(text_of(path, topic), PayloadType("ros1", kind, "ros1msg", definition), metadata)
+    for part in parts_in(path, data):
+        if part.fields[b"op"] != CONNECTION:
+            yield record_of(path, part, data)
 
 
 def _chunk_block(path: Path, part: Part, limits: Limits) -> Block:
-    size = _number(path, part, b"size")
+    size = number_of(path, part, b"size")
     if max(size, part.length) > limits.record:
         raise RecordingTooLarge(path, f"a chunk expands to {size} bytes, more than the {limits.record} allowed")
     compression = text_of(path, part.fields.get(b"compression", b""))
     return Block(part.offset, part.length, size, compression)
-
-
-def _check_first(path: Path, part: Part, size: int) -> None:
-    if part.begin != len(MAGIC):
-        return
-    if part.opcode != _Op.BAG:
-        raise CorruptRecording(path, "its first record is not that of a bag")
-    if part.fields.get(b"encryptor"):
-        raise NotARecording(path, "it is encrypted")
-    if Cursor(path, part.fields.get(b"index_pos", b"")).u64() > size:
-        raise CorruptRecording(path, "it is cut off before its index")
-
-
-def _number(path: Path, part: Part, name: bytes) -> int:
-    value = part.fields.get(name, b"")
-    if len(value) != 4:
-        raise CorruptRecording(path, f"a record without its field {name.decode()}")
-    return int.from_bytes(value, "little")
-
-
-def _length(path: Path, data: bytes) -> int:
-    if len(data) != _LENGTH.size:
-        raise CorruptRecording(path, "it is cut off")
-    return int.from_bytes(data, "little")

@@ -12,7 +12,7 @@ from mesh.recording.recovery import copy_content
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.recording.recovery import Progress
+    from mesh.content import Progress
 
 _DEFAULT: Final = Limits()
 

@@ -34,10 +34,13 @@ from mesh.recording.source import (
     Attachment,
     Block,
     Channel,
+    Expanding,
     Record,
     Segment,
     Source,
     Statistics,
+    check_counts,
+    check_definitions,
     check_window,
     load,
     survey,
@@ -47,7 +50,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
     from pathlib import Path
 
+    from mesh.content import Progress
     from mesh.recording.limits import Limits
+    from mesh.recording.source import Look
 
 T = TypeVar("T")
 
@@ -59,18 +64,22 @@ _PRIVATE: Final = 0x80
 """The opcodes from here on are anybody's own."""
 
 
-def open_mcap(path: Path, size: int, limits: Limits) -> Source:
-    """Check the whole of an MCAP file of `size` bytes.
+def open_mcap(
+    path: Path, size: int, limits: Limits, *, look: Look | None = None, progress: Progress | None = None
+) -> Source:
+    """Check the whole of an MCAP file of `size` bytes; `look` is shown every message, `progress` told of bytes.
 
     Raises `CorruptRecording`, `RecordingTooLarge`, and `NotARecording` if it is no MCAP file at all.
     """
     with path.open("rb") as file:
-        reading = Reading(path, file, limits)
+        reading = Reading(path, file, limits, look)
         reading.statistics, checked = _check_outline(path, file, size, limits)
         for frame in _runs(frames(path, file, size)):
             if frame.opcode == Opcode.DATA_END:
                 break
             reading.take(frame)
+            if progress is not None:
+                progress(frame.offset + frame.length, size)
     check_window(path, reading.segments, limits)
     if checked:
         reading.unchecked = 0
@@ -91,17 +100,19 @@ class Reading:
     path: Path
     file: BinaryIO
     limits: Limits
+    look: Look | None = None
     channels: dict[int, Channel] = field(default_factory=dict)
     segments: list[Segment] = field(default_factory=list)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
-    messages: int = 0
     attachments: list[Attachment] = field(default_factory=list)
     statistics: Statistics | None = None
     unchecked: int = 0
     _schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
+    _said: dict[tuple[int, bytes], bytes] = field(default_factory=dict)
+    """The last definition of each kind and number, as it is written."""
     _defined: int = 0
     _blocks: int = 0
-    _others: int = 0
+    _records: int = 0
 
     def source(self, size: int) -> Source:
         """The file, as far as it was read."""
@@ -139,57 +150,64 @@ class Reading:
                 attachment = attachment_of(self.path, self.file, frame)
                 self.attachments.append(attachment)
                 self._count(len(attachment.name) + len(attachment.media_type))
+                self._check_counts()
 
     def _take_block(self, block: Block, data: bytes) -> None:
         segment = survey(self.path, self._blocks, block, records=self._checked(data))
         self._blocks += 1
-        if segment is None:
-            return
-        self.segments.append(segment)
-        self.messages += segment.count
-        if self.messages > self.limits.messages:
-            raise RecordingTooLarge(self.path, f"more than {self.limits.messages} messages")
+        self._check_counts()
+        if segment is not None:
+            self.segments.append(segment)
 
     def _checked(self, data: bytes) -> Iterator[Record]:
+        look, most = self.look, self.limits.messages
         for frame in entries(self.path, data):
+            self._records += 1
+            if self._records > most:
+                self._check_counts()
             if frame.opcode == Opcode.MESSAGE:
                 record = record_of(self.path, data, frame)
-                if record.channel not in self.channels:
+                channel = self.channels.get(record.channel)
+                if channel is None:
                     raise CorruptRecording(self.path, f"a message on channel {record.channel}, which is not there")
+                if look is not None:
+                    look(channel, record.payload)
                 yield record
-                continue
-            self._others += 1
-            if self._others > self.limits.messages:
-                raise RecordingTooLarge(self.path, f"more than {self.limits.messages} records besides its messages")
-            if frame.opcode in _DEFINITIONS:
+            elif frame.opcode in _DEFINITIONS:
                 self._define(frame.opcode, data[frame.offset : frame.offset + frame.length])
             elif frame.opcode < _PRIVATE:
                 raise CorruptRecording(self.path, f"a chunk holds a record of the kind {frame.opcode}")
 
     def _define(self, opcode: int, data: bytes) -> None:
         if opcode == Opcode.METADATA:
+            self._count(len(data))
             name, values = metadata_of(self.path, data)
             self.metadata[name] = values
-        elif opcode == Opcode.SCHEMA:
-            if not self._defines(self._schemas, *schema_of(self.path, data)):
-                return
-        elif not self._defines(self.channels, *channel_of(self.path, data, self._schemas)):
+            return
+        definition = opcode, data[:2]
+        if self._said.get(definition) == data:  # every chunk may repeat them
             return
         self._count(len(data))
+        self._said[definition] = data
+        if opcode == Opcode.SCHEMA:
+            self._enter(self._schemas, *schema_of(self.path, data))
+        else:
+            self._enter(self.channels, *channel_of(self.path, data, self._schemas))
+            self._count(0)
 
     def _count(self, size: int) -> None:
         """Take note of `size` bytes of definitions."""
         self._defined += size
-        if self._defined > self.limits.definitions or len(self.channels) > self.limits.channels:
-            raise RecordingTooLarge(self.path, f"{len(self.channels)} channels, {self._defined} bytes of definitions")
+        check_definitions(self.path, self.limits, channels=len(self.channels), size=self._defined)
 
-    def _defines(self, known: dict[int, T], number: int, item: T) -> bool:
-        """Enter a definition; False if the same is there already, as when every chunk repeats them."""
-        if known.setdefault(number, item) is item:
-            return True
-        if known[number] != item:
+    def _check_counts(self) -> None:
+        blocks = self._blocks + len(self.attachments)
+        check_counts(self.path, self.limits, records=self._records, blocks=blocks)
+
+    def _enter(self, known: dict[int, T], number: int, item: T) -> None:
+        """Enter a definition, unless the same is there already in other words."""
+        if known.setdefault(number, item) != item:
             raise CorruptRecording(self.path, f"two different definitions have the number {number}")
-        return False
 
 
 def _check_outline(path: Path, file: BinaryIO, size: int, limits: Limits) -> tuple[Statistics | None, bool]:
@@ -197,20 +215,18 @@ def _check_outline(path: Path, file: BinaryIO, size: int, limits: Limits) -> tup
 
     Gives what the file says about itself at its end, and whether its data has a checksum as a whole.
     """
-    expanded, data_end, footer, statistics = 0, None, None, None
+    expanding, data_end, footer, said = Expanding(path, limits), None, None, None
     for number, frame in enumerate(frames(path, file, size)):
         if number > 2 * limits.messages:
             raise RecordingTooLarge(path, f"more than {2 * limits.messages} records")
         if frame.opcode == Opcode.CHUNK:
-            expanded += chunk_head(path, file, frame, limits=limits).block.size
+            expanding.add(chunk_head(path, file, frame, limits=limits).block)
         elif frame.opcode == Opcode.DATA_END and data_end is None:
             data_end = frame
         elif frame.opcode == Opcode.FOOTER:
             footer = frame
         elif frame.opcode == Opcode.STATISTICS:
-            statistics = statistics_of(path, content(path, file, frame, limits=limits))
-        if expanded > limits.expanded:
-            raise RecordingTooLarge(path, f"its chunks expand to more than the {limits.expanded} bytes allowed")
+            said = frame
     if data_end is None or footer is None:
         raise CorruptRecording(path, "its data has no end")
     data_crc = Cursor(path, content(path, file, data_end, limits=limits)).u32()
@@ -218,7 +234,15 @@ def _check_outline(path: Path, file: BinaryIO, size: int, limits: Limits) -> tup
     end = Cursor(path, content(path, file, footer, limits=limits))
     summary, _, crc = end.u64(), end.u64(), end.u32()
     check_stretch(path, file, start=summary or footer.offset - _PREFIX, end=footer.offset + 16, crc=crc)
-    return statistics, bool(data_crc)
+    return _said(path, file, said, limits), bool(data_crc)
+
+
+def _said(path: Path, file: BinaryIO, frame: Frame | None, limits: Limits) -> Statistics | None:
+    """The statistics of that frame, if there is one."""
+    if frame is None:
+        return None
+    check_definitions(path, limits, channels=0, size=frame.length)
+    return statistics_of(path, content(path, file, frame, limits=limits))
 
 
 def _runs(found: Iterable[Frame]) -> Iterator[Frame]:

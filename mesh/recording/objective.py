@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec import Struct
 
-from mesh.recording import bag_source, mcap_records
+from mesh.recording import bag_records, mcap_records
 from mesh.recording.bag_source import open_bag
 from mesh.recording.errors import NotARecording, RecordingTooLarge
 from mesh.recording.limits import Limits
@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from pathlib import Path
 
-    from mesh.recording.source import Channel, Source
+    from mesh.content import Progress
+    from mesh.recording.source import Channel, Look, Source
 
 _DEFAULT: Final = Limits()
 
@@ -98,25 +99,30 @@ class Objective:
             yield Written(channel, _played(channels[channel], payload, log_time, publish_time, sequence))
 
 
-def open_objective(path: Path, limits: Limits = _DEFAULT) -> Objective:
+def open_objective(path: Path, limits: Limits = _DEFAULT, *, progress: Progress | None = None) -> Objective:
     """Check the whole of the recording at `path`, an MCAP file or a ROS 1 bag by its first bytes, and open it.
 
     Reads the whole file: do so in a thread. Memory is bounded by the limits whatever the file says, and no schema
-    text is ever looked into. Raises `NotARecording`, `RecordingTooLarge`, `CorruptRecording`.
+    text is ever looked into. `progress` is told how many bytes of the file are read, of how many. Raises
+    `NotARecording`, `RecordingTooLarge`, `CorruptRecording`.
     """
-    return Objective(open_source(path, limits))
+    return Objective(open_source(path, limits, progress=progress))
 
 
-def open_source(path: Path, limits: Limits) -> Source:
-    """As `open_objective`, for what needs the messages in the order of the file."""
+def open_source(path: Path, limits: Limits, *, look: Look | None = None, progress: Progress | None = None) -> Source:
+    """As `open_objective`, for what needs the messages in the order of the file, or to `look` at them on the way."""
     size, magic = _look(path)
     if size > limits.size:
         raise RecordingTooLarge(path, f"it has {size} bytes, more than the {limits.size} allowed", reason="too-large")
     if magic.startswith(mcap_records.MAGIC):
-        return open_mcap(path, size, limits)
-    if magic.startswith(bag_source.MAGIC):
-        return open_bag(path, size, limits)
-    raise NotARecording(path, "it is neither an MCAP file nor a ROS 1 bag")
+        source = open_mcap(path, size, limits, look=look, progress=progress)
+    elif magic.startswith(bag_records.MAGIC):
+        source = open_bag(path, size, limits, look=look, progress=progress)
+    else:
+        raise NotARecording(path, "it is neither an MCAP file nor a ROS 1 bag")
+    if progress is not None:
+        progress(size, size)
+    return source
 
 
 def _played(channel: Channel, payload: bytes, log_time: int, publish_time: int, sequence: int) -> Played:
@@ -131,6 +137,6 @@ def _look(path: Path) -> tuple[int, bytes]:
         if not stat.S_ISREG(status.st_mode):
             raise NotARecording(path, "it is not a file")
         with path.open("rb") as file:
-            return status.st_size, file.read(len(bag_source.MAGIC))
+            return status.st_size, file.read(len(bag_records.MAGIC))
     except OSError as error:
         raise NotARecording(path, f"it can't be read: {error.strerror}") from error

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterable, Iterable, Iterator
 
 _SECOND: Final = 10**9
+_EARLY_NS: Final = 200_000
+"""An event loop counts in whole milliseconds and wakes up to one too late; what is left after waking earlier than that
+is yielded away, which costs two hundredths of a core at 1 kHz and takes as much off how late messages are."""
 _UNPAUSED: Final = 32
 """Late messages after which the event loop gets its turn."""
 
@@ -92,7 +95,9 @@ class MonotonicClock:
 
     async def sleep_until(self, when_ns: int) -> None:
         """Return at `when_ns`, late by about a millisecond at most if the loop is not busy."""
-        await asyncio.sleep(max(0, when_ns - time.monotonic_ns()) / _SECOND)
+        await asyncio.sleep(max(0, when_ns - _EARLY_NS - time.monotonic_ns()) / _SECOND)
+        while time.monotonic_ns() < when_ns:  # noqa: ASYNC110 - nothing else tells the time as exactly
+            await asyncio.sleep(0)
 
 
 def timeline(messages: Iterable[Played], pace: Pace, *, first_index: int = 0, start_ns: int = 0) -> Iterator[Step]:

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
     from mesh.recording.objective import Objective, Played
 
-_AHEAD: Final = 256
-"""Messages read at once, while as many before them are played."""
+_AHEAD: Final = 64
+"""Messages read at once, while as many before them are played; reading more would hold up one that is due."""
 _AHEAD_BYTES: Final = 4 << 20
 _AS_RECORDED: Final = RecordedTimes()
 _CLOCK: Final = MonotonicClock()

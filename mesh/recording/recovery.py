@@ -14,13 +14,10 @@ from mesh.recording.mcap_records import frames
 from mesh.recording.mcap_source import Reading
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
-    from typing import TypeAlias
 
+    from mesh.content import Progress
     from mesh.recording.source import Source
-
-    Progress: TypeAlias = Callable[[int, int | None], None]
 
 RECOVERED: Final = "aira-recovered"
 """Name of the metadata record that marks a file, or its first part, as recovered."""
@@ -32,10 +29,12 @@ _NO_LIMIT: Final = 1 << 62
 _OURS: Final = Limits(
     size=_NO_LIMIT,
     expanded=_NO_LIMIT,
+    bz2=_NO_LIMIT,
     record=1 << 30,
     definitions=1 << 30,
     channels=_NO_LIMIT,
     messages=_NO_LIMIT,
+    blocks=_NO_LIMIT,
 )
 
 

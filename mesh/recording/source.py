@@ -13,12 +13,18 @@ from mesh.recording.errors import CorruptRecording, RecordingTooLarge
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
     from pathlib import Path
+    from typing import TypeAlias
 
     from mesh.recording.limits import Limits
     from schemas.payloads import PayloadType
 
+    Look: TypeAlias = Callable[["Channel", bytes], None]
+    """Is shown every message of a file, on its channel, as they lie there, while the file is checked."""
+
 _RECORD_COST: Final = 256
 """Bytes of memory that a message takes besides its payload while its segment is being sorted."""
+_SEGMENT_COST: Final = 2048
+"""Bytes of memory that a segment takes besides its data while its messages are being given."""
 
 
 class Record(NamedTuple):
@@ -87,7 +93,7 @@ class Segment:
     @property
     def cost(self) -> int:
         """Bytes of memory that it takes while its messages are being given."""
-        return self.block.size + (0 if self.sorted else self.count * _RECORD_COST)
+        return self.block.size + _SEGMENT_COST + (0 if self.sorted else self.count * _RECORD_COST)
 
 
 @dataclass(frozen=True)
@@ -152,6 +158,29 @@ class Source:
         heapq.heappush(heap, (first.log_time, segment.number, first, records))
 
 
+@dataclass
+class Expanding:
+    """What the blocks of a file will expand to, in bytes, of which nothing was expanded yet."""
+
+    path: Path
+    limits: Limits
+    size: int = 0
+    bz2: int = 0
+
+    def add(self, block: Block) -> None:
+        """Count a block. Raises `RecordingTooLarge`."""
+        self.size += block.size
+        if self.size > self.limits.expanded:
+            raise RecordingTooLarge(
+                self.path, f"its chunks expand to more than the {self.limits.expanded} bytes allowed"
+            )
+        self.bz2 += block.size if block.compression == "bz2" else 0
+        if self.bz2 > self.limits.bz2:
+            raise RecordingTooLarge(
+                self.path, f"its bz2 chunks expand to more than the {self.limits.bz2} bytes allowed; lz4 is faster"
+            )
+
+
 def load(path: Path, file: BinaryIO, block: Block) -> bytes:
     """The decompressed bytes of a block. Raises `CorruptRecording`."""
     file.seek(block.offset)
@@ -172,6 +201,20 @@ def survey(path: Path, number: int, block: Block, *, records: Iterable[Record]) 
         last = time
         count += 1
     return Segment(number, block, count, start, end, in_order) if count else None
+
+
+def check_counts(path: Path, limits: Limits, *, records: int, blocks: int) -> None:
+    """Raise `RecordingTooLarge` over `limits.messages` records in blocks, or over `limits.blocks` blocks."""
+    if records > limits.messages:
+        raise RecordingTooLarge(path, f"more than {limits.messages} messages and what describes them")
+    if blocks > limits.blocks:
+        raise RecordingTooLarge(path, f"its messages and attachments lie in more than {limits.blocks} places")
+
+
+def check_definitions(path: Path, limits: Limits, *, channels: int, size: int) -> None:
+    """Raise `RecordingTooLarge` over `limits.channels` channels, or over `limits.definitions` bytes."""
+    if size > limits.definitions or channels > limits.channels:
+        raise RecordingTooLarge(path, f"{channels} channels, {size} bytes of definitions")
 
 
 def check_window(path: Path, segments: Iterable[Segment], limits: Limits) -> None:

@@ -42,7 +42,8 @@ def _add(settings: Settings, files: tuple[Path, ...], *, as_json: bool) -> None:
         for path in files:
             with progress(f"adding {path.name}") as tell:
                 cid = store.put_file(path, pin=PIN, progress=tell)
-            outcome = preflight(path)
+            with progress(f"examining {path.name}") as tell:
+                outcome = preflight(path, progress=tell)
             if not outcome.ok:
                 click.echo(f"aira: robots would refuse it ({outcome.reason}): {visible(outcome.detail)}", err=True)
             added.append({"cid": cid, "file": str(path), "reason": outcome.reason})

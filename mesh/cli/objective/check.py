@@ -50,7 +50,8 @@ def _check(settings: Settings, store: Store, objective: str, *, topics: str | No
     path, cid = _found(store, objective)
     limits = Limits(size=settings.objective_size_limit, expanded=settings.objective_expanded_limit)
     taken = None if topics is None else frozenset(name.strip() for name in topics.split(",") if name.strip())
-    outcome = preflight(path, limits, topics=taken)
+    with progress(f"reading {path.name}") as tell:
+        outcome = preflight(path, limits, topics=taken, progress=tell)
     if as_json:
         print_json(
             {"cid": cid, "file": str(path), "ok": outcome.ok, "reason": outcome.reason, "detail": outcome.detail}

@@ -27,8 +27,9 @@ def command(bag: Path, out: Path | None, as_json: bool) -> None:
 def _convert(bag: Path, out: Path, *, as_json: bool) -> None:
     readable(bag)
     free(out)
-    if open_objective(bag, GENEROUS).format != "bag":
-        raise NotARecording(bag, "it is no ROS 1 bag")
+    with progress(f"reading {bag.name}") as tell:
+        if open_objective(bag, GENEROUS, progress=tell).format != "bag":
+            raise NotARecording(bag, "it is no ROS 1 bag")
     source = cid_of_file(bag)
     try:
         with progress(f"converting {bag.name}") as tell:

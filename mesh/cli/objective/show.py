@@ -11,6 +11,7 @@ from mesh.cli.files import at_once, duration_words, size_words
 from mesh.cli.holdings import MESH, fetch, file_or_cid, opened_store, readable
 from mesh.cli.options import with_settings
 from mesh.cli.printing import plural, print_facts, print_json, print_table, visible, with_json
+from mesh.cli.progress import progress
 from mesh.recording import GENEROUS, Objective, Rates, open_objective, rates_of
 from mesh.running import run_to_end
 from schemas import cid_of_file
@@ -54,7 +55,9 @@ def _fetched(settings: Settings, cid: str) -> Path:
 
 
 def _show(path: Path, *, schemas: bool, png: Path | None, as_json: bool) -> None:
-    objective = open_objective(readable(path), GENEROUS)
+    readable(path)
+    with progress(f"reading {path.name}") as tell:
+        objective = open_objective(path, GENEROUS, progress=tell)
     if png is not None:
         from mesh.cli.objective.plot import draw
 

@@ -169,7 +169,14 @@ async def test_a_job_of_the_market_is_verified_from_its_address_alone(
     async def go(job: Run, message: object) -> None:
         job.publish("/gone", message)
 
-    order: dict[str, Any] = {"model": MODEL, "cost": 7, "lifetime": 1000, "out": None, "as_json": True}
+    order: dict[str, Any] = {
+        "model": MODEL,
+        "cost": "7wn",
+        "validator_fee": "0",
+        "lifetime": 1000,
+        "out": None,
+        "as_json": True,
+    }
     async with agent, asyncio.timeout(120):
         await _demand(person, objective=str(path), **order)
         liability = json.loads(capsys.readouterr().out.splitlines()[-1])["liability"]

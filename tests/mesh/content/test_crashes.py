@@ -12,9 +12,10 @@ import pytest
 
 from mesh.content import Store
 from schemas.unixfs import CHUNK_SIZE, blocks_of_stream
-from tests.mesh.content.test_store import ROOT, leftovers
+from tests.mesh.content.test_store import ROOT, flip_a_bit, leftovers
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
 QUOTA = 4_000_000
@@ -69,8 +70,9 @@ with Store(sys.argv[1], quota=QUOTA) as store:
 """
 
 
-def killed_at_each_step(directory: Path, work: str, prepare: str = "") -> int:
+def killed_at_each_step(directory: Path, work: str, *, check: Callable[[Path], None] | None = None) -> int:
     """Do the work again and again, killed a step later each time, with a look at the store after each; the steps."""
+    look = check or check_consistent
     script = STEPPER.replace("QUOTA", str(QUOTA)).replace("WORK", work)
     with subprocess.Popen(
         [sys.executable, "-c", script, str(directory)],
@@ -84,7 +86,7 @@ def killed_at_each_step(directory: Path, work: str, prepare: str = "") -> int:
         for step in range(2000):
             print(step, file=stepper.stdin, flush=True)
             outcome = stepper.stdout.readline().strip()
-            check_consistent(directory)
+            look(directory)
             if outcome == "done":
                 stepper.stdin.close()
                 return step
@@ -129,6 +131,34 @@ def test_making_room_and_removing_may_be_killed_at_any_step(tmp_path: Path) -> N
     assert killed_at_each_step(tmp_path, work) > 30
     with Store(tmp_path, quota=QUOTA) as store:
         assert store.list() == (pinned,)
+
+
+def test_setting_a_damaged_file_aside_may_be_killed_at_any_step(tmp_path: Path) -> None:
+    rotten, sound = bytes(range(256)) * (2 * CHUNK_SIZE // 256 + 1), b"is as it was"
+
+    def damage(directory: Path) -> None:
+        with Store(directory, quota=QUOTA) as store:
+            cid = store.put_bytes(rotten)
+            assert store.damaged() == ()
+        flip_a_bit(directory / cid, CHUNK_SIZE + 1)
+
+    def look(directory: Path) -> None:
+        with Store(directory, quota=QUOTA) as store:
+            held, aside = store.list(), store.damaged()
+            (cid,) = {*held, *aside} - {kept}
+            assert (cid in held) != (cid in aside), "it is held or set aside, never both"
+            assert store.check().damaged == (() if aside else (cid,))
+            assert store.list() == (kept,)
+            assert store.damaged() == (cid,)
+            assert store.usage().bytes == len(sound) + len(rotten)
+            assert store.usage().files == 1
+            assert store.get_block(kept) is not None
+        damage(directory)
+
+    with Store(tmp_path, quota=QUOTA) as store:
+        kept = store.put_bytes(sound)
+    damage(tmp_path)
+    assert killed_at_each_step(tmp_path, "store.check()", check=look) > 10
 
 
 @pytest.mark.parametrize("seed", range(3))

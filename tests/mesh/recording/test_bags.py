@@ -117,7 +117,7 @@ def test_what_no_writer_writes_is_corrupt(tmp_path: Path, content: bytes, why: s
     ("limits", "what"),
     [
         (Limits(messages=249), "messages"),
-        (Limits(channels=1), "connections"),
+        (Limits(channels=1), "channels"),
         (Limits(definitions=80), "definitions"),
         (Limits(record=500), "chunk"),
         (Limits(expanded=10_000), "expand"),

@@ -17,8 +17,8 @@ from mcap.opcode import Opcode
 
 from mesh.recording import Limits
 from tests.mesh.recording.mutants import FILES, mutant
-from tests.mesh.recording.raw import SCHEMA, chunk, message, raw_file, record, text
-from tests.support.bags import MAGIC, Bag, Sent, compress
+from tests.mesh.recording.raw import CHANNEL, SCHEMA, chunk, message, raw_file, record, text
+from tests.support.bags import MAGIC, Bag, Sent, compress, fields
 from tests.support.bags import record as bag_record
 from tests.support.commands import run
 
@@ -30,10 +30,12 @@ MUTANTS = 40
 """Of each of the seven sound files."""
 MEMORY = 256 << 20
 SECONDS = 5.0
-SLOW = 5
-"""How much slower than one with nothing else to do the machine may be."""
+"""Of the processor, which others at work on the machine hardly change. The slowest file takes half of it where this was
+written; reading it once more when it is played is measured apart."""
 GIB = 1 << 30
-CHUNK = Limits().record
+LIMITS = Limits()
+CHUNK = LIMITS.record
+MANY = LIMITS.messages - 10
 PLAIN = record(Opcode.CHANNEL, struct.pack("<HH", 1, 1) + text("/a") + text("") + text(""))
 REASONS = {"not-a-recording", "corrupt", "expands-too-much", "too-long", "unreadable-message", "unplayable-topic"}
 
@@ -44,22 +46,23 @@ from mesh.recording import preflight
 for path in sorted(Path(sys.argv[1]).iterdir()):
     begin = time.process_time()
     outcome = preflight(path)
-    if outcome.objective is not None and sys.argv[2] == "play":
+    examined = time.process_time()
+    if outcome.objective is not None:
         for message in outcome.objective.messages():
             pass
-    seconds = time.process_time() - begin
+    seconds = max(examined - begin, time.process_time() - examined)
     peak = next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM:"))
     print(json.dumps([path.name, outcome.reason, outcome.detail, seconds, 1024 * int(peak)]))
 """
 
 
-def opened(folder: Path, how: str = "play") -> dict[str, tuple[str, str]]:
+def opened(folder: Path) -> dict[str, tuple[str, str]]:
     """The reason and the detail of each file of the folder, all of them examined (and read) within the bounds."""
-    done = run(sys.executable, "-c", OPENING, folder, how, PYTHONPATH=str(ROOT))
+    done = run(sys.executable, "-c", OPENING, folder, PYTHONPATH=str(ROOT))
     assert done.returncode == 0, done.stderr
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     for name, _, _, seconds, peak in lines:
-        assert seconds < SECONDS * SLOW, f"{name} took {seconds} seconds of the processor"
+        assert seconds < SECONDS, f"{name} took {seconds} seconds of the processor"
         assert peak < MEMORY, f"{name} took {peak >> 20} MiB"
     return {name: (reason, detail) for name, reason, detail, *_ in lines}
 
@@ -167,6 +170,108 @@ def bag_of_tiny_messages() -> bytes:
     return bag_of(bag_record({"op": b"\x02", "conn": bytes(4), "time": bytes(8)}, b""))
 
 
+def bag_of_fields() -> bytes:
+    """A bag whose messages have as many fields as fit."""
+    many = {str(number): b"" for number in range(5000)}
+    return bag_of(bag_record({"op": b"\x02", "conn": bytes(4), "time": bytes(8), **many}, b""))
+
+
+def bag_without_chunks() -> bytes:
+    """A bag of messages outside any chunk."""
+    one = bag_record({"op": b"\x02", "conn": bytes(4), "time": bytes(8)}, b"")
+    return MAGIC + bag_record({"op": b"\x03", "index_pos": bytes(8)}, b"") + CONNECTION + one * 240_000
+
+
+def bag_of_scattered_messages() -> bytes:
+    """The same with a connection between any two of them."""
+    one = bag_record({"op": b"\x02", "conn": bytes(4), "time": bytes(8)}, b"")
+    return MAGIC + bag_record({"op": b"\x03", "index_pos": bytes(8)}, b"") + (CONNECTION + one) * 240_000
+
+
+def bag_of_slow_chunks() -> bytes:
+    """A bag of bz2, which takes longer to expand than anything else."""
+    data = CONNECTION + bag_record(
+        {"op": b"\x02", "conn": bytes(4), "time": bytes(8)}, random.Random(1).randbytes(1 << 20)
+    )
+    header = {"op": b"\x05", "compression": b"bz2", "size": struct.pack("<I", len(data))}
+    one = bag_record(header, compress(data, "bz2"))
+    return MAGIC + bag_record({"op": b"\x03", "index_pos": bytes(8)}, b"") + one * 30
+
+
+def bag_of_too_many_slow_chunks() -> bytes:
+    """The same, but too much of it."""
+    data = bytes(CHUNK)
+    header = {"op": b"\x05", "compression": b"bz2", "size": struct.pack("<I", len(data))}
+    return (
+        MAGIC + bag_record({"op": b"\x03", "index_pos": bytes(8)}, b"") + bag_record(header, compress(data, "bz2")) * 3
+    )
+
+
+def bag_of_all_that_is_taken() -> bytes:
+    """A bag of as many messages as are taken, each to be read."""
+    said = b"".join(fields({name: value}) for name, value in {"type": b"std_msgs/String"}.items())
+    connection = bag_record({"op": b"\x07", "conn": bytes(4), "topic": b"/a"}, said)
+    data = connection + bag_record({"op": b"\x02", "conn": bytes(4), "time": bytes(8)}, b"\x01\0\0\0x") * (
+        MANY // 10 - 1
+    )
+    header = {"op": b"\x05", "compression": b"lz4", "size": struct.pack("<I", len(data))}
+    return (
+        MAGIC + bag_record({"op": b"\x03", "index_pos": bytes(8)}, b"") + bag_record(header, compress(data, "lz4")) * 10
+    )
+
+
+def all_that_is_taken() -> bytes:
+    """As many messages of JSON as are taken."""
+    data = message(b'{"a":[1.5]}') * (MANY // 10)
+    chunks = [chunk(zstandard.compress(data), compression="zstd", size=len(data))] * 10
+    return raw_file(SCHEMA, CHANNEL, *chunks)
+
+
+def json_of_lists() -> bytes:
+    """As much JSON as is taken, of the kind that takes the most time and memory: lists of nothing."""
+    data = message(b"[" + b"[]," * (LIMITS.json // 30) + b"[]]")
+    return raw_file(SCHEMA, CHANNEL, *[chunk(zstandard.compress(data), compression="zstd", size=len(data))] * 9)
+
+
+def json_too_long() -> bytes:
+    """A JSON message that is ten times as large in memory as in the file."""
+    data = message(b"[" + b"[]," * (CHUNK // 3 - 100) + b"[]]")
+    return raw_file(SCHEMA, CHANNEL, chunk(zstandard.compress(data), compression="zstd", size=len(data)))
+
+
+def large_channel() -> bytes:
+    """A channel with millions of empty metadata, said again in every chunk."""
+    pairs = bytes(CHUNK - 200)
+    channel = struct.pack("<HH", 1, 1) + text("/a") + text("") + struct.pack("<I", len(pairs)) + pairs
+    data = record(Opcode.CHANNEL, channel)
+    return raw_file(SCHEMA, *[chunk(zstandard.compress(data), compression="zstd", size=len(data))] * 30)
+
+
+def metadata() -> bytes:
+    """As much metadata as is taken, all different."""
+    pairs = b"".join(text(f"{number:05x}") + bytes(4) for number in range(LIMITS.definitions // 13 - 10))
+    return raw_file(
+        SCHEMA, PLAIN, record(Opcode.METADATA, text("a") + struct.pack("<I", len(pairs)) + pairs), message()
+    )
+
+
+def long_statistics() -> bytes:
+    """Statistics of more channels than there can be, again and again."""
+    counts = bytes(10 * (CHUNK // 10 - 100))
+    return raw_file(*[record(Opcode.STATISTICS, bytes(42) + struct.pack("<I", len(counts)) + counts)] * 7)
+
+
+def attachments() -> bytes:
+    """A file of empty attachments."""
+    return raw_file(record(Opcode.ATTACHMENT, bytes(36)) * 900_000)
+
+
+def empty_chunks() -> bytes:
+    """A file of chunks with one message each, all of the same time."""
+    one = chunk(message(), inner=message())
+    return raw_file(SCHEMA, PLAIN, one * (LIMITS.blocks - 10))
+
+
 def huge_message() -> bytes:
     """A bag of one message that is larger than what is taken."""
     return Bag([Sent("/a", bytes(CHUNK + 1), 1)]).encode()
@@ -186,6 +291,20 @@ BOMBS: dict[Callable[[], bytes], str] = {
     bag_of_connections: "expands-too-much",
     bag_of_tiny_messages: "expands-too-much",
     huge_message: "expands-too-much",
+    bag_of_fields: "corrupt",
+    bag_without_chunks: "",
+    bag_of_scattered_messages: "expands-too-much",
+    bag_of_slow_chunks: "",
+    bag_of_too_many_slow_chunks: "expands-too-much",
+    bag_of_all_that_is_taken: "",
+    all_that_is_taken: "",
+    json_of_lists: "",
+    json_too_long: "expands-too-much",
+    large_channel: "expands-too-much",
+    metadata: "",
+    long_statistics: "expands-too-much",
+    attachments: "expands-too-much",
+    empty_chunks: "expands-too-much",
 }
 
 

@@ -88,3 +88,30 @@ def test_a_type_that_nobody_here_knows_is_carried_as_it_is(tmp_path: Path) -> No
     path = tmp_path / "objective"
     path.write_bytes(Bag([Sent("/b", b"\xff", T0, type="my/Type")]).encode())
     assert preflight(path).ok
+
+
+def test_the_first_message_that_nobody_can_take_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "objective"
+
+    def write(writer: Writer) -> None:
+        channel = writer.register_channel("/a", "json", 0)
+        for payload in (b"1", b"2", b"30", b"40"):
+            writer.add_message(channel, T0, payload, T0)
+
+    path.write_bytes(mcap_file(write))
+    asked: list[tuple[str, object]] = []
+
+    def obstacle(topic: str, said: object) -> str:
+        asked.append((topic, said))
+        return "it is too much" if said == 30 else ""
+
+    outcome = preflight(path, obstacle=obstacle)
+    assert (outcome.reason, outcome.detail) == ("unfit-message", "message 2 on /a: it is too much")
+    assert asked == [("/a", 1), ("/a", 2), ("/a", 30)]
+
+
+def test_more_json_than_can_be_read_in_time_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "objective"
+    path.write_bytes(on_topic("/a", b"[" + b" " * 1000 + b"]"))
+    assert preflight(path, Limits(json=1002)).ok
+    assert preflight(path, Limits(json=1001)).reason == "expands-too-much"
