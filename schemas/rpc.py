@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from schemas.liability import Liability  # msgspec reads the annotations
 from schemas.posting import Published, SendDemand, SendOffer, SendResult, SignDemand, SignOffer, SignResult
 from schemas.records import Record, UInt256
+from schemas.status import Status
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -162,6 +163,7 @@ SERVICES: Final[Mapping[str, Service]] = MappingProxyType(
         "restart": Service(RestartLiability, Done),
         "resume": Service(ResumeLiability, Done),
         "read": Service(ReadLiability, LiabilityRead),
+        "status": Service(Nothing, Status),
         "sign/demand": Service(SignDemand, Published),
         "sign/offer": Service(SignOffer, Published),
         "sign/result": Service(SignResult, Published),
@@ -224,6 +226,7 @@ __all__ = [
     "SignOffer",
     "SignResult",
     "StartLiability",
+    "Status",
     "Transaction",
     "Transfer",
     "TransferEvent",

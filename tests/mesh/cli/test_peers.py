@@ -1,0 +1,94 @@
+"""`aira peers`: who is on the channel, and how many are on the IPFS side."""
+
+from __future__ import annotations
+
+import json
+from contextlib import AsyncExitStack, asynccontextmanager
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from mesh.cli.peers import _peers
+from mesh.network import Channel, Endpoints, Network
+from mesh.settings import Settings
+from mesh.watching import present
+from schemas.status import BridgeStatus, bridge_status_key
+from tests.mesh.watching.test_presence import answering, bridge_status
+from tests.support.orders import MARKET, PERSON, ROBOT, STRANGER
+from tests.support.waiting import until_answered, until_found
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    import pytest
+
+    from tests.support.routers import EmbeddedRouter
+
+NODES = ("QmA", "QmB", "QmC")
+
+
+@asynccontextmanager
+async def bridging(router: EmbeddedRouter, *told: BridgeStatus) -> AsyncIterator[Settings]:
+    """A channel with an agent and these bridges, for who has the settings."""
+    async with (
+        Network(Endpoints(connect=(router.endpoint,))) as network,
+        Channel(network.session, MARKET) as channel,
+        AsyncExitStack() as stack,
+    ):
+        channel.announce("agent", ROBOT.address)
+        for how in told:
+            channel.announce("bridge", how.bridge)
+            stack.enter_context(answering(network.session, bridge_status_key(how.bridge, MARKET), how.encode()))
+        async with Network(Endpoints(connect=(router.endpoint,))) as reader, Channel(reader.session, MARKET) as seen:
+            for how in told:
+                await until_answered(reader.session, bridge_status_key(how.bridge, MARKET))
+
+            async def all_there() -> bool:
+                return len(await present(seen)) == 1 + len(told)
+
+            await until_found(all_there, what="everybody", seconds=30)
+        yield Settings(connect=(router.endpoint,), connect_timeout=5.0)
+
+
+async def test_nobody_is_told_in_a_line(router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]) -> None:
+    await _peers(Settings(connect=(router.endpoint,)), as_json=False)
+    assert capsys.readouterr().out == f"nobody on {MARKET}; on the IPFS side nobody knows: there is no bridge\n"
+
+
+async def test_everybody_is_told_by_role_and_address(
+    router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]
+) -> None:
+    connected = msgspec.structs.replace(bridge_status(), ipfs_peers=NODES, state="connected")
+    async with bridging(router, connected) as settings:
+        await _peers(settings, as_json=False)
+        assert capsys.readouterr().out.splitlines() == [
+            "role    address",
+            f"agent   {ROBOT.address}",
+            f"bridge  {STRANGER.address}",
+            f"2 on {MARKET}; on the IPFS side 3 nodes",
+        ]
+        await _peers(settings, as_json=True)
+        assert json.loads(capsys.readouterr().out) == {
+            "lighthouse": MARKET,
+            "peers": [
+                {"role": "agent", "address": ROBOT.address},
+                {"role": "bridge", "address": STRANGER.address},
+            ],
+            "ipfsPeers": list(NODES),
+        }
+
+
+async def test_of_several_bridges_the_one_that_carries_is_believed(
+    router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]
+) -> None:
+    carries = msgspec.structs.replace(bridge_status(), ipfs_peers=NODES[:1], state="connected")
+    stands_by = msgspec.structs.replace(bridge_status(bridge=PERSON.address), ipfs_peers=NODES, carries=False)
+    async with bridging(router, stands_by, carries) as settings:
+        await _peers(settings, as_json=False)
+    assert capsys.readouterr().out.endswith("on the IPFS side 1 node\n")
+
+
+async def test_a_bridge_without_its_daemon_says_so(router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]) -> None:
+    async with bridging(router, msgspec.structs.replace(bridge_status(), state="no daemon")) as settings:
+        await _peers(settings, as_json=False)
+    assert capsys.readouterr().out.endswith("on the IPFS side 0 nodes; the bridge says: no daemon\n")

@@ -1,0 +1,171 @@
+"""`aira rpc`: services called from the command line; arguments checked before anything is asked."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+from click.testing import CliRunner
+
+from mesh.cli import main
+from mesh.cli.arguments import request_of
+from mesh.cli.rpc import _call
+from mesh.errors import InputError
+from mesh.network import ServiceFailed
+from schemas.rpc import (
+    GUARDED,
+    SERVICES,
+    FinishLiability,
+    Nothing,
+    ReadLiability,
+    SendDemand,
+    StartLiability,
+    Transfer,
+)
+from tests.mesh.cli.chains import columns
+from tests.support.market import obliging
+from tests.support.objectives import objective
+from tests.support.orders import LIGHTHOUSE, STRANGER, demand
+from tests.support.waiting import until_found
+
+if TYPE_CHECKING:
+    from tests.support.market import Place
+
+MOST = 2**256 - 1
+
+
+def test_arguments_are_given_by_name() -> None:
+    assert request_of("start", [f"address={LIGHTHOUSE}"]) == StartLiability(LIGHTHOUSE)
+    assert request_of("finish", [f"address={LIGHTHOUSE}", "success=yes"]) == FinishLiability(LIGHTHOUSE, True)
+    assert request_of("finish", ["success=FALSE", "address=a=b"]) == FinishLiability("a=b", False)
+    assert request_of("eth/transfer", ["to=x", f"value={MOST}"]) == Transfer("x", MOST)
+    assert request_of("eth/accounts", []) == Nothing()
+
+
+def test_arguments_are_given_as_one_json_object() -> None:
+    assert request_of("read", [json.dumps({"address": LIGHTHOUSE})]) == ReadLiability(LIGHTHOUSE)
+    for value in (5, "5"):
+        assert request_of("eth/transfer", [json.dumps({"to": "x", "value": value})]) == Transfer("x", 5)
+    assert request_of("eth/accounts", ["{}"]) == Nothing()
+
+
+def test_a_signed_demand_is_sent_as_it_is() -> None:
+    request = SendDemand.of(demand())
+    assert request_of("send/demand", [request.encode().decode()]) == request
+    values = json.loads(request.encode())
+    assert request_of("send/demand", [f"{name}={value}" for name, value in values.items()]) == request
+
+
+@pytest.mark.parametrize(
+    ("service", "arguments", "line", "hint"),
+    [
+        ("strat", [], "there is no service 'strat'", "did you mean start? --list shows all"),
+        ("start", [], "start needs address", "start takes address"),
+        ("eth/transfer", ["to=x"], "eth/transfer needs value", "eth/transfer takes to, value"),
+        ("read", ["adress=x"], "read has no argument 'adress'", "did you mean address? read takes address"),
+        ("eth/accounts", ["x=y"], "eth/accounts has no argument 'x'", "eth/accounts takes no arguments"),
+        ("read", ["address"], "'address' is no argument", "write name=value, or one JSON object"),
+        ("read", ["address=x", "address=y"], "address is given twice", ""),
+        ("read", ['{"address":'], "the arguments are not JSON: Expecting value: line 1 column 12 (char 11)", ""),
+        ("read", ['{"address":5}'], "read: address is '5', and has to be text", ""),
+        ("finish", ["address=x", "success=maybe"], "finish: success is 'maybe', and has to be true or false", ""),
+        ("finish", ['{"address":"x","success":1}'], "finish: success is '1', and has to be true or false", ""),
+        *(
+            (
+                "eth/transfer",
+                ["to=x", f"value={value}"],
+                f"eth/transfer: value is '{value}', and has to be a whole number, in the smallest unit",
+                "",
+            )
+            for value in ("1.5", "-1", "", "1e9", "٣")
+        ),
+    ],
+)
+def test_what_is_wrong_with_arguments_is_one_clear_line(
+    service: str, arguments: list[str], line: str, hint: str
+) -> None:
+    with pytest.raises(InputError) as caught:
+        request_of(service, arguments)
+    assert (str(caught.value), caught.value.hint) == (line, hint)
+
+
+def test_a_number_that_no_contract_can_hold_is_refused() -> None:
+    for value in (str(MOST + 1), "9" * 5000):
+        with pytest.raises(InputError, match=r"^eth/transfer: "):
+            request_of("eth/transfer", ["to=x", f"value={value}"])
+
+
+@pytest.mark.parametrize("arguments", [[], [LIGHTHOUSE]])
+def test_without_a_service_it_says_what_is_needed(arguments: list[str]) -> None:
+    done = CliRunner().invoke(main, ["rpc", *arguments])
+    assert done.exit_code == 2
+    assert "an ADDRESS and a SERVICE are needed; --list shows the services" in done.stderr
+
+
+def test_the_list_has_every_service_with_its_arguments() -> None:
+    head, *rows = CliRunner().invoke(main, ["rpc", "--list"]).stdout.splitlines()
+    assert head.split() == ["service", "arguments", "answer"]
+    assert [row.split()[0] for row in rows] == [name + "*" * (name in GUARDED) for name in SERVICES]
+    assert next(row for row in rows if row.startswith("finish")).split()[1:] == ["address", "success", "none"]
+    listed = json.loads(CliRunner().invoke(main, ["rpc", "--list", "--json"]).stdout)
+    assert listed["eth/approve"] == {"arguments": ["spender", "value"], "answer": ["txhash"], "guarded": True}
+    assert listed.keys() == SERVICES.keys()
+
+
+async def ask(place: Place, service: str, *arguments: str, as_json: bool = False) -> None:
+    """Call a service of the robot as somebody without an account."""
+    called = place.address("robot"), service, arguments
+    await _call(place.settings("watcher"), called, timeout=10.0, as_json=as_json)
+
+
+async def test_a_reply_is_facts_or_json(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
+    async with place.agent("robot"):
+        await ask(place, "eth/accounts")
+        assert capsys.readouterr().out == f"accounts  {place.address('robot')}\n"
+        await ask(place, "eth/xrt_balance", as_json=True)
+        assert json.loads(capsys.readouterr().out) == {"balance": str(await place.balance("robot"))}
+        await ask(place, "eth/account_eth_balance", f"account={LIGHTHOUSE}")
+        assert capsys.readouterr().out == "balance  0 ETH\n"
+        await ask(place, "status")
+        assert columns(capsys.readouterr().out)["executor"] == "alive"
+
+
+async def test_a_job_is_driven_from_the_command_line(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
+    async with place.at_work(obliging(place.agent("robot"))) as person:
+        contract = await person.demand(place.save(objective(("/go", "x"))), cost=1)
+
+        async def started() -> bool:
+            try:
+                await ask(place, "start", f"address={contract.address}")
+            except ServiceFailed:
+                return False
+            return True
+
+        await until_found(started, what="the job's start", seconds=30)
+        assert columns(capsys.readouterr().out)["success"] == "yes"
+        await ask(place, "finish", f"address={contract.address}", "success=true")
+        assert columns(capsys.readouterr().out)["finish"] == "done"
+        assert (await contract.outcome()).success
+        await ask(place, "read", f"address={contract.address}")
+        shown = columns(capsys.readouterr().out)
+        assert (shown["read"], shown["address"], shown["isSuccess"]) == ("yes", contract.address, "yes")
+
+
+async def test_what_was_not_done_is_an_error(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
+    async with place.agent("robot"):
+        with pytest.raises(ServiceFailed, match=f"^start: can't start {LIGHTHOUSE}: it is not a job of this agent$"):
+            await ask(place, "start", f"address={LIGHTHOUSE}")
+        with pytest.raises(InputError, match=f"^{LIGHTHOUSE} is no job of the agent at "):
+            await ask(place, "read", f"address={LIGHTHOUSE}")
+        with pytest.raises(ServiceFailed, match=r"^eth/approve: this agent does not offer eth/approve to others$"):
+            await ask(place, "eth/approve", f"spender={LIGHTHOUSE}", "value=1")
+        assert capsys.readouterr().out == ""
+        with pytest.raises(ServiceFailed):
+            await ask(place, "start", f"address={LIGHTHOUSE}", as_json=True)
+        assert json.loads(capsys.readouterr().out)["success"] is False
+
+
+async def test_nobody_there_is_an_error(place: Place) -> None:
+    with pytest.raises(ServiceFailed, match=r"^eth/accounts: nobody answers$"):
+        await _call(place.settings("watcher"), (STRANGER.address, "eth/accounts", ()), timeout=2.0, as_json=False)

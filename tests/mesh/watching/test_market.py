@@ -1,0 +1,205 @@
+"""A market as it is watched: what is shown in the one stream, what is not believed, what a model leaves out."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import pytest
+
+from mesh.network import Channel, Endpoints, Network, message_key
+from mesh.watching import JobEvent, MarketWatch
+from schemas import ZERO_ADDRESS, EventKey, Liability, RejectKey, Verified, encode, message_hash
+from schemas.rejection import Rejection
+from tests.support.orders import (
+    LIGHTHOUSE,
+    MARKET,
+    MODEL,
+    OBJECTIVE,
+    OTHER_MODEL,
+    PERSON,
+    RECORDING,
+    ROBOT,
+    STRANGER,
+    TOKEN,
+    demand,
+    offer,
+    result,
+)
+from tests.support.waiting import until, until_heard
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from tests.support.routers import EmbeddedRouter
+
+CONTRACT = "0x5FbDB2315678afecb367f032d93F642f64180aa3"
+JOB = Liability(
+    address=CONTRACT,
+    model=MODEL,
+    objective=OBJECTIVE,
+    result="",
+    promisee=PERSON.address,
+    promisor=ROBOT.address,
+    lighthouse=LIGHTHOUSE,
+    lighthouse_fee=0,
+    token=TOKEN,
+    cost=42,
+    validator=ZERO_ADDRESS,
+    validator_fee=0,
+    is_success=False,
+    is_finalized=False,
+)
+EVENT = str(EventKey(ROBOT.address, CONTRACT, "incoming"))
+
+
+class Market:
+    """Somebody who writes on a channel, and somebody who watches it."""
+
+    def __init__(self, watch: MarketWatch, channel: Channel, writer: Network) -> None:
+        self.watch = watch
+        self.channel = channel
+        self.session = writer.session
+
+    async def heard(self) -> None:
+        """Wait until what is put is heard, on every kind of key."""
+        rejection = RejectKey(MARKET, "0" * 64, ROBOT.address)
+        for key in (str(rejection), EVENT, *(str(self.key(message)) for message in (demand(), offer(), result()))):
+            await until_heard(self.session, key)
+
+    def key(self, message: Any) -> str:
+        return message_key(MARKET, message)
+
+    async def next(self) -> Any:
+        async with asyncio.timeout(30):
+            return await anext(self.watch)
+
+    def reject(self, order: str, *, signer: Any = ROBOT, **changes: str) -> None:
+        word = Rejection(order=order, reason="expired", detail="too late", provider=ROBOT.address).signed_by(signer)
+        key = str(RejectKey(MARKET, order, ROBOT.address))
+        self.channel.put(key, msgspec.structs.replace(word, **changes).encode())
+
+    async def refused(self, reason: str, count: int = 1) -> None:
+        await until(lambda: self.watch.tally().refused.get(reason) == count, what=f"{count} refused for {reason}")
+
+
+@asynccontextmanager
+async def watched(router: EmbeddedRouter, model: str = "*") -> AsyncIterator[Market]:
+    endpoints = Endpoints(connect=(router.endpoint,))
+    async with (
+        Network(endpoints) as writer,
+        Channel(writer.session, MARKET) as channel,
+        Network(endpoints) as reader,
+        Channel(reader.session, MARKET) as watched_channel,
+    ):
+        channel.announce("agent", ROBOT.address)
+        async with MarketWatch(reader.session, watched_channel, model=model) as watch:
+            market = Market(watch, channel, writer)
+            await market.heard()
+            yield market
+
+
+@pytest.fixture
+async def market(router: EmbeddedRouter) -> AsyncIterator[Market]:
+    async with watched(router) as market:
+        yield market
+
+
+async def test_orders_and_results_come_as_they_are_published(market: Market) -> None:
+    for message in (demand(), offer(), result(), result(liability=PERSON.address)):
+        market.channel.publish(message)
+        seen = await market.next()
+        assert isinstance(seen, Verified)
+        assert (seen.message, seen.hash) == (message, message_hash(message))
+    assert market.watch.tally().received == 4
+
+
+async def test_a_message_with_another_ones_signature_is_counted_and_not_shown(market: Market) -> None:
+    forged = msgspec.structs.replace(demand(), signature="11" * 65)
+    market.channel.put(market.key(forged), encode(forged))
+    await market.refused("signature")
+    market.channel.publish(real := demand())
+    assert (await market.next()).message == real
+
+
+async def test_a_rejection_is_shown_once_and_only_when_its_provider_has_signed_it(market: Market) -> None:
+    order = message_hash(demand()).hex()
+    market.reject(order, detail="somebody else's words")
+    await market.refused("rejection")
+    market.reject(order)
+    market.reject(order)
+    market.reject("ab" * 32)
+    assert [(await market.next()).order for _ in range(2)] == [order, "ab" * 32]
+
+
+async def test_a_rejection_on_the_key_of_another_is_refused(market: Market) -> None:
+    word = Rejection(order="cd" * 32, reason="expired", detail="", provider=ROBOT.address).signed_by(ROBOT)
+    market.channel.put(str(RejectKey(MARKET, "cd" * 32, STRANGER.address)), word.encode())
+    await market.refused("rejection")
+
+
+async def test_an_agents_events_are_shown_with_the_record_of_the_contract(market: Market) -> None:
+    market.channel.put(EVENT, JOB.encode())
+    assert await market.next() == JobEvent(ROBOT.address, "incoming", JOB)
+    ended = msgspec.structs.replace(JOB, result=RECORDING, is_success=True, is_finalized=True)
+    market.channel.put(str(EventKey(ROBOT.address, CONTRACT, "finalized")), ended.encode())
+    assert await market.next() == JobEvent(ROBOT.address, "finalized", ended)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"promisor": STRANGER.address},
+        {"address": LIGHTHOUSE},
+        {"model": "\x1b[2J"},
+        {"promisee": "nobody"},
+        {"result": "no file"},
+    ],
+    ids=repr,
+)
+async def test_an_event_that_can_not_be_is_refused(market: Market, changes: dict[str, str]) -> None:
+    market.channel.put(EVENT, msgspec.structs.replace(JOB, **changes).encode())
+    await market.refused("event")
+
+
+async def test_an_event_of_an_agent_of_another_lighthouse_is_not_shown(market: Market) -> None:
+    elsewhere = msgspec.structs.replace(JOB, promisor=STRANGER.address)
+    market.channel.put(str(EventKey(STRANGER.address, CONTRACT, "ready")), elsewhere.encode())
+    await market.refused("event")
+    market.channel.put(EVENT, JOB.encode())
+    assert (await market.next()).agent == ROBOT.address
+
+
+async def test_an_agent_that_comes_later_is_shown_too(market: Market) -> None:
+    market.channel.announce("agent", STRANGER.address)
+    await until(lambda: STRANGER.address.lower() in market.watch._here, what="the newcomer")
+    theirs = msgspec.structs.replace(JOB, promisor=STRANGER.address)
+    market.channel.put(str(EventKey(STRANGER.address, CONTRACT, "ready")), theirs.encode())
+    assert (await market.next()).agent == STRANGER.address
+
+
+async def test_with_a_model_only_what_concerns_it_is_shown(router: EmbeddedRouter) -> None:
+    async with watched(router, MODEL) as market:
+        other, wanted = demand(model=OTHER_MODEL), demand()
+        market.channel.publish(other)
+        market.reject(message_hash(other).hex())
+        market.channel.publish(wanted)
+        assert (await market.next()).message == wanted
+        market.reject(message_hash(wanted).hex())
+        assert (await market.next()).order == message_hash(wanted).hex()
+        market.channel.put(EVENT, msgspec.structs.replace(JOB, model=OTHER_MODEL).encode())
+        market.channel.put(EVENT, JOB.encode())
+        assert (await market.next()).liability == JOB
+
+
+async def test_with_a_model_a_result_is_shown_once_its_contract_is_known(router: EmbeddedRouter) -> None:
+    async with watched(router, MODEL) as market:
+        early = result(liability=CONTRACT)
+        market.channel.publish(early)
+        await until(lambda: market.watch.tally().received == 1, what="the Result")
+        market.channel.put(EVENT, JOB.encode())
+        assert isinstance(await market.next(), JobEvent)
+        market.channel.publish(early)  # as the agent does until its effect is seen
+        assert (await market.next()).message == early

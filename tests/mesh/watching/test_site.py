@@ -1,0 +1,73 @@
+"""Watching on a closed site: a watcher sees what happens, an operator asks how everybody is, others do neither."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.identity import Member
+from mesh.network import Channel, Network, Services
+from mesh.watching import MarketWatch, Peer, present, status_of
+from tests.mesh.watching.test_market import EVENT, JOB
+from tests.mesh.watching.test_presence import QUICK, status
+from tests.support.orders import MARKET, PERSON, ROBOT, STRANGER
+from tests.support.sites import Site
+from tests.support.waiting import until, until_found
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mesh.watching import How
+    from schemas.rpc import Nothing
+    from schemas.status import Status
+
+SECONDS = 60.0
+
+
+@pytest.mark.parametrize(
+    ("role", "may_ask", "sees_events"), [("operator", 1, True), ("watcher", 0, True), ("person", 0, False)]
+)
+async def test_what_each_role_sees(tmp_path: Path, role: str, may_ask: int, sees_events: bool) -> None:
+    site = Site(tmp_path)
+    arm = site.enlist(Member(name="arm", address=ROBOT.address, roles=("agent",)))
+    own = STRANGER.address if role != "person" else PERSON.address
+    who = site.enlist(Member(name="who", address=own, roles=(role,)))  # type: ignore[arg-type]
+
+    async def answer(_request: Nothing) -> Status:
+        return status()
+
+    with site.open_router("wheel"):
+        async with (
+            Network(site.client(arm)) as arms,
+            Channel(arms.session, MARKET) as shown,
+            Services(arms.session, ROBOT.address) as services,
+            Network(site.client(who)) as others,
+            Channel(others.session, MARKET) as seen,
+        ):
+            services.offer("status", answer)
+            shown.announce("agent", ROBOT.address)
+
+            async def is_seen() -> bool:
+                return await present(seen) == [Peer("agent", ROBOT.address)]
+
+            async def told() -> list[How]:
+                return await status_of(others.session, ROBOT.address, MARKET, timeout=QUICK)
+
+            async with MarketWatch(others.session, seen) as watch:
+                await until_found(is_seen, what="the agent", seconds=SECONDS)
+                if may_ask:
+                    await until_found(told, what="the agent's answer", seconds=SECONDS)
+                assert len(await told()) == may_ask
+
+                def events() -> int:
+                    shown.put(EVENT, JOB.encode())
+                    return watch.tally().received
+
+                if sees_events:
+                    await until(events, what="an event", seconds=SECONDS)
+                else:
+                    for _ in range(3):
+                        events()
+                        await told()
+                    assert watch.tally().received == 0
