@@ -27,6 +27,11 @@ class Trouble:
             self._standing.add(kind)
             self._log.warning("%s: %s%s", words, error, f"; {error.hint}" if error.hint else "")
 
+    @property
+    def stands(self) -> bool:
+        """Whether something stands in the way now."""
+        return bool(self._standing)
+
     def over(self, words: str) -> None:
         """Say that it goes on (`words`), if something stood in the way."""
         if self._standing:

@@ -2,7 +2,17 @@
 
 from mesh.agent.agent import Agent
 from mesh.agent.contract import Contract, Outcome
-from mesh.agent.errors import JobFailed, OrderExpired, OrderRejected, ShortOfFunds
+from mesh.agent.errors import ContractTakenBack, JobFailed, OrderExpired, OrderRejected, ShortOfFunds
 from mesh.work.lifecycle import Phase
 
-__all__ = ["Agent", "Contract", "JobFailed", "OrderExpired", "OrderRejected", "Outcome", "Phase", "ShortOfFunds"]
+__all__ = [
+    "Agent",
+    "Contract",
+    "ContractTakenBack",
+    "JobFailed",
+    "OrderExpired",
+    "OrderRejected",
+    "Outcome",
+    "Phase",
+    "ShortOfFunds",
+]

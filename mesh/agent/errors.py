@@ -48,6 +48,18 @@ class OrderExpired(AiraError):
         self.deadline = deadline
 
 
+class ContractTakenBack(AiraError):
+    """The chain was reorganised, and a contract of before was not made again until its orders' deadline."""
+
+    def __init__(self, liability: str, deadline: int) -> None:
+        super().__init__(
+            f"the chain took the contract {liability} back, and it was not made again until block {deadline}",
+            hint="it pays nobody; post a new order, unless another contract was made of its orders",
+        )
+        self.liability = liability
+        self.deadline = deadline
+
+
 class ShortOfFunds(AiraError):
     """The account can't pay what it wants to promise: units of the token that it has, and that it needs."""
 
@@ -60,4 +72,4 @@ class ShortOfFunds(AiraError):
         self.needed = needed
 
 
-__all__ = ["JobFailed", "OrderExpired", "OrderRejected", "ServiceClosed", "ShortOfFunds"]
+__all__ = ["ContractTakenBack", "JobFailed", "OrderExpired", "OrderRejected", "ServiceClosed", "ShortOfFunds"]

@@ -12,6 +12,7 @@ import msgspec
 
 from mesh.agent.errors import JobFailed
 from mesh.errors import AiraError
+from schemas.errors import InvalidPayload
 from schemas.values import decode_value
 
 if TYPE_CHECKING:
@@ -48,21 +49,42 @@ class HandlerPerformer:
         """The topics that have a handler; None if there is one for any."""
         return None if ANY_TOPIC in self._hooks.topics else frozenset(self._hooks.topics)
 
+    def obstacle(self, topic: str, said: Any) -> str:
+        """Why the handler of a topic can't be given what a message says, decoded; empty if it can."""
+        hook = self._hook(topic)
+        try:
+            if hook is not None:
+                _typed(said, hook[1])
+        except InvalidPayload as error:
+            return str(error)
+        return ""
+
     async def perform(self, run: Run, message: Played) -> None:
         """Decode the message and wait for its handler."""
-        handler, kind = self._hooks.topics.get(message.topic) or self._hooks.topics[ANY_TOPIC]
-        await handler(run, _typed(message, kind))
+        hook = self._hook(message.topic)
+        assert hook is not None, "preflight lets no other topic pass"
+        handler, kind = hook
+        try:
+            typed = _typed(decode_value(message.payload, message.type), kind)
+        except InvalidPayload as error:
+            raise JobFailed(f"a message on {message.topic} is {error}") from None
+        await handler(run, typed)
+
+    def _hook(self, topic: str) -> tuple[Handler, type | None] | None:
+        return self._hooks.topics.get(topic) or self._hooks.topics.get(ANY_TOPIC)
 
 
-def _typed(message: Played, kind: type | None) -> Any:
-    """What a handler gets: the decoded payload, brought to the type that it was registered for."""
-    decoded = decode_value(message.payload, message.type)
-    if kind is None or isinstance(decoded, kind):
-        return decoded
+def _typed(said: Any, kind: type | None) -> Any:
+    """What a handler gets: what a message says, brought to the type that the handler was registered for.
+
+    Raises `InvalidPayload`.
+    """
+    if kind is None or isinstance(said, kind):
+        return said
     try:
-        return msgspec.convert(decoded, kind)
+        return msgspec.convert(said, kind)
     except msgspec.ValidationError as error:
-        raise JobFailed(f"a message on {message.topic} is no {kind.__name__}: {error}") from None
+        raise InvalidPayload(kind.__name__, str(error)) from None
 
 
 async def call(handler: Handler, *arguments: Any) -> None:

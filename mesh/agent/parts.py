@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from mesh.content import Exchange, Store
+from mesh.errors import ConfigurationError
 from mesh.network import Channel, Endpoints, Network, Services
 from mesh.work.ledger import Ledger
 from mesh.work.outbox import Outbox
@@ -50,7 +51,12 @@ class Parts:
     def workshop(self) -> Workshop:
         """The parts that the executor works with."""
         recordings = self.directory / "recordings"
-        recordings.mkdir(parents=True, exist_ok=True)
+        try:
+            recordings.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigurationError(
+                f"can't keep recordings in {recordings}: {error.strerror}", hint="give another folder with --data-dir"
+            ) from None
         return Workshop(
             session=self.network.session,
             signer=self.signer,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 from mesh.agent.contract import Outcome
 from mesh.agent.hooks import call
 from mesh.agent.services import offer_services
+from mesh.agent.status_service import StatusService
 from mesh.agent.token_events import TokenEvents
 from mesh.agent.trade import Trader
 from mesh.work.dealings import Dealings
@@ -50,17 +51,19 @@ class Worker:
         self._witnesses = witnesses
         self._token_events = TokenEvents(parts.channel.put, parts.signer.address)
         offer_services(parts, self.executor, drives_itself=performer is not None)
+        self._listener = Listener(
+            parts.chain, parts.ledger, parts.signer.address, self, token=parts.settings.erc20_token
+        )
+        parts.services.offer("status", StatusService(parts, self.executor, self._listener).status)
 
     async def run(self) -> None:
         """Work until cancelled."""
-        parts = self.parts
-        listener = Listener(parts.chain, parts.ledger, parts.signer.address, self, token=parts.settings.erc20_token)
         try:
             async with asyncio.TaskGroup() as tasks:
                 if self.parts.settings.enable_executor:
                     tasks.create_task(self.executor.run(), name="executor")
                 tasks.create_task(self.parts.outbox.run(), name="outbox")
-                tasks.create_task(listener.run(), name="listener")
+                tasks.create_task(self._listener.run(), name="listener")
         finally:
             await self.trader.close()
 

@@ -10,7 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from mesh.agent.contract import Contract, Outcome
-from mesh.agent.errors import OrderExpired, OrderRejected
+from mesh.agent.errors import ContractTakenBack, OrderExpired, OrderRejected
 from mesh.agent.purse import Purse
 from mesh.agent.rejections import Rejections
 from mesh.chain import NodeUnreachable, RequestRefused
@@ -57,6 +57,7 @@ class Trader:
         self._counted: dict[str, tuple[Terms, int]] = {}
         self._endings: dict[str, asyncio.Future[Outcome]] = {}
         self._contracts: dict[str, Contract] = {}
+        self._unmade: dict[str, int] = {}
         self._closed = False
         self._progress = asyncio.Event()
 
@@ -121,11 +122,16 @@ class Trader:
         return identity
 
     async def matched(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
-        """A contract was made of these orders; they need not be sent again."""
-        for identity in (demand_hash.hex(), offer_hash.hex()):
+        """A contract was made of these orders; ours among them need not be sent again.
+
+        In generation 3 others may have signed the terms of ours, which then has the same hash and is still open.
+        """
+        is_ours = {demand_hash: liability.promisee == self._address, offer_hash: liability.promisor == self._address}
+        for identity in (order.hex() for order, ours in is_ours.items() if ours):
             self._forget(identity)
             await self._parts.outbox.spend(identity, liability.address)
-        self._made(demand_hash.hex(), liability)
+        if is_ours[demand_hash]:
+            self._made(demand_hash.hex(), liability)
         for identity in list(self._counted):
             await self._offer_anew(identity)
         used = self._nonces.get(demand_hash.hex())
@@ -134,8 +140,10 @@ class Trader:
                 self._matches[identity].set_exception(_Overtaken())
 
     async def unmade(self, address: str) -> None:
-        """There is no contract at `address` after all; its orders are sent again."""
-        await self._parts.outbox.unspend(address)
+        """There is no contract at `address` after all; its orders are sent again, until their deadline."""
+        deadline = await self._parts.outbox.unspend(address)
+        if deadline is not None and address in self._endings:
+            self._unmade[address] = deadline
 
     async def contract(self, address: str) -> Contract:
         """The contract at `address`, to be waited for. Raises `NotALiability`."""
@@ -166,6 +174,18 @@ class Trader:
                 matched = self._matches.get(identity)
                 if matched is not None and not matched.done():
                     matched.set_exception(OrderExpired(identity, deadline))
+        for address, deadline in list(self._unmade.items()):
+            if deadline <= block:
+                self._lose(address, deadline)
+
+    def _lose(self, address: str, deadline: int) -> None:
+        """There will be no contract at `address` any more: its orders have expired."""
+        del self._unmade[address]
+        self._contracts = {demand: made for demand, made in self._contracts.items() if made.address != address}
+        ended = self._endings.pop(address, None)
+        if ended is not None and not ended.done():
+            ended.set_exception(ContractTakenBack(address, deadline))
+            ended.exception()  # taken note of: perhaps nobody waits for it
 
     async def _signed(self, kind: type[AnOrder], terms: Terms, **fee: Any) -> AnOrder:
         counted = terms["sender"] is not None
@@ -195,6 +215,7 @@ class Trader:
     def _made(self, demand: str, liability: Liability) -> None:
         """A demand has become a contract; perhaps once more, at another address, after a reorganisation."""
         contract, matched = self._contracts.get(demand), self._matches.get(demand)
+        self._unmade.pop(liability.address if contract is None else contract.address, None)
         if contract is not None and contract.address in self._endings:
             self._endings[liability.address] = self._endings.pop(contract.address)
             contract.liability = liability

@@ -12,7 +12,7 @@ import json
 import os
 import tempfile
 import time
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.chain.accounts import SignedTransaction
@@ -20,7 +20,7 @@ from mesh.chain.outbox import Pending
 from mesh.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Iterator
     from pathlib import Path
 
 SUFFIX: Final = ".jsonl"
@@ -39,8 +39,15 @@ class Hold:
 
     def append(self, entry: Pending) -> None:
         """Add the entry's newest version."""
-        os.write(self._descriptor, _line(entry))
-        os.fsync(self._descriptor)
+        with _on_disk(self._path):
+            # What was cut off, by a crash or a full disk, would make one unreadable line with the next.
+            end = os.pread(self._descriptor, os.fstat(self._descriptor).st_size, 0).rfind(b"\n") + 1
+            os.ftruncate(self._descriptor, end)
+            os.lseek(self._descriptor, end, os.SEEK_SET)
+            left = memoryview(_line(entry))
+            while left:  # a disk that is nearly full takes a part
+                left = left[os.write(self._descriptor, left) :]
+            os.fsync(self._descriptor)
 
     def release(self) -> None:
         """Leave the entry to whoever takes it up."""
@@ -48,8 +55,11 @@ class Hold:
 
     def remove(self) -> None:
         """End the entry."""
-        self._path.unlink(missing_ok=True)
-        os.close(self._descriptor)
+        try:
+            with _on_disk(self._path):
+                self._path.unlink(missing_ok=True)
+        finally:
+            os.close(self._descriptor)
 
 
 class Journal:
@@ -60,36 +70,37 @@ class Journal:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        try:
+        with _on_disk(folder / "x"):
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        except OSError as error:
-            raise ConfigurationError(f"can't keep sent transactions in {folder}: {error.strerror}") from None
 
     def add(self, entry: Pending) -> Hold | None:
         """Make the entry of a number and hold it; None if the number has one."""
         path = self._path(entry.nonce)
-        descriptor, unfinished = tempfile.mkstemp(suffix=UNFINISHED, dir=self._folder)
+        with _on_disk(path):
+            descriptor, unfinished = tempfile.mkstemp(suffix=UNFINISHED, dir=self._folder)
         hold = Hold(path, descriptor)
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
             hold.append(entry)
-            # The entry is whole and locked before others can see it.
-            os.link(unfinished, path)
-        except FileExistsError:
-            hold.release()
-            return None
+            with _on_disk(path):
+                fcntl.flock(descriptor, fcntl.LOCK_EX)
+                # The entry is whole and locked before others can see it.
+                if not _linked(unfinished, path):
+                    hold.release()
+                    return None
         except BaseException:
             hold.release()
             raise
         finally:
-            os.unlink(unfinished)
+            with suppress(OSError):  # what was in the way is told already
+                os.unlink(unfinished)
         return hold
 
     def hold(self, entry: Pending) -> Hold | None:
         """Hold the entry that a number has; None if there is none, or another process holds it."""
         path = self._path(entry.nonce)
         for attempt in range(LOCK_ATTEMPTS):
-            descriptor = _locked(path, fcntl.LOCK_EX)
+            with _on_disk(path):
+                descriptor = _locked(path, fcntl.LOCK_EX)
             if descriptor is not None:
                 return Hold(path, descriptor)
             if attempt and not path.exists():
@@ -105,16 +116,41 @@ class Journal:
             nonce = int(path.stem)
             if nonce in mine:
                 continue
-            descriptor = _locked(path, fcntl.LOCK_SH)
+            with _on_disk(path):
+                descriptor = _locked(path, fcntl.LOCK_SH)
             if descriptor is not None:
-                left.append(_parse(nonce, path))
-                os.close(descriptor)
+                try:
+                    with _on_disk(path):
+                        left.append(_parse(nonce, path))
+                finally:
+                    os.close(descriptor)
             elif path.exists():
                 elsewhere.add(nonce)
         return left, frozenset(elsewhere)
 
     def _path(self, nonce: int) -> Path:
         return self._folder / f"{nonce:012}{SUFFIX}"
+
+
+@contextmanager
+def _on_disk(path: Path) -> Iterator[None]:
+    """Work on the entry at `path`. Raises `ConfigurationError` where the disk does not let it."""
+    try:
+        yield
+    except OSError as error:
+        raise ConfigurationError(
+            f"can't keep sent transactions in {path.parent}: {error.strerror}",
+            hint="make room on that disk, let this user write there, or name another folder with --data-dir",
+        ) from None
+
+
+def _linked(unfinished: str, path: Path) -> bool:
+    """Give a whole entry its name; False when there is one of that name."""
+    try:
+        os.link(unfinished, path)
+    except FileExistsError:
+        return False
+    return True
 
 
 def _line(entry: Pending) -> bytes:
@@ -130,6 +166,8 @@ def _parse(nonce: int, path: Path) -> Pending:
     with suppress(ValueError):
         for line in path.read_text(encoding="utf-8").splitlines():
             lines.append(json.loads(line))
+    if not lines:
+        raise ConfigurationError(f"{path} holds no sent transaction", hint="it is damaged; move it away")
     fields = lines[-1]["fields"] | {"to": lines[-1]["fields"]["to"] or b""}
     versions = [SignedTransaction(raw=bytes.fromhex(line["raw"]), hash=line["hash"]) for line in lines]
     return Pending(nonce=nonce, fields=fields, versions=versions, sent_at=lines[0]["sentAt"], is_watched=False)

@@ -34,9 +34,9 @@ class Liabilities(Following):
         """The nonce that an account's next generation-5 order must have."""
         return await self._suite.nonce_of(await self._whose(address))
 
-    async def is_order_used(self, order_hash: bytes) -> bool:
-        """Whether a generation-3 order was used already (generation 5 is told by its nonce)."""
-        return bool(await self.node.read(self._factory_contract().functions.isHashConsumed(order_hash)))
+    async def is_order_used(self, order_hash: bytes, signer: str) -> bool:
+        """Whether a generation-3 order of `signer` (address) was used already (generation 5 is told by its nonce)."""
+        return await self._suite.is_order_used(order_hash, signer)
 
     async def liability(self, address: str) -> Liability:
         """The record of a liability. Raises `NotALiability` unless the factory made it."""

@@ -84,6 +84,10 @@ class Suite:
         """The nonce of an account's next generation-5 order. Raises `NotOffered`."""
         return int(await self._node.read(self._factory.nonceOf(address)))
 
+    async def is_order_used(self, order_hash: bytes, signer: str) -> bool:
+        """Whether the generation-3 order that `signer` has signed made its contract."""
+        return bool(await self._node.read(self._factory.isOrderUsed(order_hash, signer)))
+
     def recognise(self, liability: str) -> None:
         """Take an address for a liability: the factory said so in an event."""
         self._liabilities.add(liability)
@@ -148,6 +152,10 @@ class OriginalSuite(Suite):
         if self.generation == 3:
             raise NotOffered("nonceOf", self.generation)
         return await super().nonce_of(address)
+
+    async def is_order_used(self, order_hash: bytes, signer: str) -> bool:
+        """Whoever has signed it: the originals take terms once, and a stranger may sign another's."""
+        return bool(await self._node.read(self._factory.isHashConsumed(order_hash)))
 
     async def state(self, lighthouse: str) -> LighthouseState:
         return await lighthouse_state(self._node, lighthouse, NAMES[self.generation], current="marker")

@@ -21,12 +21,16 @@ COMMANDS: Final = {
     "liability": ("mesh.cli.liability", "look at contracts, follow them, call them off"),
     "lighthouse": ("mesh.cli.lighthouse", "make markets, look at them, become a provider"),
     "objective": ("mesh.cli.objective", "make, show, check, fetch objectives and recordings"),
+    "peers": ("mesh.cli.peers", "who is on a lighthouse's channel"),
     "provider": ("mesh.cli.provider", "match the orders of a lighthouse"),
     "replay": ("mesh.cli.replay", "play a recording again onto keys of the mesh"),
     "router": ("mesh.cli.router", "a Zenoh router for a mesh"),
+    "rpc": ("mesh.cli.rpc", "call a service of an agent"),
     "settings": ("mesh.cli.settings", "show the settings in force"),
+    "status": ("mesh.cli.status", "how agents, providers and bridges are"),
     "up": ("mesh.cli.up", "router, chain and provider in one process, for development"),
     "verify": ("mesh.cli.verify", "check a recording against its objective and its contract"),
+    "watch": ("mesh.cli.watch", "a market as it happens"),
     "xrt": ("mesh.cli.xrt", "balances, allowances and transfers of XRT and other tokens"),
 }
 """Name → (module that holds the command under the name `command`, one line of help)."""

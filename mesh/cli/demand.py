@@ -8,16 +8,32 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-import msgspec
 
+from mesh.cli.amounts import AMOUNT, XRT
 from mesh.cli.options import with_settings
-from mesh.errors import ConfigurationError, InputError
+from mesh.cli.printing import print_json, say, with_json
+from mesh.errors import AiraError, ConfigurationError, InputError
 from mesh.running import run_to_end
 from mesh.settings import CHAIN_SETTINGS, NETWORK_SETTINGS
 from schemas import InvalidCid, parse_cid
 
 if TYPE_CHECKING:
+    from mesh.agent import Agent, Contract
     from mesh.settings import Settings
+
+
+class Amount(click.ParamType[str]):
+    """An amount as people write it. What is none is refused at once; how much it is depends on the token."""
+
+    name = "amount"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """The same text."""
+        if AMOUNT.fullmatch(str(value).strip()) is None:
+            self.fail(
+                f"{str(value)[:40]!r} is not an amount; write 1.5 for one and a half XRT, or 1500000wn", param, ctx
+            )
+        return str(value)
 
 
 @click.command("demand")
@@ -25,10 +41,14 @@ if TYPE_CHECKING:
 @click.option("--objective", required=True, help="file to play, or its CID")
 @click.option(
     "--cost",
-    type=click.IntRange(min=0),
-    default=0,
+    type=Amount(),
+    default="0",
     show_default=True,
-    help="what it may cost, in the token's smallest unit (XRT: wn)",
+    help="what it may cost: 1.5 counts whole tokens (XRT), 1500000000wn (units for other tokens) the smallest unit",
+)
+@click.option("--validator", default="", help="address or ENS name of who is to judge the result [nobody]")
+@click.option(
+    "--validator-fee", type=Amount(), default="0", show_default=True, help="what the validator gets, in XRT (or wn)"
 )
 @click.option(
     "--lifetime",
@@ -38,7 +58,7 @@ if TYPE_CHECKING:
     help="blocks for which the demand is valid",
 )
 @click.option("--out", type=click.Path(path_type=Path), help="file to write the recording to")
-@click.option("--json", "as_json", is_flag=True, help="print one JSON object at the end")
+@with_json
 @with_settings(
     *NETWORK_SETTINGS,
     "lighthouse_contract",
@@ -48,33 +68,81 @@ if TYPE_CHECKING:
     *CHAIN_SETTINGS,
 )
 def command(settings: Settings, **order: Any) -> None:
-    """Publish a Demand, wait for the contract, the work and the payment. Ctrl-C stops waiting; the contract goes on."""
+    """Publish a Demand, wait for the contract, the work and the payment. Ctrl-C stops waiting; the contract goes on.
+
+    With --json one object is printed when the contract has ended, also if its recording (--out) can't be had; the
+    object then has an `error`, and the exit code is 1.
+    """
     run_to_end(lambda: _demand(settings, **order))
 
 
 async def _demand(
-    settings: Settings, *, model: str, objective: str, cost: int, lifetime: int, out: Path | None, as_json: bool
+    settings: Settings, *, objective: str, validator_fee: str, out: Path | None, as_json: bool, **terms: Any
 ) -> None:
     from mesh.agent import Agent
 
-    say = (lambda text: None) if as_json else click.echo
     settings.keyfile_and_password()
     source = await asyncio.to_thread(_source, objective)
+    fee = XRT.parse(validator_fee)
+    if fee and not terms["validator"]:
+        raise InputError("a validator's fee without a validator", hint="name the validator with --validator")
     if out is not None:
         await asyncio.to_thread(_check_writable, out)
-    async with Agent(model, settings=settings) as agent:
-        say(f"demand by {agent.address} for {model}")
-        contract = await agent.demand(source, cost=cost, lifetime=lifetime)
+    async with Agent(terms.pop("model"), settings=settings) as agent:
+        contract = await _contract(agent, source, validator_fee=fee, quiet=as_json, **terms)
+        await _ending(contract, out, as_json=as_json)
+
+
+async def _contract(
+    agent: Agent, source: str | Path, *, cost: str, validator_fee: int, quiet: bool, **terms: Any
+) -> Contract:
+    """The contract that comes of the demand; what may be said is said."""
+    from mesh.cli.tokens import check_enough, unit_of
+
+    chain, token = agent.parts.chain, agent.settings.erc20_token
+    unit = await unit_of(chain, token)
+    amount = unit.parse(cost)
+    if not quiet:
+        say(f"demand by {agent.address} for {agent.model}")
+    await check_enough(chain, unit, amount, token=token)
+    contract = await agent.demand(source, cost=amount, validator_fee=validator_fee, **terms)
+    if not quiet:
         say(f"contract {contract.address} with {contract.liability.promisor}")
-        outcome = await contract.outcome()
+    return contract
+
+
+async def _ending(contract: Contract, out: Path | None, *, as_json: bool) -> None:
+    """Wait for the end, fetch the recording, and tell of both. Raises why there is none after telling the end."""
+    outcome = await contract.outcome()
+    facts: dict[str, Any] = {"liability": contract.address, "success": outcome.success, "result": outcome.result}
+    if not as_json:
         say(f"{'paid' if outcome.success else 'refunded'}, result {outcome.result or 'none'}")
-        if out is not None and outcome.result:
-            recording = await contract.recording()
-            await asyncio.to_thread(shutil.copyfile, recording, out)
-            say(f"recording {out}")
+    failure: AiraError | None = None
+    if out is not None:
+        facts["recording"] = None
+        try:
+            if outcome.result:
+                await _keep(contract, out)
+                facts["recording"] = str(out)
+        except AiraError as error:
+            failure, facts["error"] = error, str(error)
     if as_json:
-        facts = {"liability": contract.address, "success": outcome.success, "result": outcome.result}
-        click.echo(msgspec.json.encode(facts))
+        print_json(facts)
+    elif facts.get("recording"):
+        say(f"recording {out}")
+    if failure is not None:
+        raise failure
+
+
+async def _keep(contract: Contract, out: Path) -> None:
+    """Write the recording to a file. Raises a `ContentError` when it can't be had, `AiraError` when not written."""
+    recording = await contract.recording()
+    try:
+        await asyncio.to_thread(shutil.copyfile, recording, out)
+    except OSError as error:
+        raise AiraError(
+            f"can't write the recording to {out}: {error.strerror}", hint=f"it was fetched, and is in {recording}"
+        ) from None
 
 
 def _source(objective: str) -> str | Path:

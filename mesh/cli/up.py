@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import AsyncExitStack
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from mesh.cli.engine import chosen, with_engine
 from mesh.cli.options import BLOCK_TIME, PORT, with_settings
 from mesh.running import run_until_stopped
 from mesh.settings import Settings
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 @click.command("up")
@@ -19,26 +24,37 @@ from mesh.settings import Settings
 @click.option(
     "--block-time", type=BLOCK_TIME, default=1.0, show_default=True, help="mine an empty block every so many seconds"
 )
+@with_engine
 @with_settings("listen", "data_dir")
-def command(settings: Settings, port: int, block_time: float) -> None:
+def command(settings: Settings, port: int, block_time: float, **engine: Any) -> None:
     """Run a market to develop on: a Zenoh router, a chain with the contracts, and a provider. Ctrl-C ends it.
 
-    The keyfiles of a robot and a person with money are written to the data folder; what to do with them is printed.
+    The chain is gone then, unless --state keeps it. The keyfiles of a robot and a person with money are written to the
+    data folder; what to do with them is printed.
     """
-    run_until_stopped(lambda: _serve(settings, port, block_time))
+    run_until_stopped(lambda: _serve(settings, port, block_time, **engine))
 
 
-async def _serve(settings: Settings, port: int, block_time: float) -> None:
+async def _serve(
+    settings: Settings,
+    port: int,
+    block_time: float,
+    *,
+    engine: str = "auto",
+    anvil: Path | None = None,
+    state: Path | None = None,
+) -> None:
     from mesh.demo.development import serve_chain
     from mesh.identity.routers import check_loopback
     from mesh.market.provider import Provider
     from mesh.network import Endpoints, Network
 
     check_loopback(settings.listen)
+    program = chosen(engine=engine, anvil=anvil, state=state)
     async with AsyncExitStack() as stack:
         network = await stack.enter_async_context(Network(Endpoints(listen=settings.listen, mode="router")))
         served = await stack.enter_async_context(
-            serve_chain(settings, host="127.0.0.1", port=port, block_time=block_time)
+            serve_chain(settings, host="127.0.0.1", port=port, block_time=block_time, anvil=program, state=state)
         )
         chain = await stack.enter_async_context(served.market.chain(served.url, "provider"))
         # Each generation has its own name for the lighthouse, and so its own keys.

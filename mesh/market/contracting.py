@@ -9,8 +9,11 @@ from typing import TYPE_CHECKING, Any, Protocol
 from mesh.chain import NodeUnreachable, RequestRefused, Reverted
 from mesh.errors import AiraError, InputError
 from mesh.market.blame import at_fault, word_for
+from mesh.market.patience import Patience, may_pass
 
 if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
     from mesh.chain import Chain
     from mesh.market.book import Match, Order
     from mesh.market.earnings import Books
@@ -49,27 +52,40 @@ class Contracting:
 
     def make(self, match: Match) -> None:
         """Make a contract of a pair; what can't become one leaves the market, the other order stays."""
-        self._sending.put(partial(self._make, match))
+        self._sending.put(partial(self._make, match, Patience()))
 
     def end(self, result: Verified[Result]) -> None:
         """Finalize a contract by its Result."""
-        self._sending.put(partial(self._end, result))
+        self._sending.put(partial(self._end, result, Patience()))
 
-    async def _make(self, match: Match) -> None:
+    async def _make(self, match: Match, patience: Patience) -> None:
         demand, offer = match
+        create = partial(self._chain.create_liability, self._lighthouse, demand.message, offer.message)
         try:
-            created = await self._sending.send(
-                lambda: self._chain.create_liability(self._lighthouse, demand.message, offer.message)
-            )
+            created = await self._sending.send(partial(patience.attempt, create))
         except Reverted as error:
             self._books.failed(error)
-            await self._part(match, gone=at_fault(match, error.reason, error.arguments), error=error)
-        except (NodeUnreachable, RequestRefused, InputError) as error:
+            if not self._again(partial(self._make, match, patience), patience, error):
+                await self._part(match, gone=at_fault(match, error.reason, error.arguments), error=error)
+        except (NodeUnreachable, RequestRefused) as error:
+            if not self._again(partial(self._make, match, patience), patience, error):
+                await self._part(match, gone=match, error=error)
+        except InputError as error:
             await self._part(match, gone=match, error=error)
         else:
             self._books.made(created, fee=offer.message.lighthouse_fee)
             self._used.add(created.liability, demand, offer)
             log.info("%s: created, gas %d", created.liability, created.gas_used)
+
+    def _again(
+        self,
+        work: Callable[[], Awaitable[None]],
+        patience: Patience,
+        error: NodeUnreachable | RequestRefused | Reverted,
+    ) -> bool:
+        """Try again later what may have failed for a passing reason; False when that was done often enough."""
+        pause = patience.pause() if may_pass(error) else None
+        return pause is not None and self._sending.put_later(work, after=pause, because=error)
 
     async def _part(self, match: Match, *, gone: tuple[Verified[Order], ...], error: AiraError) -> None:
         """Reject the orders that are to blame, and put back the other one, unless it was used meanwhile."""
@@ -82,23 +98,26 @@ class Contracting:
     async def _is_used(self, order: Verified[Order]) -> bool:
         try:
             if order.message.generation == 3:
-                return await self._chain.is_order_used(order.hash)
+                return await self._chain.is_order_used(order.hash, order.signer)
             return await self._chain.nonce_of(order.signer) > int(order.message.nonce)
         except RequestRefused:
             return False  # the contracts will say so when it is matched
 
-    async def _end(self, result: Verified[Result]) -> None:
+    async def _end(self, result: Verified[Result], patience: Patience) -> None:
         message = result.message
+        finalize = partial(self._chain.finalize, self._lighthouse, message)
         try:
-            settled = await self._sending.send(lambda: self._chain.finalize(self._lighthouse, message))
+            settled = await self._sending.send(partial(patience.attempt, finalize))
         except Reverted as error:
             self._books.failed(error)
-            if error.reason != "AlreadyFinalized":
+            again = self._again(partial(self._end, result, patience), patience, error)
+            if not again and error.reason != "AlreadyFinalized":
                 self._desk.reject(result, _reason(error), str(error))
         except (NodeUnreachable, RequestRefused) as error:
-            # Neither is the Result's fault for certain, and whoever is to be paid goes on sending it.
-            self._desk.reject(result, _reason(error), str(error))
-            self._desk.forget(result)
+            if not self._again(partial(self._end, result, patience), patience, error):
+                # Perhaps not the Result's fault, and whoever is to be paid goes on sending it.
+                self._desk.reject(result, _reason(error), str(error))
+                self._desk.forget(result)
         else:
             self._books.ended(message.liability, settled)
             self._used.add(message.liability, result)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
 ANSWERERS: Final = 2
 """Threads that answer: a market can be large, and who asks may be slow to take the answers."""
+QUESTIONS: Final = 64
+"""Questions that are answered or wait for it, each with a list of the book as it was; more are turned down."""
 
 
 class Memory:
@@ -32,6 +35,7 @@ class Memory:
         self._session = session
         self._lighthouse = lighthouse
         self._book = book
+        self._room = threading.Semaphore(QUESTIONS)
         self._threads = ThreadPoolExecutor(ANSWERERS, thread_name_prefix="market memory")
         self._open = True
 
@@ -54,8 +58,9 @@ class Memory:
 
     def _answer_soon(self, query: zenoh.Query) -> None:
         """On the loop's thread, as the book changes there."""
-        if self._open:
-            self._threads.submit(self._answer, query, list(self._book.orders()))
+        if self._open and self._room.acquire(blocking=False):
+            answering = self._threads.submit(self._answer, query, list(self._book.orders()))
+            answering.add_done_callback(lambda done: self._room.release())
         else:
             query.drop()  # type: ignore[no-untyped-call]
 

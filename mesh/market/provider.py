@@ -20,9 +20,11 @@ from mesh.market.contracting import Contracting
 from mesh.market.earnings import Books, Earnings
 from mesh.market.memory import Memory
 from mesh.market.sending import Sending
+from mesh.market.telling import StatusService
 from mesh.market.used import Used
 from mesh.market.watching import Watching
 from mesh.network.channel import Channel
+from mesh.network.services import Services
 from schemas import ZERO_ADDRESS, Demand, Offer, RejectKey, Result, Verified
 from schemas.rejection import Rejection
 
@@ -89,6 +91,8 @@ class Provider:
             self._offers = await stack.enter_async_context(self.channel.subscribe(Offer))
             self._results = await stack.enter_async_context(self.channel.subscribe(Result))
             await stack.enter_async_context(Memory(self._session, self._lighthouse, self.book))
+            services = await stack.enter_async_context(Services(self._session, self.address))
+            services.offer("status", self._telling.status)
             self.channel.announce("provider", self.address)
             self._stack = stack.pop_all()
         return self
@@ -107,6 +111,15 @@ class Provider:
             contracting=self._contracting,
             books=self._books,
             used=used,
+        )
+        self._telling = StatusService(
+            self._session,
+            self._chain,
+            self._lighthouse,
+            book=self.book,
+            books=self._books,
+            sending=self._sending,
+            watching=self._watching,
         )
 
     async def __aexit__(

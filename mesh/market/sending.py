@@ -7,6 +7,7 @@ import logging
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from mesh.chain import FeeTooHigh, InsufficientFunds, NodeUnreachable, RequestRefused, Reverted, TransactionTimeout
+from mesh.market.patience import may_pass
 from mesh.market.turns import NoStake, Turns
 from mesh.trouble import Trouble
 
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from mesh.chain import Chain
+    from mesh.errors import AiraError
 
     Work = Callable[[], Awaitable[None]]
 
@@ -25,13 +27,8 @@ RETRY: Final = 1.0
 """Seconds before a transaction is tried again that failed for a passing reason."""
 WAITING: Final = 1024
 """Pieces of work that wait before `room` lets nobody in."""
-OUT_OF_TURN: Final = frozenset({"NotYourTurn", "NotAProvider"})
-"""What the lighthouse says to a provider, whatever the transaction is."""
-DOUBTS: Final = 3
-"""How often that, or the node's silence, is believed though the node says that it is the provider's turn.
-
-A token can revert with the same words, or keep the node busy for longer than anybody waits.
-"""
+LATER: Final = 4096
+"""Pieces of work that wait aside at most, to be tried again."""
 
 
 class Sending:
@@ -48,6 +45,7 @@ class Sending:
         self._turns = Turns(chain, lighthouse, provider)
         self._work: asyncio.Queue[tuple[Work, int]] = asyncio.Queue()
         self._since = 0
+        self._later = 0
         self._room = asyncio.Event()
         self._room.set()
         self._trouble = Trouble(log)
@@ -56,6 +54,23 @@ class Sending:
     def put(self, work: Work) -> None:
         """Do `work`, a coroutine function that uses `send`, after what waits already."""
         self._put(work, self._head())
+
+    @property
+    def waits_for(self) -> str:
+        """In a few words what transactions wait for that is not a turn or a block; empty when they go through."""
+        return "wait for the node" if self._silence.stands else "wait" if self._trouble.stands else ""
+
+    def put_later(self, work: Work, *, after: float, because: AiraError) -> bool:
+        """Do the piece of work that runs now again, as `work`, in `after` seconds; others go through meanwhile.
+
+        False, and nothing is done, where too much waits so already.
+        """
+        if self._later >= LATER:
+            return False
+        self._trouble.met(because, "a transaction waits")
+        self._later += 1
+        asyncio.get_running_loop().call_later(after, self._put_again, work, self._since)
+        return True
 
     async def room(self) -> None:
         """Wait until less than `WAITING` pieces of work wait: for those who bring new ones."""
@@ -78,21 +93,21 @@ class Sending:
         """What `transaction` returns, sent in the provider's turn; again and again while the node is away, while gas
         is too dear, and while it is not our turn after all.
 
-        Raises `Reverted` for what the contracts refuse for another reason, and what else `transaction` raises;
-        `NodeUnreachable` when the node is there for everything but this.
+        Raises what `transaction` raises: `Reverted` for what the contracts refuse; and that it is not our turn, or that
+        the node does not answer or refuses, where the same node says that it is there and our turn has come. Then
+        others may go through (see `put_later`).
         """
-        doubts = 0
         while True:
             await self._our_turn()
             try:
                 done = await transaction()
             except (FeeTooHigh, TransactionTimeout) as error:
                 self._trouble.met(error, "a transaction waits")
-            except (NodeUnreachable, Reverted) as error:
-                if isinstance(error, Reverted) and error.reason not in OUT_OF_TURN:
+            except (NodeUnreachable, RequestRefused, Reverted) as error:
+                if not may_pass(error):
                     raise
-                doubts += await self._is_our_turn()
-                if doubts == DOUBTS:
+                if await self._is_our_turn():
+                    self._turns.forget()
                     raise
                 self._trouble.met(error, "a transaction waits")
             else:
@@ -119,6 +134,10 @@ class Sending:
         self._work.put_nowait((work, since))
         if self._work.qsize() >= WAITING:
             self._room.clear()
+
+    def _put_again(self, work: Work, since: int) -> None:
+        self._later -= 1
+        self._put(work, since)
 
     async def _our_turn(self) -> None:
         """Return when the next transaction is ours to send."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from contextlib import aclosing
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from mesh.chain import (
     Finalized,
@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from schemas import Liability
 
 log = logging.getLogger(__name__)
+
+OPEN: Final = 65_536
+"""Records of contracts that are kept until they end; those of older ones are read again when their Result comes."""
 
 
 class Watching:
@@ -77,6 +80,11 @@ class Watching:
                 self._trouble.met(error, f"the chain can't be read on from block {self.head + 1}")
                 await asyncio.sleep(RETRY)
 
+    @property
+    def waits(self) -> bool:
+        """Whether the chain can't be read just now."""
+        return self._trouble.stands
+
     async def liability(self, address: str) -> Liability:
         """The record of a liability. Raises `NotALiability`, `NodeUnreachable`, `RequestRefused`."""
         return self._open.get(address) or await self._chain.liability(address)
@@ -101,6 +109,8 @@ class Watching:
         self._used.add(address, demand, offer)
         if not liability.is_finalized:
             self._open[address] = liability
+            if len(self._open) > OPEN:
+                del self._open[next(iter(self._open))]
 
     def _take_back(self, block: Reorganised) -> None:
         """What the chain has undone is done again, unless it comes again by itself: then the contracts say so."""

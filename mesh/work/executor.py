@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from mesh.errors import AiraError, ClosedError, ContentError, InputError
+from mesh.work.ledger import Job, LedgerUnusable
 from mesh.work.lifecycle import Phase, WrongPhase, advance
 from mesh.work.objectives import Objectives
 
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable
 
     from mesh.recording import Objective
-    from mesh.work.ledger import Job
     from mesh.work.lifecycle import Witness
     from mesh.work.run import Performer, Run
     from mesh.work.workshop import Workshop
@@ -35,7 +35,6 @@ STARTED: Final = (Phase.READY, Phase.RUNNING)
 """Phases in which a job may be begun anew or gone on with."""
 PROGRESS: Final = 0.5
 """Seconds between two notes of a playback's position in the ledger."""
-
 PATIENCE: Final = 10.0
 """Seconds without a new block of an objective after which no job is taken on for it."""
 
@@ -54,7 +53,7 @@ class Executor:
         self._shop = workshop
         self._performer = performer
         self._witness = witness
-        self._objectives = Objectives(workshop, topics=None if performer is None else performer.topics)
+        self._objectives = Objectives(workshop, performer=performer)
         self._ready: asyncio.Queue[str] = asyncio.Queue()
         self._runs: dict[str, Run] = {}
         self._plays: dict[str, asyncio.Task[None]] = {}
@@ -76,15 +75,17 @@ class Executor:
             self._tasks = None
             await self._suspend()
 
+    @property
+    def is_running(self) -> bool:
+        """Whether `run` serves."""
+        return self._tasks is not None
+
     async def opened(self) -> None:
         """Return when `run` has taken up what the ledger holds."""
         await self._opened.wait()
 
     async def examine(self, cid: str) -> Objective:
-        """The objective of that CID, fetched and found fit to be played here, before a job is taken on for it.
-
-        Raises `UnfitObjective` or a `ContentError`.
-        """
+        """The objective of that CID, fetched and found fit to be played. Raises `UnfitObjective`, a `ContentError`."""
         return await self._objectives.examine(cid, patience=PATIENCE)
 
     def prepare(self, liability: Liability) -> None:
@@ -218,8 +219,7 @@ class Executor:
     async def _play_of(self, address: str) -> asyncio.Task[None] | None:
         """The playback of a job, if it goes on."""
         async with self._changing:
-            playing = self._plays.get(address)
-            if playing is not None and playing.done():
+            if (playing := self._plays.get(address)) is not None and playing.done():
                 del self._plays[address]
                 return None
             return playing
@@ -237,7 +237,7 @@ class Executor:
         """Play to the end; with a performer, finish as it went."""
         address = run.liability.address
         _playing.set(address)
-        noted = time.monotonic()
+        noted, success, note = time.monotonic(), True, ""
 
         async def progress(position: int) -> None:
             nonlocal noted
@@ -245,10 +245,11 @@ class Executor:
                 noted = time.monotonic()
                 await self._shop.ledger.set_position(address, position)
 
-        success, note = True, ""
         try:
             await self._witness(Phase.RUNNING, run.liability)
             await run.play(self._performer, progress=progress)
+        except LedgerUnusable:  # not the job's fault, which is gone on with later
+            raise
         except Exception as error:
             success, note = False, str(error) or type(error).__name__
             log.warning("%s: the job failed: %s", address, note, exc_info=not isinstance(error, AiraError))
@@ -273,8 +274,10 @@ class Executor:
     async def _put_away(self, address: str) -> None:
         """Note how far a run has come and close it."""
         run = self._runs.pop(address)
-        await self._shop.ledger.set_position(address, run.position)
-        await run.close()
+        try:
+            await self._shop.ledger.set_position(address, run.position)
+        finally:
+            await run.close()
 
     async def _stop_playing(self, address: str) -> None:
         """Cancel the playback of a job and wait for its end, unless it is the playback, or its handler, that asks."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final, Self
 
 import aiosqlite
@@ -18,7 +19,7 @@ from mesh.work.lifecycle import UNFINISHED, Phase
 from schemas import Liability
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator
     from pathlib import Path
     from types import TracebackType
 
@@ -81,10 +82,19 @@ class Outgoing(msgspec.Struct, frozen=True, kw_only=True):
     deadline: int | None
 
 
+class LedgerUnusable(ConfigurationError):
+    """The ledger can't be read or written: a full disk, a folder of somebody else's, a file that is no ledger."""
+
+    def __init__(self, path: Path, why: object) -> None:
+        hint = "make room on that disk, let this user write there, or give another folder with --data-dir"
+        super().__init__(f"can't use the ledger {path}: {why}", hint=hint)
+        self.path = path
+
+
 class Ledger:
     """The ledger in the file at `path`, made when missing: `async with Ledger(path) as ledger`.
 
-    One agent owns a file. Calls run in a thread of the ledger's own, in their order.
+    One agent owns a file. Calls run in a thread of the ledger's own, in their order. All raise `LedgerUnusable`.
     """
 
     def __init__(self, path: Path) -> None:
@@ -101,9 +111,7 @@ class Ledger:
             await self._prepare()
         except (OSError, aiosqlite.Error) as error:
             await self._close()
-            raise ConfigurationError(
-                f"can't use the ledger {self._path}: {error}", hint="give another folder with --data-dir"
-            ) from None
+            raise LedgerUnusable(self._path, error) from None
         except BaseException:
             await self._close()
             raise
@@ -174,6 +182,11 @@ class Ledger:
         rows = await self._rows(f"SELECT * FROM jobs WHERE phase IN ({marks}) AND NOT aside ORDER BY rowid", wanted)
         return [_job(row) for row in rows]
 
+    async def jobs_by_phase(self) -> dict[str, int]:
+        """How many jobs there are in each phase that has any."""
+        rows = await self._rows("SELECT phase, COUNT(*) FROM jobs WHERE NOT aside GROUP BY phase")
+        return dict(rows)
+
     async def post(self, outgoing: Outgoing) -> None:
         """Keep a signed message for sending until `settle`."""
         await self._run(POST, _posted(outgoing))
@@ -190,6 +203,11 @@ class Ledger:
             ("DELETE FROM spent WHERE rowid <= (SELECT MAX(rowid) FROM spent) - ?", (SPENT_KEPT,)),
         )
 
+    async def spent_until(self, liability: str) -> int | None:
+        """The deadline (block) of the orders that became the contract at this address; None when none is known."""
+        ((deadline,),) = await self._rows("SELECT MIN(deadline) FROM spent WHERE liability = ?", (liability,))
+        return None if deadline is None else int(deadline)
+
     async def unspend(self, liability: str) -> bool:
         """There is no contract at this address after all: its orders are to be sent again. False when it had none."""
         columns = "identity, kind, payload, deadline, posted"
@@ -203,6 +221,10 @@ class Ledger:
         await self._run("DELETE FROM outbox WHERE deadline <= ?", (head,))
         rows = await self._rows("SELECT identity, kind, payload, deadline FROM outbox ORDER BY rowid")
         return [Outgoing(identity=row[0], kind=row[1], payload=row[2], deadline=row[3]) for row in rows]
+
+    async def waiting(self) -> int:
+        """How many messages are in the outbox."""
+        return int((await self._rows("SELECT COUNT(*) FROM outbox"))[0][0])
 
     async def cursor(self, name: str) -> int | None:
         """The last block handled by `name`; None when there was none."""
@@ -227,7 +249,8 @@ class Ledger:
 
     async def _run(self, statement: str, values: tuple[Any, ...] = ()) -> bool:
         async with self._writing:
-            cursor = await self._open().execute(statement, values)
+            with self._usable():
+                cursor = await self._open().execute(statement, values)
         changed = cursor.rowcount > 0
         await cursor.close()
         return changed
@@ -237,17 +260,27 @@ class Ledger:
         database = self._open()
         async with self._writing:
             try:
-                await database.execute("BEGIN IMMEDIATE")
-                for statement, values in statements:
-                    await database.execute(statement, values)
-                await database.commit()
+                with self._usable():
+                    await database.execute("BEGIN IMMEDIATE")
+                    for statement, values in statements:
+                        await database.execute(statement, values)
+                    await database.commit()
             except BaseException:
-                # What was cancelled is executed all the same, in the ledger's thread: nothing may stay open behind it.
+                # What was cancelled is executed all the same: nothing may stay open behind it.
                 await database.rollback()
                 raise
 
     async def _rows(self, statement: str, values: tuple[Any, ...] = ()) -> list[Any]:
-        return list(await self._open().execute_fetchall(statement, values))
+        with self._usable():
+            return list(await self._open().execute_fetchall(statement, values))
+
+    @contextmanager
+    def _usable(self) -> Iterator[None]:
+        """Raise `LedgerUnusable` for what the disk does not let the database do."""
+        try:
+            yield
+        except aiosqlite.OperationalError as error:
+            raise LedgerUnusable(self._path, error) from None
 
 
 def _job(row: Any) -> Job:

@@ -12,6 +12,7 @@ from mesh.chain import (
     Finalized,
     History,
     NewLiability,
+    NoContracts,
     NodeUnreachable,
     NotALiability,
     Reorganised,
@@ -80,9 +81,15 @@ class Listener:
         while True:
             try:
                 await self._read()
-            except (NodeUnreachable, RequestRefused) as error:
+            except (NodeUnreachable, RequestRefused, NoContracts) as error:
+                # The last of a contract whose block was replaced, or of a node that is behind the one that told of it.
                 self._trouble.met(error, "the chain can't be read, trying again")
                 await asyncio.sleep(RETRY)
+
+    @property
+    def waits(self) -> bool:
+        """Whether the chain can't be read just now."""
+        return self._trouble.stands
 
     async def _read(self) -> None:
         """Read from the ledger's cursor on."""

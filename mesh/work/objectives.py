@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Coroutine
 
     from mesh.recording import Objective
+    from mesh.work.run import Performer
     from mesh.work.workshop import Workshop
 
 FETCHES: Final = 32
@@ -20,11 +21,11 @@ EXAMINATIONS: Final = 1
 
 
 class Objectives:
-    """Objectives by the address of their liability. `topics` are those that the device understands (None: any)."""
+    """Objectives by the address of their liability, each fit to be played by the performer (None: by anybody)."""
 
-    def __init__(self, shop: Workshop, *, topics: frozenset[str] | None) -> None:
+    def __init__(self, shop: Workshop, *, performer: Performer | None) -> None:
         self._shop = shop
-        self._topics = topics
+        self._performer = performer
         self._fetching = asyncio.Semaphore(FETCHES)
         self._examining = asyncio.Semaphore(EXAMINATIONS)
         self._preparing: dict[str, asyncio.Task[None]] = {}
@@ -49,7 +50,7 @@ class Objectives:
         async with self._fetching:
             path = await self._shop.fetch(cid, patience=patience)
         async with self._examining:
-            return await self._shop.examine(cid, path, topics=self._topics)
+            return await self._shop.examine(cid, path, performer=self._performer)
 
     def keep(self, address: str, objective: Objective) -> None:
         """Have it at hand until `forget`."""

@@ -69,10 +69,15 @@ class Outbox:
         """The order became the contract at the address `liability`, as far as the chain says now."""
         await self._ledger.spend(identity, liability)
 
-    async def unspend(self, liability: str) -> None:
-        """The chain has no such contract after all: its orders are sent again, now and until they have their effect."""
+    async def unspend(self, liability: str) -> int | None:
+        """The chain has no such contract after all: its orders are sent again, now and until they have their effect.
+
+        Returns the block that ends that, None for a contract of none of our orders.
+        """
+        deadline = await self._ledger.spent_until(liability)
         if await self._ledger.unspend(liability):
             await self.send()
+        return deadline
 
     async def send(self) -> None:
         """Send everything that waits, once."""

@@ -46,6 +46,9 @@ class Performer(Protocol):
     def topics(self) -> frozenset[str] | None:
         """The objective's topics that it understands; None for any."""
 
+    def obstacle(self, topic: str, said: Any) -> str:
+        """Why it can't do what a message on one of its topics says, decoded; empty if it can."""
+
     async def perform(self, run: Run, message: Played) -> None:
         """Do what one played message asks; the next one waits. An exception fails the job."""
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from mesh.settings import Settings
     from mesh.work.ledger import Ledger
     from mesh.work.outbox import Outbox
+    from mesh.work.run import Performer
     from schemas import Liability, Signer
 
 
@@ -81,13 +82,14 @@ class Workshop:
             cid, size_limit=settings.objective_size_limit, timeout=min(patience, settings.fetch_timeout)
         )
 
-    async def examine(self, cid: str, path: Path, *, topics: frozenset[str] | None) -> Objective:
-        """The objective of that CID, which is at `path`, found fit to be played. Raises `UnfitObjective`.
+    async def examine(self, cid: str, path: Path, *, performer: Performer | None) -> Objective:
+        """The objective of that CID, which is at `path`, found fit to be played by the performer, or by anybody.
 
-        `topics` are those that the device understands; None for any.
+        Raises `UnfitObjective`.
         """
         limits = Limits(size=self.settings.objective_size_limit, expanded=self.settings.objective_expanded_limit)
-        outcome = await asyncio.to_thread(preflight, path, limits, topics=topics)
+        topics, obstacle = (None, None) if performer is None else (performer.topics, performer.obstacle)
+        outcome = await asyncio.to_thread(preflight, path, limits, topics=topics, obstacle=obstacle)
         if outcome.objective is None or not outcome.ok:
             raise UnfitObjective(cid, outcome.reason, outcome.detail)
         return outcome.objective

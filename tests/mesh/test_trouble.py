@@ -31,6 +31,16 @@ def test_another_trouble_is_another_line(trouble: Trouble, caplog: pytest.LogCap
     assert caplog.messages == [f"it waits: the contract refused: {reason}" for reason in ("NotYourTurn", "Paused")]
 
 
+def test_it_stands_until_it_is_over(trouble: Trouble) -> None:
+    stands = [trouble.stands]
+    trouble.met(Reverted("Paused"), "it waits")
+    stands.append(trouble.stands)
+    trouble.over("it goes on")
+    stands.append(trouble.stands)
+
+    assert stands == [False, True, False]
+
+
 def test_its_end_is_said_once_and_then_it_may_come_again(trouble: Trouble, caplog: pytest.LogCaptureFixture) -> None:
     trouble.over("it goes on")
     trouble.met(Reverted("Paused"), "it waits")

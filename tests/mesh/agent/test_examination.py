@@ -7,6 +7,7 @@ import logging
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from msgspec import Struct
 
 from mesh.content import ContentUnavailable
 from mesh.work.workshop import UnfitObjective
@@ -19,7 +20,14 @@ if TYPE_CHECKING:
     from mesh.agent import Agent
     from mesh.work.run import Run
 
+
 MISSING = cid_of_bytes(b"nobody has this objective")
+
+
+class Speed(Struct):
+    """What a robot is told that can drive."""
+
+    metres_per_second: float
 
 
 def going(robot: Agent) -> Agent:
@@ -42,6 +50,28 @@ async def test_no_offer_is_made_for_an_objective_that_can_not_be_played(
         await until(lambda: "can't be played (unknown-topic): nobody here takes /fly" in caplog.text, seconds=30)
         fit = await person.demand(place.save(objective(("/go", Empty()))))
         assert (await fit.outcome()).success
+        assert not unfit.done()
+        unfit.cancel()
+
+
+async def test_no_offer_is_made_for_a_message_that_its_handler_can_not_take(
+    place: Place, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.WARNING)
+    robot = obliging(place.agent("robot"))
+    speeds: list[Speed] = []
+
+    @robot.on("/go", Speed)
+    async def go(job: Run, speed: Speed) -> None:
+        speeds.append(speed)
+
+    async with place.at_work(robot) as person:
+        said = objective(("/go", Speed(1.0)), ("/go", {"metres_per_second": "fast"}))
+        unfit = asyncio.create_task(person.demand(place.save(said, "unfit.mcap")))
+        await until(lambda: "(unfit-message): message 1 on /go: not a Speed" in caplog.text, seconds=30)
+        fit = await person.demand(place.save(objective(("/go", Speed(2.0)))))
+        assert (await fit.outcome()).success
+        assert speeds == [Speed(2.0)]
         assert not unfit.done()
         unfit.cancel()
 

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from msgspec.structs import replace
 
-from mesh.agent import Agent, OrderExpired, OrderRejected, Outcome, ShortOfFunds
+from mesh.agent import Agent, ContractTakenBack, OrderExpired, OrderRejected, Outcome, ShortOfFunds
 from mesh.chain import Chain, NotALiability, Timing
 from mesh.content import ContentUnavailable
 from mesh.errors import ClosedError
 from mesh.network import Endpoints, Network
 from mesh.work import outbox as outbox_module
-from schemas import ZERO_ADDRESS, Demand, RejectKey, cid_of_bytes, cid_of_file, message_hash
+from schemas import ZERO_ADDRESS, Demand, Offer, RejectKey, cid_of_bytes, cid_of_file, decode, message_hash
 from schemas.rejection import Rejection
 from tests.support.market import MODEL, Place, careless, obliging
 from tests.support.objectives import objective
@@ -259,6 +259,74 @@ async def test_orders_of_a_contract_that_the_chain_took_back_are_sent_again(plac
         async with place.provider():
             await until(lambda: contract.address != first)
             await until_found(lambda: all_posted(person, 0))
+
+
+async def test_a_contract_that_the_chain_took_back_and_nobody_makes_again_ends_at_its_deadline(place: Place) -> None:
+    async with working(place.agent("robot")) as robot, place.agent("person") as person:
+        async with place.provider():
+            contract = await person.demand(cid_of_bytes(b"a job that is made once"), lifetime=50)
+            await known(robot, contract.address)
+        outcomes = [
+            asyncio.create_task((await agent.contract(contract.address)).outcome()) for agent in (person, robot)
+        ]
+        await place.forget_blocks(1)
+        await until_found(lambda: all_posted(person, 1), what="the demand posted again")
+        await until_found(lambda: all_posted(robot, 1), what="the offer posted again")
+        assert not any(outcome.done() for outcome in outcomes)
+        await place.node.mine(60)
+        for outcome in outcomes:
+            with pytest.raises(ContractTakenBack, match="was not made again until block") as caught:
+                await asyncio.wait_for(outcome, 30)
+            assert caught.value.liability == contract.address
+        with pytest.raises(ContractTakenBack):
+            await contract.recording()
+        trader = person._working().trader
+        assert (trader._unmade, trader._endings, trader._contracts) == ({}, {}, {})
+
+
+async def test_a_contract_that_is_made_again_does_not_end_at_the_deadline(place: Place) -> None:
+    async with working(place.agent("robot")) as robot, place.agent("person") as person:
+        async with place.provider():
+            contract = await person.demand(cid_of_bytes(b"a job that is made twice"), lifetime=50)
+            await known(robot, contract.address)
+        first = contract.address
+        outcome = asyncio.create_task(contract.outcome())
+        await place.forget_blocks(1)
+        await until_found(lambda: all_posted(person, 1), what="the demand posted again")
+        async with place.provider():
+            await until(lambda: contract.address != first or not person._working().trader._unmade)
+            await until_found(lambda: all_posted(person, 0))
+        await place.node.mine(60)
+        head = await place.chains["person"].block_number()
+        await until(lambda: person.parts.clock.head >= head)
+        assert not outcome.done()
+        outcome.cancel()
+
+
+async def test_a_contract_on_our_terms_that_a_stranger_has_signed_leaves_our_demand_open(place: Place) -> None:
+    """He copies the demand with its nonce, so its hash is the same, and takes an offer of the same account."""
+    async with place.agent("person", enable_executor=False) as person:
+        demanding = asyncio.create_task(person.demand(OBJECTIVE))
+        await posted(person)
+        (waiting_demand,) = await person.parts.ledger.outbox(head=0)
+        ours = decode(waiting_demand.payload)
+        assert isinstance(ours, Demand)
+        stolen = place.market.accounts["provider"].signer.sign(replace(ours, signature=""))
+        terms = {
+            name: getattr(ours, name) for name in ("model", "objective", "token", "cost", "lighthouse", "validator")
+        }
+        fresh: dict[str, Any] = {"deadline": ours.deadline, "nonce": "ab" * 32, "lighthouse_fee": 0}
+        offer = person.parts.signer.sign(Offer(**terms, **fresh))
+        chain = place.chains["provider"]
+        made = await chain.create_liability(place.market.deployment.lighthouse, stolen, offer)
+        assert (await chain.order_hashes(made.liability))[0] == message_hash(ours)
+
+        head = await chain.block_number()
+        await until(lambda: person.parts.clock.head >= head)
+        assert not demanding.done()
+        assert await waiting(person) == ["demand"]
+        demanding.cancel()
+        await asyncio.wait([demanding])
 
 
 async def test_an_offer_that_can_not_be_signed_anew_stops_nothing(

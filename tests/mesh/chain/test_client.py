@@ -141,7 +141,9 @@ async def test_a_job_goes_from_orders_to_payment(market: Market, generation: int
 
         hashes = message_hash(demand), message_hash(offer)
         assert await chain.order_hashes(created.liability) == hashes
-        assert [await chain.is_order_used(order_hash) for order_hash in hashes] == [generation == 3] * 2
+        used = [await chain.is_order_used(order_hash, who) for order_hash, who in zip(hashes, people, strict=True)]
+        assert used == [generation == 3] * 2
+        assert not await chain.is_order_used(hashes[0], market.stranger.address), "who has signed no such order"
 
         made = await chain.liability(created.liability)
         assert (made.model, made.objective, made.result) == (demand.model, demand.objective, "")

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import shutil
 from typing import TYPE_CHECKING
 
 import pytest
 
 from mesh.chain.accounts import SignedTransaction
 from mesh.chain.journal import Journal
-from mesh.chain.outbox import Pending
+from mesh.chain.outbox import Outbox, Pending
+from mesh.errors import ConfigurationError
+from tests.support.disks import room_for
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -71,3 +74,60 @@ def test_all_versions_are_kept_and_a_line_that_was_cut_off_is_not_read(one: Jour
 def test_what_is_ones_own_is_left_out(one: Journal) -> None:
     assert one.add(_entry(7)) is not None
     assert one.read({7}) == ([], frozenset())
+
+
+def test_a_version_after_one_that_was_cut_off_is_read(one: Journal, other: Journal, tmp_path: Path) -> None:
+    entry = _entry(7)
+    hold = one.add(entry)
+    assert hold is not None
+    hold.release()
+    (path,) = tmp_path.iterdir()
+    path.write_bytes(path.read_bytes() + b'{"hash": "0x0')
+    taken_up = other.hold(entry)
+    assert taken_up is not None
+    entry.versions.append(SignedTransaction(b"\x02", "0x02"))
+    taken_up.append(entry)
+    taken_up.release()
+    (left,), _ = one.read(())
+    assert [signed.hash for signed in left.versions] == ["0x01", "0x02"]
+
+
+def test_a_full_disk_is_one_clear_line_and_leaves_nothing_behind(one: Journal, tmp_path: Path) -> None:
+    with (
+        room_for(16),
+        pytest.raises(ConfigurationError, match=f"^can't keep sent transactions in {tmp_path}: ") as caught,
+    ):
+        one.add(_entry(7))
+    assert "make room" in caught.value.hint
+    assert list(tmp_path.iterdir()) == []
+    assert one.add(_entry(7)) is not None
+
+
+def test_a_version_that_does_not_fit_leaves_the_others(one: Journal, tmp_path: Path) -> None:
+    entry = _entry(7)
+    hold = one.add(entry)
+    assert hold is not None
+    (path,) = tmp_path.iterdir()
+    entry.versions.append(SignedTransaction(b"\x02", "0x02"))
+    with room_for(path.stat().st_size + 16), pytest.raises(ConfigurationError):
+        hold.append(entry)
+    hold.append(entry)
+    hold.release()
+    (left,), _ = one.read(())
+    assert [signed.hash for signed in left.versions] == ["0x01", "0x02"]
+
+
+async def test_a_folder_that_is_gone_is_one_clear_line(one: Journal, tmp_path: Path) -> None:
+    outbox = Outbox(one)
+    entry = _entry(7)
+    assert await outbox.add(entry)
+    shutil.rmtree(tmp_path)
+    with pytest.raises(ConfigurationError, match="No such file or directory"):
+        await outbox.add(_entry(8))
+    outbox.abandon(entry)
+
+
+def test_a_damaged_entry_is_one_clear_line(one: Journal, tmp_path: Path) -> None:
+    (tmp_path / "000000000007.jsonl").write_text("garbage")
+    with pytest.raises(ConfigurationError, match="holds no sent transaction"):
+        one.read(())

@@ -7,9 +7,12 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.mesh.cli.chains import Town
+from tests.support.market import founded, place
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+__all__ = ["founded", "place"]
 
 
 @pytest.fixture(scope="module")

@@ -35,6 +35,8 @@ def test_an_empty_flag_wins_over_a_variable() -> None:
         ("chain", "up", "--port", "99999"),
         ("chain", "up", "--block-time", "0"),
         ("demand", "--model", CID, "--objective", CID, "--cost", "-1"),
+        ("demand", "--model", CID, "--objective", CID, "--cost", "1,5"),
+        ("demand", "--model", CID, "--objective", CID, "--validator-fee", "much"),
         ("demand", "--model", CID, "--objective", CID, "--lifetime", "0"),
         ("demo", "--generation", "4"),
     ],
@@ -59,7 +61,7 @@ def test_an_unknown_flag_names_those_that_are_near() -> None:
     assert "--fetch-timeout" in done.stderr
 
 
-@pytest.mark.parametrize("command", ["demand", "provider", "router", "settings", "up"])
+@pytest.mark.parametrize("command", ["demand", "peers", "provider", "router", "settings", "status", "up", "watch"])
 def test_a_mistaken_variable_is_one_clear_line_in_every_command_with_settings(command: str) -> None:
     needed = ("--model", CID, "--objective", CID) if command == "demand" else ()
     done = aira(command, *needed, AIRA_KEYFILL="x")

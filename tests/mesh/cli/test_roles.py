@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -14,7 +15,7 @@ from mesh.cli.demand import _demand
 from mesh.cli.provider import _serve as serve_provider
 from mesh.cli.router import _serve as serve_router
 from mesh.cli.up import _serve as serve_up
-from mesh.errors import ConfigurationError, NetworkUnavailable
+from mesh.errors import AiraError, ConfigurationError, NetworkUnavailable
 from mesh.network import free_endpoint
 from mesh.settings import Settings
 from schemas import cid_of_bytes, cid_of_file
@@ -24,11 +25,11 @@ from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine
-    from pathlib import Path
 
     from mesh.work.run import Run
 
 MODEL = cid_of_bytes(b"what is asked for on the command line")
+ORDER = {"model": MODEL, "cost": "0", "validator": "", "validator_fee": "0", "lifetime": 1000}
 
 
 class Printed:
@@ -78,15 +79,23 @@ async def test_a_job_from_up_to_the_recording(tmp_path: Path, printed: Printed) 
     robot = settings_of("robot", endpoint, printed.value("chain"), tmp_path)
     path, out = tmp_path / "job.mcap", tmp_path / "new" / "result.mcap"
     path.write_bytes(objective(("/go", "there")))
-    order: dict[str, Any] = {"model": MODEL, "cost": 7, "lifetime": 1000}
+    order: dict[str, Any] = ORDER | {"cost": "7wn"}
     async with obliging(moving(Agent(MODEL, settings=robot, account=load_account(robot)))), asyncio.timeout(60):
         await _demand(person, objective=str(path), out=out, as_json=False, **order)
         assert f"paid, result {cid_of_file(out)}\nrecording {out}\n" in printed
         assert f"demand by {load_account(person).address} for {MODEL}\ncontract 0x" in printed
         printed.text = ""
         await _demand(person, objective=cid_of_file(path), out=None, as_json=True, **order)
-    assert "}\n" in printed
-    assert set(json.loads(printed.text)) == {"liability", "success", "result"}
+        assert "}\n" in printed
+        assert set(json.loads(printed.text)) == {"liability", "success", "result"}
+        printed.text = ""
+        full = Path("/dev/full")
+        with pytest.raises(AiraError, match=r"^can't write the recording to /dev/full: No space left") as caught:
+            await _demand(person, objective=cid_of_file(path), out=full, as_json=True, **order)
+        assert "}\n" in printed
+        told = json.loads(printed.text)
+        assert (told["success"], told["recording"], told["error"]) == (True, None, str(caught.value))
+        assert cid_of_file(Path(caught.value.hint.split()[-1])) == told["result"]
     await stopped(up)
 
 
@@ -131,7 +140,7 @@ async def test_a_demand_that_comes_to_nothing_leaves_no_recording_behind(tmp_pat
     nowhere = settings_of("person", free_endpoint(), printed.value("chain"), tmp_path)
     out, kept = tmp_path / "new.mcap", tmp_path / "old.mcap"
     kept.write_bytes(b"an earlier one")
-    order: dict[str, Any] = {"model": MODEL, "objective": MODEL, "cost": 0, "lifetime": 10, "as_json": True}
+    order: dict[str, Any] = ORDER | {"objective": MODEL, "as_json": True}
     for path in (out, kept):
         with pytest.raises(NetworkUnavailable):
             await _demand(nowhere, out=path, **order)

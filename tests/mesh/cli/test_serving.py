@@ -91,7 +91,7 @@ def development(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Developmen
 
 def test_a_job_is_done_and_paid_between_processes(development: Development, tmp_path: Path) -> None:
     out = tmp_path / "new" / "result.mcap"
-    order = ("--model", cid_of_file(EXAMPLES / "model.md"), "--objective", EXAMPLES / "blink.mcap", "--cost", "1000")
+    order = ("--model", cid_of_file(EXAMPLES / "model.md"), "--objective", EXAMPLES / "blink.mcap", "--cost", "1000wn")
     watcher = Serving(
         sys.executable,
         EXAMPLES / "agent.py",
@@ -242,6 +242,18 @@ def test_a_wrong_password_is_one_clear_line(development: Development, tmp_path: 
 def test_too_dear_a_demand_is_one_clear_line(development: Development) -> None:
     code, line = failed(development.demand(*ORDER, SOME_CID, "--cost", str(10**30)))
     assert (code, "are needed" in line) == (1, True)
+
+
+@pytest.mark.parametrize(
+    ("terms", "why"),
+    [
+        (("--cost", "1wei"), "'1wei' is not an amount of XRT"),
+        (("--validator-fee", "1"), "a validator's fee without a validator"),
+    ],
+)
+def test_terms_that_can_not_be_are_one_clear_line(development: Development, terms: tuple[str, ...], why: str) -> None:
+    code, line = failed(development.demand(*ORDER, SOME_CID, *terms))
+    assert (code, why in line) == (2, True), line
 
 
 def test_no_router_is_one_clear_line(development: Development) -> None:

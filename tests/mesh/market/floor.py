@@ -120,7 +120,7 @@ class Floor:
         self,
         role: str = "provider",
         *,
-        endpoint: str | None = None,
+        endpoint: str | AsyncBaseProvider | None = None,
         timing: Timing = QUICK,
         **options: Any,
     ) -> AsyncIterator[Provider]:

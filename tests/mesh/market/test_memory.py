@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from typing import TYPE_CHECKING
 
 from mesh.market import OrderBook
-from mesh.market.memory import Memory
+from mesh.market import memory as memory_module
+from mesh.market.memory import ANSWERERS, Memory
 from mesh.network import Endpoints, Network, message_key
 from tests.support.orders import LIGHTHOUSE, MARKET, MODEL, OTHER_MODEL, verified_demand, verified_offer
 from tests.support.waiting import at_most, until, until_answered
 
 if TYPE_CHECKING:
+    import pytest
     import zenoh
 
     from schemas import Verified
@@ -89,6 +92,29 @@ async def test_a_question_that_comes_while_leaving_is_turned_down(router: Embedd
 
             with at_most(2):
                 assert await asking == []
+
+
+async def test_more_questions_than_can_wait_are_turned_down(
+    router: EmbeddedRouter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each that waits has a list of the whole book: whoever asks again and again would take all memory."""
+    monkeypatch.setattr(memory_module, "QUESTIONS", 1)
+    order, answerers_are_free = verified_demand(), threading.Event()
+    async with network(router) as one, network(router) as two, Memory(one.session, MARKET, holding(order)) as memory:
+        await until_answered(two.session, f"aira/{MARKET}/**")
+        await until(lambda: memory._room._value == 1)
+        for _ in range(ANSWERERS):
+            memory._threads.submit(answerers_are_free.wait)
+        first = asyncio.create_task(asyncio.to_thread(ask, two.session, f"aira/{MARKET}/**"))
+        await until(lambda: memory._threads._work_queue.qsize() > 0)
+
+        with at_most(3):
+            assert await asyncio.to_thread(ask, two.session, f"aira/{MARKET}/**") == []
+
+        assert not first.done()
+        answerers_are_free.set()
+        assert await first == [message_key(MARKET, order.message)]
+        await until_answered(two.session, f"aira/{MARKET}/**")
 
 
 async def test_leaving_after_the_session_was_closed_does_not_hang(router: EmbeddedRouter) -> None:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from contextlib import asynccontextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
+from msgspec.structs import replace as replace_fields
+from web3.providers.async_base import AsyncBaseProvider
 
 from mesh.chain import GWEI, JsonRpcServer
 from mesh.demo.market import found_market
-from mesh.market import order_id, sending, watching
-from schemas import verify_message
+from mesh.market import order_id, patience, sending, watching
+from schemas import cid_of_bytes, parse_cid, verify_message
 from tests.mesh.market.floor import QUICK, Floor
 from tests.mesh.market.tokens import BURNS_ALL_GAS, deploy_token, refuses_with, says
 from tests.support.ports import free_port
@@ -21,7 +24,10 @@ from tests.support.waiting import until, until_found
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from web3.types import RPCEndpoint, RPCResponse
+
     from mesh.market.provider import Provider
+    from schemas import Liability
     from tests.support.nodes import Anvil
     from tests.support.routers import EmbeddedRouter
 
@@ -31,6 +37,7 @@ def impatience(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is tried again is tried again soon."""
     for module in (sending, watching):
         monkeypatch.setattr(module, "RETRY", 0.05)
+    monkeypatch.setattr(patience, "PAUSE", 0.01)
 
 
 async def test_two_providers_share_the_work_in_their_turns(floor: Floor) -> None:
@@ -144,6 +151,70 @@ async def served(floor: Floor, port: int) -> AsyncIterator[str]:
     assert not isinstance(floor.node, str)
     async with JsonRpcServer(floor.node, port=port) as server:
         yield server.url
+
+
+class Moody(AsyncBaseProvider):
+    """The floor's node, whose simulations of what holds some bytes fail so many times as `fails` says."""
+
+    def __init__(self, floor: Floor, data: bytes, *, times: float = math.inf, fails: str = "silence") -> None:
+        super().__init__()
+        assert not isinstance(floor.node, str)
+        self._node, self._data, self._fails = floor.node, data.hex(), fails
+        self.left = times
+
+    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+        if method == "eth_estimateGas" and self._data in params[0]["data"] and self.left > 0:
+            self.left -= 1
+            if self._fails == "silence":
+                raise ConnectionResetError
+            return {"jsonrpc": "2.0", "id": 1, "error": {"code": -32005, "message": "too many requests"}}
+        return await self._node.make_request(method, params)
+
+
+@pytest.mark.parametrize("fails", ["silence", "refusal"])
+async def test_a_node_that_fails_now_and_then_costs_no_order_and_no_result(floor: Floor, fails: str) -> None:
+    node = Moody(floor, b"", times=3, fails=fails)
+    async with floor.provider(endpoint=node) as provider:
+        demand = floor.demand()
+        floor.publish(demand, floor.offer())
+        liability = await floor.liability_of(demand)
+        assert node.left == 0
+
+        node.left = 3
+        floor.publish(floor.result(liability.address))
+        await until(lambda: provider.earnings().finalized == 1)
+        assert node.left == 0
+    assert floor.rejections == []
+
+
+@pytest.mark.parametrize("fails", ["silence", "refusal"])
+async def test_what_a_node_never_takes_makes_nobody_wait_and_is_rejected_in_the_end(
+    floor: Floor, fails: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    objective = cid_of_bytes(fails.encode())
+    async with floor.provider(endpoint=Moody(floor, parse_cid(objective), fails=fails)) as provider:
+        monkeypatch.setattr(patience, "PAUSE", 3600.0)
+        guilty, offer = (make(cost=0, objective=objective) for make in (floor.demand, floor.offer))
+        floor.publish(guilty, offer)
+        assert await works_on(floor, provider)
+        assert floor.rejections == []
+
+        monkeypatch.setattr(patience, "PAUSE", 0.01)
+        floor.publish(*(make(cost=0, objective=objective) for make in (floor.demand, floor.offer)))
+        await until(lambda: len(floor.rejections) == 2)
+        assert {one.reason for one in floor.rejections} == {
+            "NodeUnreachable" if fails == "silence" else "RequestRefused"
+        }
+
+
+async def test_no_more_than_so_much_waits_to_be_tried_again(floor: Floor, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(patience, "PAUSE", 3600.0)
+    monkeypatch.setattr(sending, "LATER", 1)
+    objective = cid_of_bytes(b"never")
+    async with floor.provider(endpoint=Moody(floor, parse_cid(objective))):
+        for _ in range(2):
+            floor.publish(*(make(cost=0, objective=objective) for make in (floor.demand, floor.offer)))
+        await until(lambda: len(floor.rejections) == 2)
 
 
 async def test_a_node_that_is_away_for_a_while_costs_no_order_and_no_result(
@@ -262,6 +333,35 @@ async def test_what_the_chain_takes_back_is_done_again(floor: Floor) -> None:
         await until_found(finalized)
         await until(lambda: (provider.earnings().created, provider.earnings().finalized) == (2, 1))
         assert len(await floor.liabilities_of(late)) == 1
+
+
+async def test_a_contract_whose_record_is_kept_no_more_is_ended_all_the_same(
+    floor: Floor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(watching, "OPEN", 1)
+    async with floor.provider() as provider:
+        made: list[Liability] = []
+        for _ in range(2):
+            floor.publish(demand := floor.demand(cost=0), floor.offer(cost=0))
+            made.append(await floor.liability_of(demand))
+            await until(lambda: list(provider._watching._open) == [made[-1].address])
+
+        floor.publish(*(floor.result(liability.address) for liability in made))
+        await until(lambda: provider.earnings().finalized == 2)
+
+
+async def test_terms_that_a_stranger_has_copied_become_their_owners_contract_too(floor: Floor) -> None:
+    """He signs them himself, nonce and all, so that both orders have one hash."""
+    ours = floor.demand()
+    copied = floor.accounts["rival"].signer.sign(replace_fields(ours, signature=""))
+    async with floor.provider() as provider:
+        floor.publish(copied, floor.offer("rival"))
+        await until(lambda: provider.earnings().created == 1)
+        floor.publish(ours, floor.offer())
+        await until(lambda: provider.earnings().created == 2)
+    promisees = [made.promisee for made in await floor.liabilities_of(ours)]
+    assert promisees == [floor.address("rival"), floor.address("person")]
+    assert floor.rejections == []
 
 
 async def test_a_result_that_was_too_early_counts_when_it_is_sent_again(floor: Floor) -> None:

@@ -12,6 +12,8 @@ import pytest
 
 from mesh.agent import JobFailed, Phase
 from mesh.recording import open_objective
+from mesh.running import _cause
+from mesh.work.ledger import LedgerUnusable
 from mesh.work.run import NOTE_TOPIC
 from schemas import Empty, String, cid_of_bytes, cid_of_file
 from tests.support.market import Place, careless, obliging
@@ -167,8 +169,8 @@ async def test_a_handler_whose_inner_task_was_cancelled_has_not_done_its_job(pla
     assert note == "the handler of /go was cancelled"
 
 
-async def test_a_message_of_another_type_than_the_handlers_fails_the_job(place: Place) -> None:
-    robot = obliging(place.agent("robot"))
+async def test_a_message_of_another_type_than_the_handlers_is_refused_before_anything_is_played(place: Place) -> None:
+    robot = careless(place.agent("robot"))
     speeds: list[Speed] = []
 
     @robot.on("/go", Speed)
@@ -176,8 +178,8 @@ async def test_a_message_of_another_type_than_the_handlers_fails_the_job(place: 
         speeds.append(message)
 
     note, _ = await refusal(place, robot, objective(("/go", Speed(3)), ("/go", {"wheel": "fast"})))
-    assert note.startswith("a message on /go is no Speed")
-    assert speeds == [Speed(3)]
+    assert "(unfit-message): message 1 on /go: not a Speed" in note
+    assert speeds == []
 
 
 async def test_a_topic_without_handler_is_refused_before_anything_is_played(place: Place) -> None:
@@ -384,3 +386,36 @@ async def test_a_late_device_message_of_a_played_topic_keeps_its_role(place: Pla
         contract = await person.demand(place.save(objective(("/go", "go"))))
         messages: list[Played] = list((await recorded(contract)).messages())
     assert [String.decode(message.payload).data for message in messages] == ["go", "gone"]
+
+
+async def test_a_ledger_that_can_not_be_written_ends_the_agent_and_fails_no_job(place: Place) -> None:
+    """As on a full disk: when there is room again, the restarted agent goes on with the job."""
+    writable = [False]
+    done: list[str] = []
+    before = await place.chains["person"].block_number()
+
+    def robot() -> Agent:
+        made = obliging(place.agent("robot"))
+
+        @made.on("/go")
+        async def go(job: Run, message: Any) -> None:
+            if not writable[0]:
+                await made.parts.ledger._run("PRAGMA query_only = ON")
+            done.append(message.data)
+
+        return made
+
+    async with place.provider(), place.agent("person") as person:
+
+        async def asked(robot: Agent) -> None:
+            async with robot:
+                await (await person.demand(place.save(objective(("/go", "there"))))).outcome()
+
+        with pytest.raises(ExceptionGroup) as caught:
+            await asyncio.wait_for(asked(robot()), 30)
+        assert isinstance(_cause(caught.value), LedgerUnusable), "one line, and no traceback"
+        writable[0] = True
+        (made,) = await place.chains["person"].liabilities(promisee=place.address("person"), from_block=before)
+        async with robot():
+            assert (await asyncio.wait_for((await person.contract(made.address)).outcome(), 30)).success
+    assert set(done) == {"there"}

@@ -14,10 +14,11 @@ import pytest
 from mesh.errors import ClosedError, ConfigurationError
 from mesh.work import Ledger, Phase
 from mesh.work import ledger as ledger_module
-from mesh.work.ledger import VERSION
+from mesh.work.ledger import VERSION, LedgerUnusable
 from mesh.work.outbox import outgoing
 from schemas import cid_of_bytes
 from tests.mesh.work.samples import liability, message
+from tests.support.disks import room_for
 from tests.support.orders import demand
 from tests.support.waiting import until
 
@@ -345,3 +346,20 @@ async def test_only_the_latest_orders_are_kept(ledger: Ledger, monkeypatch: pyte
 async def test_what_is_not_in_the_outbox_is_not_spent(ledger: Ledger) -> None:
     await ledger.spend("an order of before", "0xA")
     assert not await ledger.unspend("0xA")
+
+
+async def test_a_full_disk_is_one_clear_line_and_nothing_is_half_written(ledger: Ledger, path: Path) -> None:
+    await ledger.add_job(liability())
+    address, signed = liability().address, message()
+    room = path.with_name(path.name + "-wal").stat().st_size
+    with room_for(room):
+        with pytest.raises(LedgerUnusable, match=f"^can't use the ledger {path}: ") as caught:
+            await ledger.set_phase(address, Phase.READY)
+        with pytest.raises(LedgerUnusable):
+            await ledger.complete(address, success=True, result=RESULT, note="", outgoing=signed)
+    assert "make room" in caught.value.hint
+    job = await ledger.job(address)
+    assert job is not None
+    assert (job.phase, await ledger.outbox(head=0)) == (Phase.INCOMING, [])
+    await ledger.complete(address, success=True, result=RESULT, note="", outgoing=signed)
+    assert await ledger.outbox(head=0) == [signed]

@@ -6,9 +6,10 @@ import asyncio
 import logging
 import secrets
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
+from web3.providers.async_base import AsyncBaseProvider
 
 from mesh.background import Background
 from mesh.chain import Approval, Chain, ChainWentBack, History, JsonRpcServer, NewLiability, Timing, Transfer
@@ -16,12 +17,15 @@ from mesh.work import Ledger
 from mesh.work import listener as listener_module
 from mesh.work.listener import Listener
 from schemas import Demand, Offer, Result, message_hash
+from tests.support.market import QUICK
 from tests.support.orders import RECORDING, terms
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
+
+    from web3.types import RPCEndpoint, RPCResponse
 
     from schemas import Liability
     from tests.support.market import Place
@@ -299,3 +303,33 @@ async def test_a_contract_that_a_reorganisation_took_before_it_was_read_is_left_
     listener = Listener(place.chains["robot"], ledger, place.address("robot"), diary)
     await listener._new_liability(NewLiability(place.address("robot"), "0x"))
     assert diary.liabilities == []
+
+
+class Behind(AsyncBaseProvider):
+    """The place's node as one of several behind a balancer: for some calls, it lacks the newest contract."""
+
+    def __init__(self, place: Place) -> None:
+        super().__init__()
+        self._node = place.node.provider
+        self.contract, self.calls = "", 0
+
+    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+        if method == "eth_call" and params[0]["to"] == self.contract and self.calls > 0:
+            self.calls -= 1
+            return {"jsonrpc": "2.0", "id": 1, "result": "0x"}
+        return await self._node.make_request(method, params)
+
+
+async def test_a_node_that_is_behind_loses_no_contract(
+    place: Place, ledger: Ledger, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(listener_module, "RETRY", 0.05)
+    node = Behind(place)
+    robot, ens = place.market.accounts["robot"], place.market.deployment.ens
+    async with Chain(node, account=robot, ens=ens, timing=QUICK) as chain:
+        await ledger.set_cursor(Listener.NAME, await chain.block_number())
+        address, *_ = await contract(place)
+        node.contract, node.calls = address, 2
+        async with listening(place, ledger, chain=chain) as diary:
+            await until(lambda: diary.liabilities)
+    assert ([made.address for made, *_ in diary.liabilities], node.calls <= 0) == ([address], True)

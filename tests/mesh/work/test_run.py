@@ -87,6 +87,9 @@ class Performing:
     def __init__(self, function: Callable[[Run, Played], Awaitable[object]]) -> None:
         self._function = function
 
+    def obstacle(self, topic: str, said: Any) -> str:
+        return ""
+
     async def perform(self, run: Run, message: Played) -> None:
         await self._function(run, message)
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from mesh.agent.hooks import HandlerPerformer, Hooks
 from mesh.content import ContentUnavailable
 from mesh.errors import InputError
 from mesh.recording import AtOnce, RecordedTimes, open_objective
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from mesh.recording import Objective
+    from mesh.work.run import Performer, Run
     from tests.support.market import Place
 
 
@@ -35,9 +37,18 @@ async def opened(place: Place, **settings: Any) -> AsyncIterator[Workshop]:
         yield robot.parts.workshop()
 
 
-async def examined(shop: Workshop, cid: str, *, topics: frozenset[str] | None = None) -> Objective:
+async def examined(shop: Workshop, cid: str, performer: Performer | None = None) -> Objective:
     """The objective of that CID, fetched where it has to be."""
-    return await shop.examine(cid, await shop.fetch(cid), topics=topics)
+    return await shop.examine(cid, await shop.fetch(cid), performer=performer)
+
+
+def taking(topic: str) -> Performer:
+    """A performer that has a handler for one topic."""
+
+    async def handler(job: Run, message: Any) -> None:
+        pass
+
+    return HandlerPerformer(Hooks(topics={topic: (handler, None)}))
 
 
 async def test_an_objective_in_the_store_is_examined_where_it_is(shop: Workshop) -> None:
@@ -76,7 +87,7 @@ async def test_an_objective_rotten_in_the_store_is_fetched_anew(place: Place, sh
 async def test_an_unfit_objective_says_which_and_why(shop: Workshop) -> None:
     cid = shop.store.put_bytes(objective(("/a", Empty())))
     with pytest.raises(UnfitObjective, match=f"objective {cid} can't be played") as caught:
-        await examined(shop, cid, topics=frozenset({"/b"}))
+        await examined(shop, cid, taking("/b"))
     assert caught.value.reason == "unknown-topic"
     assert isinstance(caught.value, InputError)
 

@@ -1,0 +1,60 @@
+"""`aira up` as a process of its own: what runs its chain, and whether that is kept."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+import pytest
+from click.testing import CliRunner
+
+from mesh.chain import Node
+from mesh.cli import main
+from tests.mesh.cli.chains import columns, refused
+from tests.support.commands import AIRA, Serving
+from tests.support.peers import require
+from tests.support.ports import free_port
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def up(folder: Path, *options: str | Path, **variables: str) -> Serving:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    arguments = ("--port", "0", "--listen", endpoint, "--data-dir", folder, *options)
+    return Serving(*AIRA, "up", *arguments, says="provider    0x", variables=variables)
+
+
+@pytest.fixture
+def on_path(tmp_path: Path) -> dict[str, str]:
+    """Variables with which anvil is on the path."""
+    folder = tmp_path / "programs"
+    folder.mkdir()
+    (folder / "anvil").symlink_to(require("anvil"))
+    return {"PATH": f"{folder}:{os.environ['PATH']}"}
+
+
+def test_anvil_is_taken_where_it_is_on_the_path(tmp_path: Path, on_path: dict[str, str]) -> None:
+    with up(tmp_path, **on_path) as server:
+        assert columns(server.log())["engine"] == f"anvil ({tmp_path}/programs/anvil)"
+
+
+def test_the_embedded_chain_can_be_asked_for(tmp_path: Path, on_path: dict[str, str]) -> None:
+    with up(tmp_path, "--engine", "embedded", **on_path) as server:
+        assert columns(server.log())["engine"] == "embedded"
+
+
+async def test_the_chain_is_kept_in_a_file(tmp_path: Path) -> None:
+    options = ("--anvil", require("anvil"), "--state", tmp_path / "chain.json")
+    first_blocks = []
+    for _ in range(2):
+        with up(tmp_path, *options) as server:
+            async with Node(columns(server.log())["chain"]) as node:
+                first_blocks.append((await node.web3.eth.get_block(1))["hash"])
+    assert first_blocks[0] == first_blocks[1]
+
+
+def test_a_chain_that_nothing_can_keep_is_one_clear_line(tmp_path: Path) -> None:
+    options = ["--engine", "embedded", "--state", str(tmp_path / "chain.json")]
+    done = CliRunner().invoke(main, ["up", "--listen", f"tcp/127.0.0.1:{free_port()}", *options])
+    refused(done, 2, "only anvil can keep the chain in a file")

@@ -1,0 +1,34 @@
+"""How much the ledger holds, for whoever asks how the agent is."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from mesh.work import Ledger, Phase
+from mesh.work.outbox import outgoing
+from tests.mesh.work.samples import liability
+from tests.support.orders import demand
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+async def test_jobs_are_counted_by_phase_and_those_set_aside_are_none(tmp_path: Path) -> None:
+    async with Ledger(tmp_path / "ledger.sqlite") as ledger:
+        assert await ledger.jobs_by_phase() == {}
+        await ledger.add_job(liability())
+        assert await ledger.jobs_by_phase() == {"incoming": 1}
+        await ledger.set_phase(liability().address, Phase.FINALIZED)
+        assert await ledger.jobs_by_phase() == {"finalized": 1}
+        await ledger.set_aside(liability().address)
+        assert await ledger.jobs_by_phase() == {}
+
+
+async def test_messages_wait_until_they_are_settled(tmp_path: Path) -> None:
+    async with Ledger(tmp_path / "ledger.sqlite") as ledger:
+        orders = [outgoing(demand()) for _ in range(2)]
+        for order in orders:
+            await ledger.post(order)
+        assert await ledger.waiting() == 2
+        await ledger.settle(orders[0].identity)
+        assert await ledger.waiting() == 1
