@@ -9,8 +9,8 @@ import msgspec
 from mesh.cli.amounts import XRT, Unit
 from mesh.cli.liability.words import short
 from mesh.cli.printing import visible
-from mesh.watching import JobEvent
-from schemas import Demand, Result, Verified
+from mesh.watching import JobEvent, Reading
+from schemas import Demand, Empty, Result, String, Verified
 from schemas.rejection import Rejection
 
 if TYPE_CHECKING:
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from schemas import Liability, Offer
 
 LONGEST: Final = 200
-"""Letters of what a provider says to people that are shown."""
+"""Letters of what somebody says that are shown."""
 DIGITS: Final = 8
 """Of an order's hash in a line; with --json there are all 64."""
 KIND: Final = 9
 """Letters of the longest word for what happened."""
 
 
-def facts(seen: Seen, *, time: str) -> dict[str, Any]:
+def facts(seen: Seen | Reading, *, time: str) -> dict[str, Any]:
     """Something that happened at `time` (ISO 8601), for programs. Amounts are text, in the smallest unit."""
     match seen:
         case Verified():
@@ -39,6 +39,9 @@ def facts(seen: Seen, *, time: str) -> dict[str, Any]:
         case Rejection():
             about = {"event": "rejected", "order": seen.order, "provider": seen.provider}
             about |= {"reason": seen.reason, "detail": seen.detail}
+        case Reading():
+            about = {"event": "reading", "signer": seen.signer, "result": seen.result, "topic": seen.topic}
+            about["value"] = _value(seen)
         case JobEvent(agent, event, liability):
             about = {"event": event, "agent": agent, "liability": msgspec.json.decode(liability.encode())}
     return {"time": time} | about
@@ -68,7 +71,7 @@ class Words:
     def __init__(self, xrt: str | None) -> None:
         self._xrt = xrt
 
-    def line(self, seen: Seen) -> str:
+    def line(self, seen: Seen | Reading) -> str:
         """The line, without the time."""
         match seen:
             case Verified():
@@ -77,6 +80,8 @@ class Words:
             case Rejection():
                 why = visible(seen.detail[:LONGEST] or seen.reason[:LONGEST])
                 kind, words = "rejected", f"{seen.order[:DIGITS]} by {short(seen.provider)}: {why}"
+            case Reading():
+                kind, words = "reading", f"{visible(seen.topic)}  {_shown(seen)}, from {short(seen.signer)}"
             case JobEvent(_, kind, liability):
                 words = self._work(liability)
         return f"{kind:<{KIND}}  {words}"
@@ -102,6 +107,23 @@ class Words:
     def _work(self, job: Liability) -> str:
         parties = f"{short(job.promisor)} for {short(job.promisee)}, {self.cost(job.cost, job.token)}"
         return f"{job.address}  {parties}" + (f", {_ended(job.is_success)}: {job.result}" if job.result else "")
+
+
+def _value(reading: Reading) -> Any:
+    """What was read as JSON has it; bytes become base64."""
+    match reading.value:
+        case Empty():
+            return None
+        case String(data):
+            return data
+        case value:
+            return value
+
+
+def _shown(reading: Reading) -> str:
+    value = _value(reading)
+    text = value if isinstance(value, str) else msgspec.json.encode(value).decode()
+    return visible(text[:LONGEST] + ("…" if len(text) > LONGEST else ""))
 
 
 def _short_cid(cid: str) -> str:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import logging
 import signal
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from datetime import UTC, datetime
+from functools import partial
 from typing import TYPE_CHECKING
 
 import click
@@ -24,17 +25,19 @@ if TYPE_CHECKING:
 
     import zenoh
 
+    from mesh.cli.happenings import Words
     from mesh.network import Channel, Network
     from mesh.settings import Settings
-    from mesh.watching import MarketWatch, Tally
+    from mesh.watching import MarketWatch, Reading, Seen, Tally
 
 
 @click.command("watch")
 @click.option("--model", help="only what concerns this model (CID)")
 @click.option("--open", "with_open", is_flag=True, help="begin with the orders that are open now")
+@click.option("--readings", is_flag=True, help="show what Results without a contract hold, such as a sensor's readings")
 @with_json
 @with_settings(*NETWORK_SETTINGS, "lighthouse_contract", "xrt_contract")
-def command(settings: Settings, model: str | None, with_open: bool, as_json: bool) -> None:
+def command(settings: Settings, model: str | None, with_open: bool, readings: bool, as_json: bool) -> None:
     """Tell what happens on a lighthouse, a line each: orders, rejections, contracts and their work, Results. Ctrl-C
     ends it.
 
@@ -45,29 +48,44 @@ def command(settings: Settings, model: str | None, with_open: bool, as_json: boo
     That a contract was made is what agents say; `aira liability watch` asks the chain.
     """
     start_log(logging.WARNING)
-    run_until_stopped(lambda: _watch(settings, model, with_open=with_open, as_json=as_json))
+    run_until_stopped(lambda: _watch(settings, model, with_open=with_open, readings=readings, as_json=as_json))
 
 
-async def _watch(settings: Settings, model: str | None, *, with_open: bool, as_json: bool) -> None:
+async def _watch(
+    settings: Settings, model: str | None, *, with_open: bool, as_json: bool, readings: bool = False
+) -> None:
     from mesh.agent.parts import watching
-    from mesh.cli.happenings import Words, facts
-    from mesh.watching import MarketWatch
+    from mesh.cli.happenings import Words
+    from mesh.watching import MarketWatch, Readings
 
     if model is not None:
         parse_cid(model)
-    async with watching(settings) as (network, channel):
-        words = Words(await _xrt(settings, network.session, channel))
-        async with MarketWatch(network.session, channel, model=model or "*") as seen, _beside(network, seen) as tasks:
-            if not as_json:
-                click.echo(f"watching {channel.lighthouse}; Ctrl-C ends it", err=True)
-            if with_open:
-                tasks.start(seen.recall(), "open orders")
-            async for something in seen:
-                now = datetime.now(UTC)
-                if as_json:
-                    print_json(facts(something, time=now.isoformat(timespec="milliseconds").replace("+00:00", "Z")))
-                else:
-                    say(f"{now.astimezone():%H:%M:%S}  {words.line(something)}")
+    async with AsyncExitStack() as stack:
+        network, channel = await stack.enter_async_context(watching(settings))
+        words = None if as_json else Words(await _xrt(settings, network.session, channel))
+        tell = partial(_tell, words)
+        looking = await stack.enter_async_context(Readings(network.session, tell)) if readings else None
+        seen = await stack.enter_async_context(MarketWatch(network.session, channel, model=model or "*"))
+        tasks = await stack.enter_async_context(_beside(network, seen))
+        if not as_json:
+            click.echo(f"watching {channel.lighthouse}; Ctrl-C ends it", err=True)
+        if with_open:
+            tasks.start(seen.recall(), "open orders")
+        async for something in seen:
+            tell(something)
+            if looking is not None:
+                looking.see(something)
+
+
+def _tell(words: Words | None, something: Seen | Reading) -> None:
+    """Print what happened: in `words` for people, as JSON where there are none."""
+    from mesh.cli.happenings import facts
+
+    now = datetime.now(UTC)
+    if words is None:
+        print_json(facts(something, time=now.isoformat(timespec="milliseconds").replace("+00:00", "Z")))
+    else:
+        say(f"{now.astimezone():%H:%M:%S}  {words.line(something)}")
 
 
 @asynccontextmanager

@@ -32,14 +32,19 @@ def test_who_asks_for_nothing_is_told_what_the_sensors_measure(
     watching = {"AIRA_CONNECT": market["AIRA_CONNECT"]}
     with (
         at_work("air_pollution", "air", protocol, market) as uno,
-        Serving(*AIRA, "watch", says="watching", variables=watching) as watch,
+        Serving(*AIRA, "watch", "--readings", says="watching", variables=watching) as watch,
     ):
         for channel, volts in enumerate(VOLTS.values()):
             uno.apply(channel, int(volts * 1000))
         person = EXAMPLES / "air_pollution" / "person.py"
         done = run(sys.executable, person, "--times", "2", "--out", out, **as_role("person", market))
-        asyncio.run(until(lambda: "done, for 0x" in watch.log(), what="the Result in `aira watch`", seconds=30))
+        shown = "reading    /measurements  "
+        asyncio.run(until(lambda: shown in watch.log(), what="the reading in `aira watch`", seconds=30))
+        watched = watch.log()
     assert done.returncode == 0, done.stdout + done.stderr
+    assert "done, for 0x" in watched
+    first = next(line.split(shown)[1] for line in watched.splitlines() if shown in line)
+    assert [float(number) for number in first.split(",")[0].split()] == pytest.approx(list(VOLTS.values()), abs=0.02)
     told = dict(line.rsplit(maxsplit=2)[:2] for line in done.stdout.splitlines() if line.endswith(" V"))
     assert told.keys() == VOLTS.keys()
     for gas, volts in VOLTS.items():

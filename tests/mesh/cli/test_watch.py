@@ -17,8 +17,8 @@ from mesh.cli.watch import _watch, told
 from mesh.errors import InvalidCid
 from mesh.network import Channel, Endpoints, Network, message_key
 from mesh.settings import Settings
-from mesh.watching import JobEvent, Tally
-from schemas import RejectKey, encode, message_hash, verify_message
+from mesh.watching import JobEvent, Reading, Readings, Tally
+from schemas import Empty, RejectKey, Result, String, encode, message_hash, verify_message
 from schemas.rejection import Rejection
 from tests.mesh.watching.test_market import CONTRACT, EVENT, JOB
 from tests.support.commands import AIRA, aira, environment
@@ -250,3 +250,49 @@ def test_without_a_router_it_is_one_clear_line(command: list[str]) -> None:
     line, hint = done.stderr.splitlines()
     assert line == "aira: no Zenoh router at tcp/127.0.0.1:1 (no answer within 0.3 s)"
     assert "aira router" in hint
+
+
+async def test_what_a_result_without_a_contract_holds_is_shown(place: Place, said: Said) -> None:
+    readings = objective(("/measurements", "0.5 1.0"), ("/measurements", "0.6 1.1"))
+    work = asyncio.create_task(_watch(place.settings("watcher"), None, with_open=False, readings=True, as_json=True))
+    async with place.at_work(obliging(robot(place))) as sensor:
+        await until_heard(sensor.parts.network.session, EVENT)
+        cid = sensor.parts.store.put_file(place.save(readings))
+        signed = sensor.parts.signer.sign(Result(liability=place.address("robot"), result=cid, success=True))
+        sensor.channel.publish(signed)
+        await until(lambda: len(said.events()) >= 3, what="the Result and two readings", seconds=30)
+    work.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await work
+    shown = [event for event in said.events() if event["event"] == "reading"]
+    assert [event["value"] for event in shown] == ["0.5 1.0", "0.6 1.1"]
+    assert {(event["signer"], event["result"], event["topic"]) for event in shown} == {
+        (place.address("person"), cid, "/measurements")
+    }
+
+
+async def test_a_result_that_nobody_has_is_told_and_holds_up_nothing(
+    router: EmbeddedRouter, said: Said, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mesh.watching.readings.TIMEOUT", 0.5)
+    told: list[Reading] = []
+    async with (
+        Network(Endpoints(connect=(router.endpoint,))) as network,
+        Readings(network.session, told.append) as looking,
+    ):
+        looking.see(verify_message(result(liability=CONTRACT)))
+        await until(lambda: "can't be shown: " in caplog.text, what="the warning", seconds=30)
+        looking.see(JobEvent(ROBOT.address, "incoming", JOB))
+        looking.see(verify_message(result(liability=CONTRACT)))
+        assert looking._waiting == 0
+    assert told == []
+
+
+def test_a_reading_in_words_does_not_steer_the_terminal() -> None:
+    line = words(Reading(ROBOT.address, RECORDING, "/air", String("\x1b[2J" + "y" * 500)))
+    assert line.startswith("reading    /air  ")
+    assert "\x1b" not in line
+    assert len(line) < 300
+    assert words(Reading(ROBOT.address, RECORDING, "/air", {"CO": 1})).startswith('reading    /air  {"CO":1}, from 0x')
+    assert words(Reading(ROBOT.address, RECORDING, "/air", Empty())).startswith("reading    /air  null, from 0x")
+    assert words(Reading(ROBOT.address, RECORDING, "/air", b"ab")).startswith('reading    /air  "YWI=", from 0x')
