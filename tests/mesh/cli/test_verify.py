@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -30,6 +31,7 @@ from tests.support.routers import client_config
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
     from pathlib import Path
 
     from click.testing import Result
@@ -146,12 +148,11 @@ def settings_of(role: str, endpoint: str, url: str, folder: Path) -> Settings:
     )
 
 
-async def test_a_job_of_the_market_is_verified_from_its_address_alone(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    endpoint = free_endpoint()
-    up = asyncio.create_task(serve_up(Settings(listen=(endpoint,), data_dir=str(tmp_path)), port=0, block_time=0.1))
-    printed = ""
+@asynccontextmanager
+async def served_market(folder: Path, capsys: pytest.CaptureFixture[str]) -> AsyncIterator[tuple[str, str]]:
+    """`aira up` in this process: the router's endpoint and the chain's URL."""
+    endpoint, printed = free_endpoint(), ""
+    up = asyncio.create_task(serve_up(Settings(listen=(endpoint,), data_dir=str(folder)), port=0, block_time=0.1))
 
     def served() -> bool:
         nonlocal printed
@@ -159,51 +160,51 @@ async def test_a_job_of_the_market_is_verified_from_its_address_alone(
         return up.done() or "provider    0x" in printed
 
     await until(served, seconds=60)
-    url = next(line.split()[1] for line in printed.splitlines() if line.startswith("chain"))
-    robot, person = (settings_of(role, endpoint, url, tmp_path) for role in ("robot", "person"))
-    path = tmp_path / "job.mcap"
-    path.write_bytes(objective(("/go", "there"), ("/go", "back")))
+    yield endpoint, next(line.split()[1] for line in printed.splitlines() if line.startswith("chain"))
+    up.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await up
+
+
+def moving(robot: Settings) -> Agent:
+    """A robot that goes where it is told to."""
     agent = obliging(Agent(MODEL, settings=robot, account=load_account(robot)))
 
     @agent.on("/go")
     async def go(job: Run, message: object) -> None:
         job.publish("/gone", message)
 
-    order: dict[str, Any] = {
-        "model": MODEL,
-        "cost": "7wn",
-        "validator_fee": "0",
-        "lifetime": 1000,
-        "out": None,
-        "as_json": True,
-    }
-    async with agent, asyncio.timeout(120):
-        await _demand(person, objective=str(path), **order)
-        liability = json.loads(capsys.readouterr().out.splitlines()[-1])["liability"]
-        nobody = Settings(
-            connect=(endpoint,), fetch_timeout=10.0, web3_http_provider=url, data_dir=str(tmp_path / "arbiter")
-        )
-        nothing = Files(objective=None, result=None, message=None)
-        assert await _verify(nobody, liability, nothing, offline=False, as_json=True)
-        said = json.loads(capsys.readouterr().out)
-        assert [finding["holds"] for finding in said["findings"]] == [True] * 14
-        with zenoh.open(client_config(endpoint)) as session:
-            listener = Listener(session)
-            await _replay(nobody, Replay(source=liability))
-            robots = f"aira/agent/{load_account(robot).address.lower()}/liability/{liability.lower()}"
-            keys = sorted(await asyncio.to_thread(listener.keys, 4))
-            assert keys == [f"{robots}/objective/go"] * 2 + [f"{robots}/topic/gone"] * 2
-            await _replay(nobody, Replay(source=liability, of_objective=True, to="lab/stage"))
-            assert (await asyncio.to_thread(listener.keys, 6))[4:] == ["lab/stage/go"] * 2
-        capsys.readouterr()
-        easier = tmp_path / "easier.mcap"
-        easier.write_bytes(objective(("/go", "there")))
-        other = Files(objective=easier, result=None, message=None)
-        assert not await _verify(nobody, liability, other, offline=False, as_json=False)
-        printed = capsys.readouterr().out
-        assert "FAILS  objective-file" in printed
-        with pytest.raises(AiraError):
-            await _verify(nobody, OTHER, nothing, offline=False, as_json=False)
-    up.cancel()
-    with pytest.raises(asyncio.CancelledError):
-        await up
+    return agent
+
+
+async def test_a_job_of_the_market_is_verified_from_its_address_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, easier = tmp_path / "job.mcap", tmp_path / "easier.mcap"
+    path.write_bytes(objective(("/go", "there"), ("/go", "back")))
+    easier.write_bytes(objective(("/go", "there")))
+    order: dict[str, Any] = {"model": MODEL, "cost": "7wn", "validator_fee": "0", "lifetime": 1000}
+    nothing, other = (Files(objective=file, result=None, message=None) for file in (None, easier))
+    async with asyncio.timeout(180), served_market(tmp_path, capsys) as (endpoint, url):
+        robot, person = (settings_of(role, endpoint, url, tmp_path) for role in ("robot", "person"))
+        folder = str(tmp_path / "arbiter")
+        nobody = Settings(connect=(endpoint,), fetch_timeout=10.0, web3_http_provider=url, data_dir=folder)
+        async with moving(robot):
+            await _demand(person, objective=str(path), out=None, as_json=True, **order)
+            liability = json.loads(capsys.readouterr().out.splitlines()[-1])["liability"]
+            assert await _verify(nobody, liability, nothing, offline=False, as_json=True)
+            said = json.loads(capsys.readouterr().out)
+            assert [finding["holds"] for finding in said["findings"]] == [True] * 14
+            with zenoh.open(client_config(endpoint)) as session:
+                listener = Listener(session)
+                await _replay(nobody, Replay(source=liability))
+                robots = f"aira/agent/{load_account(robot).address.lower()}/liability/{liability.lower()}"
+                keys = sorted(await asyncio.to_thread(listener.keys, 4))
+                assert keys == [f"{robots}/objective/go"] * 2 + [f"{robots}/topic/gone"] * 2
+                await _replay(nobody, Replay(source=liability, of_objective=True, to="lab/stage"))
+                assert (await asyncio.to_thread(listener.keys, 6))[4:] == ["lab/stage/go"] * 2
+            capsys.readouterr()
+            assert not await _verify(nobody, liability, other, offline=False, as_json=False)
+            assert "FAILS  objective-file" in capsys.readouterr().out
+            with pytest.raises(AiraError):
+                await _verify(nobody, OTHER, nothing, offline=False, as_json=False)
