@@ -207,9 +207,9 @@ async def test_a_gateway_serves_where_there_is_no_daemon(router: EmbeddedRouter,
         assert path.read_bytes() == content
 
 
+@pytest.mark.parametrize("kind", ["kubo"], indirect=True)  # the gateway of a js-ipfs gives no blocks
 async def test_a_kubos_own_gateway_is_a_source(swarm: Swarm, bob: Bare, tmp_path: Path) -> None:
-    if not isinstance(swarm.b, Kubo):
-        pytest.skip("the gateway of a js-ipfs gives no blocks")
+    assert isinstance(swarm.b, Kubo)
     content = content_of(CHUNK_SIZE + 1, str(tmp_path))
     cid = (await bob.call("add", *SETTINGS, content=content))["Hash"]
     async with Gateway(swarm.b.gateway) as source:
