@@ -5,38 +5,18 @@ from __future__ import annotations
 import re
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-import pytest
 
 from mesh.recording import open_objective
 from schemas import EMPTY, cid_of_file
 from tests.support.commands import AIRA, Serving, aira, run
+from tests.support.lessons import EXAMPLES, as_role, market
 from tests.support.ports import free_port
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
 ROOT = Path(__file__).parents[2]
-EXAMPLE = ROOT / "examples" / "hello_mesh"
+EXAMPLE = EXAMPLES / "hello_mesh"
 
 
-@pytest.fixture
-def market(tmp_path: Path) -> Iterator[dict[str, str]]:
-    """What the README has in its first shell; the variables of the other ones, but for the keyfile."""
-    endpoint, port = f"tcp/127.0.0.1:{free_port()}", free_port()
-    up = ("up", "--data-dir", tmp_path, "--listen", endpoint, "--port", str(port))
-    with Serving(*AIRA, *up, says="provider    0x"):
-        yield {
-            "AIRA_CONNECT": endpoint,
-            "AIRA_WEB3_HTTP_PROVIDER": f"http://127.0.0.1:{port}",
-            "AIRA_DATA_DIR": str(tmp_path),
-            "AIRA_KEYFILE_PASSWORD_FILE": str(tmp_path / "development" / "password"),
-        }
-
-
-def as_role(role: str, market: dict[str, str]) -> dict[str, str]:
-    return market | {"AIRA_KEYFILE": f"{market['AIRA_DATA_DIR']}/development/{role}.json"}
+__all__ = ["market"]
 
 
 def test_the_readme_names_the_model_as_it_is() -> None:
