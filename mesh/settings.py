@@ -69,6 +69,9 @@ CHAIN_SETTINGS: Final = (
 NETWORK_SETTINGS: Final = ("connect", "connect_timeout", "tls_ca", "tls_certificate", "tls_key")
 """The options that decide which network is joined, and as whom."""
 
+SERVER_SETTINGS: Final = ("log_level", "log_format", "metrics_listen")
+"""The options by which an operator sees what a server does."""
+
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Every option of the mesh, with its default. See `describe` for what each means."""
@@ -111,6 +114,9 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     content_limit: PositiveInt = 10 * 1024**3
     open_orders_limit: PositiveInt = 1_000_000
     open_services: bool = False
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    log_format: Literal["human", "json"] = "human"
+    metrics_listen: str = ""
 
     def __post_init__(self) -> None:
         """Names that are not given are those of the generation, from here on: they don't change with it any more."""
@@ -197,6 +203,9 @@ MEANING: Final[Mapping[str, str]] = {
     "open_orders_limit": "orders that a provider keeps open at most",
     "open_services": "let anyone on the router have this agent sign, send messages and spend"
     " (rpc/sign, rpc/send, rpc/eth/transfer, transfer_from, approve)",
+    "log_level": "the least that is logged: debug, info, warning, error",
+    "log_format": "an event of the log as a line for people (human), or as a JSON object (json)",
+    "metrics_listen": "HOST:PORT at which a server tells its metrics (/metrics) and its health (/health); empty: nowhere",
 }
 """What each option means, in a line."""
 
