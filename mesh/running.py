@@ -1,4 +1,4 @@
-"""How a program of the mesh runs and ends: signals, errors as one line, exit codes, the log."""
+"""How a program of the mesh runs and ends: signals, errors as one line, exit codes."""
 
 from __future__ import annotations
 
@@ -11,6 +11,10 @@ from mesh.errors import AiraError, ConfigurationError, InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
+
+    from mesh.settings import Settings
+
+log = logging.getLogger(__name__)
 
 INTERRUPTED: Final = 130
 """Exit code of a command that Ctrl-C kept from its end."""
@@ -26,22 +30,36 @@ def run_to_end(main: Callable[[], Coroutine[Any, Any, object]]) -> None:
         sys.exit(INTERRUPTED)
 
 
-def run_until_stopped(main: Callable[[], Coroutine[Any, Any, object]]) -> None:
-    """Run a server; Ctrl-C and SIGTERM are its normal end. Exits 1 or 2 on errors."""
-    start_log()
+def run_until_stopped(
+    main: Callable[[], Coroutine[Any, Any, object]], *, settings: Settings | None = None, role: str = ""
+) -> None:
+    """Run a server; Ctrl-C and SIGTERM are its normal end. Exits 1 or 2 on errors.
+
+    It logs as the `settings` say, and is called `role` there.
+    """
+    from mesh.telemetry.logs import start_log, start_log_of
+
+    if settings is None:
+        start_log(role=role)
+    else:
+        start_log_of(settings, role)
     _run(main)
 
 
-def start_log(level: int = logging.INFO) -> None:
-    """Write the log to stderr, a line an event; does nothing where logging is set up already."""
-    logging.basicConfig(level=level, format="%(asctime)s %(levelname)-7s %(message)s", datefmt="%H:%M:%S")
-
-
 def fail(error: AiraError) -> NoReturn:
-    """Say what is wrong and what to do in a line each, and exit: 2 for what the caller gave, 1 for the rest."""
-    print(f"aira: {error}", file=sys.stderr)
-    if error.hint:
-        print(f"      {error.hint}", file=sys.stderr)
+    """Say what is wrong and what to do in a line each, and exit: 2 for what the caller gave, 1 for the rest.
+
+    Where a server logs in JSON, that is an event of its log.
+    """
+    from mesh.telemetry.context import facts  # here, as few commands come to this
+    from mesh.telemetry.logs import writes_json
+
+    if writes_json():
+        log.error("%s", error, extra=facts(hint=error.hint))
+    else:
+        print(f"aira: {error}", file=sys.stderr)
+        if error.hint:
+            print(f"      {error.hint}", file=sys.stderr)
     sys.exit(2 if isinstance(error, InputError | ConfigurationError) else 1)
 
 

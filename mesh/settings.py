@@ -166,7 +166,8 @@ DEFAULTS: Final = Settings()
 MEANING: Final[Mapping[str, str]] = {
     "connect": "Zenoh routers to connect to, tried in turn (several fail over)",
     "listen": "where `aira router` listens",
-    "connect_timeout": "seconds to wait for a router at the start; -1 waits for ever",
+    "connect_timeout": "seconds to wait for a router at the start;"
+    " -1 waits for ever, also for the node, the contracts and files",
     "tls_ca": "the site's certificate (PEM), by which a router and its clients know each other on tls/ endpoints",
     "tls_certificate": "own certificate for tls/ endpoints (PEM), made by `aira identity new`",
     "tls_key": "the key of tls_certificate (PEM)",
@@ -205,7 +206,7 @@ MEANING: Final[Mapping[str, str]] = {
     " (rpc/sign, rpc/send, rpc/eth/transfer, transfer_from, approve)",
     "log_level": "the least that is logged: debug, info, warning, error",
     "log_format": "an event of the log as a line for people (human), or as a JSON object (json)",
-    "metrics_listen": "HOST:PORT at which a server tells its metrics (/metrics) and its health (/health); empty: nowhere",
+    "metrics_listen": "HOST:PORT where a server tells its metrics (/metrics) and its health (/health); empty: nowhere",
 }
 """What each option means, in a line."""
 

@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from schemas.liability import Liability  # msgspec reads the annotations
+from schemas.logs import LogsRead, ReadLogs
 from schemas.posting import Published, SendDemand, SendOffer, SendResult, SignDemand, SignOffer, SignResult
 from schemas.records import Record, UInt256
 from schemas.status import Status
@@ -164,6 +165,7 @@ SERVICES: Final[Mapping[str, Service]] = MappingProxyType(
         "resume": Service(ResumeLiability, Done),
         "read": Service(ReadLiability, LiabilityRead),
         "status": Service(Nothing, Status),
+        "logs": Service(ReadLogs, LogsRead),
         "sign/demand": Service(SignDemand, Published),
         "sign/offer": Service(SignOffer, Published),
         "sign/result": Service(SignResult, Published),
@@ -213,9 +215,11 @@ __all__ = [
     "Done",
     "FinishLiability",
     "LiabilityRead",
+    "LogsRead",
     "Nothing",
     "Published",
     "ReadLiability",
+    "ReadLogs",
     "RestartLiability",
     "ResumeLiability",
     "SendDemand",

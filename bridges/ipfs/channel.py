@@ -7,26 +7,27 @@ import logging
 import re
 import secrets
 import time
-from contextlib import AsyncExitStack
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import zenoh
 
 from bridges.ipfs.carrying import MARK, ToIpfs, ToMesh
 from bridges.ipfs.link import Link
 from bridges.ipfs.memory import Side
+from bridges.ipfs.metrics import Standing
 from bridges.ipfs.presence import Presence
 from bridges.ipfs.report import figures_of, news
 from bridges.ipfs.status import BridgeStatus, status_key
 from bridges.ipfs.traffic import LIMIT, Fate, Traffic
-from mesh.errors import ClosedError, InvalidMessage
+from mesh.errors import InvalidMessage
 from mesh.network import Pump
 from mesh.network.crossing import call_in_loop
+from mesh.role import Role
 from schemas import lighthouse_selector
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from types import TracebackType
+    from contextlib import AsyncExitStack
 
     from bridges.ipfs.daemon import Daemon
     from bridges.ipfs.dialects import Event
@@ -55,7 +56,7 @@ class Sample(NamedTuple):
     marked: bool
 
 
-class ChannelBridge:
+class ChannelBridge(Role):
     """Carries messages both ways: `async with ChannelBridge(...) as bridge`, then `run`.
 
     `gate` checks what passes for `lighthouse` (ENS name); `journal` is this bridge's own memory; `neighbours` are swarm
@@ -65,10 +66,13 @@ class ChannelBridge:
 
     Network, daemon and journal stay the caller's to close.
 
-    A message that was accepted is carried, and once: it waits in the journal until the daemon has taken it. When the
-    daemon dies in the middle of a call nobody can know whether that one message went out, and it is published again;
-    what a daemon took in its very last moment may be lost with it, until its sender sends it again.
+    A message that was accepted is carried, and once: it waits in the journal until the daemon has taken it, also when
+    `run` is cancelled meanwhile. When the daemon dies in the middle of a call nobody can know whether that one message
+    went out, and it is published again; what a daemon took in its very last moment may be lost with it, until its
+    sender sends it again.
     """
+
+    title = "bridge"
 
     def __init__(
         self,
@@ -99,40 +103,24 @@ class ChannelBridge:
         self._report_interval = report
         self._began = time.monotonic()
         self._looking_up = asyncio.Semaphore(LOOKING_UP)
-        self._stack: AsyncExitStack | None = None
 
-    async def __aenter__(self) -> Self:
-        if self._stack is not None:
-            raise ClosedError("this bridge is open already")
+    async def _open(self, stack: AsyncExitStack) -> None:
         session = self._network.session
-        async with AsyncExitStack() as stack:
-            self._pump: Pump[Sample] = await stack.enter_async_context(
-                Pump(session, lighthouse_selector(self.lighthouse), _read)
-            )
-            # After the subscription: who sees the bridge's token can be sure to be heard.
-            self._presence = await stack.enter_async_context(
-                Presence(session, self.lighthouse, self.address, self.traffic, wake=self._wake)
-            )
-            loop = asyncio.get_running_loop()
-            queryable: Any = session.declare_queryable(
-                status_key(self.address, self.lighthouse), lambda query: call_in_loop(loop, self._answer, query)
-            )
-            stack.callback(lambda: None if session.is_closed() else queryable.undeclare())
-            self._stack = stack.pop_all()
+        self._pump: Pump[Sample] = await stack.enter_async_context(
+            Pump(session, lighthouse_selector(self.lighthouse), _read)
+        )
+        # After the subscription: who sees the bridge's token can be sure to be heard.
+        self._presence = await stack.enter_async_context(
+            Presence(session, self.lighthouse, self.address, self.traffic, wake=self._wake)
+        )
+        loop = asyncio.get_running_loop()
+        queryable: Any = session.declare_queryable(
+            status_key(self.address, self.lighthouse), lambda query: call_in_loop(loop, self._answer, query)
+        )
+        stack.callback(lambda: None if session.is_closed() else queryable.undeclare())
         self._restore()
-        return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        stack, self._stack = self._stack, None
-        if stack is not None:
-            await stack.aclose()
-
-    async def run(self) -> None:
-        """Carry until cancelled. What waits then is in the journal."""
-        if self._stack is None:
-            raise ClosedError("the bridge is not open", hint="use it inside `async with`")
+    async def _work(self) -> None:
         async with asyncio.TaskGroup() as tasks:
             self._tasks = tasks
             tasks.create_task(self._take_from_mesh(), name=f"mesh → bridge {self.lighthouse}")
@@ -162,6 +150,10 @@ class ChannelBridge:
             content=self._content(),
             uptime=round(time.monotonic() - self._began, 1),
         )
+
+    def standing(self) -> Standing:
+        """How it is now, and what it stands on."""
+        return Standing(self.status(), routed=self._network.connected, subscribed=self.link.up)
 
     def _state(self) -> str:
         if not self._network.connected:
@@ -253,7 +245,7 @@ class ChannelBridge:
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
-            if self._stack is not None:
+            if self.is_open:
                 query.reply(
                     status_key(self.address, self.lighthouse), self.status().encode(), encoding="application/json"
                 )

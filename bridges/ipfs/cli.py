@@ -11,14 +11,20 @@ from typing import TYPE_CHECKING, Final
 import click
 import msgspec
 
+from mesh.cli.announcing import announce
 from mesh.cli.options import with_settings
 from mesh.errors import ConfigurationError, NetworkUnavailable
 from mesh.running import run_until_stopped
-from mesh.settings import CHAIN_SETTINGS, NETWORK_SETTINGS
+from mesh.settings import CHAIN_SETTINGS, NETWORK_SETTINGS, SERVER_SETTINGS
+from mesh.telemetry.context import Speaker
+from mesh.telemetry.log_service import LogService
+from mesh.telemetry.logs import introduce
+from schemas import parse_address
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from bridges.ipfs.service import IpfsBridge
     from mesh.chain import Chain
     from mesh.network import Network
     from mesh.settings import Settings
@@ -45,6 +51,7 @@ AGAIN: Final = 1.0
     "fetch_timeout",
     "keyfile",
     *CHAIN_SETTINGS,
+    *SERVER_SETTINGS,
 )
 def command(settings: Settings, api: str | None, lighthouses: tuple[str, ...]) -> None:
     """Carry messages and content between the mesh and the legacy network on IPFS. Ctrl-C ends it.
@@ -55,7 +62,7 @@ def command(settings: Settings, api: str | None, lighthouses: tuple[str, ...]) -
     """
     if api:
         settings = msgspec.structs.replace(settings, ipfs_http_provider=api)
-    run_until_stopped(lambda: _serve(settings, lighthouses))
+    run_until_stopped(lambda: _serve(settings, lighthouses), settings=settings, role="bridge")
 
 
 def _address(settings: Settings) -> str | None:
@@ -80,20 +87,39 @@ async def _serve(settings: Settings, lighthouses: tuple[str, ...]) -> None:
             f"the IPFS bridge needs {error.name}, which is not installed", hint="pip install 'aira-mesh[ipfs]'"
         ) from error
 
+    from mesh.starting import files
+    from mesh.telemetry.serving import Telemetry
+
     base_url(settings.ipfs_http_provider)  # before anything is waited for
     async with AsyncExitStack() as stack:
+        telemetry = await stack.enter_async_context(Telemetry(settings.metrics_listen))
+        await files(settings)
         chain = _chain(settings)
-        network = await _network(settings, stack)
+        network = await _network(settings, stack, waits=telemetry.starting)
         bridge = await stack.enter_async_context(
             IpfsBridge(network, settings, lighthouses=lighthouses, chain=chain, address=_address(settings))
         )
-        for channel in bridge.channels:
-            click.echo(f"bridge {channel.address} carries {channel.lighthouse} to and from {bridge.daemon.api}")
+        stack.enter_context(telemetry.showing(measure=bridge.measure, health=bridge.parts))
+        await _introduce(bridge, network, stack)
         await bridge.run()
 
 
-async def _network(settings: Settings, stack: AsyncExitStack) -> Network:
-    """The session, as soon as there is a router."""
+async def _introduce(bridge: IpfsBridge, network: Network, stack: AsyncExitStack) -> None:
+    """Say what the bridge is, and answer who asks for its log."""
+    from mesh.network import Services
+
+    introduce(Speaker("bridge", parse_address(bridge.channels[0].address)))
+    for channel in bridge.channels:
+        words = f"bridge {channel.address} carries {channel.lighthouse} to and from {bridge.daemon.api}"
+        announce(log, words, bridge=channel.address)
+    # Of one process: each address answers for all of it.
+    for address in {channel.address for channel in bridge.channels}:
+        services = await stack.enter_async_context(Services(network.session, address))
+        services.offer("logs", LogService("bridge", "").logs)
+
+
+async def _network(settings: Settings, stack: AsyncExitStack, *, waits: Callable[[str], None]) -> Network:
+    """The session, as soon as there is a router; `waits` is told why there is none."""
     from mesh.agent.parts import endpoints_of
     from mesh.network import Network
 
@@ -104,6 +130,7 @@ async def _network(settings: Settings, stack: AsyncExitStack) -> Network:
         except NetworkUnavailable as error:
             if not said:
                 log.warning("the bridge waits for a router: %s", error)
+            waits(str(error))
             said = True
             await asyncio.sleep(AGAIN)
 

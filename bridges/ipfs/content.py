@@ -37,6 +37,10 @@ TRANSFERS: Final = 8
 """Files on their way at once because a message names them; the others wait."""
 WAITING: Final = 4096
 """Files that wait for that; more are passed over, and count as failed."""
+ATTEMPTS: Final = 4
+"""How often a file that a message names is tried to be added."""
+AGAIN: Final = 10.0
+"""Seconds between two of these attempts."""
 FRUITLESS: Final = 10.0
 """Seconds for which a block that IPFS did not give is not asked for again."""
 REMEMBERED: Final = 65_536
@@ -48,7 +52,8 @@ class ContentBridge:
 
     Inside, a block that somebody in the mesh asks for and that `store` does not hold is asked of `sources`, and the
     file that it begins is kept. `daemon` is where files are added; `providers` are further nodes that pin them.
-    `size_limit` is in bytes of a file, `timeout` in seconds for a file. What is used stays the caller's to close.
+    `size_limit` is in bytes of a file, `timeout` in seconds for a file, `again` in seconds between two attempts to add
+    one. What is used stays the caller's to close.
     """
 
     def __init__(
@@ -62,6 +67,7 @@ class ContentBridge:
         providers: tuple[Daemon, ...] = (),
         size_limit: int,
         timeout: float,
+        again: float = AGAIN,
     ) -> None:
         self._session = session
         self._id = str(session.zid())
@@ -72,6 +78,7 @@ class ContentBridge:
         self._providers = providers
         self._size_limit = size_limit
         self._timeout = timeout
+        self._again = again
         self._parts: OrderedDict[str, None] = OrderedDict()
         self._fruitless: OrderedDict[str, float] = OrderedDict()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -144,7 +151,7 @@ class ContentBridge:
         self._start(self._try_to_fetch(cid), f"fetch {cid}")
 
     def add_soon(self, cid: str) -> None:
-        """As `add`, without waiting; what fails is logged and counted."""
+        """As `add`, without waiting; what is not there or not taken is tried again, what fails logged and counted."""
         self._start(self._try_to_add(cid), f"add {cid}")
 
     def figures(self) -> ContentFigures:
@@ -178,12 +185,18 @@ class ContentBridge:
             log.info("not fetched from IPFS: %s", error)
 
     async def _try_to_add(self, cid: str) -> None:
-        try:
-            async with self._transfers:
-                await self.add(cid)
-        except AiraError as error:
-            self._counts["failed"] += 1
-            log.warning("not added to IPFS: %s", error)
+        for left in reversed(range(ATTEMPTS)):
+            try:
+                async with self._transfers:
+                    await self.add(cid)
+                return
+            except AiraError as error:
+                if not left or not isinstance(error, ContentUnavailable | IpfsError):
+                    self._counts["failed"] += 1
+                    log.warning("not added to IPFS: %s", error)
+                    return
+                log.debug("not added to IPFS yet: %s", error)
+            await asyncio.sleep(self._again)
 
     def _start(self, work: Coroutine[Any, Any, None], name: str) -> None:
         if not self._open or len(self._tasks) >= WAITING:

@@ -31,8 +31,13 @@ class Version(msgspec.Struct, frozen=True):
     js_core: str = msgspec.field(default="", name="ipfs-core")
     js_interface: str = msgspec.field(default="", name="interface-ipfs-core")
 
+    @property
+    def is_js(self) -> bool:
+        """Whether it is js-ipfs; all others are go-ipfs or Kubo."""
+        return bool(self.js_core or self.js_interface)
+
     def __str__(self) -> str:
-        if self.js_core or self.js_interface:
+        if self.is_js:
             return f"js-ipfs {self.version or 'unknown'}"
         return f"{'go-ipfs' if _numbers(self.version) < _KUBO_SINCE else 'kubo'} {self.version or 'unknown'}"
 

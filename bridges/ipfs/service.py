@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import AsyncExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final
 
 from bridges.ipfs.channel import ChannelBridge
 from bridges.ipfs.content import ContentBridge
@@ -15,23 +14,26 @@ from bridges.ipfs.gateway import Gateway
 from bridges.ipfs.journal import Journal
 from bridges.ipfs.market import Markets
 from bridges.ipfs.memory import Side
+from bridges.ipfs.metrics import bridge_families, content_families, parts_of
 from bridges.ipfs.sources import Sources
 from mesh.content import Exchange, Store
-from mesh.errors import ClosedError, ConfigurationError
+from mesh.errors import ConfigurationError
+from mesh.network.figures import network_families
+from mesh.role import Role
 from schemas import Demand, Result, decode
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-    from contextlib import AbstractAsyncContextManager
-    from types import TracebackType
+    from collections.abc import Callable, Iterable, Mapping
+    from contextlib import AbstractAsyncContextManager, AsyncExitStack
 
     from bridges.ipfs.gate import Passenger
     from mesh.chain import Chain
     from mesh.network import Network
     from mesh.settings import Settings
+    from mesh.telemetry.families import Family
 
 
-class IpfsBridge:
+class IpfsBridge(Role):
     """The channels of `lighthouses` (ENS names) and the content: `async with IpfsBridge(...) as bridge`, then `run`.
 
     With `chain`, which makes a client of it that is not open yet, ENS names in messages are looked up, orders must be
@@ -39,6 +41,8 @@ class IpfsBridge:
     reached. `address` is the bridge's name on the mesh, by default a new one for each channel. The network stays the
     caller's to close.
     """
+
+    title = "IPFS bridge"
 
     def __init__(
         self,
@@ -54,36 +58,32 @@ class IpfsBridge:
         self._lighthouses = tuple(name.lower() for name in lighthouses or (settings.lighthouse_contract,))
         self._markets = chain and Markets(chain, self._lighthouses, interval=max(settings.poll_interval, 1.0))
         self._address = address
-        self._stack: AsyncExitStack | None = None
         self.channels: tuple[ChannelBridge, ...] = ()
-        self.daemon: Final = Daemon(settings.ipfs_http_provider, authorization=_authorization(settings))
+        self.daemon: Final = Daemon(settings.ipfs_http_provider, authorization=authorization_of(settings))
 
-    async def __aenter__(self) -> Self:
-        if self._stack is not None:
-            raise ClosedError("this bridge is open already")
-        async with AsyncExitStack() as stack:
-            await stack.enter_async_context(self.daemon)
-            self.content = await self._open_content(stack)
-            self.channels = tuple([await self._open_channel(stack, name) for name in self._lighthouses])
-            self._stack = stack.pop_all()
-        return self
+    async def _open(self, stack: AsyncExitStack) -> None:
+        await stack.enter_async_context(self.daemon)
+        self.content = await self._open_content(stack)
+        self.channels = tuple([await self._open_channel(stack, name) for name in self._lighthouses])
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        stack, self._stack = self._stack, None
-        if stack is not None:
-            await stack.aclose()
-
-    async def run(self) -> None:
-        """Carry messages and content until cancelled."""
-        if self._stack is None:
-            raise ClosedError("the bridge is not open", hint="use it inside `async with`")
+    async def _work(self) -> None:
         async with asyncio.TaskGroup() as tasks:
             for channel in self.channels:
                 tasks.create_task(channel.run(), name=f"bridge of {channel.lighthouse}")
             if self._markets is not None:
                 tasks.create_task(self._markets.run(), name="bridge: the chain")
+
+    async def measure(self) -> Iterable[Family]:
+        """Its figures: of each channel, of the content, and of its session."""
+        return (
+            *bridge_families(channel.standing() for channel in self.channels),
+            *content_families(self.content.figures()),
+            *network_families(self._network),
+        )
+
+    def parts(self) -> Mapping[str, str]:
+        """The state of each of its parts: the router, and for each channel the daemon."""
+        return parts_of(channel.standing() for channel in self.channels)
 
     @property
     def _directory(self) -> Path:
@@ -151,7 +151,8 @@ class IpfsBridge:
                     self.content.fetch_soon(cid)
 
 
-def _authorization(settings: Settings) -> str:
+def authorization_of(settings: Settings) -> str:
+    """The `Authorization` header that the daemon wants, none if empty. Raises `ConfigurationError`."""
     if not settings.ipfs_authorization_file:
         return ""
     path = Path(settings.ipfs_authorization_file).expanduser()

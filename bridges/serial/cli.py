@@ -8,8 +8,9 @@ import click
 
 from mesh.cli.options import with_settings
 from mesh.errors import AiraError
-from mesh.running import fail, start_log
-from mesh.settings import NETWORK_SETTINGS
+from mesh.running import fail
+from mesh.settings import NETWORK_SETTINGS, SERVER_SETTINGS
+from mesh.telemetry.logs import start_log_of
 
 if TYPE_CHECKING:
     from bridges.serial.serving import Protocol
@@ -81,7 +82,7 @@ def _number(text: str) -> int | float | str:
     callback=_renaming,
     help="what the board's topic, or all beneath it, is called in the mesh: /led=/left/led, /=/left",
 )
-@with_settings(*NETWORK_SETTINGS)
+@with_settings(*NETWORK_SETTINGS, *SERVER_SETTINGS)
 def command(
     settings: Settings,
     port: str,
@@ -104,21 +105,24 @@ def command(
     """
     from bridges.serial.edge import DeviceId
     from bridges.serial.names import Names
-    from bridges.serial.serving import serve
+    from bridges.serial.serving import serve, telling, wait_for_files
     from mesh.network.endpoints import Endpoints
 
-    start_log()
+    start_log_of(settings, "edge")
     endpoints = Endpoints.from_settings(settings)
     try:
-        serve(
-            DeviceId(agent=agent, name=name),
-            port,
-            endpoints=endpoints,
-            protocol=protocol,
-            baud=baud,
-            patience=patience,
-            parameters=parameters,
-            names=Names(renamed),
-        )
+        with telling(settings.metrics_listen) as told:
+            wait_for_files(settings)
+            serve(
+                DeviceId(agent=agent, name=name),
+                port,
+                endpoints=endpoints,
+                protocol=protocol,
+                baud=baud,
+                patience=patience,
+                parameters=parameters,
+                names=Names(renamed),
+                told=told,
+            )
     except AiraError as error:
         fail(error)

@@ -27,7 +27,9 @@ from bridges.serial.jobs import Jobs
 from bridges.serial.line import Line
 from bridges.serial.names import Names
 from bridges.serial.replying import is_meant_for, patience_of, refuse, reply
+from bridges.serial.tally import Tally
 from mesh.errors import InvalidKey
+from mesh.telemetry.context import concerning
 from schemas.chunks import topic_chunks
 from schemas.keys import DeviceTopicKey, LiabilityTopicKey, event_selector, parse_key
 from schemas.payloads import STRING, String, payload_type
@@ -90,6 +92,7 @@ class Edge:
         self._patience = patience
         self._jobs = Jobs()
         self._line = Line(port, dialect, baud=baud, deliver=self._deliver)
+        self.tally = Tally(self._line)
         self._asked: dict[Command, zenoh.Query] = {}
         self._declared: dict[str, list[Any]] = {}
         self._token: Any = None
@@ -116,10 +119,15 @@ class Edge:
         self._line.stop()
 
     def _deliver(self, happening: Happening) -> None:
+        with concerning(self._jobs.current):
+            self._take(happening)
+
+    def _take(self, happening: Happening) -> None:
         match happening:
             case Ready(about):
                 self._serve(about)
             case Gone(why):
+                self.tally.board_lost()
                 log.warning("the board is absent: %s", why)
                 self._note(f"absent: {why}")
                 self._be_absent()
@@ -181,7 +189,7 @@ class Edge:
             self._line.do(partial(self._command, str(sample.key_expr), sample.payload.to_bytes(), given))
 
     def _command(self, key: str, payload: bytes, given: PayloadType) -> None:
-        topic, _ = self._place(key)
+        topic, job = self._place(key)
         if topic is None:
             return
         now = time.monotonic()
@@ -189,7 +197,8 @@ class Edge:
         try:
             self._line.dialect.submit(Command(topic.name, payload, now + self._patience), now)
         except (UnfitMessage, BoardBusy) as error:
-            log.warning("%s", error)
+            with concerning(job):
+                log.warning("%s", error)
 
     def _heard_call(self, query: zenoh.Query) -> None:
         self._line.do(partial(self._call, query))
@@ -208,7 +217,9 @@ class Edge:
         try:
             self._line.dialect.submit(command, now)
         except (UnfitMessage, BoardBusy) as error:
-            refuse(query, "full" if isinstance(error, BoardBusy) else "unfit", str(error))
+            reason = "full" if isinstance(error, BoardBusy) else "unfit"
+            self.tally.ended(reason)
+            refuse(query, reason, str(error))
             return
         self._asked[command] = query
         if job:
@@ -258,6 +269,7 @@ class Edge:
 
     def _ended(self, ended: Ended) -> None:
         query = self._asked.pop(ended.command, None)
+        self.tally.ended(ended.reason or ended.ending.value)
         if ended.ending is Ending.FAILED:
             log.warning("%s: %s (%s)", ended.command.topic, ended.detail, ended.reason)
         if query is not None:

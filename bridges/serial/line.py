@@ -49,6 +49,13 @@ class Line:
         self._complaint = ""
         self._strange = float("inf")
         self._bytes = 0
+        self.openings = 0
+        """How often the port was opened."""
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the port is open."""
+        return self._port is not None
 
     def do(self, wish: Callable[[], object]) -> None:
         """Have something done on the line's thread soon; from any thread."""
@@ -142,6 +149,7 @@ class Line:
                 log.log(logging.INFO if isinstance(error, PortMissing) else logging.WARNING, "%s; waiting", error)
             return
         self._complaint = ""
+        self.openings += 1
         self._backlog.clear()
         log.info("%s is open at %d baud", self.name, self._baud)
         self._strange, self._bytes = time.monotonic() + STRANGE, 0

@@ -6,23 +6,35 @@ import logging
 import secrets
 import signal
 import sys
-from typing import TYPE_CHECKING, Literal
+import time
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from bridges.serial.edge import DeviceId, Edge
 from bridges.serial.ports import PortName
+from bridges.serial.telling import tell_log
+from mesh.cli.announcing import announce
 from mesh.network.opening import Opening
 from mesh.running import INTERRUPTED
+from mesh.starting import AGAIN, lacking
+from mesh.telemetry.context import Speaker
+from mesh.telemetry.logs import introduce
+from schemas.address import parse_address
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Iterator, Mapping
+
+    import zenoh
 
     from bridges.serial.dialect import Dialect
     from bridges.serial.names import Names
     from mesh.network.endpoints import Endpoints
+    from mesh.settings import Settings
 
 log = logging.getLogger(__name__)
 
 Protocol = Literal["frames", "rosserial"]
+Told: TypeAlias = "Callable[[Edge, zenoh.Session], None]"
 
 
 def dialect_of(protocol: Protocol, *, baud: int, parameters: Mapping[str, object]) -> Dialect:
@@ -36,6 +48,30 @@ def dialect_of(protocol: Protocol, *, baud: int, parameters: Mapping[str, object
     return CallingDialect(baud=baud, session=secrets.randbelow(0xFFFF) + 1)
 
 
+def wait_for_files(settings: Settings) -> None:
+    """Wait for the files that the settings name, where they say so. On the main thread, as `serve`."""
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(INTERRUPTED))
+    for _ in lacking(settings):
+        time.sleep(AGAIN)
+
+
+@contextmanager
+def telling(listen: str) -> Iterator[Told]:
+    """Tell metrics and health at `listen` (HOST:PORT), if it is not empty: of what the yielded function is called with.
+
+    Raises `ConfigurationError`. What that needs is loaded only now.
+    """
+    if not listen:
+        yield lambda edge, session: None
+        return
+    from bridges.serial.figures import EdgeFigures
+    from mesh.telemetry.opening import open_server
+
+    figures = EdgeFigures()
+    with open_server(listen, figures.families, figures.health):
+        yield figures.begin
+
+
 def serve(
     device: DeviceId,
     port: str,
@@ -46,8 +82,9 @@ def serve(
     patience: float,
     parameters: Mapping[str, object],
     names: Names,
+    told: Told,
 ) -> None:
-    """Serve a board until Ctrl-C or SIGTERM. On the main thread of a process of its own.
+    """Serve a board until Ctrl-C or SIGTERM. On the main thread of a process of its own. `told` is of `telling`.
 
     Raises `NetworkUnavailable`, `InputError` for a port that can't be named, `InvalidKey` for such a device.
     """
@@ -59,5 +96,9 @@ def serve(
         edge = Edge(session, device, name, dialect, baud=baud, patience=patience, names=names)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda number, frame: edge.stop())
-        print(f"edge of {device.agent}: {device.name} on {name}, {protocol}, Zenoh id {session.zid()}", flush=True)
-        edge.run()
+        words = f"edge of {device.agent}: {device.name} on {name}, {protocol}, Zenoh id {session.zid()}"
+        told(edge, session)
+        introduce(Speaker("edge", parse_address(device.agent)))
+        announce(log, words, device=device.name)
+        with tell_log(session, device):
+            edge.run()

@@ -5,13 +5,19 @@ from __future__ import annotations
 import asyncio
 import logging
 from contextlib import AsyncExitStack
-from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
+from functools import partial
+from typing import TYPE_CHECKING, Final, Self, TypeVar
 
-from mesh.agent.hooks import Handler, HandlerPerformer, Hooks, call
-from mesh.agent.parts import chain_of, load_account, watching, working
+from mesh.agent.hooks import Handler, HandlerPerformer, Hooks, hear, repeat
+from mesh.agent.parts import load_account, watching, working
+from mesh.agent.watcher import Watcher
 from mesh.background import Background
 from mesh.errors import ClosedError, ConfigurationError
 from mesh.settings import load
+from mesh.starting import entered, files
+from mesh.telemetry.context import Speaker, speaking
+from mesh.telemetry.logs import introduce
+from mesh.telemetry.serving import Telemetry
 from schemas import Demand, Offer, Result, Verified
 
 if TYPE_CHECKING:
@@ -61,6 +67,8 @@ class Agent:
         self._hooks = Hooks()
         self._stack = AsyncExitStack()
         self._running = False
+        self.telemetry = Telemetry(self.settings.metrics_listen)
+        """Where its metrics and its health are told, if the settings say so."""
         self._channel: Channel | None = None
         self._worker: Worker | None = None
 
@@ -125,7 +133,7 @@ class Agent:
         """Serve until Ctrl-C or SIGTERM. Errors that a person can mend are one line, and exit code 1 or 2."""
         from mesh.running import run_until_stopped
 
-        run_until_stopped(self.serve)
+        run_until_stopped(self.serve, settings=self.settings, role="agent")
 
     async def serve(self) -> None:
         """Serve until cancelled."""
@@ -220,46 +228,58 @@ class Agent:
 
     async def _open(self, stack: AsyncExitStack) -> None:
         """Open the parts, then start what runs beside them."""
+        await stack.enter_async_context(self.telemetry)
+        await files(self.settings)
         account = self._account
         if account is None and self.settings.keyfile:
             account = await asyncio.to_thread(load_account, self.settings)
+        who = Speaker("agent", "" if account is None else account.address, self.settings.lighthouse_contract.lower())
+        introduce(who)
+        with speaking(who):
+            await self._open_as(stack, account)
+
+    async def _open_as(self, stack: AsyncExitStack, account: Account | None) -> None:
+        """The same for `account`, or for nobody in particular."""
         if account is None:
-            network, self._channel = await stack.enter_async_context(watching(self.settings))
+            network, channel = await stack.enter_async_context(watching(self.settings))
+            self._channel = channel
+            role: Watcher | Worker = Watcher(network, channel)
             log.info("watching %s, Zenoh id %s", self.channel.lighthouse, network.id)
         else:
-            await self._open_working(stack, account)
+            role = await self._open_working(stack, account)
         assert self._channel is not None
         subscriptions = []
         for kind, handlers in self._hooks.market.items():
             model = self.model if kind is not Result and self.model else "*"
             subscription = await stack.enter_async_context(self._channel.subscribe(kind, model=model))
             subscriptions.append((subscription, handlers, DEMANDS if kind is Demand else 1))
+        measure = partial(role.measure, [subscription for subscription, _, _ in subscriptions])
+        stack.enter_context(self.telemetry.showing(measure=measure, health=role.health))
         # Last, and so ended first: until then, all that handlers and jobs use is open.
         tasks = await stack.enter_async_context(Background())
         if self._worker is not None:
             tasks.start(self._worker.run(), "worker")
         for subscription, handlers, at_once in subscriptions:
             tasks.start(subscription.recall(), "recall")
-            tasks.start(_hear(subscription, handlers, at_once=at_once), "hear")
+            tasks.start(hear(subscription, handlers, at_once=at_once), "hear")
         for seconds, handler in self._hooks.periodic:
-            tasks.start(_repeat(seconds, handler), f"every {seconds:g} s")
+            tasks.start(repeat(seconds, handler), f"every {seconds:g} s")
 
     def _ended(self) -> None:
         self._running = False
         self._channel = self._worker = None
 
-    async def _open_working(self, stack: AsyncExitStack, account: Account) -> None:
+    async def _open_working(self, stack: AsyncExitStack, account: Account) -> Worker:
         from mesh.agent.party import Worker  # loads web3, which an agent that watches does without
 
-        chain = self._given_chain
-        if chain is None:
-            chain = await stack.enter_async_context(chain_of(self.settings, account))
-        parts = await stack.enter_async_context(working(self.settings, account, chain))
+        make = partial(working, self.settings, account, self._given_chain)
+        parts = await entered(stack, self.settings, make, role="agent", waits=self.telemetry.starting)
         performer = HandlerPerformer(self._hooks) if self._hooks.topics else None
-        self._worker = Worker(parts, performer=performer, witnesses=self._hooks.liabilities)
+        worker = self._worker = Worker(parts, performer=performer, witnesses=self._hooks.liabilities)
         self._channel = parts.channel
         self._channel.announce("agent", account.address)
         log.info("account %s on %s, Zenoh id %s", account.address, parts.channel.lighthouse, parts.network.id)
+        return worker
 
     def _on_market(self, kind: type[Demand | Offer | Result], handler: H) -> H:
         self._hooks.market.setdefault(kind, []).append(handler)
@@ -273,26 +293,3 @@ class Agent:
                 hint="give it one: keyfile and keyfile_password_file in the settings",
             )
         return self._worker
-
-
-async def _hear(subscription: Any, handlers: list[Handler], *, at_once: int) -> None:
-    """Hand each message to all handlers in turn; so many messages at once."""
-    turns = asyncio.Semaphore(at_once)
-
-    async def handle(message: Any) -> None:
-        try:
-            for handler in handlers:
-                await call(handler, message)
-        finally:
-            turns.release()
-
-    async with asyncio.TaskGroup() as tasks:
-        async for message in subscription:
-            await turns.acquire()
-            tasks.create_task(handle(message), name="handler")
-
-
-async def _repeat(seconds: float, handler: Handler) -> None:
-    while True:
-        await call(handler)
-        await asyncio.sleep(seconds)

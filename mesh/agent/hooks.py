@@ -93,7 +93,7 @@ async def call(handler: Handler, *arguments: Any) -> None:
     try:
         await handler(*arguments)
     except AiraError as error:
-        log.warning("%s: %s", name, error)
+        log.warning("handler %s: %s", name, error)
     except asyncio.CancelledError:
         task = asyncio.current_task()
         if task is not None and task.cancelling():
@@ -101,3 +101,27 @@ async def call(handler: Handler, *arguments: Any) -> None:
         log.error("handler %s ended with the cancellation of what it waited for; the agent goes on", name)
     except Exception:
         log.exception("handler %s failed; the agent goes on", name)
+
+
+async def hear(subscription: Any, handlers: list[Handler], *, at_once: int) -> None:
+    """Hand each message to all handlers in turn; so many messages at once."""
+    turns = asyncio.Semaphore(at_once)
+
+    async def handle(message: Any) -> None:
+        try:
+            for handler in handlers:
+                await call(handler, message)
+        finally:
+            turns.release()
+
+    async with asyncio.TaskGroup() as tasks:
+        async for message in subscription:
+            await turns.acquire()
+            tasks.create_task(handle(message), name="handler")
+
+
+async def repeat(seconds: float, handler: Handler) -> None:
+    """Call the handler every so many seconds, until cancelled."""
+    while True:
+        await call(handler)
+        await asyncio.sleep(seconds)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -24,10 +25,15 @@ if TYPE_CHECKING:
 
 
 class Clock:
-    """The chain's time as this agent knows it: the number of the last block handled."""
+    """The chain's time as this agent knows it: the number of the last block handled, and when that was."""
 
-    def __init__(self) -> None:
-        self.head = 0
+    def __init__(self, head: int) -> None:
+        self.pass_to(head)
+
+    def pass_to(self, block: int) -> None:
+        """All of `block` has been handled."""
+        self.head = block
+        self.passed_at = time.monotonic()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,16 +124,17 @@ async def watching(settings: Settings) -> AsyncIterator[tuple[Network, Channel]]
 
 
 @asynccontextmanager
-async def working(settings: Settings, account: Account, chain: Chain) -> AsyncIterator[Parts]:
-    """The parts of an agent with an account, on `chain` (open).
+async def working(settings: Settings, account: Account, chain: Chain | None) -> AsyncIterator[Parts]:
+    """The parts of an agent with an account, on `chain` (open), or on the chain that the settings name.
 
     Its state is in the settings' folder, by address; what concerns the chain, by chain.
     """
-    home = settings.state_directory / account.address
-    directory = home / await _name_of(chain)
-    clock = Clock()
-    clock.head = await chain.block_number()
     async with AsyncExitStack() as stack:
+        if chain is None:
+            chain = await stack.enter_async_context(chain_of(settings, account))
+        home = settings.state_directory / account.address
+        directory = home / await _name_of(chain)
+        clock = Clock(await chain.block_number())
         network = await stack.enter_async_context(Network(endpoints_of(settings)))
         lighthouse = settings.lighthouse_contract
         channel = await stack.enter_async_context(

@@ -4,27 +4,33 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from mesh.agent.contract import Outcome
+from mesh.agent.figures import AgentFigures
 from mesh.agent.hooks import call
 from mesh.agent.services import offer_services
 from mesh.agent.status_service import StatusService
 from mesh.agent.token_events import TokenEvents
 from mesh.agent.trade import Trader
+from mesh.telemetry.context import of_its_liability
+from mesh.telemetry.log_service import LogService
 from mesh.work.dealings import Dealings
 from mesh.work.executor import Executor
 from mesh.work.lifecycle import Phase
 from mesh.work.listener import Listener
 from mesh.work.outbox import result_identity
+from mesh.work.returning import settle_ended
 from schemas.keys import EventKey, LiabilityEvent
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from mesh.agent.hooks import Handler
     from mesh.agent.parts import Parts
     from mesh.chain import Approval, Transfer
+    from mesh.network import Subscription
+    from mesh.telemetry.families import Family
     from mesh.work.run import Performer
     from schemas import Liability
 
@@ -54,35 +60,55 @@ class Worker:
         self._listener = Listener(
             parts.chain, parts.ledger, parts.signer.address, self, token=parts.settings.erc20_token
         )
-        parts.services.offer("status", StatusService(parts, self.executor, self._listener).status)
+        parts.services.offer("logs", LogService("agent", parts.signer.address).logs)
+        self._status = StatusService(parts, self.executor, self._listener)
+        self._figures = AgentFigures(parts, workshop)
+        parts.services.offer("status", self._status.status)
 
     async def run(self) -> None:
         """Work until cancelled."""
         try:
             async with asyncio.TaskGroup() as tasks:
                 if self.parts.settings.enable_executor:
-                    tasks.create_task(self.executor.run(), name="executor")
+                    tasks.create_task(self._do_jobs(), name="executor")
                 tasks.create_task(self.parts.outbox.run(), name="outbox")
                 tasks.create_task(self._listener.run(), name="listener")
         finally:
             await self.trader.close()
 
+    async def _do_jobs(self) -> None:
+        """Do the jobs; first, those of the last time that ended meanwhile are done with."""
+        await settle_ended(self.parts.chain, self.parts.ledger, self)
+        await self.executor.run()
+
+    async def measure(self, subscriptions: Sequence[Subscription[Any]]) -> tuple[Family, ...]:
+        """The figures of its work, and of what it hears over `subscriptions`."""
+        return await self._figures.measure(subscriptions)
+
+    def health(self) -> Mapping[str, str]:
+        """The state of each of its parts, as `aira status` shows it."""
+        return self._status.parts()
+
+    @of_its_liability
     async def new_liability(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
         """A contract names us: trade it as a promisee, work for it as a promisor (an account may be both)."""
         await self.trader.matched(liability, demand_hash=demand_hash, offer_hash=offer_hash)
         if liability.promisor == self.parts.signer.address and self.parts.settings.enable_executor:
             await self._dealings.accept(liability)
 
+    @of_its_liability
     async def finalized(self, address: str, *, success: bool, result: str) -> None:
         """A contract has ended, perhaps one of ours."""
         await self._dealings.finalized(address, success=success)
         await self.parts.outbox.settle(result_identity(address))  # of no job, but signed for somebody else
         self.trader.finalized(address, Outcome(success=success, result=result))
 
+    @of_its_liability
     async def taken_back(self, address: str) -> None:
         """The end of a contract, perhaps one of ours, did not happen after all."""
         await self._dealings.taken_back(address)
 
+    @of_its_liability
     async def unmade(self, address: str) -> None:
         """A contract, perhaps one of ours, was not made after all."""
         await self._dealings.unmade(address)
@@ -98,7 +124,7 @@ class Worker:
 
     async def new_head(self, block: int) -> None:
         """The chain has grown."""
-        self.parts.clock.head = block
+        self.parts.clock.pass_to(block)
         self.trader.passed(block)
 
     async def _phase(self, phase: Phase, liability: Liability) -> None:

@@ -83,7 +83,7 @@ def _signed_rejection(payload: bytes) -> Rejection | None:
     try:
         rejection = Rejection.decode(payload)
     except InvalidRecord as error:
-        log.info("an unreadable rejection: %s", error)
+        log.debug("an unreadable rejection: %s", error)
         return None
     return rejection if rejection.is_signed else None
 

@@ -7,6 +7,7 @@ import time
 from typing import TYPE_CHECKING
 
 import mesh
+from mesh.network.figures import link_state
 from schemas.status import ALIVE, OFF, Status, StoreUse, Work
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ class StatusService:
             version=mesh.__version__,
             zenoh_id=parts.network.id,
             lighthouse=parts.channel.lighthouse,
-            parts=self._states(),
+            parts=self.parts(),
             head=parts.clock.head,
             chain_id=parts.chain.chain_id,
             xrt=parts.chain.xrt,
@@ -42,7 +43,7 @@ class StatusService:
             work=await self._work(),
         )
 
-    def _states(self) -> dict[str, str]:
+    def parts(self) -> dict[str, str]:
         """Of the four nodes of the legacy stack. The signer has its key in memory, or there is no agent."""
         if not self._parts.settings.enable_executor:
             executor = OFF
@@ -50,7 +51,7 @@ class StatusService:
             executor = ALIVE if self._executor.is_running else "has not begun"
         return {
             "executor": executor,
-            "channel": ALIVE if self._parts.network.connected else "waits for a router",
+            "channel": link_state(self._parts.network),
             "signer": ALIVE,
             "listener": "waits for the node" if self._listener.waits else ALIVE,
         }

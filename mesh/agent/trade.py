@@ -16,6 +16,7 @@ from mesh.agent.rejections import Rejections
 from mesh.chain import NodeUnreachable, RequestRefused
 from mesh.errors import AiraError, ClosedError
 from mesh.market.book import Refusal
+from mesh.telemetry.context import concerning, facts
 from schemas import ZERO_ADDRESS, Demand, Offer, message_hash
 
 if TYPE_CHECKING:
@@ -105,7 +106,8 @@ class Trader:
             try:
                 return await self._contract_of(signed, costs)
             except _Overtaken:
-                log.info("demand %s is signed anew: its nonce was used meanwhile", message_hash(signed).hex())
+                order = message_hash(signed).hex()
+                log.info("demand %s is signed anew: its nonce was used meanwhile", order, extra=facts(order=order))
 
     async def offer(self, terms: Terms, *, lighthouse_fee: int) -> str:
         """Sign and post an offer; returns its hash (hex). It is sent again until it is taken or its deadline passes.
@@ -162,6 +164,8 @@ class Trader:
         ended = self._endings.pop(address, None)
         self._contracts = {demand: made for demand, made in self._contracts.items() if made.address != address}
         if ended is not None and not ended.done():
+            with concerning(address):
+                log.info("it has ended, %s", "paid" if outcome.success else "refunded")
             ended.set_result(outcome)
 
     def passed(self, block: int) -> None:
@@ -220,6 +224,7 @@ class Trader:
             self._endings[liability.address] = self._endings.pop(contract.address)
             contract.liability = liability
         elif matched is not None and not matched.done():
+            log.info("made of the demand %s", demand, extra=facts(order=demand))
             self._contracts[demand] = self._contract(liability)
             matched.set_result(self._contracts[demand])
 
@@ -245,7 +250,7 @@ class Trader:
             self._counted[identity] = counted
             raise
         except AiraError as error:
-            log.warning("the offer %s is given up: %s", identity, error)
+            log.warning("the offer %s is given up: %s", identity, error, extra=facts(order=identity))
         await self._parts.outbox.settle(identity)
 
     def _forget(self, identity: str) -> None:
@@ -259,7 +264,8 @@ class Trader:
         That is known when the chain has been read as far as it went when the nonce was asked for.
         """
         if rejection.reason == Refusal.FULL:
-            log.warning("provider %s has no room for the order %s now", rejection.provider, identity)
+            known = facts(order=identity, reason=rejection.reason)
+            log.warning("provider %s has no room for the order %s now", rejection.provider, identity, extra=known)
             return
         nonce = self._nonces.get(identity)
         overtaken = nonce is not None and nonce < await self._chain.nonce_of(self._address)

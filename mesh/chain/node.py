@@ -15,6 +15,7 @@ from mesh.chain.fees import FeePolicy
 from mesh.chain.journal import Journal
 from mesh.chain.outbox import Outbox
 from mesh.chain.provider import open_provider
+from mesh.chain.tally import Tally
 from mesh.chain.timing import Timing
 from mesh.errors import ClosedError
 
@@ -60,7 +61,8 @@ class Node:
         self.fees = fees or FeePolicy()
         self._journal = journal
         self._chain_folder: Path | None = None
-        self._provider = open_provider(endpoint, self.timing)
+        self.tally = Tally()
+        self._provider = open_provider(endpoint, self.timing, self.tally)
         self._chain_id: int | None = None
         self.web3: AsyncWeb3[Any] = AsyncWeb3(self._provider, middleware=[])
         self._outboxes: dict[str, Outbox] = {}

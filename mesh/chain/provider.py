@@ -16,6 +16,7 @@ from web3.providers.async_base import AsyncBaseProvider
 
 from mesh.chain.errors import NodeUnreachable, RequestRefused, WrongChain
 from mesh.chain.reverts import decode_revert
+from mesh.chain.tally import Tally
 from mesh.chain.transports import HttpTransport, WebSocketTransport
 from mesh.errors import AiraError, ClosedError, ConfigurationError
 
@@ -66,11 +67,12 @@ class ReliableProvider(AsyncBaseProvider):
     passed over later.
     """
 
-    def __init__(self, ways: Sequence[Way], *, timing: Timing) -> None:
+    def __init__(self, ways: Sequence[Way], *, timing: Timing, tally: Tally) -> None:
         super().__init__()
         self.endpoint = ", ".join(way.endpoint for way in ways)
         self._ways = tuple(ways)
         self._timing = timing
+        self._tally = tally
         self._chain_id: object = None
         self._is_open = False
 
@@ -111,7 +113,9 @@ class ReliableProvider(AsyncBaseProvider):
             failures: list[Exception] = []
             for way in self._ways[:1] if method == SEND else self._ways:
                 try:
-                    return _checked(method, await self._ask(way, method, params))
+                    answer = await self._ask(way, method, params)
+                    self._tally.answered()
+                    return _checked(method, answer)
                 except AiraError:
                     raise
                 except CONNECTION_ERRORS as error:
@@ -123,6 +127,7 @@ class ReliableProvider(AsyncBaseProvider):
             log.debug("%s failed (%s); trying again in %.2f s", method, why, delay)
             await asyncio.sleep(delay)
             delay *= 2
+        self._tally.failed()
         raise NodeUnreachable(self.endpoint, why) from failures[-1]
 
     async def _ask(self, way: Way, method: RPCEndpoint, params: Any) -> dict[str, Any]:
@@ -167,17 +172,18 @@ class ReliableProvider(AsyncBaseProvider):
                 await way.owned.close()
 
 
-def open_provider(endpoint: Endpoint, timing: Timing) -> ReliableProvider:
+def open_provider(endpoint: Endpoint, timing: Timing, tally: Tally | None = None) -> ReliableProvider:
     """The provider of an endpoint: `http(s)://…`, `ws(s)://…`, several of them, or a provider object.
 
-    Several are a sequence, or one text with commas. Nothing is connected yet. Raises `ConfigurationError` for any
-    other text.
+    Several are a sequence, or one text with commas. Nothing is connected yet. `tally` counts whether they answer.
+    Raises `ConfigurationError` for any other text.
     """
+    tally = tally or Tally()
     if isinstance(endpoint, AsyncBaseProvider):
-        return ReliableProvider([Way(endpoint, endpoint=str(endpoint))], timing=timing)
+        return ReliableProvider([Way(endpoint, endpoint=str(endpoint))], timing=timing, tally=tally)
     texts = [endpoint] if isinstance(endpoint, str) else endpoint
     urls = [url.strip() for text in texts for url in text.split(",")] or [""]
-    return ReliableProvider([_way(url) for url in urls], timing=timing)
+    return ReliableProvider([_way(url) for url in urls], timing=timing, tally=tally)
 
 
 def _way(url: str) -> Way:

@@ -23,6 +23,7 @@ from mesh.chain.submission import (
     is_waiting_elsewhere,
     submit,
 )
+from mesh.chain.tally import Fate
 from mesh.chain.watching import NumberLost, Watch
 from schemas.address import parse_address
 
@@ -94,10 +95,14 @@ class Sender:
             except NumberLost:
                 log.info("the number %d was another transaction's; sending with the next", entry.nonce)
                 await outbox.forget(entry)
+                self._node.tally.count(Fate.LOST)
                 continue
             finally:
                 outbox.abandon(entry)
-            if receipt["status"] != 1:
+            went_through = receipt["status"] == 1
+            self._node.tally.count(Fate.MINED if went_through else Fate.FAILED)
+            self._node.tally.paid(gas_used=int(receipt["gasUsed"]), wei=_wei(receipt))
+            if not went_through:
                 raise await self._why_failed(entry.fields, receipt)
             return _receipt(signed, receipt)
 
@@ -142,6 +147,9 @@ class Sender:
         except RequestRefused as refused:
             await self._raise_if_poor(fields, refused)
             raise
+        except Reverted:
+            self._node.tally.count(Fate.REFUSED)
+            raise
 
     async def _send_numbered(self, outbox: Outbox, fields: dict[str, Any]) -> Pending:
         """Sign with the next number and send; again where another client was faster."""
@@ -167,6 +175,7 @@ class Sender:
                 outbox.abandon(entry)
                 raise
             else:
+                self._node.tally.count(Fate.SENT)
                 return entry
         raise NodeUnreachable(self._node.endpoint, "other clients of the account take all its numbers")
 

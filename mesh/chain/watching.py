@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 from mesh.chain.errors import RequestRefused, TransactionTimeout
 from mesh.chain.fees import Fees
 from mesh.chain.submission import count_mined, find_receipt, is_known, submit
+from mesh.chain.tally import Fate
 
 if TYPE_CHECKING:
     from web3.types import TxReceipt
@@ -121,6 +122,7 @@ class Watch:
             fields = entry.fields | fees.fields()
             signed = self._account.sign_transaction({**fields, "nonce": entry.nonce})
             await self._outbox.add_version(entry, fields, signed)
+            self._node.tally.count(Fate.REPLACED)
             log.warning("the transaction %s is stuck; replaced by %s with higher fees", stuck.hash, signed.hash)
         await self._send_again(entry)
 

@@ -93,6 +93,8 @@ def _value(service: str, field: msgspec.structs.FieldInfo, given: Any) -> Any:
     if isinstance(given, str):
         if kind is bool and given.lower() in TRUTHS:
             return TRUTHS[given.lower()]
+        if kind is int and given.isascii() and given.isdigit():
+            return int(given)
         if kind is UInt256 and given.isascii() and given.isdigit():
             return given
     if kind not in KINDS or (type(given) is kind and kind is not UInt256):

@@ -4,19 +4,27 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from contextlib import AsyncExitStack, asynccontextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import click
 
 from mesh.background import Background
+from mesh.cli.announcing import announce
 from mesh.cli.options import with_settings
 from mesh.running import run_until_stopped
-from mesh.settings import CHAIN_SETTINGS, NETWORK_SETTINGS
+from mesh.settings import CHAIN_SETTINGS, NETWORK_SETTINGS, SERVER_SETTINGS
+from mesh.telemetry.context import Speaker
+from mesh.telemetry.logs import introduce
+from mesh.telemetry.serving import Telemetry
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import AsyncIterator, Callable
 
-    from mesh.market.provider import Earnings
+    from mesh.chain import Account
+    from mesh.market.provider import Earnings, Provider
+    from mesh.network import Network
     from mesh.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -33,6 +41,7 @@ REPORT: Final = 600.0
     "keyfile_password_file",
     *CHAIN_SETTINGS,
     "open_orders_limit",
+    *SERVER_SETTINGS,
 )
 def command(settings: Settings) -> None:
     """Match the demands and offers of a lighthouse, make their contracts, finalize them. Ctrl-C ends it.
@@ -40,27 +49,49 @@ def command(settings: Settings) -> None:
     The account needs a stake at the lighthouse, and ETH for gas. What it earns and spends is logged every ten minutes
     and at the end.
     """
-    run_until_stopped(lambda: _serve(settings))
+    run_until_stopped(lambda: _serve(settings), settings=settings, role="provider")
 
 
 async def _serve(settings: Settings) -> None:
-    from mesh.agent.parts import chain_of, endpoints_of, load_account
+    from mesh.agent.parts import load_account
+    from mesh.starting import entered, files
+
+    lighthouse = settings.lighthouse_contract
+    async with AsyncExitStack() as stack:
+        telemetry = await stack.enter_async_context(Telemetry(settings.metrics_listen))
+        await files(settings)
+        account = await asyncio.to_thread(load_account, settings)
+        introduce(Speaker("provider", account.address, lighthouse.lower()))
+        make = partial(_opened, settings, account, telemetry)
+        network, provider = await entered(stack, settings, make, role="provider", waits=telemetry.starting)
+        words = f"provider {provider.address} serves {lighthouse}, Zenoh id {network.id}"
+        announce(log, words, provider=provider.address, zenoh=network.id)
+        tasks = await stack.enter_async_context(Background())
+        tasks.start(_report(provider.earnings), "earnings")
+        await provider.run()
+
+
+@asynccontextmanager
+async def _opened(
+    settings: Settings, account: Account, telemetry: Telemetry
+) -> AsyncIterator[tuple[Network, Provider]]:
+    """The provider with all that it needs: a node, contracts, a stake, a router; and with its figures to be seen."""
+    from mesh.agent.parts import chain_of, endpoints_of
+    from mesh.market.process import ProviderProcess
     from mesh.market.provider import Provider
     from mesh.market.standing import check_standing
     from mesh.network import Network
 
     lighthouse = settings.lighthouse_contract
-    account = await asyncio.to_thread(load_account, settings)
     async with chain_of(settings, account) as chain:
         await check_standing(chain, lighthouse)
         async with (
             Network(endpoints_of(settings)) as network,
             Provider(network.session, chain, lighthouse, limit=settings.open_orders_limit) as provider,
-            Background() as tasks,
         ):
-            click.echo(f"provider {provider.address} serves {lighthouse}, Zenoh id {network.id}")
-            tasks.start(_report(provider.earnings), "earnings")
-            await provider.run()
+            process = ProviderProcess(network, chain, [provider])
+            with telemetry.showing(measure=process.measure, health=process.health):
+                yield network, provider
 
 
 async def _report(earnings: Callable[[], Earnings]) -> None:

@@ -9,16 +9,23 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from mesh.cli.announcing import announce
 from mesh.cli.options import with_settings
 from mesh.cli.printing import print_json, print_table, visible, with_json
 from mesh.errors import AiraError, ConfigurationError
 from mesh.running import fail, run_until_stopped
+from mesh.settings import SERVER_SETTINGS
+from mesh.telemetry.serving import Telemetry
 from mesh.trouble import Trouble
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from contextlib import AbstractContextManager
+
     from mesh.identity import Roster
-    from mesh.network import Endpoints
+    from mesh.network import Endpoints, Network
     from mesh.settings import Settings
+    from mesh.telemetry.families import Family
 
 log = logging.getLogger(__name__)
 
@@ -28,7 +35,7 @@ LOOK: Final = 1.0
 
 
 @click.group("router", invoke_without_command=True)
-@with_settings(*SITE)
+@with_settings(*SITE, *SERVER_SETTINGS)
 @click.pass_context
 def command(context: click.Context, settings: Settings) -> None:
     """Run a Zenoh router, the place where agents, providers and people meet. Ctrl-C ends it.
@@ -39,7 +46,7 @@ def command(context: click.Context, settings: Settings) -> None:
     """
     context.obj = settings
     if context.invoked_subcommand is None:
-        run_until_stopped(lambda: _serve(settings))
+        run_until_stopped(lambda: _serve(settings), settings=settings, role="router")
 
 
 @command.command("acl", short_help="say who may do what")
@@ -97,15 +104,29 @@ def config(settings: Settings, out: Path) -> None:
 async def _serve(settings: Settings) -> None:
     from mesh.identity.routers import router_endpoints
     from mesh.network import Network
+    from mesh.starting import files
 
-    endpoints = router_endpoints(settings)
-    while True:
-        certificate = _contents(endpoints)
-        async with Network(endpoints) as network:
-            click.echo(f"router {network.id} listens at {', '.join(settings.listen)}")
-            click.echo(_who_is_let_in(endpoints))
-            endpoints = await _changed(settings, endpoints, certificate)
-        log.info("the roster or the certificate has changed: the router begins anew")
+    async with Telemetry(settings.metrics_listen) as telemetry:
+        await files(settings)
+        endpoints = router_endpoints(settings)
+        while True:
+            certificate = _contents(endpoints)
+            async with Network(endpoints) as network:
+                announce(log, f"router {network.id} listens at {', '.join(settings.listen)}", zenoh=network.id)
+                announce(log, _who_is_let_in(endpoints))
+                with _shown(telemetry, network):
+                    endpoints = await _changed(settings, endpoints, certificate)
+            log.info("the roster or the certificate has changed: the router begins anew")
+
+
+def _shown(telemetry: Telemetry, network: Network) -> AbstractContextManager[None]:
+    """A router's figures and health: that it listens, and who is linked to it."""
+    from mesh.network.figures import link_state, network_families
+
+    async def measure() -> Iterable[Family]:
+        return network_families(network)
+
+    return telemetry.showing(measure=measure, health=lambda: {"router": link_state(network)})
 
 
 async def _changed(settings: Settings, endpoints: Endpoints, certificate: bytes) -> Endpoints:

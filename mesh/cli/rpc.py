@@ -11,12 +11,12 @@ from mesh.cli.amounts import ETH
 from mesh.cli.arguments import request_of, wanted
 from mesh.cli.conditions import spoken
 from mesh.cli.options import with_settings
-from mesh.cli.printing import print_facts, print_json, print_table, visible, with_json
+from mesh.cli.printing import print_facts, print_json, print_table, say, visible, with_json
 from mesh.errors import InputError
 from mesh.running import run_to_end
 from mesh.settings import NETWORK_SETTINGS
 from schemas import Record, parse_address
-from schemas.rpc import GUARDED, SERVICES, Balance, Done, LiabilityRead, Status
+from schemas.rpc import GUARDED, SERVICES, Balance, Done, LiabilityRead, LogsRead, Status
 
 if TYPE_CHECKING:
     from mesh.settings import Settings
@@ -87,6 +87,7 @@ async def _call(
 ) -> None:
     from mesh.agent.parts import endpoints_of
     from mesh.network import Network, ServiceFailed, call
+    from mesh.telemetry.events import human_line
 
     address, service, arguments = parse_address(called[0]), called[1], called[2]
     request = request_of(service, arguments)
@@ -98,7 +99,10 @@ async def _call(
         raise ServiceFailed(service, visible(reply.msg) or "it was not done")
     if isinstance(reply, LiabilityRead) and not reply.read:
         raise InputError(f"{getattr(request, 'address', 'it')} is no job of the agent at {address}")
-    if not as_json:
+    if isinstance(reply, LogsRead) and not as_json:
+        for event in reply.entries:
+            say(human_line(event))
+    elif not as_json:
         print_facts(_balance_of(service, reply) or _spoken(reply) or {service: "done"})
 
 

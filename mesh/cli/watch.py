@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import signal
 from contextlib import AsyncExitStack, asynccontextmanager
 from datetime import UTC, datetime
@@ -16,8 +15,9 @@ from mesh.background import Background
 from mesh.cli.options import with_settings
 from mesh.cli.pipes import until_unread
 from mesh.cli.printing import plural, print_json, say, with_json
-from mesh.running import run_until_stopped, start_log
+from mesh.running import run_until_stopped
 from mesh.settings import NETWORK_SETTINGS
+from mesh.telemetry.logs import start_log
 from schemas import InvalidAddress, parse_address, parse_cid
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def command(settings: Settings, model: str | None, with_open: bool, readings: bo
 
     That a contract was made is what agents say; `aira liability watch` asks the chain.
     """
-    start_log(logging.WARNING)
+    start_log(level="warning")
     run_until_stopped(lambda: _watch(settings, model, with_open=with_open, readings=readings, as_json=as_json))
 
 

@@ -55,6 +55,21 @@ def open_directory(directory: Path) -> tuple[BlockIndex, int]:
     return index, in_use
 
 
+def is_in_use(directory: Path) -> bool:
+    """Whether a store has the directory open, in this process or another."""
+    try:
+        descriptor = os.open(directory / _IN_USE, os.O_RDONLY | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
+
+
 def held_in(directory: Path) -> tuple[str, ...]:
     """The CIDs that files of the directory are named by, sorted."""
     return tuple(sorted(name for name in os.listdir(directory) if is_cid(name)))

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NoReturn
 
 from mesh.background import Background
+from mesh.demo.anvil_state import STATE_SECONDS, keep_state, prepare_state
 from mesh.errors import ConfigurationError, RemoteError
 
 if TYPE_CHECKING:
@@ -31,8 +32,6 @@ KEPT_LINES: Final = 5
 """Lines of what it said last that are shown when it ends by itself."""
 PR_SET_PDEATHSIG: Final = 1
 """From `linux/prctl.h`."""
-STATE_SECONDS: Final = 10
-"""Between two savings of the state: what a power cut costs at most."""
 
 
 class NodeEnded(RemoteError):
@@ -139,13 +138,15 @@ async def serve_anvil(
         if block_time is not None:
             command += ["--block-time", f"{block_time:g}", "--mixed-mining"]
         if state is not None:
-            await asyncio.to_thread(_check_state, state)
+            await asyncio.to_thread(prepare_state, state)
             command += ["--state", str(state), "--state-interval", str(STATE_SECONDS)]
         node = Anvil(program, await _start(program, command), host=host, port=port)
         stack.push_async_callback(node.stop)
         await node.until_ready(facts)
         tasks = await stack.enter_async_context(Background())
         tasks.start(node.watch(), "watch over anvil")
+        if state is not None:
+            tasks.start(keep_state(state), "copies of the chain")
         yield node
 
 
@@ -193,19 +194,3 @@ def _bindable(host: str, port: int) -> int:
         raise ConfigurationError(
             f"can't listen on {host}:{port}: {error.strerror}", hint="another node may run there; choose another port"
         ) from None
-
-
-def _check_state(state: Path) -> None:
-    """Raise `ConfigurationError` for a file that holds no chain, or a folder that is not there."""
-    try:
-        if not state.exists():
-            state.parent.mkdir(parents=True, exist_ok=True)
-            return
-        with state.open("rb") as file:
-            content = json.load(file)
-    except OSError as error:
-        raise ConfigurationError(f"can't keep the chain in {state}: {error.strerror}") from None
-    except ValueError:
-        content = None
-    if not isinstance(content, dict) or "accounts" not in content:
-        raise ConfigurationError(f"{state} holds no chain of anvil", hint="name another file, or remove it")

@@ -10,6 +10,7 @@ from mesh.chain import NodeUnreachable, RequestRefused, Reverted
 from mesh.errors import AiraError, InputError
 from mesh.market.blame import at_fault, word_for
 from mesh.market.patience import Patience, may_pass
+from mesh.telemetry.context import concerning, facts
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -75,7 +76,9 @@ class Contracting:
         else:
             self._books.made(created, fee=offer.message.lighthouse_fee)
             self._used.add(created.liability, demand, offer)
-            log.info("%s: created, gas %d", created.liability, created.gas_used)
+            known = facts(demand=demand.hash.hex(), offer=offer.hash.hex(), gas=created.gas_used)
+            with concerning(created.liability):
+                log.info("created, gas %d", created.gas_used, extra=known)
 
     def _again(
         self,
@@ -104,6 +107,10 @@ class Contracting:
             return False  # the contracts will say so when it is matched
 
     async def _end(self, result: Verified[Result], patience: Patience) -> None:
+        with concerning(result.message.liability):
+            await self._finalize(result, patience)
+
+    async def _finalize(self, result: Verified[Result], patience: Patience) -> None:
         message = result.message
         finalize = partial(self._chain.finalize, self._lighthouse, message)
         try:
@@ -121,7 +128,8 @@ class Contracting:
         else:
             self._books.ended(message.liability, settled)
             self._used.add(message.liability, result)
-            log.info("%s: finalized, success %s, gas %d", message.liability, message.success, settled.gas_used)
+            known = facts(gas=settled.gas_used)
+            log.info("finalized, success %s, gas %d", message.success, settled.gas_used, extra=known)
 
 
 def _reason(error: AiraError) -> str:

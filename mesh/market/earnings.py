@@ -10,6 +10,9 @@ import msgspec
 if TYPE_CHECKING:
     from mesh.chain import Created, Reverted, Settled
 
+REASONS: Final = 64
+"""Reasons of rejections that are told apart at most: a stranger's contract may make up any number of them."""
+OTHER: Final = "Other"
 REMEMBERED: Final = 4096
 """Transactions that can still be taken back; the chain replaces its last blocks only."""
 WN_DIGITS: Final = 9
@@ -41,8 +44,8 @@ class Earnings(msgspec.Struct, frozen=True, kw_only=True):
         )
 
 
-class _Entry(NamedTuple):
-    """What one transaction changed. Named as the fields of `Earnings`."""
+class Entry(NamedTuple):
+    """What one transaction changed, or several together. Named as the fields of `Earnings`."""
 
     created: int = 0
     finalized: int = 0
@@ -52,32 +55,48 @@ class _Entry(NamedTuple):
     minted: int = 0
 
 
+class Turnover(NamedTuple):
+    """All that was ever entered: it only grows. `matches` are the pairs that were to become contracts."""
+
+    matches: int
+    entered: Entry
+    taken_back: Entry
+    """What of it the chain took back again."""
+
+
 class Books:
     """The account of one provider."""
 
     def __init__(self) -> None:
-        self._total = _Entry()
+        self._entered = Entry()
+        self._taken_back = Entry()
+        self._matches = 0
         self._rejected: Counter[str] = Counter()
-        self._made: OrderedDict[str, _Entry] = OrderedDict()
-        self._ended: OrderedDict[str, _Entry] = OrderedDict()
+        self._made: OrderedDict[str, Entry] = OrderedDict()
+        self._ended: OrderedDict[str, Entry] = OrderedDict()
 
     def made(self, created: Created, *, fee: int) -> None:
         """A contract was made, for which its promisor paid `fee` (wn)."""
-        entry = _Entry(created=1, gas_used=created.gas_used, spent=created.wei, fees=fee)
+        entry = Entry(created=1, gas_used=created.gas_used, spent=created.wei, fees=fee)
         self._enter(self._made, created.liability, entry)
 
     def ended(self, liability: str, settled: Settled) -> None:
         """The contract at the address `liability` was finalized."""
-        entry = _Entry(finalized=1, gas_used=settled.gas_used, spent=settled.wei, minted=settled.minted)
+        entry = Entry(finalized=1, gas_used=settled.gas_used, spent=settled.wei, minted=settled.minted)
         self._enter(self._ended, liability, entry)
 
     def failed(self, error: Reverted) -> None:
         """A transaction was refused; it has cost something if it was mined."""
-        self._add(_Entry(gas_used=error.gas_used, spent=error.wei))
+        self._entered = _sum(self._entered, Entry(gas_used=error.gas_used, spent=error.wei))
 
     def rejected(self, reason: str) -> None:
         """A message can't be used, for this reason (a machine-readable word)."""
-        self._rejected[reason] += 1
+        known = reason in self._rejected or len(self._rejected) < REASONS
+        self._rejected[reason if known else OTHER] += 1
+
+    def matched(self) -> None:
+        """A demand and an offer agree."""
+        self._matches += 1
 
     def unmade(self, liability: str) -> None:
         """The chain took back that the contract was made."""
@@ -89,21 +108,26 @@ class Books:
 
     def earnings(self) -> Earnings:
         """The account as it stands."""
-        return Earnings(rejected=dict(self._rejected), **self._total._asdict())
+        total = Entry(*(entered - undone for entered, undone in zip(self._entered, self._taken_back, strict=True)))
+        return Earnings(rejected=dict(self._rejected), **total._asdict())
 
-    def _enter(self, page: OrderedDict[str, _Entry], liability: str, entry: _Entry) -> None:
+    def turnover(self) -> Turnover:
+        """What the account has seen."""
+        return Turnover(self._matches, self._entered, self._taken_back)
+
+    def _enter(self, page: OrderedDict[str, Entry], liability: str, entry: Entry) -> None:
         self._strike(page, liability)
         page[liability] = entry
-        self._add(entry)
+        self._entered = _sum(self._entered, entry)
         if len(page) > REMEMBERED:
             page.popitem(last=False)
 
-    def _strike(self, page: OrderedDict[str, _Entry], liability: str) -> None:
-        entry = page.pop(liability, _Entry())
-        self._add(_Entry(*(-amount for amount in entry)))
+    def _strike(self, page: OrderedDict[str, Entry], liability: str) -> None:
+        self._taken_back = _sum(self._taken_back, page.pop(liability, Entry()))
 
-    def _add(self, entry: _Entry) -> None:
-        self._total = _Entry(*(total + more for total, more in zip(self._total, entry, strict=True)))
+
+def _sum(total: Entry, more: Entry) -> Entry:
+    return Entry(*(one + other for one, other in zip(total, more, strict=True)))
 
 
 def _decimal(amount: int, digits: int) -> str:

@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from contextlib import AsyncExitStack
 from functools import partial
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 from mesh.chain import NotALiability, RequestRefused
-from mesh.errors import ClosedError
 from mesh.market.blame import USED
 from mesh.market.book import LIMIT, Match, OrderBook, Refusal
 from mesh.market.contracting import Contracting
 from mesh.market.earnings import Books, Earnings
+from mesh.market.figures import MarketFigures
 from mesh.market.memory import Memory
 from mesh.market.sending import Sending
 from mesh.market.telling import StatusService
@@ -25,18 +24,22 @@ from mesh.market.used import Used
 from mesh.market.watching import Watching
 from mesh.network.channel import Channel
 from mesh.network.services import Services
+from mesh.role import Role
+from mesh.telemetry.context import Speaker, concerning, facts, speaking
+from mesh.telemetry.log_service import LogService
 from schemas import ZERO_ADDRESS, Demand, Offer, RejectKey, Result, Verified
 from schemas.rejection import Rejection
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-    from types import TracebackType
+    from collections.abc import Callable, Iterable, Mapping
+    from contextlib import AsyncExitStack
 
     import zenoh
 
     from mesh.chain import Chain
     from mesh.market.book import Order
     from mesh.network import Subscription
+    from mesh.telemetry.families import Family
     from schemas import Liability
 
 log = logging.getLogger(__name__)
@@ -44,12 +47,15 @@ log = logging.getLogger(__name__)
 __all__ = ["Earnings", "Provider"]
 
 
-class Provider:
+class Provider(Role):
     """A provider of one lighthouse: `async with Provider(session, chain, lighthouse) as provider`, then `run`.
 
     `lighthouse` is the ENS name; the chain's account must have its stake there. `matched` is told of each pair before
-    its contract is made. Session and chain stay the caller's to close.
+    its contract is made. Session and chain stay the caller's to close. When `run` is cancelled, a transaction that is
+    on its way may still go through.
     """
+
+    title = "provider"
 
     def __init__(
         self,
@@ -70,32 +76,40 @@ class Provider:
         self._limit = limit
         self._matched = matched
         self._books = Books()
-        self._stack: AsyncExitStack | None = None
+        self._speaker = Speaker("provider", self.address, self._lighthouse)
 
-    async def __aenter__(self) -> Self:
+    async def _open(self, stack: AsyncExitStack) -> None:
         market, head = await self._chain.resolve(self._lighthouse), await self._chain.block_number()
         self.book = OrderBook(market, limit=self._limit)
         self.book.expire(head)
         self._prepare(market, head)
-        async with AsyncExitStack() as stack:
-            self.channel = await stack.enter_async_context(
-                Channel(
-                    self._session,
-                    self._lighthouse,
-                    address=market,
-                    resolver=self._chain.resolve,
-                    head=lambda: self._watching.head,
-                )
+        self.channel = await stack.enter_async_context(
+            Channel(
+                self._session,
+                self._lighthouse,
+                address=market,
+                resolver=self._chain.resolve,
+                head=lambda: self._watching.head,
             )
-            self._demands = await stack.enter_async_context(self.channel.subscribe(Demand))
-            self._offers = await stack.enter_async_context(self.channel.subscribe(Offer))
-            self._results = await stack.enter_async_context(self.channel.subscribe(Result))
-            await stack.enter_async_context(Memory(self._session, self._lighthouse, self.book))
-            services = await stack.enter_async_context(Services(self._session, self.address))
+        )
+        self._demands = await stack.enter_async_context(self.channel.subscribe(Demand))
+        self._offers = await stack.enter_async_context(self.channel.subscribe(Offer))
+        self._results = await stack.enter_async_context(self.channel.subscribe(Result))
+        await stack.enter_async_context(Memory(self._session, self._lighthouse, self.book))
+        self._figures = MarketFigures(
+            self.channel,
+            self._chain,
+            subscriptions=(self._demands, self._offers, self._results),
+            book=self.book,
+            books=self._books,
+            sending=self._sending,
+            watching=self._watching,
+        )
+        services = await stack.enter_async_context(Services(self._session, self.address))
+        with speaking(self._speaker):
             services.offer("status", self._telling.status)
-            self.channel.announce("provider", self.address)
-            self._stack = stack.pop_all()
-        return self
+            services.offer("logs", LogService("provider", self.address).logs)
+        self.channel.announce("provider", self.address)
 
     def _prepare(self, market: str, head: int) -> None:
         """What works on the chain, for the lighthouse at the address `market`."""
@@ -122,17 +136,11 @@ class Provider:
             watching=self._watching,
         )
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        stack, self._stack = self._stack, None
-        if stack is not None:
-            await stack.aclose()
+    async def _work(self) -> None:
+        with speaking(self._speaker):
+            await self._serve()
 
-    async def run(self) -> None:
-        """Serve the lighthouse until cancelled. A transaction that is on its way then may still go through."""
-        if self._stack is None:
-            raise ClosedError("the provider is not open", hint="use it inside `async with`")
+    async def _serve(self) -> None:
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._take(self._demands), name="provider demands")
             tasks.create_task(self._take(self._offers), name="provider offers")
@@ -144,6 +152,14 @@ class Provider:
         """What was done, earned and spent so far."""
         return self._books.earnings()
 
+    async def measure(self) -> Iterable[Family]:
+        """Its figures, with its lighthouse as a label; those of its chain and its session are not among them."""
+        return await self._figures.measure()
+
+    def health(self) -> Mapping[str, str]:
+        """The state of each of its parts, as `aira status` shows it."""
+        return self._telling.parts()
+
     def put_back(self, order: Verified[Order]) -> None:
         """Take an order into the market again that was matched before."""
         self._add(order)
@@ -152,7 +168,8 @@ class Provider:
         """Tell the sender why. That an order was used already is no news to whom it made a contract."""
         self._books.rejected(reason)
         order = message.hash.hex()
-        log.warning("rejected %s of %s: %s", order, message.signer, detail)
+        known = facts(order=order, signer=message.signer, reason=reason)
+        log.warning("rejected %s of %s: %s", order, message.signer, detail, extra=known)
         if reason != USED:
             rejection = Rejection(order=order, reason=reason, detail=detail, provider=self.address)
             key = str(RejectKey(self._lighthouse, order, self.address))
@@ -173,7 +190,9 @@ class Provider:
         """Take an order into the book, or to the chain with its counterpart; or say why not."""
         outcome = self.book.add(order)
         if isinstance(outcome, Match):
-            log.info("matched demand %s and offer %s", outcome.demand.hash.hex(), outcome.offer.hash.hex())
+            demand, offer = outcome.demand.hash.hex(), outcome.offer.hash.hex()
+            log.info("matched demand %s and offer %s", demand, offer, extra=facts(demand=demand, offer=offer))
+            self._books.matched()
             self._matched(outcome)
             self._contracting.make(outcome)
         elif isinstance(outcome, Refusal):
@@ -185,19 +204,23 @@ class Provider:
     async def _take_results(self) -> None:
         async for result in self._results:
             await self._sending.room()
-            liability = await self._sending.ask(partial(self._liability, result.message.liability))
-            if liability is None:
-                # An answer without a contract; or the node has not heard of the contract yet.
-                self._results.forget(result)
-            elif result.signer != liability.promisor and liability.validator == ZERO_ADDRESS:
-                self.reject(result, "WrongSigner", f"signed by {result.signer}, not by the promisor")
-            elif not liability.is_finalized:
-                self._contracting.end(result)
+            with concerning(result.message.liability):
+                await self._take_result(result)
+
+    async def _take_result(self, result: Verified[Result]) -> None:
+        liability = await self._sending.ask(partial(self._liability, result.message.liability))
+        if liability is None:
+            # An answer without a contract; or the node has not heard of the contract yet.
+            self._results.forget(result)
+        elif result.signer != liability.promisor and liability.validator == ZERO_ADDRESS:
+            self.reject(result, "WrongSigner", f"signed by {result.signer}, not by the promisor")
+        elif not liability.is_finalized:
+            self._contracting.end(result)
 
     async def _liability(self, address: str) -> Liability | None:
         """The record of a liability; None for another address."""
         try:
             return await self._watching.liability(address)
         except (NotALiability, RequestRefused) as error:
-            log.info("a Result waits to be sent again: %s", error)
+            log.debug("a Result waits to be sent again: %s", error)
             return None

@@ -60,6 +60,11 @@ class Sending:
         """In a few words what transactions wait for that is not a turn or a block; empty when they go through."""
         return "wait for the node" if self._silence.stands else "wait" if self._trouble.stands else ""
 
+    @property
+    def waiting(self) -> int:
+        """Pieces of work that wait for their turn, or to be tried again."""
+        return self._work.qsize() + self._later
+
     def put_later(self, work: Work, *, after: float, because: AiraError) -> bool:
         """Do the piece of work that runs now again, as `work`, in `after` seconds; others go through meanwhile.
 

@@ -52,7 +52,7 @@ class StatusService:
             version=mesh.__version__,
             zenoh_id=str(self._session.zid()),
             lighthouse=self._lighthouse,
-            parts=self._states(),
+            parts=self.parts(),
             head=self._watching.head,
             chain_id=self._chain.chain_id,
             xrt=self._chain.xrt,
@@ -69,7 +69,8 @@ class StatusService:
             ),
         )
 
-    def _states(self) -> dict[str, str]:
+    def parts(self) -> dict[str, str]:
+        """The state of each part: that its transactions go through, and that it reads the chain."""
         return {
             "transactions": self._sending.waits_for or ALIVE,
             "listener": "waits for the node" if self._watching.waits else ALIVE,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from contextlib import aclosing
 from typing import TYPE_CHECKING, Final
 
@@ -18,6 +19,7 @@ from mesh.chain import (
     RequestRefused,
 )
 from mesh.market.sending import RETRY
+from mesh.telemetry.context import concerning, facts
 from mesh.trouble import Trouble
 from schemas import Demand, Offer, Result, address_bytes
 
@@ -52,6 +54,8 @@ class Watching:
     ) -> None:
         self.head = head
         """The latest block that was read."""
+        self.read_at = time.monotonic()
+        """When that was, on the monotonic clock."""
         self._chain = chain
         self._lighthouse = lighthouse
         self._desk = desk
@@ -95,9 +99,10 @@ class Watching:
                 await self._forget_orders(event.liability)
             elif isinstance(event, Finalized):
                 self._open.pop(event.liability, None)
-        self.head = block.block_number
+        self.head, self.read_at = block.block_number, time.monotonic()
         for order in self._book.expire(self.head):
-            log.info("expired order %s of %s", order.hash.hex(), order.signer)
+            known = facts(order=order.hash.hex(), signer=order.signer)
+            log.info("expired order %s of %s", order.hash.hex(), order.signer, extra=known)
 
     async def _forget_orders(self, address: str) -> None:
         liability = await self._chain.liability(address)
@@ -119,6 +124,8 @@ class Watching:
         finalized = [event.liability for event in block.events_taken_back if isinstance(event, Finalized)]
         log.warning("the chain took back %d contracts and %d endings", len(created), len(finalized))
         for address in created:
+            with concerning(address):
+                log.warning("the chain took the contract back")
             self._open.pop(address, None)
             self._books.unmade(address)
             for order in self._used.pop(address, Demand, Offer):

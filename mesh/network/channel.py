@@ -148,7 +148,7 @@ def _presence_keys(texts: list[str]) -> Iterator[PresenceKey]:
         try:
             key = parse_key(text)
         except InvalidKey as error:
-            log.info("a presence token is left out: %s", error)
+            log.debug("a presence token is left out: %s", error)
             continue
         if isinstance(key, PresenceKey):
             yield key

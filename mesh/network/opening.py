@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import threading
 import time
@@ -12,9 +13,12 @@ import zenoh
 from mesh.errors import ClosedError, ConfigurationError, NetworkUnavailable
 from mesh.network.endpoints import ATTEMPT
 from mesh.network.errors import NotAdmitted
+from mesh.trouble import Trouble
 
 if TYPE_CHECKING:
     from mesh.network.endpoints import Endpoints
+
+log = logging.getLogger(__name__)
 
 PAUSE: Final = 0.2
 """Seconds between two attempts."""
@@ -30,27 +34,27 @@ class Opening:
         self._lock = threading.Lock()
         self._session: zenoh.Session | None = None
         self._abandoned = threading.Event()
+        self._trouble = Trouble(log)
 
     def run(self) -> zenoh.Session:
         """The open session.
 
         Raises `NetworkUnavailable` when no router answers in the endpoints' time, `NotAdmitted` when each that there
         is keeps this identity out, `ConfigurationError` when it can't listen, `ClosedError` when it was abandoned.
+        Of who waits for ever the log tells once that it waits.
         """
-        timeout = self._endpoints.timeout
-        ends = time.monotonic() + timeout if timeout >= 0 else float("inf")
+        ends = time.monotonic() + self._endpoints.timeout
         while True:
             try:
                 session = zenoh.open(self._endpoints.config())
             except zenoh.ZError as error:
                 if self._endpoints.mode == "router":
                     raise self._not_listening(error) from None
-                self._check_admitted()
-                if time.monotonic() + PAUSE >= ends:
-                    raise NetworkUnavailable(self._endpoints.connect, f"no answer within {timeout:g} s") from None
+                self._check_patience(ends)
                 self._abandoned.wait(PAUSE)
                 session = None
             if (opened := self._wanted(session)) is not None:
+                self._trouble.over("a router answers")
                 return opened
 
     def abandon(self) -> None:
@@ -69,6 +73,15 @@ class Opening:
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]
         raise ClosedError("the opening of the network session was abandoned")
+
+    def _check_patience(self, ends: float) -> None:
+        """After an attempt without an answer: raise if there is to be no other one after `ends`, seconds."""
+        self._check_admitted()
+        timeout, routers = self._endpoints.timeout, self._endpoints.connect
+        if timeout < 0:
+            self._trouble.met(NetworkUnavailable(routers, "no answer yet"), "waiting for a router")
+        elif time.monotonic() + PAUSE >= ends:
+            raise NetworkUnavailable(routers, f"no answer within {timeout:g} s") from None
 
     def _check_admitted(self) -> None:
         """Waiting does not help who is not let in anywhere."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import difflib
 import logging
+from contextvars import copy_context
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -92,10 +93,10 @@ class Services:
         if not self._open:
             raise ClosedError("the services are not open", hint="use them inside `async with`")
         loop, request_type = asyncio.get_running_loop(), _service(service).request
-        key = str(RpcKey(self._address, service))
+        key, context = str(RpcKey(self._address, service)), copy_context()
 
         def asked(query: zenoh.Query) -> None:
-            call_in_loop(loop, self._answer_soon, query, key, request_type, handler)
+            call_in_loop(loop, self._answer_soon, query, key, request_type, handler, context=context)
 
         self._queryables.append(self._session.declare_queryable(key, asked))
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from contextvars import copy_context
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Self
 
@@ -48,6 +49,8 @@ class Network:
         self._session: zenoh.Session | None = None
         self._watchers: set[asyncio.Queue[NetworkChange]] = set()
         self._linked: set[str] = set()
+        self.losses = 0
+        """How often the network was lost since the session was made."""
         self._listener: Any = None
 
     @property
@@ -66,6 +69,11 @@ class Network:
     def connected(self) -> bool:
         """Whether a router is reachable now (a router itself always is, as long as it is open)."""
         return self._session is not None and (self._endpoints.mode == "router" or bool(self._linked))
+
+    @property
+    def links(self) -> int:
+        """To how many others the session is linked: routers, or for a router its clients as well."""
+        return len(self._linked)
 
     async def __aenter__(self) -> Self:
         if self._session is not None:
@@ -90,9 +98,9 @@ class Network:
 
     def _watch(self, session: zenoh.Session) -> None:
         """Follow the links. Those of now are read once the listener is there, so that none is missed in between."""
-        loop = asyncio.get_running_loop()
+        loop, context = asyncio.get_running_loop(), copy_context()
         self._listener = session.info.declare_transport_events_listener(
-            lambda event: call_in_loop(loop, self._transport_changed, event), history=True
+            lambda event: call_in_loop(loop, self._transport_changed, event, context=context), history=True
         )
         self._linked = {str(zid) for zid in session.info.routers_zid()}
 
@@ -105,7 +113,9 @@ class Network:
         if self.connected == before:
             return
         change = NetworkChange.REGAINED if self.connected else NetworkChange.LOST
-        log.info("network %s", change.value)
+        self.losses += change is NetworkChange.LOST
+        # No warning: commands say it in their own words.
+        log.info("a router is there again" if self.connected else "the router is gone; waiting for it")
         for queue in self._watchers:
             queue.put_nowait(change)
 

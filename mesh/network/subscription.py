@@ -100,6 +100,11 @@ class Subscription(Generic[M]):
         while samples and not asking.is_cancelled:
             self._pump.feed(samples.popleft())
 
+    @property
+    def kind(self) -> str:
+        """What comes: `demand`, `offer` or `result`."""
+        return self._door.kind.__name__.lower()
+
     def forget(self, verified: Verified[M]) -> None:
         """Let a message arrive once more when it is sent again: what had to be done with it can't be done yet."""
         self._door.forget(verified)
@@ -124,6 +129,6 @@ class Subscription(Generic[M]):
             addresses = {name: await self._resolver(name) for name in names_in(unresolved.message)}
             return self._door.resolved(unresolved, addresses)
         except AiraError as error:
-            log.info("a message names what can't be resolved: %s", error)
+            log.debug("a message names what can't be resolved: %s", error)
             self._door.refuse("name")
             return None

@@ -42,6 +42,7 @@ class Statistics(msgspec.Struct, frozen=True, kw_only=True):
     """What came through one door so far. `invalid` counts by reason; `dropped` fell out unseen, oldest first."""
 
     received: int
+    accepted: int
     invalid: Mapping[str, int]
     duplicate: int
     dropped: int
@@ -57,7 +58,7 @@ class Door(Generic[M]):
     """
 
     def __init__(self, kind: type[M], *, lighthouse: str, address: str | None, head: Callable[[], int]) -> None:
-        self._kind: type[M] = kind
+        self.kind: type[M] = kind
         self._lighthouse = lighthouse
         self._address = address
         self._head = head
@@ -65,6 +66,7 @@ class Door(Generic[M]):
         self._passed: OrderedDict[tuple[str, str], None] = OrderedDict()
         self._invalid: Counter[str] = Counter()
         self._duplicate = 0
+        self._accepted = 0
 
     def __call__(self, sample: zenoh.Sample) -> Verified[M] | Unresolved[M] | None:
         """What a Zenoh sample holds, if it may pass."""
@@ -74,8 +76,8 @@ class Door(Generic[M]):
         """The message of `payload`, verified; or unresolved; or None, counted under its reason."""
         try:
             message = decode(payload)
-            if not isinstance(message, self._kind):
-                raise InvalidMessage("kind", f"a {type(message).__name__} on a key of {self._kind.__name__}")
+            if not isinstance(message, self.kind):
+                raise InvalidMessage("kind", f"a {type(message).__name__} on a key of {self.kind.__name__}")
             if (key, message.signature) in self._passed:
                 self._count_duplicate()
                 return None
@@ -106,7 +108,11 @@ class Door(Generic[M]):
         """What passed through this door, given what came to it and what was lost before."""
         with self._lock:
             return Statistics(
-                received=received, invalid=dict(self._invalid), duplicate=self._duplicate, dropped=dropped
+                received=received,
+                accepted=self._accepted,
+                invalid=dict(self._invalid),
+                duplicate=self._duplicate,
+                dropped=dropped,
             )
 
     def _verified(self, message: M, key: str) -> Verified[M] | None:
@@ -140,4 +146,5 @@ class Door(Generic[M]):
             if len(self._passed) >= REMEMBERED:
                 self._passed.popitem(last=False)
             self._passed[key, message.signature] = None
+            self._accepted += 1
         return True

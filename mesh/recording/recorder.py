@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from contextvars import copy_context
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final, Self
 
@@ -73,6 +74,18 @@ class RecordingSummary:
     size: int
 
 
+@dataclass(frozen=True, kw_only=True)
+class RecorderStatistics:
+    """What a recorder, or several, have done so far: messages in the file, and messages dropped.
+
+    `lag` is for how many seconds the message that waits longest has waited to be written.
+    """
+
+    recorded: int
+    lost: int
+    lag: float
+
+
 _SETTINGS: Final = RecorderSettings()
 
 
@@ -97,13 +110,17 @@ class Recorder:
         self._closing = False
         self._closed = threading.Event()
         self._lost = 0
+        self._recorded = 0
+        self._since = self._taken_since = 0.0
         self._failure: Exception | None = None
         self._summary: RecordingSummary | None = None
         try:
             self._file = PartialFile(path)
         except OSError as error:
             raise RecordingFailed(path, error.strerror or str(error)) from error
-        self._thread = threading.Thread(target=self._run, name=f"aira-recorder-{path.stem[-8:]}", daemon=True)
+        self._thread = threading.Thread(
+            target=copy_context().run, args=(self._run,), name=f"aira-recorder-{path.stem[-8:]}", daemon=True
+        )
         self._thread.start()
 
     def __enter__(self) -> Self:
@@ -118,6 +135,18 @@ class Recorder:
     def lost(self) -> int:
         """Messages dropped so far, because too much was waiting or the disk refused it."""
         return self._lost
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the file is written, or given up: nothing is counted any more."""
+        return self._summary is not None or self._failure is not None
+
+    def statistics(self) -> RecorderStatistics:
+        """What it has done so far; from any thread."""
+        with self._lock:
+            now = time.monotonic()
+            since = self._taken_since if self._taken else self._since if self._queue else now
+            return RecorderStatistics(recorded=self._recorded, lost=self._lost, lag=now - since)
 
     def record(
         self,
@@ -152,6 +181,8 @@ class Recorder:
                 self._lost += 1
                 return
             first = not self._queue
+            if first:
+                self._since = time.monotonic()
             self._queue.append((topic, payload, type, role, log_time, publish_time))
             self._queued += cost
         if first:
@@ -209,15 +240,16 @@ class Recorder:
         with self._lock:
             self._queued -= sum([len(message[1]) for message in messages]) + _COST * len(messages)
             self._lost += len(refused)
+            self._recorded += len(messages) - len(refused)
         self._taken -= len(messages)
         for error in refused:
-            log.warning("%s: a message is lost: %s", self.path.name, error)
+            log.warning("a message is lost for %s: %s", self.path.name, error)
 
     def _take(self) -> list[Message]:
         """All that waits; it counts as waiting until it is written."""
         with self._lock:
             batch, self._queue = self._queue, []
-        self._taken = len(batch)
+            self._taken, self._taken_since = len(batch), self._since
         return batch
 
     def _check(self, topic: str, payload: bytes, log_time: int, publish_time: int) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
 Kind = Literal["counter", "gauge"]
 """Counters only grow while a process runs; gauges go up and down."""
@@ -45,3 +45,25 @@ def gauge(name: str, meaning: str, value: float) -> Family:
 def by_label(name: str, kind: Kind, meaning: str, label: str, values: Mapping[str, float]) -> Family:
     """A family with one label: a figure for each of its values."""
     return Family(name, kind, meaning, tuple(Sample(value, {label: key}) for key, value in values.items()))
+
+
+def labelled(families: Iterable[Family], **labels: str) -> tuple[Family, ...]:
+    """The same figures with further labels, such as the lighthouse that all of them are of."""
+    return tuple(
+        family._replace(samples=tuple(Sample(sample.value, {**labels, **sample.labels}) for sample in family.samples))
+        for family in families
+    )
+
+
+def merged(families: Iterable[Family]) -> tuple[Family, ...]:
+    """Each name once, with the samples of all families of that name: several roles of one process have the same.
+
+    Raises `ValueError` where two of one name mean different things.
+    """
+    found: dict[str, Family] = {}
+    for family in families:
+        known = found.setdefault(family.name, family._replace(samples=()))
+        if (known.kind, known.meaning) != (family.kind, family.meaning):
+            raise ValueError(f"two families named {family.name}")
+        found[family.name] = known._replace(samples=known.samples + family.samples)
+    return tuple(found.values())

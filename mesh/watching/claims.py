@@ -42,14 +42,18 @@ class Reader(Generic[C]):
         self._reason = reason
         self._lock = threading.Lock()
         self._refused: Counter[str] = Counter()
+        self._accepted = 0
 
     def __call__(self, sample: zenoh.Sample) -> C | None:
         """The claim in a sample; None for one that is refused."""
         try:
-            return self._read(str(sample.key_expr), sample.payload.to_bytes())
+            claim = self._read(str(sample.key_expr), sample.payload.to_bytes())
         except AiraError:
             self.refuse()
             return None
+        with self._lock:
+            self._accepted += 1
+        return claim
 
     def refuse(self) -> None:
         """Count one that is not believed."""
@@ -59,7 +63,8 @@ class Reader(Generic[C]):
     def statistics(self, *, received: int, dropped: int) -> Statistics:
         """What was read, given what came and what was lost before."""
         with self._lock:
-            return Statistics(received=received, invalid=dict(self._refused), duplicate=0, dropped=dropped)
+            refused = dict(self._refused)
+            return Statistics(received=received, accepted=self._accepted, invalid=refused, duplicate=0, dropped=dropped)
 
 
 def read_rejection(key: str, payload: bytes) -> Rejection:

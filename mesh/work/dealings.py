@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from mesh.telemetry.context import facts
 from mesh.work.lifecycle import Phase, advance
 from mesh.work.outbox import result_identity
 
@@ -42,7 +43,8 @@ class Dealings:
             await self._shop.owe_result(address, success=bool(job.success), result=job.result, note=job.note)
             await self._shop.outbox.send()
             return
-        log.info("%s: incoming, model %s, objective %s", address, liability.model, liability.objective)
+        known = facts(model=liability.model, objective=liability.objective, cost=liability.cost)
+        log.info("incoming, model %s, objective %s", liability.model, liability.objective, extra=known)
         await self._witness(Phase.INCOMING, liability)
         self._executor.prepare(liability)
 
@@ -54,7 +56,7 @@ class Dealings:
             # In this order: after a crash between the two, the same block is handled again and finds the job unended.
             await self._shop.outbox.settle(result_identity(address))
             await self._shop.ledger.set_phase(address, advance(address, job.phase, Phase.FINALIZED))
-        log.info("%s: finalized, %s", address, "paid" if success else "refunded")
+        log.info("finalized, %s", "paid" if success else "refunded")
         ended = msgspec.structs.replace(job.liability, is_finalized=True, is_success=success, result=job.result or "")
         await self._witness(Phase.FINALIZED, ended)
 
@@ -67,7 +69,7 @@ class Dealings:
             if job is None or job.phase is not Phase.FINALIZED or job.result is None:
                 return
             await self._shop.owe_result(address, success=bool(job.success), result=job.result, note=job.note)
-        log.warning("%s: the chain took back its end; the Result is sent again", address)
+        log.warning("the chain took back its end; the Result is sent again")
         await self._shop.outbox.send()
 
     async def unmade(self, address: str) -> None:
@@ -77,4 +79,4 @@ class Dealings:
                 return
             await self._shop.ledger.set_aside(address)
             await self._shop.outbox.settle(result_identity(address))
-        log.warning("%s: the chain took the contract back; its job rests", address)
+        log.warning("the chain took the contract back; its job rests")

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from mesh.errors import AiraError, ClosedError, ContentError, InputError
+from mesh.telemetry.context import concerning, of_its_liability
 from mesh.work.ledger import Job, LedgerUnusable
 from mesh.work.lifecycle import Phase, WrongPhase, advance
 from mesh.work.objectives import Objectives
@@ -104,6 +105,7 @@ class Executor:
             if job is not None:
                 await self._shop.unpin(address)
 
+    @of_its_liability
     async def start(self, address: str) -> None:
         """Play the objective of a ready job. Returns when the playback has begun. Raises `WrongPhase`."""
         await self._objective_at_hand(address)
@@ -113,6 +115,7 @@ class Executor:
                 raise WrongPhase(address, asked="start", phase=job.phase)
             await self._begin(job, 0)
 
+    @of_its_liability
     async def restart(self, address: str) -> None:
         """Begin a running or ready job anew: a fresh recording, the objective from its first message."""
         await self._objective_at_hand(address)
@@ -124,6 +127,7 @@ class Executor:
             await asyncio.to_thread(self._shop.discard_recording, address)
             await self._begin(job, 0)
 
+    @of_its_liability
     async def resume(self, address: str) -> None:
         """Go on with an interrupted job at the position in the ledger, adding to its recording."""
         await self._objective_at_hand(address)
@@ -143,6 +147,7 @@ class Executor:
             is_finalized=job.phase is Phase.FINALIZED,
         )
 
+    @of_its_liability
     async def finish(self, address: str, *, success: bool, note: str = "") -> str:
         """End a job: close the recording, keep it under its CID, sign and send the Result. Returns the CID.
 
@@ -159,7 +164,7 @@ class Executor:
             await self._shop.owe_result(address, success=success, result=cid, note=note)
             await asyncio.to_thread(summary.path.unlink, missing_ok=True)
             self._objectives.forget(address)
-        log.info("%s: complete, success %s, result %s, %d messages", address, success, cid, summary.messages)
+        log.info("complete, success %s, result %s, %d messages", success, cid, summary.messages)
         await self._witness(Phase.COMPLETE, msgspec.structs.replace(job.liability, result=cid, is_success=success))
         await self._shop.outbox.send()
         return cid
@@ -183,13 +188,14 @@ class Executor:
         if job is not None and job.phase in STARTED:
             await self._objectives.wait(address)
 
+    @of_its_liability
     async def _prepare(self, liability: Liability) -> None:
         address = liability.address
         try:
             await self._shop.pin(liability.objective, address)
             objective = await self._objectives.examine(liability.objective)
         except (ContentError, InputError) as error:
-            log.warning("%s: refused: %s", address, error)
+            log.warning("refused: %s", error)
             await self._unless_ended(self.finish(address, success=False, note=str(error)))
             return
         async with self._changing:
@@ -200,7 +206,7 @@ class Executor:
                 await self._shop.ledger.set_phase(address, Phase.READY)
             self._objectives.keep(address, objective)
         if job.phase is Phase.INCOMING:
-            log.info("%s: ready, %d messages to play", address, objective.count)
+            log.info("ready, %d messages to play", objective.count)
             await self._witness(Phase.READY, liability)
         self._ready.put_nowait(address)
 
@@ -208,7 +214,8 @@ class Executor:
         while True:
             address = await self._ready.get()
             if self._performer is not None:
-                await self._unless_ended(self._serve(address))
+                with concerning(address):
+                    await self._unless_ended(self._serve(address))
 
     async def _serve(self, address: str) -> None:
         """Start or resume a job whose code is ours, and wait for its end; it may be restarted in between."""
@@ -230,7 +237,7 @@ class Executor:
         run = self._runs[address] = await self._shop.new_run(job.liability, objective=objective, position=position)
         await self._shop.ledger.set_phase(address, Phase.RUNNING, position=position)
         run.open()
-        log.info("%s: running, from message %d of %d", address, position, objective.count)
+        log.info("running, from message %d of %d", position, objective.count)
         self._plays[address] = tasks.create_task(self._play(run), name=f"play {address}")
 
     async def _play(self, run: Run) -> None:
@@ -252,7 +259,7 @@ class Executor:
             raise
         except Exception as error:
             success, note = False, str(error) or type(error).__name__
-            log.warning("%s: the job failed: %s", address, note, exc_info=not isinstance(error, AiraError))
+            log.warning("the job failed: %s", note, exc_info=not isinstance(error, AiraError))
         await self._shop.ledger.set_position(address, run.position)
         if self._performer is not None or not success:
             await self._unless_ended(self.finish(address, success=success, note=note))
@@ -260,10 +267,11 @@ class Executor:
     async def _suspend(self) -> None:
         """Leave the running jobs as another run of the agent can go on with them."""
         for address in tuple(self._runs):
-            try:
-                await self._put_away(address)
-            except AiraError as error:
-                log.error("%s: %s", address, error)
+            with concerning(address):
+                try:
+                    await self._put_away(address)
+                except AiraError as error:
+                    log.error("how far it has come is not written down: %s", error)
 
     async def _abandon(self, address: str) -> None:
         """Stop whatever runs for a job, keeping its files."""

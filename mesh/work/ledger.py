@@ -184,8 +184,11 @@ class Ledger:
 
     async def jobs_by_phase(self) -> dict[str, int]:
         """How many jobs there are in each phase that has any."""
-        rows = await self._rows("SELECT phase, COUNT(*) FROM jobs WHERE NOT aside GROUP BY phase")
-        return dict(rows)
+        return {phase: count for phase, count, _ in await self.standing()}
+
+    async def standing(self) -> list[tuple[str, int, float]]:
+        """Each phase that has any jobs: how many, and since when (Unix time) the one that came first stands there."""
+        return await self._rows("SELECT phase, COUNT(*), MIN(changed) FROM jobs WHERE NOT aside GROUP BY phase")
 
     async def post(self, outgoing: Outgoing) -> None:
         """Keep a signed message for sending until `settle`."""
@@ -224,7 +227,11 @@ class Ledger:
 
     async def waiting(self) -> int:
         """How many messages are in the outbox."""
-        return int((await self._rows("SELECT COUNT(*) FROM outbox"))[0][0])
+        return sum((await self.waiting_by_kind()).values())
+
+    async def waiting_by_kind(self) -> dict[str, int]:
+        """The same for each kind that is there: `demand`, `offer`, `result`."""
+        return dict(await self._rows("SELECT kind, COUNT(*) FROM outbox GROUP BY kind"))
 
     async def cursor(self, name: str) -> int | None:
         """The last block handled by `name`; None when there was none."""

@@ -19,6 +19,7 @@ from mesh.chain import (
     RequestRefused,
     Transfer,
 )
+from mesh.telemetry.context import concerning
 from mesh.trouble import Trouble
 
 if TYPE_CHECKING:
@@ -130,7 +131,8 @@ class Listener:
         try:
             liability = await self._chain.liability(event.liability)
         except NotALiability as error:
-            log.warning("a reorganisation was quicker: %s", error)
+            with concerning(event.liability):
+                log.warning("a reorganisation was quicker: %s", error)
             return
         if self._account in (liability.promisor, liability.promisee):
             demand_hash, offer_hash = await self._chain.order_hashes(event.liability)

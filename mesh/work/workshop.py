@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import mesh
 from mesh.errors import InputError
 from mesh.recording import AtOnce, Limits, RecordedTimes, Recorder, RecordingAbout, preflight
+from mesh.recording.recorders import Recorders
 from mesh.settings import LONGEST
 from mesh.work.lifecycle import Phase
 from mesh.work.outbox import outgoing
@@ -53,6 +54,7 @@ class Workshop:
     exchange: Exchange
     settings: Settings
     recordings: Path
+    recorders: Recorders = field(default_factory=Recorders)
 
     async def pin(self, cid: str, address: str) -> None:
         """Let the store keep a file, which need not be there yet, for the liability at `address` until `unpin`."""
@@ -131,7 +133,7 @@ class Workshop:
             software=f"aira-mesh {mesh.__version__}",
             topics=",".join(sorted(self._chosen_topics())),
         )
-        return Recorder(finished, about)
+        return self.recorders.open(finished, about)
 
     def _recording_files(self, address: str) -> tuple[Path, Path, Path]:
         """Where the recording is when it is whole, while it is being made, and while it is gone on with."""

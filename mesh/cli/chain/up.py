@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from mesh.cli.announcing import announce
 from mesh.cli.engine import chosen, with_engine
 from mesh.cli.options import BLOCK_TIME, PORT, with_settings
-from mesh.cli.printing import print_json, say, with_json
+from mesh.cli.printing import print_json, with_json
 from mesh.running import run_until_stopped
+from mesh.settings import SERVER_SETTINGS
+from mesh.telemetry.serving import Telemetry
 
 if TYPE_CHECKING:
     from mesh.settings import Settings
+
+log = logging.getLogger(__name__)
 
 
 @click.command("up")
@@ -22,7 +28,7 @@ if TYPE_CHECKING:
 @click.option("--block-time", type=BLOCK_TIME, help="also mine an empty block every so many seconds")
 @with_engine
 @with_json
-@with_settings("data_dir")
+@with_settings("data_dir", *SERVER_SETTINGS)
 def command(settings: Settings, host: str, port: int, block_time: float | None, as_json: bool, **engine: Any) -> None:
     """Serve a chain with the contracts on it, as JSON-RPC over HTTP and WebSocket.
 
@@ -36,13 +42,29 @@ def command(settings: Settings, host: str, port: int, block_time: float | None, 
         from mesh.demo.development import serve_chain
 
         program = chosen(**engine)
-        async with serve_chain(
-            settings, host=host, port=port, block_time=block_time, anvil=program, state=engine["state"]
-        ) as served:
+        async with (
+            Telemetry(settings.metrics_listen) as telemetry,
+            serve_chain(
+                settings, host=host, port=port, block_time=block_time, anvil=program, state=engine["state"]
+            ) as served,
+        ):
             if as_json:
                 print_json(served.facts())
             else:
-                say(served.describe())
-            await asyncio.Event().wait()
+                announce(log, served.describe(), **served.facts())
+            await _tell(served.url, telemetry)
 
-    run_until_stopped(serve)
+    run_until_stopped(serve, settings=settings, role="chain")
+
+
+async def _tell(url: str, telemetry: Telemetry) -> None:
+    """Tell how the chain at `url` is, if anybody is to be told, until cancelled."""
+    from mesh.chain import Node
+    from mesh.demo.looking import Look
+
+    if not telemetry.url:
+        await asyncio.Event().wait()
+    async with Node(url) as node:
+        look = Look(node)
+        with telemetry.showing(measure=look.measure, health=look.health):
+            await look.run()

@@ -1,0 +1,134 @@
+"""`aira logs`: the log of an agent, a provider, a bridge or a device, from elsewhere."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from mesh.cli.options import with_settings
+from mesh.cli.pipes import until_unread
+from mesh.cli.printing import plural, say, visible, with_json
+from mesh.errors import RemoteError
+from mesh.running import run_to_end
+from mesh.settings import NETWORK_SETTINGS
+from schemas import parse_address
+from schemas.keys import DeviceTopicKey, RpcKey
+from schemas.logs import LEVELS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from mesh.settings import Settings
+    from mesh.watching.logs import LogReader, Look
+    from schemas.logs import LogEvent
+
+PAUSE: Final = 0.5
+"""Seconds between two looks at what is new."""
+DEVICE_LOG: Final = "/log"
+"""The topic on which the edge agent of a device tells its log."""
+
+
+@click.command("logs")
+@click.argument("address")
+@click.option("--device", help="of the edge agent that serves this device of the agent with ADDRESS")
+@click.option("--follow", "-f", is_flag=True, help="go on with what comes, until Ctrl-C")
+@click.option("--lines", "-n", type=click.IntRange(min=0), default=100, show_default=True, help="begin with so many")
+@click.option(
+    "--level", type=click.Choice(LEVELS[:-1]), default="debug", show_default=True, help="the least that is shown"
+)
+@click.option("--liability", default="", metavar="ADDRESS", help="only what concerns this contract")
+@click.option(
+    "--timeout", type=click.FloatRange(min=0, min_open=True), default=3.0, show_default=True, help="seconds to wait"
+)
+@with_json
+@with_settings(*NETWORK_SETTINGS)
+def command(
+    settings: Settings,
+    address: str,
+    device: str | None,
+    follow: bool,
+    lines: int,
+    level: str,
+    liability: str,
+    timeout: float,
+    as_json: bool,
+) -> None:
+    """Show the last events of whoever has ADDRESS: an agent, a provider, a bridge.
+
+    Each keeps its last 2,000 events, of the levels that its setting log_level lets pass. With --json a JSON object a
+    line, as the role itself writes with log_format = "json".
+    """
+    from mesh.telemetry.events import human_line, json_line
+
+    async def show() -> None:
+        agent = parse_address(address)
+        key = str(RpcKey(agent, "logs") if device is None else DeviceTopicKey(agent, device, DEVICE_LOG))
+        wanted = {"lines": lines, "level": level, "liability": liability and parse_address(liability)}
+        await _show(settings, key, wanted, line=json_line if as_json else human_line, timeout=timeout, follow=follow)
+
+    run_to_end(show)
+
+
+async def _show(
+    settings: Settings,
+    key: str,
+    wanted: dict[str, Any],
+    *,
+    line: Callable[[LogEvent], str],
+    timeout: float,
+    follow: bool,
+) -> None:
+    from mesh.agent.parts import endpoints_of
+    from mesh.background import Background
+    from mesh.network import Network
+    from mesh.watching.logs import LogReader
+
+    async with Network(endpoints_of(settings)) as network, Background() as tasks:
+        tasks.start(until_unread(), "readers of stdout")
+        reader = LogReader(network.session, key, **wanted)
+        look = await reader.look(timeout=timeout)
+        if not look.answered:
+            raise RemoteError(
+                f"nobody tells its log at {key}",
+                hint="is it running, and on the same router? see `aira peers`; on a closed site operators may ask",
+            )
+        _tell(look, line)
+        while look.more:
+            look = await reader.look(timeout=timeout)
+            _tell(look, line)
+        if follow:
+            await _follow(reader, line, timeout=timeout)
+
+
+async def _follow(reader: LogReader, line: Callable[[LogEvent], str], *, timeout: float) -> None:
+    """Show what comes, and say to stderr when nobody answers any more, and when somebody does again."""
+    from mesh.network import ServiceFailed
+    from mesh.watching.logs import Look
+
+    trouble = ""
+    while True:
+        await asyncio.sleep(PAUSE)
+        try:
+            look = await reader.look(timeout=timeout)
+            met = "" if look.answered else "nobody answers now; waiting"
+        except ServiceFailed as error:
+            look, met = Look([]), visible(str(error))
+        if met != trouble:
+            _note(met or "it answers again")
+            trouble = met
+        _tell(look, line)
+
+
+def _tell(look: Look, line: Callable[[LogEvent], str]) -> None:
+    for began in look.began:
+        _note(f"it has begun anew at {visible(began)}")
+    if look.missed:
+        _note(f"missed {plural(look.missed, 'event')}, which came faster than they could be read")
+    for event in look.events:
+        say(line(event))
+
+
+def _note(words: str) -> None:
+    click.echo(f"aira: {words}", err=True)

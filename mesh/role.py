@@ -1,0 +1,57 @@
+"""What every role is: opened and closed by `async with`, and at work while it runs."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from contextlib import AsyncExitStack
+from typing import TYPE_CHECKING, ClassVar, Self
+
+from mesh.errors import ClosedError
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+
+class Role(ABC):
+    """`async with role`, then `await role.run()`. Leaving closes what was opened, the last first.
+
+    A subclass says who it is in `title`, for people to read, opens what it stands on in `_open`, and does what it is
+    for in `_work`. Where `_open` fails, what it has opened so far is closed.
+    """
+
+    title: ClassVar[str]
+    _stack: AsyncExitStack | None = None
+
+    async def __aenter__(self) -> Self:
+        if self._stack is not None:
+            raise ClosedError(f"this {self.title} is open already")
+        async with AsyncExitStack() as stack:
+            await self._open(stack)
+            self._stack = stack.pop_all()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        stack, self._stack = self._stack, None
+        if stack is not None:
+            await stack.aclose()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it is inside `async with`."""
+        return self._stack is not None
+
+    async def run(self) -> None:
+        """Work until cancelled. Raises `ClosedError` outside `async with`."""
+        if self._stack is None:
+            raise ClosedError(f"this {self.title} is not open", hint="use it inside `async with`")
+        await self._work()
+
+    @abstractmethod
+    async def _open(self, stack: AsyncExitStack) -> None:
+        """Open what the role stands on, onto `stack`."""
+
+    @abstractmethod
+    async def _work(self) -> None:
+        """Do what the role is for, until cancelled."""

@@ -1,0 +1,97 @@
+"""What is counted of transactions and of the node: each by what became of it, and what it cost."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.chain import XRT, Account, Chain, EmbeddedChain, Node, NodeUnreachable, Reverted, Sender, deploy
+from mesh.chain.embedded import EmbeddedProvider
+from mesh.chain.tally import Fate
+from tests.mesh.chain.conftest import QUICK
+from tests.mesh.chain.lives import anvil, ask, life, stranger, until_waiting
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from typing import Any
+
+    from web3.types import RPCEndpoint, RPCResponse
+
+    from tests.support.nodes import Anvil
+
+__all__ = ["anvil"]
+
+NONE = {"sent": 0, "replaced": 0, "mined": 0, "failed": 0, "refused": 0, "lost": 0}
+
+
+class _Line(EmbeddedProvider):
+    """A way to an embedded chain that can be cut."""
+
+    cut = False
+
+    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+        if self.cut:
+            raise ConnectionResetError("it is cut")
+        return await super().make_request(method, params)
+
+
+@pytest.fixture
+async def node() -> AsyncIterator[EmbeddedChain]:
+    async with EmbeddedChain() as node:
+        yield node
+
+
+async def test_a_transaction_that_goes_through_is_sent_and_mined_and_costs_its_gas(node: EmbeddedChain) -> None:
+    async with Node(node.provider, timing=QUICK) as way:
+        account = Account.from_key(node.funded_keys[0])
+        before = await way.eth_balance(account.address)
+        receipt = await Sender(way, account).send(to=stranger(), data=b"", value=5)
+        counted = way.tally.statistics()
+        assert counted.transactions == NONE | {"sent": 1, "mined": 1}
+        assert (counted.gas_used, counted.wei) == (receipt.gas_used, receipt.wei)
+        assert before - await way.eth_balance(account.address) == counted.wei + 5
+
+
+async def test_what_the_contracts_would_refuse_is_never_sent_and_costs_nothing(node: EmbeddedChain) -> None:
+    deployer, friend = (Account.from_key(key) for key in node.funded_keys[:2])
+    await deploy(node.provider, deployer)
+    async with Chain(node.provider, account=friend, timing=QUICK) as chain:
+        with pytest.raises(Reverted, match="ERC20InsufficientBalance"):
+            await chain.transfer(deployer.address, XRT)
+        counted = chain.node.tally.statistics()
+        assert counted.transactions == NONE | {"refused": 1}
+        assert (counted.gas_used, counted.wei) == (0, 0)
+
+
+async def test_a_node_that_falls_silent_is_lost_once_and_each_question_fails(node: EmbeddedChain) -> None:
+    line = _Line(node)
+    async with Node(line, timing=replace(QUICK, attempts=2)) as way:
+        for silence in (1, 2):
+            line.cut = True
+            for _ in range(3):
+                with pytest.raises(NodeUnreachable):
+                    await way.block_number()
+            counted = way.tally.statistics()
+            assert (counted.losses, counted.failures) == (silence, 3 * silence)
+            line.cut = False
+            await way.block_number()
+        assert way.tally.statistics().losses == 2
+
+
+async def test_a_stuck_transaction_is_replaced_and_mined_once(anvil: Anvil) -> None:
+    async with life(anvil, replace(QUICK, replace_after=0.1)) as (way, sender):
+        sending = asyncio.create_task(sender.send(to=stranger(), data=b"", value=5))
+        first = (await until_waiting(way, 1))[0]
+        offered = int((await ask(way, "eth_getTransactionByHash", first))["maxFeePerGas"], 16)
+        await ask(way, "anvil_setNextBlockBaseFeePerGas", hex(offered + 1))
+        async with asyncio.timeout(30):
+            while not sending.done():
+                await ask(way, "evm_mine")
+                await asyncio.sleep(0.05)
+        await sending
+        counted = way.tally.statistics().transactions
+        assert (counted[Fate.SENT], counted[Fate.MINED], counted[Fate.FAILED]) == (1, 1, 0)
+        assert counted[Fate.REPLACED] >= 1

@@ -1,0 +1,201 @@
+"""`aira health`, and the servers that it asks: what they say while they start, work, and wait."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+import threading
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.settings import Settings
+from schemas.status import ALIVE
+from tests.support.commands import AIRA, Serving, aira
+from tests.support.ports import free_port
+from tests.support.scraping import health, scraped
+from tests.support.waiting import until_found
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+LONG = 60.0
+THIRD = Settings(generation=3).lighthouse_contract
+FIFTH = Settings(generation=5).lighthouse_contract
+
+
+@pytest.fixture
+def listen() -> str:
+    """Where a server of the test tells its metrics."""
+    return f"127.0.0.1:{free_port()}"
+
+
+@contextmanager
+def answering(answer: bytes) -> Iterator[str]:
+    """Something that answers one question with these bytes; gives its address."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer_once() -> None:
+            line, _ = server.accept()
+            with line:
+                line.recv(65_536)
+                line.sendall(answer)
+
+        thread = threading.Thread(target=answer_once)
+        thread.start()
+        yield f"http://127.0.0.1:{server.getsockname()[1]}"
+        thread.join()
+
+
+def test_a_router_is_well_and_the_exit_code_says_so(listen: str) -> None:
+    with Serving(
+        *AIRA, "router", "--listen", f"tcp/127.0.0.1:{free_port()}", "--metrics-listen", listen, says="without a roster"
+    ):
+        done = aira("health", "--url", f"http://{listen}")
+        assert (done.returncode, done.stdout) == (0, "router  alive\n")
+        as_json = aira("health", "--json", AIRA_METRICS_LISTEN=listen)
+        assert json.loads(as_json.stdout) == {"ok": True, "parts": {"router": "alive"}}
+        everywhere = aira("health", AIRA_METRICS_LISTEN=f"0.0.0.0:{listen.split(':')[1]}")
+        assert (everywhere.returncode, everywhere.stdout) == (0, "router  alive\n")
+
+
+async def test_aira_up_tells_the_markets_of_both_generations_apart(listen: str, tmp_path: Path) -> None:
+    options = ("--port", "0", "--listen", f"tcp/127.0.0.1:{free_port()}", "--data-dir", tmp_path)
+    url = f"http://{listen}"
+    with Serving(*AIRA, "up", "--engine", "embedded", *options, "--metrics-listen", listen, says="provider    0x"):
+        status, parts = await health(url)
+        assert (status, set(parts.values())) == (200, {ALIVE})
+        assert parts.keys() == {
+            "channel",
+            *(f"{part} of {lighthouse}" for part in ("transactions", "listener") for lighthouse in (THIRD, FIFTH)),
+        }
+        figures = await scraped(url)
+        assert figures.of_label("aira_orders_open", "lighthouse") == {THIRD, FIFTH}
+        assert figures("aira_account_eth_wei") > 0
+        assert aira("health", "--url", url).returncode == 0
+
+
+async def test_a_chain_tells_how_high_it_is(listen: str, tmp_path: Path) -> None:
+    options = ("--port", "0", "--engine", "embedded", "--data-dir", tmp_path)
+    url = f"http://{listen}"
+    with Serving(*AIRA, "chain", "up", *options, "--metrics-listen", listen, says="password"):
+
+        async def is_well() -> bool:
+            return await health(url) == (200, {"chain": ALIVE})
+
+        await until_found(is_well, what="the chain", seconds=LONG)
+        assert (await scraped(url))("aira_chain_head_block") > 0
+
+
+async def test_a_provider_that_waits_for_its_node_says_so(listen: str, tmp_path: Path) -> None:
+    keyfile, password = tmp_path / "key.json", tmp_path / "password"
+    password.write_text("open sesame\n")
+    assert aira("account", "new", keyfile, "--password-file", password).returncode == 0
+    node = f"http://127.0.0.1:{free_port()}"
+    variables = {"AIRA_KEYFILE": str(keyfile), "AIRA_KEYFILE_PASSWORD_FILE": str(password)}
+    options = ("--connect-timeout", "-1", "--web3-http-provider", node, "--data-dir", tmp_path)
+    url = f"http://{listen}"
+    with Serving(
+        *AIRA, "provider", *options, "--metrics-listen", listen, says="the provider waits", variables=variables
+    ):
+        status, parts = await health(url)
+        assert status == 503
+        assert parts["start"].startswith("waits: ")
+        assert node in parts["start"]
+        done = aira("health", "--url", url)
+        assert (done.returncode, done.stderr) == (1, "")
+        assert done.stdout.startswith("start  waits: ")
+
+
+@pytest.mark.parametrize("command", [("router",), ("up", "--port", "0"), ("chain", "up", "--port", "0")])
+def test_a_port_that_is_taken_is_one_clear_line(command: tuple[str, ...], tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        place = f"127.0.0.1:{taken.getsockname()[1]}"
+        done = aira(
+            *command,
+            "--metrics-listen",
+            place,
+            AIRA_DATA_DIR=str(tmp_path),
+            AIRA_LISTEN=f"tcp/127.0.0.1:{free_port()}",
+        )
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"aira: can't tell metrics and health at {place}: Address already in use\n")
+    assert len(done.stderr.splitlines()) == 2
+
+
+def test_a_place_that_is_none_is_one_clear_line() -> None:
+    done = aira("router", "--metrics-listen", "9464", AIRA_LISTEN=f"tcp/127.0.0.1:{free_port()}")
+
+    assert done.returncode == 2
+    assert done.stderr.startswith("aira: '9464' is no HOST:PORT to tell metrics at\n")
+
+
+def test_where_nobody_answers_is_one_clear_line_and_code_1(listen: str) -> None:
+    done = aira("health", "--url", f"http://{listen}")
+
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"aira: nobody tells its health at {listen}: Connection refused\n")
+
+
+def test_who_does_not_answer_in_time_is_one_clear_line_and_code_1() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        done = aira("health", "--url", f"http://127.0.0.1:{silent.getsockname()[1]}", "--timeout", "0.2")
+
+    assert done.returncode == 1
+    assert done.stderr.startswith("aira: nobody tells its health at 127.0.0.1:")
+    assert "timed out" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "answer", [b"HTTP/1.0 200 OK\r\n\r\n<html>", b'HTTP/1.0 200 OK\r\n\r\n{"ok": 1}', b"HTTP/1.0 404 No\r\n\r\n"]
+)
+def test_what_is_no_server_of_the_mesh_is_one_clear_line_and_code_1(answer: bytes) -> None:
+    with answering(answer) as url:
+        done = aira("health", "--url", url)
+
+    assert done.returncode == 1
+    assert "is no server of the mesh" in done.stderr
+
+
+def test_what_is_said_can_not_steer_the_terminal() -> None:
+    with answering(b'HTTP/1.0 503 No\r\n\r\n{"ok": false, "parts": {"a\\u001b[2J": "b\\u001b[31m"}}') as url:
+        done = aira("health", "--url", url)
+
+    assert done.returncode == 1
+    assert "\x1b" not in done.stdout
+
+
+@pytest.mark.parametrize(
+    "url", ["127.0.0.1:9464", "https://127.0.0.1:9464", "http://127.0.0.1", "http://[", "http://:x"]
+)
+def test_an_address_that_is_none_is_one_clear_line_and_code_2(url: str) -> None:
+    done = aira("health", "--url", url)
+
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"aira: {url!r} is not the address of a server\n")
+
+
+def test_without_an_address_it_says_what_to_give() -> None:
+    done = aira("health")
+
+    assert done.returncode == 2
+    assert "--url" in done.stderr
+
+
+def test_it_loads_little() -> None:
+    program = """
+import sys
+sys.argv = ["aira", "health", "--url", "http://127.0.0.1:9"]
+try:
+    import mesh.cli; mesh.cli.main()
+except SystemExit:
+    heavy = ("web3", "zenoh", "asyncio", "prometheus_client", "aiohttp", "rich")
+    print([name for name in heavy if name in sys.modules])
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+
+    assert done.stdout == "[]\n"

@@ -1,0 +1,60 @@
+"""A chain in a file: whole after a start, whatever cut off its writing."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.chain import Account, Node, Sender
+from mesh.demo.anvil import serve_anvil
+from mesh.demo.anvil_state import kept, prepare_state
+from mesh.errors import ConfigurationError
+from tests.support.peers import require
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+NOBODY = "0x00000000000000000000000000000000000000AA"
+
+
+async def test_a_chain_whose_writing_was_cut_off_goes_on_from_the_last_whole_one(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    program, state = require("anvil"), tmp_path / "state.json"
+    async with (
+        serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=state) as node,
+        Node(node.url) as client,
+    ):
+        await Sender(client, Account.from_key(node.funded_keys[0])).send(to=NOBODY, data=b"", value=7)
+        await until(
+            lambda: kept(state).exists() and NOBODY[2:].lower() in kept(state).read_text().lower(),
+            what="a copy with the payment in it",
+            seconds=30,
+        )
+    whole = state.read_bytes()
+    state.write_bytes(whole[: len(whole) // 2])
+    async with (
+        serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=state) as node,
+        Node(node.url) as client,
+    ):
+        assert await client.eth_balance(NOBODY) == 7
+    assert "was cut off while it was written: the chain goes on from the last whole one" in caplog.text
+
+
+def test_without_a_whole_copy_half_a_chain_is_one_clear_line_and_stays_as_it_is(tmp_path: Path) -> None:
+    state = tmp_path / "state.json"
+    for file in (state, kept(state)):
+        file.write_bytes(b'{"accounts": {')
+    with pytest.raises(ConfigurationError, match=r"state\.json holds no chain of anvil"):
+        prepare_state(state)
+    assert state.read_bytes() == kept(state).read_bytes() == b'{"accounts": {'
+
+
+def test_a_whole_chain_is_not_replaced_by_an_older_one(tmp_path: Path) -> None:
+    state = tmp_path / "state.json"
+    state.write_bytes(b'{"accounts": {}, "block": 2}')
+    kept(state).write_bytes(b'{"accounts": {}, "block": 1}')
+    prepare_state(state)
+    assert state.read_bytes() == b'{"accounts": {}, "block": 2}'

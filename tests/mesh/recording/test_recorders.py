@@ -1,0 +1,62 @@
+"""The figures of several recorders: added up, and kept when they are closed."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import TYPE_CHECKING
+
+from mesh.recording import RecordingAbout
+from mesh.recording.partial import PartialFile
+from mesh.recording.recorders import Recorders
+from schemas.payloads import STRING
+from tests.support.waiting import SECONDS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    import pytest
+
+ABOUT = RecordingAbout()
+
+
+def wait(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + SECONDS
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def test_the_figures_of_recorders_that_are_closed_stay(tmp_path: Path) -> None:
+    recorders = Recorders()
+    for name, count in (("one", 3), ("two", 4)):
+        with recorders.open(tmp_path / f"{name}.mcap", ABOUT) as recorder:
+            for _ in range(count):
+                recorder.record("/led", b"on", STRING)
+    third = recorders.open(tmp_path / "three.mcap", ABOUT)
+    third.record("/led", b"on", STRING)
+    wait(lambda: recorders.statistics().recorded == 8)
+    assert recorders.statistics().lost == 0
+    assert recorders.statistics().lag == 0
+    third.close()
+    assert recorders.statistics().recorded == 8
+    assert recorders._open == []
+
+
+def test_the_lag_grows_while_the_disk_does_not_take_anything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    held, add = threading.Event(), PartialFile.add
+
+    def slowly(self: PartialFile, messages: list[tuple[object, ...]]) -> object:
+        assert held.wait(SECONDS)
+        return add(self, messages)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(PartialFile, "add", slowly)
+    recorders = Recorders()
+    with recorders.open(tmp_path / "one.mcap", ABOUT) as recorder:
+        recorder.record("/led", b"on", STRING)
+        wait(lambda: recorders.statistics().lag > 0.2)
+        assert recorders.statistics().recorded == 0
+        held.set()
+        wait(lambda: recorders.statistics().lag == 0)
+    assert recorders.statistics().recorded == 1

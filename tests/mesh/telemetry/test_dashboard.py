@@ -1,0 +1,186 @@
+"""The dashboard and the alerts speak of figures that roles really serve, with labels that these really have."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import pytest
+
+from bridges.ipfs.metrics import Standing, bridge_families, content_families
+from bridges.serial.dialect import Counters
+from bridges.serial.figures import families_of
+from bridges.serial.tally import EdgeStatistics
+from mesh.market.process import ProviderProcess
+from mesh.market.provider import Provider
+from mesh.network import Endpoints, Network
+from mesh.telemetry.exposition import Exposition
+from mesh.telemetry.families import labelled
+from mesh.telemetry.health import up
+from schemas.status import ContentFigures
+from tests.bridges.ipfs.statuses import status, way
+from tests.support.scraping import Figures
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from mesh.agent import Agent
+    from mesh.telemetry.families import Family
+    from tests.support.market import Place
+
+ROOT: Final = Path(__file__).parents[3]
+DASHBOARD: Final = ROOT / "deploy" / "grafana" / "aira-mesh.json"
+ALERTS: Final = ROOT / "deploy" / "prometheus" / "alerts.yml"
+ADDED: Final = {"job", "instance"}
+"""Labels that Prometheus itself gives to every figure."""
+ROLE: Final = {"role"}
+"""A label by which figures of several roles are told apart in this test alone."""
+NAME: Final = re.compile(r"\b(?:aira|process)_[a-z0-9_]+\b")
+SELECTED: Final = re.compile(r"(?P<name>\b(?:aira|process)_[a-z0-9_]+)(?:\{(?P<labels>[^}]*)\})?(?P<range>\[[^]]*\])?")
+GROUPED: Final = re.compile(r"\bby \((?P<labels>[^)]*)\)")
+CONTENT: Final = ContentFigures(
+    fetched=0, fetched_bytes=0, lies=0, answered=0, added=0, added_bytes=0, by_blocks=0, pinned=0, failed=0
+)
+
+
+class Known(NamedTuple):
+    """What is served under a name."""
+
+    type: str
+    labels: set[str]
+
+
+def edge_families() -> tuple[Family, ...]:
+    return families_of(
+        EdgeStatistics(
+            line=Counters(),
+            calls={"done": 1},
+            openings=1,
+            board_losses=0,
+            line_is_open=True,
+            board_is_present=True,
+        )
+    )
+
+
+def bridge() -> tuple[Family, ...]:
+    ways = way(invalid={"hash": 1}, dropped={"no-room": 1}, kinds={"demand": 1})
+    return (*bridge_families([Standing(status(to_ipfs=ways, to_mesh=ways), True, True)]), *content_families(CONTENT))
+
+
+async def role_families(place: Place) -> list[Family]:
+    """Of a provider that has rejected and taken back something, and of an agent."""
+    robot: Agent = place.agent("robot")
+
+    @robot.on_demand
+    async def hear(demand: object) -> None:
+        """So that the agent hears something."""
+
+    async with (
+        Network(Endpoints(connect=(place.endpoint,))) as network,
+        Provider(network.session, place.chains["provider"], place.market.deployment.lighthouse_name) as provider,
+        robot,
+    ):
+        provider._books.rejected("DeadlineReached")
+        process = ProviderProcess(network, place.chains["provider"], [provider])
+        # They tell nothing over HTTP here, and measure the same.
+        of_provider = [*await process.measure(), up(process.health())]
+        return [*labelled(of_provider, role="provider"), *labelled(await robot.telemetry.measure(), role="agent")]
+
+
+@pytest.fixture
+async def served(place: Place) -> Mapping[str, Known]:
+    """All that any role serves, by name."""
+    families = [*await role_families(place), *edge_families(), *bridge()]
+    figures = Figures(Exposition().render(families)[0].decode())
+    known = {}
+    for family in figures.families.values():
+        name = family.name + ("_total" if family.type == "counter" else "")
+        known[name] = Known(family.type, {label for sample in family.samples for label in sample.labels} - ROLE)
+    return known
+
+
+def expressions() -> Iterator[str]:
+    """Every expression of the dashboard and of the alerts."""
+    dashboard = json.loads(DASHBOARD.read_text())
+    for panel in dashboard["panels"]:
+        for target in panel.get("targets", ()):
+            yield target["expr"]
+    for variable in dashboard["templating"]["list"]:
+        if variable["type"] == "query":
+            yield variable["query"]["query"]
+    yield from re.findall(r"^\s+expr: (.*)$", ALERTS.read_text(), flags=re.MULTILINE)
+
+
+async def test_every_expression_is_of_figures_that_are_served(served: Mapping[str, Known]) -> None:
+    asked = {name for expression in expressions() for name in NAME.findall(expression)}
+
+    assert len(asked) > 40
+    assert asked <= served.keys()
+
+
+async def test_every_label_of_an_expression_is_one_that_its_figures_have(served: Mapping[str, Known]) -> None:
+    for expression in expressions():
+        names = NAME.findall(expression)
+        for found in SELECTED.finditer(expression):
+            wanted = set(re.findall(r"(\w+)\s*(?:=~|!~|!=|=)", found["labels"] or ""))
+            assert wanted <= served[found["name"]].labels | ADDED, expression
+        for grouped in GROUPED.finditer(expression):
+            labels = {label.strip() for label in grouped["labels"].split(",")}
+            assert labels <= set.union(ADDED, *(served[name].labels for name in names)), expression
+
+
+async def test_rates_are_of_counters_and_of_nothing_else(served: Mapping[str, Known]) -> None:
+    for expression in expressions():
+        if expression.startswith("label_values("):
+            continue
+        for found in SELECTED.finditer(expression):
+            assert bool(found["range"]) == (served[found["name"]].type == "counter"), expression
+        assert expression.count("(") == expression.count(")")
+
+
+async def test_names_kinds_and_meanings_are_well_formed(served: Mapping[str, Known], place: Place) -> None:
+    families = [*await role_families(place), *edge_families(), *bridge()]
+    for family in families:
+        assert re.fullmatch(r"aira(_[a-z]+)+", family.name), family.name
+        assert family.name.endswith("_total") == (family.kind == "counter"), family.name
+        assert family.meaning, family.name
+        assert family.meaning[0].isupper() or family.meaning.startswith("1 "), family.name
+        assert not family.meaning.endswith("."), family.name
+        assert "\n" not in family.meaning, family.name
+        for sample in family.samples:
+            assert all(re.fullmatch(r"[a-z]+", label) for label in sample.labels), family.name
+            assert not any(re.search(r"0x[0-9a-fA-F]{40}", value) for value in sample.labels.values()), family.name
+
+
+def panels() -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = json.loads(DASHBOARD.read_text())["panels"]
+    return found
+
+
+def test_the_dashboard_has_its_rows_and_no_two_panels_in_one_place() -> None:
+    rows = [panel["title"] for panel in panels() if panel["type"] == "row"]
+    assert rows == ["Health", "Market", "Jobs", "Money", "Network", "Devices", "Bridge"]
+    assert len({panel["id"] for panel in panels()}) == len(panels())
+    taken: set[tuple[int, int]] = set()
+    for panel in panels():
+        place = panel["gridPos"]
+        cells = {
+            (x, y)
+            for x in range(place["x"], place["x"] + place["w"])
+            for y in range(place["y"], place["y"] + place["h"])
+        }
+        assert not cells & taken, panel["title"]
+        assert max(x for x, _ in cells) < 24, panel["title"]
+        taken |= cells
+
+
+def test_every_alert_says_what_it_is_and_what_to_look_at() -> None:
+    rules = ALERTS.read_text().split("- alert: ")[1:]
+
+    assert len(rules) >= 5
+    for rule in rules:
+        for part in ("expr: ", "severity: ", "summary: ", "description: "):
+            assert rule.count(part) == 1, rule

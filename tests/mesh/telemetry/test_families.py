@@ -1,0 +1,92 @@
+"""Figures as a role has them: put together, labelled, rendered for Prometheus, and read again."""
+
+from __future__ import annotations
+
+import pytest
+from prometheus_client.openmetrics.parser import text_string_to_metric_families as open_metrics
+
+from mesh.telemetry.exposition import Exposition
+from mesh.telemetry.families import Family, Sample, by_label, counter, gauge, labelled, merged
+from mesh.telemetry.health import Health, up
+from tests.support.scraping import Figures
+
+
+def rendered(*families: Family) -> Figures:
+    text, content_type = Exposition().render(families)
+    assert content_type.startswith("text/plain")
+    return Figures(text.decode())
+
+
+def test_a_counter_and_a_gauge_are_told_with_their_kind_and_meaning() -> None:
+    figures = rendered(counter("aira_jobs_done_total", "Jobs done", 3), gauge("aira_queue", "What waits", 1.5))
+
+    assert (figures("aira_jobs_done_total"), figures("aira_queue")) == (3, 1.5)
+    assert (figures.families["aira_jobs_done"].type, figures.families["aira_jobs_done"].documentation) == (
+        "counter",
+        "Jobs done",
+    )
+    assert figures.families["aira_queue"].type == "gauge"
+
+
+def test_labels_are_told_whatever_they_hold() -> None:
+    strange = 'a "quoted"\nline \\ and ☃'
+
+    figures = rendered(by_label("aira_x", "gauge", "x", "reason", {strange: 1, "plain": 2}))
+
+    assert (figures("aira_x", reason=strange), figures("aira_x", reason="plain")) == (1, 2)
+
+
+def test_a_scraper_that_asks_for_openmetrics_gets_it() -> None:
+    families = [counter("aira_jobs_done_total", "Jobs done", 3)]
+
+    text, content_type = Exposition().render(families, accept="application/openmetrics-text; version=1.0.0")
+
+    assert content_type.startswith("application/openmetrics-text")
+    found = {family.name: family for family in open_metrics(text.decode())}  # type: ignore[no-untyped-call]
+    assert found["aira_jobs_done"].samples[0].value == 3
+
+
+def test_the_process_tells_its_memory_its_start_and_the_version() -> None:
+    figures = rendered()
+
+    assert figures("process_resident_memory_bytes") > 1e6
+    assert figures("process_start_time_seconds") > 1e9
+    assert figures.of_label("aira_info", "version")
+
+
+def test_labels_are_added_to_all_samples_and_do_not_hide_their_own() -> None:
+    families = (gauge("aira_a", "a", 1), by_label("aira_b", "gauge", "b", "kind", {"demand": 2}))
+
+    first, second = labelled(families, lighthouse="north")
+
+    assert first.samples == (Sample(1, {"lighthouse": "north"}),)
+    assert second.samples == (Sample(2, {"lighthouse": "north", "kind": "demand"}),)
+
+
+def test_the_same_figure_of_two_lighthouses_is_one_family() -> None:
+    both = [labelled([gauge("aira_a", "a", place)], lighthouse=name)[0] for place, name in enumerate(("n", "s"))]
+
+    figures = rendered(*both)
+
+    assert (figures("aira_a", lighthouse="n"), figures("aira_a", lighthouse="s")) == (0, 1)
+
+
+def test_one_name_can_not_mean_two_things() -> None:
+    with pytest.raises(ValueError, match="two families named aira_a"):
+        merged([gauge("aira_a", "a", 1), gauge("aira_a", "something else", 1)])
+
+
+@pytest.mark.parametrize(
+    ("parts", "ok"),
+    [
+        ({"channel": "alive", "executor": "alive"}, True),
+        ({"channel": "alive", "executor": "off"}, True),
+        ({"channel": "waits for a router", "executor": "alive"}, False),
+    ],
+)
+def test_who_has_a_part_that_waits_is_not_well(parts: dict[str, str], ok: bool) -> None:
+    health = Health.of(parts)
+
+    assert health.ok is ok
+    assert Health.decode(health.encode()) == health
+    assert sum(sample.value for sample in up(parts).samples) == (2 if ok else 1)

@@ -1,0 +1,170 @@
+"""Events of the log: what they hold, and that each is one line, whatever it quotes."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import threading
+from contextvars import copy_context
+from typing import Any
+
+import pytest
+
+from mesh.telemetry.context import Speaker, concerning, facts, of_its_liability, speaking
+from mesh.telemetry.events import LARGEST, LONGEST_MESSAGE, event_of, human_line, json_line, without_secrets
+from schemas.logs import LogEvent
+from tests.support.orders import ROBOT, STRANGER
+
+LIABILITY = "0x8A7B7Bf07722e6c80579326C4F162692ccD71F39"
+ARM = Speaker("agent", ROBOT.address, "market.eth")
+HOSTILE = "so\n12:00:00 INFO    all is well\r\x1b[2J\x9b31m\x85\u2028\u202e\x7f{\x00}"
+
+
+def record(message: str, *arguments: object, level: int = logging.INFO, error: BaseException | None = None) -> Any:
+    info = None if error is None else (type(error), error, error.__traceback__)
+    return logging.LogRecord("mesh.work.executor", level, __file__, 1, message, arguments, info)
+
+
+def failed(words: str) -> ZeroDivisionError:
+    """An error that was raised."""
+    try:
+        raise ZeroDivisionError(words)
+    except ZeroDivisionError as error:
+        return error
+
+
+def test_an_event_says_who_speaks_and_which_contract_it_concerns() -> None:
+    with speaking(ARM), concerning(LIABILITY.lower()):
+        event = event_of(record("ready, %d messages to play", 3))
+    told = json.loads(json_line(event))
+    assert told.pop("time").endswith("Z")
+    assert told == {
+        "level": "info",
+        "logger": "mesh.work.executor",
+        "message": "ready, 3 messages to play",
+        "role": "agent",
+        "address": ROBOT.address,
+        "lighthouse": "market.eth",
+        "liability": LIABILITY,
+    }
+
+
+def test_the_time_is_utc_with_milliseconds() -> None:
+    event = record("now")
+    event.created = 1_700_000_000.0019
+    assert event_of(event).time == "2023-11-14T22:13:20.001Z"
+
+
+def test_the_contract_is_at_the_front_of_the_human_line() -> None:
+    with concerning(LIABILITY):
+        line = human_line(event_of(record("finalized, paid", level=logging.WARNING)))
+    assert line[8:] == f" WARNING {LIABILITY}: finalized, paid"
+    assert human_line(event_of(record("started")))[8:] == " INFO    started"
+
+
+def test_who_speaks_in_threads_of_libraries_is_the_process() -> None:
+    assert event_of(record("x"), default=ARM).address == ROBOT.address
+    with speaking(Speaker("provider", STRANGER.address)):
+        assert event_of(record("x"), default=ARM).role == "provider"
+
+
+def test_facts_are_members_of_the_json_object_and_never_replace_a_field() -> None:
+    event = record("rejected")
+    vars(event).update(facts(order="ab" * 32, gas=7, level="none", message="forged"))
+    told = json.loads(json_line(event_of(event)))
+    assert (told["order"], told["gas"]) == ("ab" * 32, "7")
+    assert (told["level"], told["message"]) == ("info", "rejected")
+
+
+@pytest.mark.parametrize("write", [human_line, json_line])
+def test_what_a_stranger_says_stays_on_one_line_and_steers_no_terminal(write: Any) -> None:
+    line = write(event_of(record("%s of %s", HOSTILE, "him")))
+    assert line.isprintable(), ascii(line)
+    assert len(line.splitlines()) == 1
+
+
+def test_programs_get_what_a_stranger_said_unchanged() -> None:
+    assert json.loads(json_line(event_of(record("%s", HOSTILE))))["message"] == HOSTILE
+
+
+def test_an_exception_is_a_part_of_the_one_json_line() -> None:
+    line = json_line(event_of(record("the job failed", error=failed("by\nnothing"))))
+    told = json.loads(line)
+    assert len(line.splitlines()) == 1
+    assert told["error"] == "ZeroDivisionError: by\nnothing"
+    assert told["trace"].startswith("Traceback (most recent call last):\n")
+    assert "in failed\n" in told["trace"]
+
+
+def test_no_line_of_a_traceback_looks_like_an_event() -> None:
+    _, *rest = human_line(event_of(record("failed", error=failed(HOSTILE)))).split("\n")
+    assert len(rest) > 3
+    for line in rest:
+        assert line.startswith("    | ")
+        assert line.isprintable()
+
+
+def test_an_event_fits_into_a_reply_however_long_its_words_are() -> None:
+    event = event_of(record("x" * 100_000, error=failed("\x00" * 100_000)))
+    assert event.message.startswith("x" * 1_000)
+    assert event.message.endswith("characters more)")
+    assert len(event.encode()) <= LARGEST
+    assert event_of(record("x" * 5_000)).message == "x" * LONGEST_MESSAGE + "… (1,000 characters more)"
+
+
+def test_names_of_files_that_are_no_text_can_be_told() -> None:
+    event = event_of(record("can't read %s", b"\xff.mcap".decode("utf-8", "surrogateescape")))
+    assert event.message == "can't read \\udcff.mcap"
+    assert LogEvent.decode(event.encode()) == event
+
+
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        ("wss://user:pass@node.example:8546/x fails", "wss://node.example:8546/x fails"),
+        ("(https://node.example/v3/0123456789abcdef0123) fails", "(https://node.example/v3/… fails"),
+        ("https://node.example/?apikey=abc, then", "https://node.example/?… then"),
+        ("http://127.0.0.1:8545 and tcp/127.0.0.1:7447", "http://127.0.0.1:8545 and tcp/127.0.0.1:7447"),
+        (f"http://gateway/ipfs/Qm{'a' * 44}", f"http://gateway/ipfs/Qm{'a' * 44}"),
+    ],
+)
+def test_what_opens_doors_in_a_url_is_left_out(said: str, told: str) -> None:
+    assert without_secrets(said).replace(")", "") == told
+    event = event_of(record("%s", said, error=failed(said)))
+    for secret in ("pass@", "0123456789abcdef", "apikey"):
+        assert secret not in event.message + event.error + event.trace.replace(repr(said), "")
+
+
+def test_levels_have_names_and_those_in_between_count_as_the_lower() -> None:
+    named = {level: event_of(record("x", level=level)).level for level in (0, 5, 10, 20, 25, 30, 40, 50, 99)}
+    assert list(named.values()) == [
+        "debug", "debug", "debug", "info", "info", "warning", "error", "critical", "critical",
+    ]  # fmt: skip
+
+
+async def test_tasks_and_threads_inherit_the_contract_and_leave_others_alone() -> None:
+    seen: dict[str, str] = {}
+
+    class Work:
+        @of_its_liability
+        async def do(self, address: str, *, name: str) -> None:
+            await asyncio.sleep(0.01)
+            seen[name] = event_of(record("x")).liability
+            seen[f"{name}'s thread"] = await asyncio.to_thread(lambda: event_of(record("x")).liability)
+            bare = threading.Thread(target=copy_context().run, args=(self.note, f"{name}'s own thread"))
+            bare.start()
+            bare.join()
+
+        def note(self, name: str) -> None:
+            seen[name] = event_of(record("x")).liability
+
+    await asyncio.gather(Work().do(ROBOT.address, name="one"), Work().do(STRANGER.address, name="other"))
+    assert {seen["one"], seen["one's thread"], seen["one's own thread"]} == {ROBOT.address}
+    assert {seen["other"], seen["other's thread"], seen["other's own thread"]} == {STRANGER.address}
+    assert event_of(record("x")).liability == ""
+
+
+def test_a_clock_that_is_none_is_shown_as_such() -> None:
+    event = LogEvent(time="\x1b[31m", level="info", logger="x", message="hello")
+    assert human_line(event) == "--:--:-- INFO    hello"

@@ -1,0 +1,117 @@
+"""The log of whole processes: whatever happens in one that logs in JSON, each of its lines is a JSON object."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+import pytest
+
+from tests.support.commands import run
+
+START = """
+import asyncio, logging, threading, warnings
+from mesh.errors import RemoteError
+from mesh.running import run_until_stopped
+from mesh.settings import load
+log = logging.getLogger("my.robot")
+
+async def main():
+    {body}
+
+run_until_stopped(main, settings=load(), role="robot")
+"""
+
+
+def said(body: str, *, code: int = 0, **variables: str) -> list[str]:
+    """What a program of this body says, on stdout and stderr together."""
+    done = run(sys.executable, "-c", START.format(body="\n    ".join(body.strip().splitlines())), **variables)
+    assert done.returncode == code, done.stderr
+    return [*done.stdout.splitlines(), *done.stderr.splitlines()]
+
+
+def told(body: str, *, code: int = 0, **variables: str) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in said(body, code=code, AIRA_LOG_FORMAT="json", **variables)]
+
+
+def test_a_users_own_words_are_events() -> None:
+    (event,) = told('log.info("the lamp %s", "is on")')
+    assert (event["level"], event["logger"], event["message"]) == ("info", "my.robot", "the lamp is on")
+    assert event["role"] == "robot"
+
+
+def test_the_human_format_is_time_level_words() -> None:
+    (line,) = said('log.warning("the lamp is dim")')
+    assert line[8:] == " WARNING the lamp is dim"
+
+
+@pytest.mark.parametrize(
+    ("level", "words"),
+    [("debug", "dbiwe"), ("info", "biwe"), ("warning", "we"), ("error", "e")],
+)
+def test_the_level_decides_what_is_said(level: str, words: str) -> None:
+    body = 'log.debug("d"); log.info("b"); log.info("i"); log.warning("w"); log.error("e")'
+    events = told(body, AIRA_LOG_LEVEL=level)
+    assert "".join(event["message"] for event in events if event["logger"] == "my.robot") == words
+
+
+def test_libraries_speak_only_of_trouble_unless_all_is_to_be_said() -> None:
+    body = 'web3 = logging.getLogger("web3.providers"); web3.info("chatter"); web3.warning("trouble")'
+    assert [event["message"] for event in told(body)] == ["trouble"]
+    assert "chatter" in [event["message"] for event in told(body, AIRA_LOG_LEVEL="debug")]
+
+
+def test_an_error_that_ends_a_server_is_an_event_with_what_to_do() -> None:
+    (event,) = told('raise RemoteError("the node is gone", hint="start it")', code=1)
+    assert (event["level"], event["message"], event["hint"]) == ("error", "the node is gone", "start it")
+    assert said('raise RemoteError("the node is gone", hint="start it")', code=1) == [
+        "aira: the node is gone",
+        "      start it",
+    ]
+
+
+def test_a_defect_that_ends_a_server_is_one_line_with_its_traceback() -> None:
+    event = told('raise ZeroDivisionError("so\\nwhat")', code=1)[-1]
+    assert (event["level"], event["error"]) == ("critical", "ZeroDivisionError: so\nwhat")
+    assert "in main\n" in event["trace"]
+
+
+def test_a_thread_that_fails_is_one_line() -> None:
+    body = 'thread = threading.Thread(target=lambda: 1 / 0, name="pump"); thread.start(); thread.join()'
+    (event,) = told(body)
+    assert (event["message"], event["error"]) == ("the thread pump failed", "ZeroDivisionError: division by zero")
+
+
+def test_a_task_that_fails_unheard_is_one_line() -> None:
+    body = """
+async def fail(): raise ZeroDivisionError
+task = asyncio.create_task(fail())
+await asyncio.sleep(0)
+await asyncio.sleep(0)
+del task
+"""
+    (event,) = told(body)
+    assert (event["logger"], event["level"]) == ("asyncio", "error")
+    assert "ZeroDivisionError" in event["error"]
+
+
+def test_a_warning_is_one_line() -> None:
+    (event,) = told('warnings.warn("old fashioned", DeprecationWarning, stacklevel=1)', PYTHONWARNINGS="always")
+    assert event["logger"] == "py.warnings"
+    assert "old fashioned" in event["message"]
+
+
+def test_a_wrong_call_of_the_log_is_told_and_stops_nothing() -> None:
+    first, second = told('log.info("%d messages", "many"); log.info("it goes on")')
+    assert (first["level"], "'%d messages'" in first["message"]) == ("error", True)
+    assert first["error"].startswith("TypeError")
+    assert second["message"] == "it goes on"
+
+
+def test_a_program_that_logs_in_its_own_way_goes_on_to() -> None:
+    body = 'logging.basicConfig(format="mine %(message)s", force=True); log.warning("hello")'
+    assert said(body, AIRA_LOG_FORMAT="json") == ["mine hello"]
+    own = "import logging; logging.basicConfig(format='mine %(message)s', level=20)\n" + START
+    done = run(sys.executable, "-c", own.format(body='log.info("hello")'), AIRA_LOG_FORMAT="json")
+    assert done.stderr == "mine hello\n"

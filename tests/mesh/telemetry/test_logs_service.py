@@ -1,0 +1,203 @@
+"""The service `logs` of roles, over real routers: whose events are told, and who may ask."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from mesh.agent import Agent
+from mesh.identity import Member
+from mesh.network import Endpoints, Network, ServiceFailed, Services, call
+from mesh.telemetry.context import Speaker, concerning, speaking
+from mesh.telemetry.log_service import LogService
+from mesh.telemetry.logs import Log, keep_log
+from mesh.watching.logs import LogReader
+from schemas import RpcKey
+from schemas.logs import LogsRead, ReadLogs
+from tests.support.market import obliging
+from tests.support.objectives import objective
+from tests.support.orders import OBJECTIVE, PERSON, ROBOT, STRANGER
+from tests.support.sites import Site
+from tests.support.waiting import until, until_answered, until_found
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from mesh.identity.roles import Role
+    from schemas import Signer
+    from tests.support.market import Place
+    from tests.support.routers import EmbeddedRouter
+
+log = logging.getLogger(__name__)
+
+
+@pytest.fixture
+def kept(caplog: pytest.LogCaptureFixture) -> Iterator[Log]:
+    """This process keeps its log, beside what pytest does with it."""
+    caplog.set_level(logging.INFO)
+    keep_log()
+    root = logging.getLogger()
+    (handler,) = [handler for handler in root.handlers if isinstance(handler, Log)]
+    yield handler
+    root.removeHandler(handler)
+
+
+async def logs(place: Place, role: str, **asked: Any) -> LogsRead:
+    """What the role tells of its log."""
+    async with Network(Endpoints(connect=(place.endpoint,))) as network:
+        reply = await call(network.session, place.address(role), "logs", ReadLogs(**asked))
+    assert isinstance(reply, LogsRead)
+    return reply
+
+
+async def test_agent_and_provider_tell_what_concerns_a_contract(place: Place, kept: Log) -> None:
+    robot = obliging(place.agent("robot"))
+
+    @robot.on("*")
+    async def work(job: Any, message: Any) -> None:
+        log.info("the lamp is on")
+        await asyncio.to_thread(log.info, "the lamp is off")
+
+    @robot.on_liability
+    async def phase(phase: Any, liability: Any) -> None:
+        log.info("it is %s", phase)
+
+    async with place.at_work(robot) as person:
+        contract = await person.demand(place.save(objective(("/go", "x"))), cost=1)
+        assert (await contract.outcome()).success
+
+        async def is_told() -> bool:
+            told = await logs(place, "robot", liability=contract.address)
+            return told.entries[-1].message == "it is finalized"
+
+        await until_found(is_told, what="the end of the job", seconds=30)
+        told = await logs(place, "robot", liability=contract.address)
+        provided = await logs(place, "provider", liability=contract.address)
+        asked = await logs(place, "person", liability=contract.address)
+    words = [entry.message for entry in told.entries]
+    for word in ("incoming", "ready", "running", "the lamp is on", "the lamp is off", "complete", "finalized"):
+        assert any(one.startswith(word) for one in words), (word, words)
+    assert [one for one in words if one.startswith("it is")] == [
+        f"it is {phase}" for phase in ("incoming", "ready", "running", "complete", "finalized")
+    ]
+    assert {(entry.role, entry.address, entry.liability) for entry in told.entries} == {
+        ("agent", place.address("robot"), contract.address)
+    }
+    assert [entry.message.split(",")[0] for entry in provided.entries] == ["created", "finalized"]
+    assert {(entry.role, entry.address) for entry in provided.entries} == {("provider", place.address("provider"))}
+    assert {entry.lighthouse for entry in (*told.entries, *provided.entries)} == {
+        place.market.deployment.lighthouse_name
+    }
+    made, ended = asked.entries
+    assert (made.message.startswith("made of the demand"), ended.message) == (True, "it has ended, paid")
+    assert made.facts["order"] == provided.entries[0].facts["demand"]
+
+
+async def test_an_order_that_is_rejected_is_named_by_its_hash(place: Place, kept: Log) -> None:
+    async with place.provider() as provider, place.agent("robot") as robot:
+        order = await robot.offer(objective=OBJECTIVE, cost=1)
+        await until(lambda: len(provider.book), what="the order in the book")
+        (message,) = provider.book.orders()
+        provider.reject(message, "expired", "too late")
+        (told,) = (await logs(place, "provider", level="warning")).entries
+    assert (told.facts["order"], told.facts["reason"]) == (order, "expired")
+
+
+async def test_a_program_that_keeps_no_log_says_so(place: Place) -> None:
+    async with place.agent("robot"):
+        with pytest.raises(ServiceFailed, match="part of a program that keeps no log"):
+            await logs(place, "robot")
+
+
+async def test_a_level_that_there_is_not_is_refused(place: Place, kept: Log) -> None:
+    async with place.agent("robot"):
+        with pytest.raises(ServiceFailed, match="'loud' is no level"):
+            await logs(place, "robot", level="loud")
+
+
+async def test_the_reader_says_how_many_events_it_missed(router: EmbeddedRouter, kept: Log) -> None:
+    kept.ring._most = 20
+    async with (
+        Network(Endpoints(connect=(router.endpoint,))) as network,
+        Services(network.session, ROBOT.address) as services,
+        Network(Endpoints(connect=(router.endpoint,))) as elsewhere,
+    ):
+        services.offer("logs", LogService("agent", ROBOT.address).logs)
+        key = str(RpcKey(ROBOT.address, "logs"))
+        await until_answered(elsewhere.session, key)
+        reader = LogReader(elsewhere.session, key, lines=0)
+        assert (await reader.look()).events == []
+        with speaking(Speaker("agent", ROBOT.address)), concerning(STRANGER.address):
+            for number in range(50):
+                log.info("number %d", number)
+        look = await reader.look()
+        assert [event.message for event in look.events] == [f"number {number}" for number in range(30, 50)]
+        assert look.missed == 30
+        assert (await reader.look()).events == []
+
+
+async def test_all_who_answer_are_followed_each_by_itself(router: EmbeddedRouter, kept: Log) -> None:
+    """Two processes with one account; here the other one is a queryable with a log of its own."""
+    other = Log()
+
+    class Other(LogService):
+        def read(self, asked: ReadLogs) -> LogsRead:
+            return other.ring.read(asked)
+
+    async with (
+        Network(Endpoints(connect=(router.endpoint,))) as network,
+        Network(Endpoints(connect=(router.endpoint,))) as second,
+        Services(network.session, ROBOT.address) as services,
+        Services(second.session, ROBOT.address) as others,
+        Network(Endpoints(connect=(router.endpoint,))) as elsewhere,
+    ):
+        services.offer("logs", LogService("agent", ROBOT.address).logs)
+        others.offer("logs", Other("provider", ROBOT.address).logs)
+        reader = LogReader(elsewhere.session, str(RpcKey(ROBOT.address, "logs")), lines=5)
+
+        async def both_answer() -> bool:
+            await reader.look()
+            return len(reader._after) == 2
+
+        await until_found(both_answer, what="the answers of both")
+        log.info("of one")
+        other.emit(logging.makeLogRecord({"name": "t", "msg": "of the other", "levelno": 20}))
+        look = await reader.look()
+    assert [event.message for event in look.events] == ["of one", "of the other"]
+
+
+async def test_on_a_closed_site_operators_may_ask_and_agents_may_not(tmp_path: Path, kept: Log) -> None:
+    site = Site(tmp_path)
+    people: dict[str, tuple[Signer, Role]] = {
+        "robot": (ROBOT, "agent"),
+        "person": (PERSON, "agent"),
+        "watch": (STRANGER, "operator"),
+    }
+    folders = {
+        name: site.enlist(Member(name=name, address=signer.address.lower(), roles=(role,)))
+        for name, (signer, role) in people.items()
+    }
+    with site.open_router("wheel"):
+        async with (
+            Network(site.client(folders["robot"])) as robot,
+            Services(robot.session, ROBOT.address) as services,
+            Network(site.client(folders["watch"])) as operator,
+            Network(site.client(folders["person"])) as person,
+        ):
+            services.offer("logs", LogService("agent", ROBOT.address).logs)
+            log.info("a secret of the site")
+            await until_answered(operator.session, str(RpcKey(ROBOT.address, "logs")))
+            reply = await call(operator.session, ROBOT.address, "logs", ReadLogs(lines=1))
+            assert [entry.message for entry in reply.entries] == ["a secret of the site"]
+            with pytest.raises(ServiceFailed, match="nobody answers"):
+                await call(person.session, ROBOT.address, "logs", ReadLogs(), timeout=3)
+
+
+async def test_an_agent_without_an_account_has_no_log_to_ask_for(place: Place, kept: Log) -> None:
+    async with Agent(settings=place.settings("watcher")):
+        (event,) = [entry for entry in kept.ring.read(ReadLogs()).entries if entry.message.startswith("watching")]
+    assert (event.role, event.address) == ("agent", "")

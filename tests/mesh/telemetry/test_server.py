@@ -1,0 +1,218 @@
+"""The two pages over HTTP: what is asked rightly, what is not, who is slow, and where nothing can be served."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import time
+from contextlib import ExitStack, closing
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.errors import ConfigurationError
+from mesh.telemetry import server
+from mesh.telemetry.families import counter
+from mesh.telemetry.health import Health
+from mesh.telemetry.opening import open_server, place
+from tests.support.ports import free_port
+from tests.support.scraping import Figures, get
+from tests.support.waiting import SECONDS, at_most
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+    from mesh.telemetry.families import Family
+    from mesh.telemetry.server import Server
+
+WELL = Health.of({"channel": "alive"})
+SECRET = "x-not-to-be-told-again"
+
+
+def some() -> Iterable[Family]:
+    return [counter("aira_some_total", "Some", 7)]
+
+
+def serving(*, families: Callable[[], Iterable[Family]] = some, health: Callable[[], Health] = lambda: WELL) -> Server:
+    return open_server("127.0.0.1:0", families, health)
+
+
+@pytest.fixture
+def url() -> Iterator[str]:
+    """A server's address."""
+    with serving() as running:
+        yield running.url
+
+
+def connected(url: str) -> socket.socket:
+    host, _, port = url.removeprefix("http://").rpartition(":")
+    return socket.create_connection((host, int(port)), timeout=30)
+
+
+def said(url: str, request: bytes) -> bytes:
+    """All that is answered to some bytes, until the server closes the connection."""
+    with connected(url) as line:
+        line.sendall(request)
+        line.shutdown(socket.SHUT_WR)
+        answer = b""
+        while received := line.recv(65_536):
+            answer += received
+        return answer
+
+
+def trickle(line: socket.socket) -> None:
+    """Send for ever, a byte at a time. Raises `OSError` when the other side has closed the line."""
+    while True:
+        line.sendall(b"G")
+        time.sleep(0.01)
+
+
+def test_metrics_and_health_are_told(url: str) -> None:
+    assert Figures(get(url, "/metrics").text)("aira_some_total") == 7
+    assert get(url, "/health")[:2] == (200, '{"ok":true,"parts":{"channel":"alive"}}\n')
+    assert get(url, "/health?x=1").status == 200
+    assert get(url, "/health").headers["Content-Type"] == "application/json"
+
+
+def test_who_is_not_well_says_so_with_503_and_its_parts() -> None:
+    with serving(health=lambda: Health.of({"channel": "waits for a router"})) as running:
+        assert get(running.url, "/health")[:2] == (
+            503,
+            '{"ok":false,"parts":{"channel":"waits for a router"}}\n',
+        )
+
+
+def test_a_head_has_the_length_and_no_body(url: str) -> None:
+    page = get(url, "/health", method="HEAD")
+
+    assert (page.status, page.text, page.headers["Content-Length"]) == (200, "", "40")
+
+
+@pytest.mark.parametrize(
+    "path", ["/", "/metrics/", "/metric", "/../metrics", "/health/../../etc/passwd", f"/{SECRET}", "*"]
+)
+def test_any_other_path_is_404_and_never_told_again(url: str, path: str) -> None:
+    page = get(url, path)
+
+    assert (page.status, page.text) == (404, "there is /metrics, and /health\n")
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "TRACE", "CONNECT", "PROPFIND"])
+def test_nothing_can_be_done_but_reading(url: str, method: str) -> None:
+    page = get(url, "/health", method=method)
+
+    assert page.status == 501
+    assert "health" not in page.text
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        b"\r\n\r\n",
+        b"GET\r\n\r\n",
+        b"GET /health HTTP/9.9\r\n\r\n",
+        b"GET /" + b"a" * 70_000 + b" HTTP/1.1\r\n\r\n",
+        b"GET /nothing HTTP/1.1\r\n" + b"x: y\r\n" * 1000 + b"\r\n",
+        b"GET /nothing HTTP/1.1\r\nx: " + b"y" * 70_000 + b"\r\n\r\n",
+        b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(range(256)),
+        f"{SECRET} {SECRET} HTTP/1.1\r\n\r\n".encode(),
+        f"GET /<b>{SECRET}</b> HTTP/1.1\r\nHost: {SECRET}\r\n\r\n".encode(),
+    ],
+)
+def test_what_is_no_question_is_refused_and_the_next_one_answered(url: str, request_: bytes) -> None:
+    answer = said(url, request_)
+
+    assert not answer.startswith((b"HTTP/1.0 2", b"HTTP/1.1 2"))
+    assert SECRET.encode() not in answer
+    assert get(url, "/health").status == 200
+
+
+def test_who_sends_byte_by_byte_is_cut_off_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "PATIENCE", 0.5)
+    with serving() as running, at_most(20), connected(running.url) as slow, pytest.raises(OSError, match=r"\w"):
+        trickle(slow)
+
+
+def test_so_many_connections_are_held_and_more_are_closed_unanswered(url: str) -> None:
+    with ExitStack() as stack:
+        for _ in range(server.CONNECTIONS):
+            stack.enter_context(closing(connected(url)))
+        with connected(url) as one_more:
+            assert one_more.recv(1) == b""
+    answer, deadline = b"", time.monotonic() + SECONDS
+    while not answer and time.monotonic() < deadline:  # those that have left make room, once that is noticed
+        answer = said(url, b"GET /health HTTP/1.0\r\n\r\n")
+    assert answer.startswith(b"HTTP/1.0 200")
+
+
+def test_a_failure_is_an_answer_that_tells_nothing_of_it(caplog: pytest.LogCaptureFixture) -> None:
+    def fail() -> Iterable[Family]:
+        raise ZeroDivisionError(SECRET)
+
+    with serving(families=fail) as running:
+        page = get(running.url, "/metrics")
+        assert (page.status, page.text) == (500, "this failed; the server's log says why\n")
+        assert get(running.url, "/health").status == 200
+    assert SECRET in caplog.text
+
+
+def test_a_port_that_is_taken_is_one_clear_line(url: str) -> None:
+    taken = url.removeprefix("http://")
+
+    with pytest.raises(ConfigurationError, match=f"can't tell metrics and health at {taken}: ") as raised:
+        open_server(taken, some, lambda: WELL).__enter__()
+
+    assert "--metrics-listen" in raised.value.hint
+
+
+def test_a_host_that_is_none_is_one_clear_line() -> None:
+    with pytest.raises(ConfigurationError, match=r"can't tell metrics and health at 192\.0\.2\.1:\d+: "):
+        open_server(f"192.0.2.1:{free_port()}", some, lambda: WELL).__enter__()
+
+
+@pytest.mark.parametrize("listen", ["9464", ":9464", "host:", "host:x", "host:65536", "host:-1", "::1:9464", "[]:1"])
+def test_what_is_no_host_and_port_is_one_clear_line(listen: str) -> None:
+    with pytest.raises(ConfigurationError, match="is no HOST:PORT to tell metrics at"):
+        place(listen)
+
+
+@pytest.mark.parametrize(
+    ("listen", "found"),
+    [("0.0.0.0:9464", ("0.0.0.0", 9464)), ("[::1]:0", ("::1", 0)), ("localhost:80", ("localhost", 80))],
+)
+def test_a_host_and_a_port_are_found(listen: str, found: tuple[str, int]) -> None:
+    assert place(listen) == found
+
+
+def test_ipv6_is_served() -> None:
+    with open_server("[::1]:0", some, lambda: WELL) as running:
+        assert running.url.startswith("http://[::1]:")
+        assert get(running.url, "/health").status == 200
+
+
+def test_the_port_is_free_again_at_the_end() -> None:
+    with serving() as running:
+        listen = running.url.removeprefix("http://")
+        get(running.url, "/health")
+    with open_server(listen, some, lambda: WELL) as again:
+        assert get(again.url, "/health").status == 200
+
+
+def test_without_prometheus_client_it_is_one_clear_line() -> None:
+    program = """
+import sys
+sys.modules["prometheus_client"] = None
+from mesh.errors import ConfigurationError
+from mesh.telemetry.opening import open_server
+try:
+    open_server("127.0.0.1:0", list, None)
+except ConfigurationError as error:
+    print(error, "|", error.hint)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+
+    assert done.stdout == (
+        "metrics need prometheus_client, which is not installed | "
+        "pip install 'aira-mesh[metrics]', or leave metrics_listen empty\n"
+    )

@@ -1,0 +1,133 @@
+"""Metrics and health of what runs in an event loop: before it has begun, while it works, when the loop is held up."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor as Threads
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.errors import ChainError, ConfigurationError
+from mesh.telemetry import serving
+from mesh.telemetry.families import Family, counter, gauge, labelled
+from mesh.telemetry.serving import Telemetry
+from schemas.status import ALIVE
+from tests.support.scraping import SECONDS, get, health, scraped
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterable
+
+HERE = "127.0.0.1:0"
+"""A port that nobody has."""
+
+
+def telling(name: str, value: float, **labels: str) -> Callable[[], Awaitable[Iterable[Family]]]:
+    async def measure() -> Iterable[Family]:
+        return labelled([gauge(name, "Of the test", value)], **labels)
+
+    return measure
+
+
+async def test_without_a_place_nothing_is_served() -> None:
+    async with Telemetry("") as telemetry:
+        with telemetry.showing(measure=telling("aira_a", 1), health=lambda: {"part": ALIVE}):
+            assert telemetry.url == ""
+
+
+async def test_what_has_not_begun_is_not_well_and_says_what_it_waits_for() -> None:
+    async with Telemetry(HERE) as telemetry:
+        assert await health(telemetry.url) == (503, {"start": "has not come to its end"})
+        telemetry.starting("no router answers")
+        assert await health(telemetry.url) == (503, {"start": "waits: no router answers"})
+        figures = await scraped(telemetry.url)
+        assert figures("aira_part_up", part="start") == 0
+        with telemetry.showing(health=lambda: {"channel": ALIVE}):
+            assert await health(telemetry.url) == (200, {"channel": ALIVE})
+        assert (await health(telemetry.url))[0] == 503
+
+
+async def test_several_roles_of_one_process_are_told_together() -> None:
+    async with Telemetry(HERE) as telemetry:
+        with (
+            telemetry.showing(measure=telling("aira_a", 1, lighthouse="north"), health=lambda: {"north": ALIVE}),
+            telemetry.showing(measure=telling("aira_a", 2, lighthouse="south"), health=lambda: {"south": "waits"}),
+        ):
+            figures = await scraped(telemetry.url)
+            assert (figures("aira_a", lighthouse="north"), figures("aira_a", lighthouse="south")) == (1, 2)
+            assert (figures("aira_part_up", part="north"), figures("aira_part_up", part="south")) == (1, 0)
+            assert await health(telemetry.url) == (503, {"north": ALIVE, "south": "waits"})
+
+
+async def test_each_scrape_measures_anew() -> None:
+    count = 0
+
+    async def measure() -> Iterable[Family]:
+        nonlocal count
+        count += 1
+        return [counter("aira_scrapes_total", "Scrapes", count)]
+
+    async with Telemetry(HERE) as telemetry:
+        with telemetry.showing(measure=measure, health=dict):
+            for expected in (1, 2, 3):
+                assert (await scraped(telemetry.url))("aira_scrapes_total") == expected
+
+
+async def test_a_loop_that_stands_still_is_not_well_and_nobody_waits_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serving, "ANSWERED_WITHIN", 0.2)
+    async with Telemetry(HERE) as telemetry:
+        with telemetry.showing(measure=telling("aira_a", 1), health=lambda: {"channel": ALIVE}), Threads() as threads:
+            asked = [threads.submit(get, telemetry.url, path) for path in ("/health", "/metrics")]
+            # Waited for here, as by a handler that does not give way.
+            of_health, of_metrics = [asking.result(SECONDS) for asking in asked]
+            assert (of_health.status, of_metrics.status) == (503, 503)
+            assert "event loop" in of_health.text
+            assert await health(telemetry.url) == (200, {"channel": ALIVE})
+
+
+async def test_what_can_not_be_measured_now_is_no_failure_of_the_server(caplog: pytest.LogCaptureFixture) -> None:
+    async def measure() -> Iterable[Family]:
+        raise ChainError("the ledger is full")
+
+    async with Telemetry(HERE) as telemetry:
+        with telemetry.showing(measure=measure, health=lambda: {"channel": ALIVE}):
+            page = await asyncio.to_thread(get, telemetry.url, "/metrics")
+            assert (page.status, page.text) == (503, "this can't be told now; the server's log says why\n")
+    assert "the ledger is full" in caplog.text
+
+
+async def test_two_servers_can_not_have_one_port() -> None:
+    async with Telemetry(HERE) as telemetry:
+        with pytest.raises(ConfigurationError, match="can't tell metrics and health"):
+            await Telemetry(telemetry.url.removeprefix("http://")).__aenter__()
+
+
+LOADED = """
+import asyncio, sys
+{what}
+names = ("prometheus_client", "http.server", {more})
+print(sorted(name for name in names if name in sys.modules))
+"""
+
+
+@pytest.mark.parametrize(
+    ("what", "more"),
+    [
+        ("from mesh.telemetry.serving import Telemetry\nasyncio.run(Telemetry('').__aenter__())", ""),
+        ("import mesh.agent.agent, mesh.agent.party", ""),
+        ("import mesh.market.provider, mesh.market.process", ""),
+        ("import mesh.cli.provider, mesh.cli.router, mesh.cli.up, mesh.cli.chain.up", ""),
+        (
+            "from bridges.serial.serving import telling\nwith telling(''): import bridges.serial.edge",
+            '"web3", "aiohttp"',
+        ),
+    ],
+)
+def test_who_serves_no_metrics_does_not_load_what_serves_them(what: str, more: str) -> None:
+    program = LOADED.format(what=what, more=more)
+
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+
+    assert done.stdout == "[]\n"
