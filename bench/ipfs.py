@@ -1,9 +1,10 @@
 """Messages over IPFS PubSub, over the bridge, and over Zenoh: how long one takes, how many pass, what is lost or twice.
 
-`ipfs` is a bare client of one js-ipfs daemon publishing to a bare client of another, connected one: what the legacy
-network did. `bridge` is a demand put on a Zenoh key that comes to a bare client of the second daemon. `zenoh` is the
-same demand to a verified subscription. Daemons and router are processes of their own. Latencies are of single
-messages, one after the other; rates are of as many as are given without waiting.
+`ipfs` is a bare client of one daemon publishing to a bare client of another, connected one: what the legacy network
+did. `bridge` is a demand put on a Zenoh key that comes to a bare client of the second daemon. `zenoh` is the same
+demand to a verified subscription. The daemons are js-ipfs, or with `--daemon kubo` those that `AIRA_KUBO` names; a Kubo
+is given a message each 20 ms at most. Daemons and router are processes of their own. Latencies are of single messages,
+one after the other; rates are of as many as are given without waiting.
 """
 
 from __future__ import annotations
@@ -27,16 +28,20 @@ from mesh.background import Background  # noqa: E402
 from mesh.network import Channel, Endpoints, Network, free_endpoint  # noqa: E402
 from messages import route  # noqa: E402
 from orders import ADDRESS, LIGHTHOUSE, signed_demands  # noqa: E402
+from peers.catalog import PeerMissing, locate  # noqa: E402
 from report import arguments, show  # noqa: E402
 from schemas import Demand, encode  # noqa: E402
-from tests.support.ipfs import JsIpfs  # noqa: E402
+from tests.support.ipfs import JsIpfs, Kubo  # noqa: E402
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Sequence
 
+    from tests.support.ipfs import IpfsDaemon
+
 PATIENCE: Final = 15.0
 """Seconds without anything new after which what has not come is lost."""
 WARM_UP: Final = 5
+KINDS: Final[dict[str, type[IpfsDaemon]]] = {"js-ipfs": JsIpfs, "kubo": Kubo}
 LOOKS: Final = 300
 """How often it is looked for a listener, a tenth of a second apart."""
 
@@ -173,7 +178,7 @@ def publishing(channel: Channel) -> Callable[[Demand], Awaitable[None]]:
     return say
 
 
-async def measure_all(endpoint: str, one: JsIpfs, two: JsIpfs, count: int) -> dict[str, Any]:
+async def measure_all(endpoint: str, one: IpfsDaemon, two: IpfsDaemon, count: int) -> dict[str, Any]:
     """All three ways."""
     async with Daemon(one.api) as here, Daemon(two.api) as there:
         for daemon in (here, there):
@@ -189,11 +194,16 @@ async def measure_all(endpoint: str, one: JsIpfs, two: JsIpfs, count: int) -> di
 
 def main() -> None:
     """Run it."""
-    options = arguments("messages over IPFS PubSub, the bridge and Zenoh", count=1000)
+    options = arguments("messages over IPFS PubSub, the bridge and Zenoh", count=1000, daemon=tuple(KINDS))
+    try:
+        locate(options.daemon)
+    except PeerMissing as missing:
+        sys.exit(str(missing))
+    kind = KINDS[options.daemon]
     endpoint = free_endpoint()
     router = multiprocessing.get_context("spawn").Process(target=route, args=(endpoint,), daemon=True)
     router.start()
-    with JsIpfs() as one, JsIpfs() as two:
+    with kind() as one, kind() as two:
         figures = asyncio.run(measure_all(endpoint, one, two, options.count))
     router.terminate()
     show(figures, as_json=options.json)

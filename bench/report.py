@@ -7,12 +7,16 @@ import json
 from typing import Any
 
 
-def arguments(description: str, **defaults: int) -> argparse.Namespace:
-    """The command line: `--json`, and a number for each of `defaults`."""
+def arguments(description: str, **defaults: int | tuple[str, ...]) -> argparse.Namespace:
+    """The command line: `--json`, and for each of `defaults` a number, or one of several words, of which the first."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     for name, default in defaults.items():
-        parser.add_argument(f"--{name.replace('_', '-')}", type=int, default=default)
+        option = f"--{name.replace('_', '-')}"
+        if isinstance(default, tuple):
+            parser.add_argument(option, choices=default, default=default[0])
+        else:
+            parser.add_argument(option, type=int, default=default)
     return parser.parse_args()
 
 

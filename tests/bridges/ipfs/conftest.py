@@ -69,14 +69,7 @@ def topic() -> str:
 
 
 @pytest.fixture
-async def alice(swarm: Swarm) -> AsyncIterator[Bare]:
-    """A legacy client of daemon A."""
-    async with Bare(swarm.a.api) as client:
-        yield client
-
-
-@pytest.fixture
 async def bob(swarm: Swarm) -> AsyncIterator[Bare]:
     """A legacy client of daemon B."""
-    async with Bare(swarm.b.api) as client:
+    async with Bare(swarm.b.api, pause=0.02 if isinstance(swarm.b, Kubo) else 0.002) as client:
         yield client

@@ -19,10 +19,15 @@ def multibase(data: bytes) -> str:
 
 
 class Bare:
-    """A client of the daemon whose RPC is at `api`. `heard` is what it heard since `listen` returned."""
+    """A client of the daemon whose RPC is at `api`. `heard` is what it heard since `listen` returned.
 
-    def __init__(self, api: str) -> None:
+    `pause` seconds follow on each message: a Kubo drops what it checks after a later message of the same node, and it
+    checks those that come together in any order.
+    """
+
+    def __init__(self, api: str, *, pause: float = 0.02) -> None:
         self._api = api
+        self._pause = pause
         self.heard: list[bytes] = []
         self._tasks: list[asyncio.Task[None]] = []
 
@@ -66,6 +71,7 @@ class Bare:
                 if "validation ignored" not in str(refused):
                     raise
             else:
+                await asyncio.sleep(self._pause)
                 return
 
     async def peers(self, topic: str) -> list[str]:

@@ -11,6 +11,7 @@ from mesh.identity.roster import Member
 from mesh.network import Channel, Network
 from schemas import encode
 from tests.bridges.ipfs.bridges import on_mesh, until_seen
+from tests.bridges.ipfs.pages import health
 from tests.support.commands import AIRA, Serving, aira
 from tests.support.orders import PERSON, demand, offer
 from tests.support.ports import free_port
@@ -74,8 +75,12 @@ def test_the_bridge_comes_up_without_the_chains_node_and_says_what_it_does_not_c
 async def test_the_bridge_waits_for_a_router(router: EmbeddedRouter, tmp_path: Path) -> None:
     await asyncio.to_thread(router.stop)
     line = command(router, tmp_path, "--api", f"/ip4/127.0.0.1/tcp/{free_port()}", "--lighthouse", MARKET)
-    waiting = Serving(*line, "--connect-timeout", "1", says="waits for a router")
-    async with waiting as bridge:
+    port = free_port()
+    listen = ("--metrics-listen", f"127.0.0.1:{port}")
+    async with Serving(*line, "--connect-timeout", "1", *listen, says="waits for a router") as bridge:
+        code, parts = await asyncio.to_thread(health, port)
+        assert (code, list(parts)) == (503, ["start"])
+        assert "waits" in parts["start"]
         await asyncio.to_thread(router.start)
         await until(lambda: f"carries {MARKET}" in bridge.log(), seconds=60)
         assert bridge.log().count("waits for a router") == 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from hashlib import sha256
@@ -141,6 +142,31 @@ async def test_what_is_made_in_the_mesh_is_added_under_its_name_and_pinned_by_fu
         assert (figures.added, figures.by_blocks, figures.pinned) == (1, 0, 1)
         pins = await bob.call("pin/ls", ("arg", cid), ("type", "recursive"))
         assert cid in json.dumps(pins)
+
+
+async def test_what_a_message_names_before_it_is_there_is_added_when_it_comes(
+    swarm: Swarm, bob: Bare, router: EmbeddedRouter, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG, "bridges.ipfs.content")
+    content = content_of(1000, str(tmp_path))
+    async with (
+        agent(router.endpoint, tmp_path / "agent") as person,
+        door(router.endpoint, swarm.a.api, tmp_path / "bridge", timeout=2.0, again=0.5) as bridge,
+    ):
+        bridge.content.add_soon(cid_of_bytes(content))
+        await until(lambda: "not added to IPFS yet" in caplog.text, seconds=SECONDS)
+        cid = await asyncio.to_thread(person.store.put_bytes, content)
+        await until(lambda: bridge.content.figures().added == 1, seconds=SECONDS)
+        assert bridge.content.figures().failed == 0
+        assert await bob.cat(cid) == content
+
+
+async def test_what_never_comes_is_given_up_and_counted(router: EmbeddedRouter, tmp_path: Path) -> None:
+    api = f"http://127.0.0.1:{free_port()}"
+    async with door(router.endpoint, api, tmp_path / "bridge", timeout=0.2, again=0.05) as bridge:
+        bridge.content.add_soon(cid_of_bytes(str(tmp_path).encode()))
+        await until(lambda: bridge.content.figures().failed == 1, seconds=SECONDS)
+        assert bridge.content.figures().added == 0
 
 
 async def test_a_file_that_the_daemon_would_name_otherwise_is_given_to_it_block_by_block(

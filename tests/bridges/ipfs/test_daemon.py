@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from bridges.ipfs import Daemon, DaemonRefused, DaemonUnreachable, NoPeers
+from bridges.ipfs import AccessDenied, Daemon, DaemonRefused, DaemonUnreachable, NoPeers
 from bridges.ipfs.daemon import SETTINGS
 from mesh.errors import ClosedError
 from schemas import CHUNK_SIZE, cid_of_bytes
+from tests.support.ipfs import Kubo
 from tests.support.ports import free_port
 from tests.support.waiting import until_found
 
@@ -23,6 +24,17 @@ if TYPE_CHECKING:
     from tests.bridges.ipfs.legacy import Bare
 
 DATA = bytes(range(256)) + b'{"tx":"\n"}'
+OTHER = "12D3KooWRBhwfeP2Y4TCx1SM6s9rUoHhR5STiGwxBhgFRcw3UERE"
+NEEDED = ("version", "id", "pubsub", "swarm", "add", "block", "pin")
+
+
+class ProtectedKubo(Kubo):
+    """A Kubo that lets in who has a secret, to what a bridge needs."""
+
+    def configure(self, config: dict[str, Any]) -> None:
+        super().configure(config)
+        paths = [f"/api/v0/{call}" for call in NEEDED]
+        config["API"] = {"Authorizations": {"bridge": {"AuthSecret": "bearer:right", "AllowedPaths": paths}}}
 
 
 @pytest.fixture
@@ -104,6 +116,31 @@ async def test_a_call_that_the_daemon_does_not_know_is_refused_in_its_words(daem
     with pytest.raises(DaemonRefused, match=r".") as refused:
         await daemon.connect("/ip4/127.0.0.1/tcp/1/p2p/nonsense")
     assert refused.value.why
+
+
+async def test_a_protected_kubo_opens_what_a_bridge_needs_to_the_right_secret(topic: str, tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_bytes(b"behind a secret")
+    async with ProtectedKubo() as kubo:
+        async with Daemon(kubo.api, authorization="Bearer right") as daemon, daemon.subscribe(topic) as events:
+            await daemon.greet()
+            assert (await daemon.identity()).id == kubo.peer_id
+            assert await daemon.listeners(topic) == await daemon.neighbours() == []
+            await daemon.publish(topic, DATA)
+            event = await anext(events)
+            assert event is not None
+            assert event.data == DATA
+            name = await daemon.add(file)
+            block = await daemon.block(name, limit=1000)
+            await daemon.put_block(block)
+            await daemon.pin(name)
+            await daemon.unpin(name)
+            with pytest.raises(DaemonRefused, match="connect") as refused:
+                await daemon.connect(f"/ip4/127.0.0.1/tcp/{free_port()}/p2p/{OTHER}")
+            assert not isinstance(refused.value, AccessDenied)
+        async with Daemon(kubo.api, authorization="Bearer wrong") as daemon:
+            with pytest.raises(AccessDenied, match="Access Denied"):
+                await daemon.greet()
 
 
 async def test_a_daemon_that_is_not_there_is_unreachable() -> None:

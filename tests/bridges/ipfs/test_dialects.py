@@ -31,6 +31,12 @@ def test_a_daemon_is_called_what_it_was_called_then() -> None:
     assert str(Version(version="0.18.1", js_core="0.18.1")) == "js-ipfs 0.18.1"
 
 
+@pytest.mark.parametrize("version", [Version(version="0.18.1", js_core="0.18.1"), Version(js_interface="^0.133.1")])
+def test_js_ipfs_is_told_from_the_others(version: Version) -> None:
+    assert version.is_js
+    assert not Version(version="0.44.0", golang="go1.26").is_js
+
+
 def test_multibase_writes_topics_as_base64url_without_padding() -> None:
     assert Multibase().topic("a.lighthouse") == "uYS5saWdodGhvdXNl"
     assert Multibase().topic("topic?>") == "udG9waWM_Pg"

@@ -14,7 +14,7 @@ from bridges.ipfs import AccessDenied, Daemon, PubSubDisabled
 from bridges.ipfs.writing import legacy_json
 from schemas import encode
 from tests.bridges.ipfs.bridges import bridging, on_mesh, until_seen
-from tests.bridges.ipfs.old_daemon import OldDaemon
+from tests.bridges.ipfs.replays import OldDaemon
 from tests.support.orders import demand, offer
 from tests.support.waiting import until
 

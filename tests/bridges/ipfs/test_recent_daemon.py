@@ -13,7 +13,7 @@ from bridges.ipfs.writing import legacy_json
 from schemas import encode
 from tests.bridges.ipfs.bridges import bridging, on_mesh, until_seen
 from tests.bridges.ipfs.legacy import Bare
-from tests.bridges.ipfs.recent_daemon import RecentDaemon
+from tests.bridges.ipfs.replays import RecentDaemon
 from tests.support.orders import demand, offer
 from tests.support.waiting import until
 
@@ -50,6 +50,27 @@ async def test_several_channels_do_not_overtake_each_other_at_one_daemon() -> No
         await daemon.greet()
         await asyncio.gather(*(daemon.publish(f"topic {number}", b"hello") for number in range(6)))
         assert recent.overtaken == 0
+
+
+async def test_a_flood_of_the_mesh_comes_to_other_nodes_that_check_it_in_the_wrong_order(
+    router: EmbeddedRouter, topic: str, tmp_path: Path
+) -> None:
+    async with RecentDaemon() as one, RecentDaemon(busy=0.01) as two:
+        one.others, two.others = [two], [one]
+        async with (
+            Bare(two.api) as bob,
+            on_mesh(router.endpoint, topic) as mesh,
+            bridging(router.endpoint, one.api, topic, tmp_path / "journal.sqlite") as bridge,
+        ):
+            await bob.listen(topic)
+            await until(lambda: bridge.status().state == "connected", seconds=SECONDS)
+            await until_seen(mesh, bridge.address)
+            orders = [demand(cost=number) for number in range(50)]
+            for order in orders:
+                mesh.channel.publish(order)
+            await until(lambda: bridge.status().to_ipfs.carried == len(orders), seconds=SECONDS)
+            await until(lambda: len(bob.heard) + two.lost == len(orders), seconds=SECONDS)
+            assert bob.heard == [legacy_json(order) for order in orders]
 
 
 async def test_what_somebody_else_has_overtaken_is_published_again(

@@ -4,8 +4,9 @@ import logging
 from typing import TYPE_CHECKING
 
 from bridges.ipfs.report import figures_of, news
-from schemas.status import BridgeStatus, ContentFigures, Way
+from schemas.status import ContentFigures
 from tests.bridges.ipfs.bridges import bridging, on_mesh, until_seen
+from tests.bridges.ipfs.statuses import status, way
 from tests.support.orders import demand
 from tests.support.ports import free_port
 from tests.support.waiting import until
@@ -16,19 +17,6 @@ if TYPE_CHECKING:
     import pytest
 
     from tests.support.routers import EmbeddedRouter
-
-
-def way(**figures: object) -> Way:
-    nothing: dict[str, object] = dict.fromkeys(
-        ("received", "known", "accepted", "carried", "left", "waiting", "left_waiting", "unheard"), 0
-    )
-    return Way(**(nothing | {"invalid": {}, "dropped": {}, "per_second": 0.5} | figures))  # type: ignore[arg-type]
-
-
-def status(**figures: object) -> BridgeStatus:
-    rest = {"bridge": "0x", "lighthouse": "l", "state": "connected", "carries": True, "api": "", "daemon": ""}
-    more = {"dialect": "", "ipfs_peers": (), "mesh_peers": (), "losses": 0, "last_error": ""}
-    return BridgeStatus(**(rest | more | {"to_ipfs": way(), "to_mesh": way()} | figures))  # type: ignore[arg-type]
 
 
 def test_only_what_is_new_is_said() -> None:

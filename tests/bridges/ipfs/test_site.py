@@ -10,7 +10,7 @@ from mesh.background import Background
 from mesh.identity.roster import Member
 from mesh.network import Channel, Network
 from schemas import Offer, verify_message
-from tests.bridges.ipfs.old_daemon import OldDaemon
+from tests.bridges.ipfs.replays import OldDaemon
 from tests.support.orders import LIGHTHOUSE, PERSON, ROBOT, demand, offer
 from tests.support.sites import MARKET, Site
 from tests.support.waiting import until

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 __all__ = ["founded", "place"]
 
 LONG = 60.0
+OTHER_MODEL = cid_of_bytes(b"what the second robot of the test can do")
 
 
 def is_at_work(uno: SimulatedBoard) -> bool:
@@ -166,7 +167,6 @@ async def second_robot(place: Place, account: Account, model: str) -> AsyncItera
 
 
 async def test_two_boards_do_jobs_of_one_market_at_the_same_time(place: Place) -> None:
-    other_model = cid_of_bytes(b"what the second robot of the test can do")
     counting_began, talking_began = asyncio.Event(), asyncio.Event()
     first = obliging(place.agent("robot"))
     counter = Device(first, patience=LONG)
@@ -178,7 +178,7 @@ async def test_two_boards_do_jobs_of_one_market_at_the_same_time(place: Place) -
         await counter.call("/slow", 1, job=job)
 
     account = Account.from_key(place.node.funded_keys[4])
-    async with second_robot(place, account, other_model) as second:
+    async with second_robot(place, account, OTHER_MODEL) as second:
         talker = Device(second, patience=LONG)
 
         @second.on("/say", String)
@@ -198,7 +198,7 @@ async def test_two_boards_do_jobs_of_one_market_at_the_same_time(place: Place) -
         ):
             async with place.at_work(first, second) as person:
                 contracts = await asyncio.gather(
-                    person.demand(numbers, cost=1), person.demand(words, cost=1, model=other_model)
+                    person.demand(numbers, cost=1), person.demand(words, cost=1, model=OTHER_MODEL)
                 )
                 outcomes = await asyncio.gather(*(contract.outcome() for contract in contracts))
                 assert all(outcome.success for outcome in outcomes)
