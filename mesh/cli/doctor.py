@@ -1,0 +1,141 @@
+"""`aira doctor`: what stands in the way of a role on this machine."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import aclosing
+from typing import TYPE_CHECKING, Any, Final, get_args
+
+import click
+
+from mesh.cli.options import with_settings
+from mesh.cli.printing import plural, print_json, say, visible, with_json
+from mesh.doctor.case import Case, Line, Role, examined_as
+from mesh.doctor.findings import Verdict
+from mesh.errors import AiraError, InputError
+from mesh.running import fail, run_to_end
+from mesh.settings import CHAIN_SETTINGS, NETWORK_SETTINGS
+
+if TYPE_CHECKING:
+    from mesh.doctor.checks import Checked
+    from mesh.settings import Settings
+
+COLOURS: Final = {Verdict.OK: "green", Verdict.WARN: "yellow", Verdict.FAIL: "red"}
+MARK: Final = 6
+"""Columns of the mark before each line."""
+
+
+@click.command("doctor")
+@click.option("--role", type=click.Choice(get_args(Role)), help="what this machine is to be [what the settings imply]")
+@click.option(
+    "--timeout",
+    type=click.FloatRange(0, 600, min_open=True),
+    default=15.0,
+    show_default=True,
+    help="seconds for all checks together",
+)
+@click.option("--chain-id", type=click.IntRange(1), help="number of the chain that it should be (EIP-155)")
+@click.option("--port", default="", help="of an edge agent: its serial port, as in `aira edge PORT`")
+@click.option("--protocol", type=click.Choice(["frames", "rosserial"]), default="frames", help="what its board speaks")
+@click.option("--baud", type=click.IntRange(300, 4_000_000), default=57_600, help="bits per second of its port")
+@click.option("--agent", default="", help="of an edge agent: address of the agent whose device it serves")
+@click.option("--device", default="", help="of an edge agent: name of that device")
+@with_json
+@with_settings(
+    *NETWORK_SETTINGS,
+    "listen",
+    "link",
+    "roster",
+    "lighthouse_contract",
+    "erc20_token",
+    "keyfile",
+    "keyfile_password_file",
+    *CHAIN_SETTINGS,
+    "content_limit",
+    "ipfs_http_provider",
+    "ipfs_authorization_file",
+)
+def command(settings: Settings, as_json: bool, timeout: float, role: Role | None, **options: Any) -> None:
+    """Look at everything that a role needs on this machine, and say what is wrong and what to do about it.
+
+    The router and what it lets this identity do, the clocks, the chain and its contracts, the account and its money,
+    the disk; for a bridge also the IPFS daemon, for an edge agent the serial port and its board (which opening the port
+    starts anew). Nothing is changed or spent, and no key or password is shown.
+
+    A line for each check: ok, warn (it works now) or FAIL. With --json an object for each: name, ok, found, do. What
+    can't be tried because of a failure before it is left out. Exits 1 if anything fails.
+    """
+    try:
+        case = _case(settings, role, **options)
+    except AiraError as error:
+        fail(error)
+    failed: list[str] = []
+    run_to_end(lambda: _examine(case, failed, seconds=timeout, as_json=as_json))
+    if failed:
+        sys.exit(1)
+
+
+def _case(settings: Settings, role: Role | None, **options: Any) -> Case:
+    """Who is examined. Raises `InputError` for options that can't be meant together."""
+    agent, device = options["agent"], options["device"]
+    if bool(agent) != bool(device):
+        raise InputError("of --agent and --device one is missing")
+    return examined_as(
+        Case(
+            settings=settings,
+            asked_role=role,
+            agent=agent,
+            device=device,
+            line=Line(port=options["port"], protocol=options["protocol"], baud=options["baud"]),
+            chain_id=options["chain_id"] or 0,
+        )
+    )
+
+
+async def _examine(case: Case, failed: list[str], *, seconds: float, as_json: bool) -> None:
+    """Make the checks and tell each; the names of those that fail go into `failed`."""
+    from mesh.doctor import checks_for, examine
+
+    verdicts: dict[Verdict, list[str]] = {verdict: [] for verdict in Verdict}
+    left_out: list[str] = []
+    async with checks_for(case) as checks, aclosing(examine(checks, seconds=seconds)) as examined:
+        width = max(len(check.name) for check in checks)
+        async for checked in examined:
+            if checked.finding is None:
+                left_out.append(checked.name)
+                continue
+            verdicts[checked.finding.verdict].append(checked.name)
+            if as_json:
+                _print_object(case, checked)
+            else:
+                _say_line(case, checked, width)
+    if not as_json:
+        _sum_up(case, len(checks), verdicts, left_out)
+    failed += verdicts[Verdict.FAIL]
+
+
+def _print_object(case: Case, checked: Checked) -> None:
+    assert checked.finding is not None
+    found, do = (case.without_secrets(text) for text in checked.finding[1:])
+    print_json({"name": checked.name, "ok": checked.finding.ok, "found": found, "do": do})
+
+
+def _say_line(case: Case, checked: Checked, width: int) -> None:
+    assert checked.finding is not None
+    verdict, found, do = checked.finding
+    mark = click.style(f"{verdict.value:<{MARK}}", fg=COLOURS[verdict], bold=verdict is Verdict.FAIL)
+    say(f"{mark}{checked.name:<{width}}  {visible(case.without_secrets(found))}")
+    if do:
+        say(f"{'':<{MARK + width}}  -> {visible(case.without_secrets(do))}")
+
+
+def _sum_up(case: Case, count: int, verdicts: dict[Verdict, list[str]], left_out: list[str]) -> None:
+    failed, warned = verdicts[Verdict.FAIL], verdicts[Verdict.WARN]
+    say()
+    if left_out:
+        say(f"not tried, because of a failure before: {', '.join(left_out)}")
+    if failed:
+        say(f"{plural(len(failed), 'check')} of {count} failed for the role {case.role}: {', '.join(failed)}")
+    else:
+        warnings = f"; with a warning: {', '.join(warned)}" if warned else ""
+        say(f"all {count} checks are in order for the role {case.role}{warnings}")

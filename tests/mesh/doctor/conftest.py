@@ -1,0 +1,21 @@
+"""Fixtures for the tests of the doctor."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.mesh.cli.chains import Town
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Town]:
+    """A served chain with the contracts, and people with money, who keep their files to themselves."""
+    with Town(tmp_path_factory.mktemp("town")) as founded:
+        for file in (founded.folder / "password", *(person.keyfile for person in founded.people.values())):
+            file.chmod(0o600)
+        yield founded

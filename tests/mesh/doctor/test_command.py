@@ -1,0 +1,218 @@
+"""`aira doctor`: its lines, its objects, its exit code, and what it never shows."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import socket
+import sys
+from typing import TYPE_CHECKING, Any
+
+from mesh.doctor import Case
+from mesh.doctor.case import Line
+from mesh.doctor.certificate import Shown
+from mesh.identity import Member
+from mesh.settings import Settings
+from tests.mesh.cli.chains import PASSWORD, Town
+from tests.mesh.doctor.examining import settings_of
+from tests.support.commands import aira, run
+from tests.support.ports import free_port
+from tests.support.sites import Site
+from tests.support.waiting import at_most
+
+if TYPE_CHECKING:
+    import subprocess
+    from pathlib import Path
+
+    from tests.support.routers import EmbeddedRouter
+
+LINE = re.compile(r"(?P<mark>ok|warn|FAIL) +(?P<name>\S+(?: \S+)*)  +(?P<found>\S.*)")
+ARM = "0x" + "0a" * 20
+
+
+def objects(done: subprocess.CompletedProcess[str]) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def test_a_sound_machine_has_a_line_for_each_check_and_ends_with_0(town: Town, router: EmbeddedRouter) -> None:
+    done = aira("doctor", "--role", "provider", "--connect", router.endpoint, **town.variables("provider"))
+
+    assert (done.returncode, done.stderr) == (0, "")
+    *lines, last = [line for line in done.stdout.splitlines() if line and "->" not in line]
+    parts = [LINE.fullmatch(line) for line in lines]
+    assert all(parts), done.stdout
+    assert [part["name"] for part in parts if part] == [
+        *("router", "session", "own write", "denied write", "router clock"),
+        *("node", "chain", "node clock", "chain clock", "contracts", "lighthouse", "token"),
+        *("keyfile", "ether", "tokens", "stake", "turn", "data folder", "disk space"),
+    ]
+    assert last == "all 19 checks are in order for the role provider"
+    assert "\x1b" not in done.stdout
+    assert PASSWORD not in done.stdout
+
+
+def test_a_warning_ends_with_0_and_is_named_at_the_end(town: Town, router: EmbeddedRouter, tmp_path: Path) -> None:
+    password = tmp_path / "password"
+    password.write_text(PASSWORD)
+    password.chmod(0o644)
+    variables = town.variables("robot") | {"AIRA_KEYFILE_PASSWORD_FILE": str(password)}
+    done = aira("doctor", "--connect", router.endpoint, **variables)
+
+    assert done.returncode == 0, done.stdout
+    assert done.stdout.endswith("checks are in order for the role agent; with a warning: keyfile\n")
+    assert f"-> chmod 600 {password}\n" in done.stdout
+
+
+def test_a_failure_says_what_to_do_what_was_not_tried_and_ends_with_1(tmp_path: Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with at_most(30):
+        done = aira("doctor", "--role", "operator", "--connect", endpoint)
+
+    assert (done.returncode, done.stderr) == (1, "")
+    assert done.stdout.splitlines() == [
+        f"FAIL  router        {endpoint}: no router listens there",
+        "                    -> start one there with `aira router`, or name another with --connect tcp/HOST:PORT",
+        "",
+        "not tried, because of a failure before: session, own write, denied write, router clock",
+        "1 check of 5 failed for the role operator: router",
+    ]
+
+
+def test_json_is_an_object_a_check_with_four_names(town: Town, router: EmbeddedRouter) -> None:
+    variables = town.variables("robot") | {"AIRA_CONNECT": router.endpoint}
+    done = aira("doctor", "--json", **variables)
+    found = objects(done)
+
+    assert (done.returncode, done.stderr) == (0, "")
+    assert all(list(each) == ["name", "ok", "found", "do"] for each in found)
+    assert all(each["ok"] is True and each["found"] for each in found)
+    assert {each["do"] for each in found} == {""}
+
+
+def test_json_of_a_failure_has_what_to_do(town: Town, router: EmbeddedRouter) -> None:
+    done = aira("doctor", "--json", "--role", "provider", "--connect", router.endpoint, **town.variables("stranger"))
+
+    assert done.returncode == 1
+    (failed,) = [each for each in objects(done) if not each["ok"]]
+    assert failed["name"] == "stake"
+    assert "has no stake" in failed["found"]
+    assert "aira lighthouse join" in failed["do"]
+
+
+def test_a_wrong_password_is_shown_neither_as_it_is_nor_as_it_should_be(town: Town, tmp_path: Path) -> None:
+    (tmp_path / "password").write_text("open barley\n")
+    variables = town.variables("robot") | {"AIRA_KEYFILE_PASSWORD_FILE": str(tmp_path / "password")}
+    done = aira("doctor", "--json", "--role", "agent", **variables)
+
+    (keyfile,) = [each for each in objects(done) if each["name"] == "keyfile"]
+    assert not keyfile["ok"]
+    assert not any(word in done.stdout + done.stderr for word in ("barley", PASSWORD))
+
+
+def test_a_key_in_the_address_of_a_node_is_not_shown() -> None:
+    port = free_port()
+    done = aira("doctor", "--role", "agent", "--web3-http-provider", f"http://me:sesame@127.0.0.1:{port}/v3/0xc0ffee")
+
+    assert f"http://127.0.0.1:{port}/…" in done.stdout
+    assert not any(word in done.stdout + done.stderr for word in ("sesame", "c0ffee"))
+
+
+def test_settings_that_can_t_be_read_end_with_2() -> None:
+    done = aira("doctor", "--generation", "4")
+
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert "generation" in done.stderr
+
+
+def test_a_device_without_its_agent_ends_with_2() -> None:
+    done = aira("doctor", "--device", "lamp")
+
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "--agent" in done.stderr
+
+
+def test_a_server_that_takes_connections_and_says_nothing_ends_with_the_time() -> None:
+
+    with socket.create_server(("127.0.0.1", 0)) as silent, at_most(40):
+        port = silent.getsockname()[1]
+        done = aira(
+            *("doctor", "--timeout", "3", "--json", "--connect", f"tcp/127.0.0.1:{port}"),
+            *("--web3-http-provider", f"http://127.0.0.1:{port}"),
+        )
+
+    failed = [each["name"] for each in objects(done) if not each["ok"]]
+    assert done.returncode == 1
+    assert failed == ["session", "node"]
+
+
+def test_the_certificate_s_role_is_taken_where_none_is_named(tmp_path: Path) -> None:
+    site = Site(tmp_path)
+    folder = site.enlist(Member(name="desk", address=ARM, roles=("operator",)))
+    settings = settings_of(site.client(folder))
+    files = ("--tls-ca", settings.tls_ca, "--tls-certificate", settings.tls_certificate, "--tls-key", settings.tls_key)
+    with site.open_router("wheel"):
+        done = aira("doctor", "--connect", site.endpoint, *files)
+
+    assert done.returncode == 0, done.stdout
+    assert "for the role operator" in done.stdout
+    assert "refused, as it should be: " in done.stdout
+
+
+def shown(*roles: str) -> Shown:
+    """What a certificate with these roles says."""
+    return Shown(address=ARM, name="somebody", roles=roles, until=0.0)
+
+
+def test_the_role_follows_from_the_settings() -> None:
+    assert Case(settings=Settings()).role == "agent"
+    assert Case(settings=Settings(roster="roster.toml")).role == "router"
+    assert Case(settings=Settings(), line=Line(port="/dev/ttyACM0")).role == "edge"
+    assert Case(settings=Settings(), identity=shown("watcher")).role == "operator"
+    assert Case(settings=Settings(), identity=shown("provider")).role == "provider"
+    assert Case(settings=Settings(roster="roster.toml"), asked_role="person", identity=shown("edge")).role == "person"
+
+
+def test_nothing_is_left_behind(town: Town, router: EmbeddedRouter, tmp_path: Path) -> None:
+    before = sorted(os.listdir(tmp_path))
+    variables = town.variables("robot") | {"AIRA_DATA_DIR": str(tmp_path / "state")}
+    done = aira("doctor", "--connect", router.endpoint, **variables)
+
+    assert done.returncode == 0, done.stdout
+    assert sorted(os.listdir(tmp_path)) == before
+
+
+SMALL = """
+import sys
+for name in ("web3", "eth_account", "eth_abi", "aiohttp", "cryptography", "prometheus_client"):
+    sys.modules[name] = None
+from mesh.__main__ import main
+main()
+"""
+"""The command line on an edge machine, which has none of these."""
+
+
+def test_an_edge_machine_is_examined_without_what_only_other_roles_need(tmp_path: Path) -> None:
+    site = Site(tmp_path)
+    folder = site.enlist(Member(name="lamp", address=ARM, roles=("edge",)))
+    settings = settings_of(site.client(folder))
+    files = ("--tls-ca", settings.tls_ca, "--tls-certificate", settings.tls_certificate, "--tls-key", settings.tls_key)
+    with site.open_router("wheel"):
+        done = run(
+            sys.executable, "-c", SMALL, "doctor", "--json", "--port", "/dev/null", "--connect", site.endpoint, *files
+        )
+
+    found = {each["name"]: each for each in objects(done)}
+    assert done.stderr == ""
+    assert [name for name, each in found.items() if not each["ok"]] == ["serial port"]
+    assert found["certificate"]["found"].startswith(f"lamp, edge, {ARM}: valid")
+    assert found["denied write"]["found"] == "refused, as it should be: a write in the jobs of its agent"
+
+
+def test_another_role_there_is_told_what_is_missing() -> None:
+    done = run(sys.executable, "-c", SMALL, "doctor", "--json", "--role", "agent")
+
+    (node,) = [each for each in objects(done) if each["name"] == "node"]
+    assert "which is not installed here" in node["found"]
+    assert "pip install 'aira-mesh[chain" in node["do"]

@@ -1,0 +1,99 @@
+"""The disk: a folder that can't be written, a disk that is full, and one that soon will be."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import TYPE_CHECKING
+
+from mesh.doctor import Case, Verdict
+from mesh.doctor.disk import LEAST, look_at_folder, look_at_room
+from mesh.settings import Settings
+from tests.mesh.doctor.examining import examined
+from tests.support.commands import run
+from tests.support.disks import room_for
+from tests.support.routers import EmbeddedRouter
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+AS_NOBODY = """
+import os, sys
+from pathlib import Path
+from mesh.doctor.disk import look_at_folder
+if os.geteuid() == 0:
+    os.setgroups([]), os.setgid(65534), os.setuid(65534)
+print(*look_at_folder(Path(sys.argv[1])), sep="\\n")
+"""
+
+
+def test_a_folder_that_takes_a_file_is_sound_and_keeps_nothing_of_it(tmp_path: Path) -> None:
+    finding = look_at_folder(tmp_path)
+
+    assert finding.verdict is Verdict.OK
+    assert finding.found.startswith(f"{tmp_path} is written and synced in ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_is_yet_to_be_made_is_looked_at_where_it_will_be(tmp_path: Path) -> None:
+    finding = look_at_folder(tmp_path / "a" / "b")
+
+    assert finding.found == f"{tmp_path / 'a' / 'b'} is made at the start; {tmp_path} takes it"
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_folder_of_another_user_is_named_with_both_and_the_cure(tmp_path: Path) -> None:
+    tmp_path.chmod(0o555)
+    for parent in tmp_path.parents:
+        if parent.stat().st_uid == os.geteuid() and parent != parent.parent:
+            parent.chmod(parent.stat().st_mode | 0o011)
+    done = run(sys.executable, "-c", AS_NOBODY, tmp_path)
+
+    verdict, found, do = done.stdout.splitlines()
+    assert verdict == "Verdict.FAIL", done.stderr
+    assert f"{tmp_path} can't be written: Permission denied; it belongs to " in found
+    assert do.startswith("sudo chown -R ")
+    assert "--data-dir" in do
+
+
+async def test_a_data_dir_that_is_a_file_is_named(tmp_path: Path) -> None:
+    (tmp_path / "state").write_text("")
+    with EmbeddedRouter() as router:
+        settings = Settings(connect=(router.endpoint,), data_dir=str(tmp_path / "state" / "deeper"))
+        found = await examined(Case(settings=settings, asked_role="bridge"))
+
+    assert "data folder" in found.failed
+    assert "can't be written: Not a directory" in found.one("data folder").found
+    assert "disk space" not in found
+
+
+def test_a_full_disk_is_said_to_be_full(tmp_path: Path) -> None:
+    with room_for(1024):
+        finding = look_at_folder(tmp_path)
+
+    assert not finding.ok
+    assert finding.found.startswith(f"the disk of {tmp_path} is full")
+    assert "free some space" in finding.do
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_room_for_all_that_may_be_kept_is_sound(tmp_path: Path) -> None:
+    assert look_at_room(tmp_path, content_limit=1024).verdict is Verdict.OK
+
+
+def test_a_limit_beyond_the_disk_is_a_warning_that_counts_what_is_kept(tmp_path: Path) -> None:
+    store = tmp_path / "0xAb" / "content"
+    store.mkdir(parents=True)
+    (store / "Qm").write_bytes(b"")
+    os.truncate(store / "Qm", 3 * 1024**3)
+
+    finding = look_at_room(tmp_path, content_limit=1024**5)
+
+    assert finding.verdict is Verdict.WARN
+    assert "3.0 GiB kept of at most 1,048,576.0 GiB" in finding.found
+    assert "--content-limit" in finding.do
+
+
+def test_a_disk_without_room_for_a_ledger_fails(tmp_path: Path) -> None:
+    assert not look_at_room(tmp_path, content_limit=1024, least=1024**6).ok
+    assert look_at_room(tmp_path, content_limit=1024, least=LEAST).ok

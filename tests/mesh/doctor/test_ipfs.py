@@ -1,0 +1,95 @@
+"""The IPFS daemon: one that is not there, one without PubSub, one that wants a password, and a sound one."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from bridges.ipfs.check import checks
+from mesh.doctor import Case, Verdict
+from mesh.settings import Settings
+from tests.bridges.ipfs.replays import RecentDaemon
+from tests.mesh.doctor.examining import Found, examined, made
+from tests.support.ipfs import JsIpfs
+from tests.support.ports import free_port
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+class Mute(JsIpfs):
+    """A daemon without PubSub."""
+
+    def configure(self, config: dict[str, Any]) -> None:
+        super().configure(config)
+        config["Pubsub"] = {"Enabled": False}
+
+
+async def found_at(api: str, **options: Any) -> Found:
+    """What is found of the daemon there."""
+    return await made(checks(Case(settings=Settings(ipfs_http_provider=api, **options), asked_role="bridge")))
+
+
+async def test_a_daemon_with_pubsub_is_sound_and_named(js_ipfs: JsIpfs) -> None:
+    found = await found_at(js_ipfs.api)
+
+    assert found.failed == []
+    assert found.one("ipfs daemon").found == f"js-ipfs 0.18.1 at {js_ipfs.api}, speaks the multibase dialect"
+    assert found.one("ipfs pubsub").found.startswith("enabled; ")
+
+
+async def test_a_daemon_without_pubsub_is_told_how_to_get_it_and_one_that_knows_nobody_is_a_warning() -> None:
+    with Mute() as mute:
+        found = await found_at(mute.api)
+
+    assert "not enabled" in found.cause("ipfs pubsub")
+    assert "ipfs config --json Pubsub.Enabled true" in found.cause("ipfs pubsub")
+    assert found.one("ipfs swarm").verdict is Verdict.WARN
+    assert "--ipfs-swarm-connect" in found.one("ipfs swarm").do
+
+
+async def test_a_daemon_that_wants_a_password_is_told_from_one_that_is_not_there(tmp_path: Path) -> None:
+    secret = tmp_path / "authorization"
+    secret.write_text("Bearer wrong")
+    async with RecentDaemon(authorization="Bearer right") as recent:
+        cause = (await found_at(recent.api, ipfs_authorization_file=str(secret))).cause("ipfs daemon")
+        secret.write_text("Bearer right")
+        allowed = await found_at(recent.api, ipfs_authorization_file=str(secret))
+
+    assert "Access Denied" in cause
+    assert "--ipfs-authorization-file" in cause
+    assert "wrong" not in cause
+    assert allowed.one("ipfs daemon").ok
+
+
+async def test_a_daemon_that_is_not_there_is_named_once() -> None:
+    api = f"http://127.0.0.1:{free_port()}"
+    found = await found_at(api)
+
+    assert api in found.cause("ipfs daemon")
+    assert "is the daemon running" in found.cause("ipfs daemon")
+    assert list(found) == ["ipfs daemon"]
+
+
+async def test_a_password_in_the_daemon_s_address_is_not_shown() -> None:
+    case = Case(settings=Settings(ipfs_http_provider=f"http://me:sesame@127.0.0.1:{free_port()}"))
+
+    found = (await made(checks(case))).one("ipfs daemon")
+
+    assert not found.ok
+    assert "sesame" not in str(found)
+
+
+def test_only_a_bridge_needs_a_daemon_unless_one_is_named() -> None:
+    assert "ipfs" not in Case(settings=Settings()).fields
+    assert "ipfs" in Case(settings=Settings(), asked_role="bridge").fields
+    assert "ipfs" in Case(settings=Settings(ipfs_http_provider="http://ipfs:5001")).fields
+
+
+async def test_a_bridge_without_a_daemon_hears_of_it_among_the_rest() -> None:
+    settings = Settings(
+        connect=(f"tcp/127.0.0.1:{free_port()}",),
+        web3_http_provider=f"http://127.0.0.1:{free_port()}",
+        ipfs_http_provider=f"http://127.0.0.1:{free_port()}",
+    )
+
+    assert (await examined(Case(settings=settings, asked_role="bridge"))).failed == ["router", "node", "ipfs daemon"]

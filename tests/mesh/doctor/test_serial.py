@@ -1,0 +1,120 @@
+"""The serial line: ports that are not there, may not be used or are taken, and boards that answer or don't."""
+
+from __future__ import annotations
+
+import grp
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from bridges.serial import check
+from bridges.serial.ports import Port
+from mesh.doctor import Case
+from mesh.doctor.case import Line
+from mesh.settings import Settings
+from tests.mesh.doctor.examining import examined
+from tests.support.boards import COUNTER, ROSSERIAL_ECHO, board
+from tests.support.commands import run
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from tests.support.routers import EmbeddedRouter
+
+IMPORTS = """
+import os, sys
+from bridges.serial.check import look_at_port
+from mesh.doctor.case import Line
+"""
+LOOK = f"{IMPORTS}print(*look_at_port(Line(port=sys.argv[1])), sep=os.linesep)"
+AS_NOBODY = LOOK.replace("print", "if os.geteuid() == 0: os.setgroups([]), os.setgid(65534), os.setuid(65534)\nprint")
+
+
+@pytest.fixture
+def silent() -> Iterator[str]:
+    """A port at whose other end nobody answers."""
+    master, slave = os.openpty()
+    yield os.ttyname(slave)
+    os.close(master)
+    os.close(slave)
+
+
+def test_a_port_that_opens_is_sound(silent: str) -> None:
+    assert check.look_at_port(Line(port=silent)).found == f"{silent} opens at 57,600 baud"
+
+
+async def test_a_port_that_is_not_there_is_named(router: EmbeddedRouter) -> None:
+    case = Case(settings=Settings(connect=(router.endpoint,)), line=Line(port="/dev/ttyNOTHING"))
+
+    found = await examined(case)
+
+    assert case.role == "edge"
+    cause = found.cause("serial port")
+    assert "no serial port /dev/ttyNOTHING" in cause
+    assert "is the board plugged in?" in cause
+    assert "serial board" not in found
+
+
+def test_a_port_without_permission_is_named_with_its_group_and_the_cure(silent: str) -> None:
+    os.chmod(silent, 0)
+    if os.geteuid() == 0:
+        os.chown(silent, -1, grp.getgrnam("dialout").gr_gid)
+    done = run(sys.executable, "-c", AS_NOBODY, silent)
+
+    verdict, found, do = done.stdout.splitlines()
+    assert verdict == "Verdict.FAIL", done.stderr
+    assert f"{silent} can't be opened by " in found
+    assert "no permission; it belongs to the group " in found
+    assert do.startswith("sudo usermod -aG ")
+    assert "log in anew" in do
+
+
+def test_a_port_that_another_program_uses_is_told_from_a_forbidden_one(silent: str) -> None:
+    port = Port(Path(silent), baud=57_600)
+    try:
+        done = run(sys.executable, "-c", LOOK, silent)
+    finally:
+        port.close()
+
+    verdict, found, do = done.stdout.splitlines()
+    assert verdict == "Verdict.FAIL", done.stderr
+    assert "another process uses it" in found
+    assert "fuser" in do
+
+
+def test_a_file_that_is_no_port_is_said_to_be_none() -> None:
+    finding = check.look_at_port(Line(port="/dev/null"))
+
+    assert not finding.ok
+    assert "it is no serial port" in finding.found
+
+
+def test_a_port_on_which_nobody_answers_is_told_what_may_be_wrong(silent: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(check, "ANSWER", 0.5)
+
+    finding = check.listen_to_board(Line(port=silent))
+
+    assert not finding.ok
+    assert finding.found == "no board answers in frames at 57,600 baud"
+    assert "--protocol rosserial" in finding.do
+
+
+def test_a_board_that_answers_is_named_with_what_it_speaks() -> None:
+    with board(COUNTER) as there:
+        finding = check.listen_to_board(Line(port=str(there.port)))
+
+    assert finding.ok, finding
+    assert "speaks frames" in finding.found
+
+
+def test_a_rosserial_board_answers_in_rosserial_only() -> None:
+    with board(ROSSERIAL_ECHO) as there:
+        as_rosserial = check.listen_to_board(Line(port=str(there.port), protocol="rosserial"))
+        as_frames = check.listen_to_board(Line(port=str(there.port)))
+
+    assert as_rosserial.ok, as_rosserial
+    assert "speaks rosserial" in as_rosserial.found
+    assert not as_frames.ok
