@@ -1,0 +1,185 @@
+"""`aira state`: what agents remember, and how it is kept safe."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from mesh.cli.files import at_once, size_words
+from mesh.cli.options import with_settings
+from mesh.cli.printing import plural, print_facts, print_json, print_table, visible, with_json
+from mesh.running import run_to_end
+
+if TYPE_CHECKING:
+    from mesh.settings import Settings
+    from mesh.state import ArchiveContents, Inventory
+
+FILE = click.Path(dir_okay=False, path_type=Path)
+
+
+@click.group("state")
+def command() -> None:
+    """Look at what the agents of a data folder remember: jobs, signed messages, recordings under way, files by CID; and
+    back it up and restore it. Keyfiles and passwords are never part of it.
+    """
+
+
+@command.command("show", short_help="what is there, or what is in a backup")
+@click.argument("file", required=False, type=FILE)
+@with_json
+@with_settings("data_dir")
+def show(settings: Settings, file: Path | None, as_json: bool) -> None:
+    """Print what the agents of the data folder remember, while they run or not. With FILE, what that backup holds: it
+    is read to its end and compared with its checksums.
+    """
+    if file is None:
+        run_to_end(lambda: _show(settings.state_directory, as_json=as_json))
+    else:
+        at_once(lambda: _show_archive(file, as_json=as_json))
+
+
+@command.command("backup", short_help="write it to a file, while agents run")
+@click.argument("file", type=FILE)
+@click.option(
+    "--content",
+    type=click.Choice(["needed", "all", "none"]),
+    default="needed",
+    show_default=True,
+    help="files by CID that go along: pinned ones and those that jobs need, all, or none",
+)
+@with_json
+@with_settings("data_dir")
+def backup(settings: Settings, file: Path, content: str, as_json: bool) -> None:
+    """Write what the agents of the data folder remember to FILE (tar.zst), which is replaced in the end.
+
+    The agents may run: the backup is what a crash at one moment would have left.
+    """
+    run_to_end(lambda: _back_up(settings.state_directory, file, content, as_json=as_json))
+
+
+@command.command("restore", short_help="put a backup back")
+@click.argument("file", type=FILE)
+@click.option(
+    "--existing",
+    type=click.Choice(["refuse", "set-aside"]),
+    default="refuse",
+    show_default=True,
+    help="when there is a state already: do nothing, or keep the old one in the folder .replaced-TIME beside the new",
+)
+@with_json
+@with_settings("data_dir")
+def restore(settings: Settings, file: Path, existing: str, as_json: bool) -> None:
+    """Put the backup FILE into the data folder, whose agents must not run.
+
+    Nothing is changed unless all of FILE is sound. See to it that the agent from which the backup was taken never runs
+    again: two of one account would do every job twice.
+    """
+    run_to_end(lambda: _restore(settings.state_directory, file, existing, as_json=as_json))
+
+
+async def _show(folder: Path, *, as_json: bool) -> None:
+    from mesh.state import take_inventory
+
+    found = await take_inventory(folder)
+    if as_json:
+        print_json(found)
+    else:
+        _print_inventory(found)
+
+
+def _print_inventory(found: Inventory) -> None:
+    rows = []
+    for account in found.accounts:
+        rows += [
+            (
+                account.address,
+                chain.chain,
+                "-" if chain.block is None else chain.block,
+                ", ".join(f"{count} {phase}" for phase, count in chain.jobs.items()) or "none",
+                chain.waiting,
+                chain.recordings,
+            )
+            for chain in account.chains
+        ]
+    if rows:
+        print_table(("ACCOUNT", "CHAIN", "BLOCK", "JOBS", "TO SEND", "RECORDING"), rows)
+    print_facts(
+        {
+            account.address: f"{plural(account.files, 'file')}, {size_words(account.bytes)}"
+            f" ({size_words(account.pinned_bytes)} pinned){', in use' if account.in_use else ''}"
+            for account in found.accounts
+        }
+    )
+    print_facts({"transactions under way": found.transactions})
+
+
+def _show_archive(file: Path, *, as_json: bool) -> None:
+    from mesh.state import examine_archive
+
+    found = examine_archive(file)
+    if as_json:
+        print_json(found)
+    else:
+        _print_archive(found)
+
+
+def _print_archive(found: ArchiveContents) -> None:
+    print_facts(
+        {
+            "made": visible(found.made),
+            "by": visible(found.software),
+            "parts": ", ".join(found.parts),
+            "files": ", ".join(f"{count} {kind}" for kind, count in found.files.items()),
+            "content": visible(found.content),
+            "unpacked": size_words(found.bytes),
+            "checksums": "as they should be",
+        }
+    )
+
+
+async def _back_up(folder: Path, file: Path, content: str, *, as_json: bool) -> None:
+    from mesh.state import Extent, back_up
+
+    done = await back_up(folder, file, content=Extent(content))
+    if as_json:
+        print_json({"file": str(file), **_as_dict(done)})
+        return
+    print_facts(
+        {
+            "backup": file,
+            "size": size_words(done.size),
+            "accounts": ", ".join(done.accounts) or None,
+            "jobs under way": done.jobs,
+            "content": plural(done.files, "file"),
+            "not held": ", ".join(done.missing) or None,
+        }
+    )
+
+
+async def _restore(folder: Path, file: Path, existing: str, *, as_json: bool) -> None:
+    from mesh.state import Existing
+    from mesh.state import restore as put_back
+
+    done = await put_back(file, folder, existing=Existing(existing))
+    jobs = {job.liability.address: job.phase.value for job in done.jobs}
+    if as_json:
+        aside = None if done.aside is None else str(done.aside)
+        print_json({"folder": str(folder), "made": done.made, "parts": done.parts, "jobs": jobs, "aside": aside})
+        return
+    print_facts(
+        {
+            "restored to": folder,
+            "as it was at": visible(done.made),
+            "before that": done.aside,
+            "jobs under way": len(jobs),
+        }
+    )
+    print_facts(jobs)
+
+
+def _as_dict(done: object) -> dict[str, object]:
+    from dataclasses import asdict
+
+    return asdict(done)  # type: ignore[call-overload, no-any-return]

@@ -1,0 +1,258 @@
+"""The file of a backup: a tar (ustar, regular files only) in one zstd frame, which `tar --zstd` lists and unpacks.
+
+`state.json` is its first member and says of which format it is, `checksums.json` its last, with the SHA-256 of all
+others; so a file that was cut is told from a whole one. Reading takes 512 bytes for a header and no more, so that a
+stranger's file can't ask for memory.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tarfile
+from contextlib import suppress
+from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, Self, TypeVar
+
+import msgspec
+import zstandard
+
+from mesh.content.files import no_room_is_store_full, sync_directory
+from mesh.errors import ConfigurationError
+from mesh.state.errors import ArchiveUnusable
+from mesh.state.layout import is_part, part_of
+
+if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+    from pathlib import Path
+    from types import TracebackType
+
+T = TypeVar("T")
+
+FORMAT: Final = 1
+ABOUT: Final = "state.json"
+CHECKSUMS: Final = "checksums.json"
+LARGEST_TEXT: Final = 64 << 20
+"""Bytes that `state.json` and `checksums.json` have at most: a quarter of a million files."""
+PIECE: Final = 1 << 20
+"""Bytes read and written at once."""
+
+
+class About(msgspec.Struct, frozen=True, kw_only=True):
+    """What a backup says of itself. `made` is when (ISO 8601), `content` which files by CID it has along."""
+
+    format: int
+    made: str
+    software: str
+    content: str
+    parts: tuple[str, ...]
+
+
+class Sink(Protocol):
+    """Where the bytes of one member go."""
+
+    def write(self, data: bytes, /) -> object: ...
+
+
+class Keep(Protocol):
+    """What to do with a member of that name and size in bytes: where its bytes go, until it is left."""
+
+    def __call__(self, name: str, size: int, /) -> AbstractContextManager[Sink]: ...
+
+
+class ArchiveWriter:
+    """Writes the backup at `path`: `with ArchiveWriter(path, about) as archive`, then `add`.
+
+    It is readable by its owner only, and appears whole when the block ends without an error, or not at all. Raises
+    `StoreFull`, and `ConfigurationError` where it can't be written.
+    """
+
+    def __init__(self, path: Path, about: About) -> None:
+        self._path = path
+        self._temporary = path.with_name(f".{path.name}.{os.getpid()}")
+        self.about: Final = about
+        self._sums: dict[str, str] = {}
+        self.size = 0
+        """Bytes of the whole file, once it is there."""
+
+    def __enter__(self) -> Self:
+        try:
+            descriptor = os.open(self._temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise ConfigurationError(f"can't write {self._path}: {error.strerror}") from None
+        self._file = os.fdopen(descriptor, "wb")
+        self._stream = zstandard.ZstdCompressor(write_checksum=True).stream_writer(self._file, closefd=False)
+        self._add_text(ABOUT, msgspec.json.encode(self.about))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if error is None:
+                with no_room_is_store_full(self._path.parent):
+                    self._finish()
+        finally:
+            self._file.close()
+            with suppress(FileNotFoundError):
+                self._temporary.unlink()
+
+    def add(self, name: str, source: BinaryIO, *, size: int) -> None:
+        """Add the next `size` bytes of `source`. Raises `ConfigurationError` where it has fewer."""
+        digest, left = hashlib.sha256(), size
+        with no_room_is_store_full(self._path.parent):
+            self._begin(name, size)
+            while left:
+                data = source.read(min(left, PIECE))
+                if not data:
+                    raise ConfigurationError(f"{name} became shorter while it was read", hint="try again")
+                digest.update(data)
+                self._stream.write(data)
+                left -= len(data)
+            self._pad(size)
+        self._sums[name] = digest.hexdigest()
+
+    def _finish(self) -> None:
+        self._add_text(CHECKSUMS, msgspec.json.encode(self._sums))
+        self._stream.write(bytes(2 * tarfile.BLOCKSIZE))
+        self._stream.close()  # type: ignore[no-untyped-call]
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self.size = self._file.tell()
+        self._temporary.rename(self._path)
+        sync_directory(self._path.parent)
+
+    def _add_text(self, name: str, text: bytes) -> None:
+        self._begin(name, len(text))
+        self._stream.write(text)
+        self._pad(len(text))
+
+    def _begin(self, name: str, size: int) -> None:
+        header = tarfile.TarInfo(name)
+        header.size, header.mode = size, 0o600
+        try:
+            self._stream.write(header.tobuf(tarfile.USTAR_FORMAT))
+        except ValueError as error:  # of 8 GiB and more, which no file of an agent is
+            raise ConfigurationError(f"{name} can't be backed up: {error}") from None
+
+    def _pad(self, size: int) -> None:
+        self._stream.write(bytes(-size % tarfile.BLOCKSIZE))
+
+
+def read_about(path: Path) -> About:
+    """What a backup says of itself; the rest of it is not looked at. Raises `ArchiveUnusable`."""
+    with _Reading(path) as reading:
+        return reading.about()
+
+
+def read_archive(path: Path, keep: Keep) -> About:
+    """Hand every file of a backup to `keep`, and return what it says of itself once all is found to be as it was made.
+
+    Names are those of a state and no others, each once. Raises `ArchiveUnusable`; what was kept is then worth nothing.
+    """
+    with _Reading(path) as reading:
+        about, sums = reading.about(), {}
+        while (header := reading.header()).name != CHECKSUMS:
+            if part_of(header.name) not in about.parts or header.name in sums:
+                raise ArchiveUnusable(path, f"it holds {header.name[:200]!r}, which is no part of a state")
+            with keep(header.name, header.size) as sink:
+                sums[header.name] = reading.copy(header.size, sink)
+        text = reading.text(header)
+        reading.end()
+        stated = reading.decoded(text, dict[str, str])
+        if stated != sums:
+            wrong = next(iter(sorted(name for name in {*sums, *stated} if sums.get(name) != stated.get(name))))
+            raise ArchiveUnusable(path, f"{wrong[:200]} is not as it was written")
+        return about
+
+
+class _Reading:
+    """A backup's members in their order."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __enter__(self) -> Self:
+        try:
+            self._file = self._path.open("rb")
+        except OSError as error:
+            raise ArchiveUnusable(self._path, f"it can't be read: {error.strerror}", hint="name another") from None
+        self._stream = zstandard.ZstdDecompressor().stream_reader(self._file)
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self._file.close()
+
+    def about(self) -> About:
+        """The first member."""
+        header = self.header()
+        if header.name != ABOUT:
+            raise ArchiveUnusable(self._path, "it is no backup of a state", hint="`aira state backup` makes one")
+        text = self.text(header)
+        stated = self.decoded(text, dict[str, object]).get("format")
+        if stated != FORMAT:
+            why = f"it was written by another version (format {str(stated)[:20]}, this one knows {FORMAT})"
+            raise ArchiveUnusable(self._path, why, hint="use the aira-mesh that made it, or a newer one")
+        about = self.decoded(text, About)
+        if not all(is_part(part) for part in about.parts) or len(set(about.parts)) < len(about.parts):
+            raise ArchiveUnusable(self._path, "it says that it has parts which no state has")
+        return about
+
+    def header(self) -> tarfile.TarInfo:
+        """Of the next member, a regular file."""
+        block = self._read(tarfile.BLOCKSIZE)
+        try:
+            header = tarfile.TarInfo.frombuf(block, "utf-8", "surrogateescape")
+        except tarfile.HeaderError:
+            raise ArchiveUnusable(self._path, "it is damaged, or no backup") from None
+        if header.type != tarfile.REGTYPE or header.size < 0:
+            raise ArchiveUnusable(self._path, f"{header.name[:200]!r} in it is no plain file")
+        return header
+
+    def text(self, header: tarfile.TarInfo) -> bytes:
+        """The bytes of a member that is read as a whole."""
+        if header.size > LARGEST_TEXT:
+            raise ArchiveUnusable(self._path, f"{header.name} in it is too long")
+        text = self._read(header.size)
+        self._read(-header.size % tarfile.BLOCKSIZE)
+        return text
+
+    def decoded(self, text: bytes, kind: type[T]) -> T:
+        """What a member's JSON says."""
+        try:
+            return msgspec.json.decode(text, type=kind)
+        except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+            raise ArchiveUnusable(self._path, f"it is damaged: {error}") from None
+
+    def copy(self, size: int, sink: Sink) -> str:
+        """Write the bytes of a member; gives their SHA-256."""
+        digest, left = hashlib.sha256(), size
+        while left:
+            data = self._read(min(left, PIECE))
+            digest.update(data)
+            sink.write(data)
+            left -= len(data)
+        self._read(-size % tarfile.BLOCKSIZE)
+        return digest.hexdigest()
+
+    def end(self) -> None:
+        """See that nothing follows; the frame's own checksum is compared here."""
+        try:
+            rest = self._read(2 * tarfile.BLOCKSIZE) + self._stream.read(1)
+        except zstandard.ZstdError as error:
+            raise ArchiveUnusable(self._path, f"it is damaged ({error})") from None
+        if any(rest) or len(rest) > 2 * tarfile.BLOCKSIZE:
+            raise ArchiveUnusable(self._path, "something follows its end")
+
+    def _read(self, size: int) -> bytes:
+        """Exactly so many bytes."""
+        pieces, left = [], size
+        while left:
+            try:
+                piece = self._stream.read(left)
+            except (zstandard.ZstdError, OSError) as error:
+                raise ArchiveUnusable(self._path, f"it is damaged, or no backup ({error})") from None
+            if not piece:
+                raise ArchiveUnusable(self._path, "it ends in the middle")
+            pieces.append(piece)
+            left -= len(piece)
+        return b"".join(pieces)

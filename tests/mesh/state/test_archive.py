@@ -1,0 +1,218 @@
+"""Backups that strangers have had in their hands, and what a disk has done to them."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import tarfile
+import tracemalloc
+from typing import TYPE_CHECKING
+
+import pytest
+import zstandard
+
+from mesh.state import ArchiveUnusable, Extent, back_up, examine_archive, restore, restoring
+from tests.mesh.state.conftest import ADDRESS, CHAIN, Folder, forge, members, names_in, unpacked
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    Members = list[tuple[tarfile.TarInfo, bytes]]
+
+
+@pytest.fixture
+async def archive(folder: Folder, tmp_path: Path) -> Path:
+    await back_up(folder.path, tmp_path / "it", content=Extent.ALL)
+    return tmp_path / "it"
+
+
+async def refused(archive: Path, tmp_path: Path) -> str:
+    """Why it is refused; nothing of it is left anywhere."""
+    (tmp_path / "new").mkdir(exist_ok=True)
+    before = names_in(tmp_path)
+    with pytest.raises(ArchiveUnusable) as caught:
+        await restore(archive, tmp_path / "new")
+    assert names_in(tmp_path / "new") == []
+    assert names_in(tmp_path) == before
+    with pytest.raises(ArchiveUnusable):
+        examine_archive(archive)
+    return str(caught.value)
+
+
+NAMES = [
+    "../outside",
+    "/etc/passwd",
+    f"{ADDRESS}/../../outside",
+    f"{ADDRESS}/{CHAIN}/ledger.sqlite/../../../outside",
+    f"{ADDRESS}/{CHAIN}/ledger.sqlite-wal",
+    f"{ADDRESS}/{CHAIN}/recordings/it.mcap",
+    f"{ADDRESS}/content/.blocks.sqlite",
+    f"{ADDRESS}/keyfile.json",
+    f"{ADDRESS}/{CHAIN}/ledger.sqlite\n",
+    "transactions/1/x/000000000001.jsonl",
+    "development/robot.json",
+    "",
+]
+
+
+@pytest.mark.parametrize("name", NAMES)
+async def test_a_name_that_no_state_has_is_refused(archive: Path, tmp_path: Path, name: str) -> None:
+    def change(members: Members) -> None:
+        header = tarfile.TarInfo(name)
+        header.size = 4
+        members.insert(2, (header, b"evil"))
+
+    said = await refused(forge(archive, tmp_path / "forged", change), tmp_path)
+    assert "which is no part of a state" in said
+    assert "\n" not in said
+
+
+@pytest.mark.parametrize("kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.DIRTYPE, tarfile.CHRTYPE, tarfile.FIFOTYPE])
+async def test_only_plain_files_are_taken(archive: Path, tmp_path: Path, kind: bytes) -> None:
+    def change(members: Members) -> None:
+        header = tarfile.TarInfo(f"{ADDRESS}/{CHAIN}/recordings/{ADDRESS}.mcap")
+        header.type, header.linkname = kind, "/etc/passwd"
+        members.insert(2, (header, b""))
+
+    assert "no plain file" in await refused(forge(archive, tmp_path / "forged", change), tmp_path)
+
+
+@pytest.mark.parametrize("kind", [tarfile.GNUTYPE_LONGNAME, tarfile.XHDTYPE])
+async def test_a_header_can_t_ask_for_memory(archive: Path, tmp_path: Path, kind: bytes) -> None:
+    def change(members: Members) -> None:
+        header = tarfile.TarInfo("long")
+        header.type, header.size = kind, 300 << 20
+        members.insert(0, (header, bytes(300 << 20)))
+
+    forged = forge(archive, tmp_path / "forged", change)
+    tracemalloc.start()
+    try:
+        assert "no plain file" in await refused(forged, tmp_path)
+        assert tracemalloc.get_traced_memory()[1] < 16 << 20
+    finally:
+        tracemalloc.stop()
+
+
+async def test_a_file_that_is_there_twice_is_refused(archive: Path, tmp_path: Path) -> None:
+    forged = forge(archive, tmp_path / "forged", lambda members: members.insert(2, members[1]))
+    assert "no part of a state" in await refused(forged, tmp_path)
+
+
+async def test_more_than_the_disk_has_is_refused_at_its_header(
+    archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def change(members: Members) -> None:
+        members[1][0].size = 8**11 - 1
+
+    monkeypatch.setattr(restoring, "SPARE", shutil.disk_usage(tmp_path).free - (4 << 30))
+    assert "more room than the disk has" in await refused(forge(archive, tmp_path / "forged", change), tmp_path)
+
+
+def changed(archive: Path, forged: Path, place: float) -> Path:
+    data = bytearray(archive.read_bytes())
+    data[int(len(data) * place)] ^= 0x10
+    forged.write_bytes(data)
+    return forged
+
+
+async def test_one_bit_that_is_wrong_is_found(archive: Path, tmp_path: Path) -> None:
+    """But for those that make no difference, as the window of a frame."""
+    found = 0
+    for place in range(40):
+        forged = changed(archive, tmp_path / "forged", place / 40)
+        if still_the_same(archive, forged):
+            continue
+        await refused(forged, tmp_path)
+        found += 1
+    assert found > 30
+
+
+def still_the_same(archive: Path, forged: Path) -> bool:
+    try:
+        return unpacked(forged) == unpacked(archive)
+    except zstandard.ZstdError:
+        return False
+
+
+async def test_a_changed_file_is_found_by_its_checksum(archive: Path, tmp_path: Path) -> None:
+    def change(members: Members) -> None:
+        header, data = members[2]
+        members[2] = (header, data.replace(b"so far", b"sO far"))
+
+    said = await refused(forge(archive, tmp_path / "forged", change), tmp_path)
+    assert said.endswith(".mcap.part is not as it was written")
+
+
+@pytest.mark.parametrize("place", [1, 2, -2])
+async def test_a_file_that_is_missing_is_found(archive: Path, tmp_path: Path, place: int) -> None:
+    def change(members: Members) -> None:
+        del members[place]
+
+    assert "is not as it was written" in await refused(forge(archive, tmp_path / "forged", change), tmp_path)
+
+
+def cut(archive: Path, cut: Path, part: float) -> Path:
+    data = archive.read_bytes()
+    cut.write_bytes(data[: int(len(data) * part)])
+    return cut
+
+
+@pytest.mark.parametrize("part", [0.0, 0.1, 0.5, 0.99])
+async def test_a_backup_that_was_cut_is_found(archive: Path, tmp_path: Path, part: float) -> None:
+    await refused(cut(archive, tmp_path / "cut", part), tmp_path)
+
+
+async def test_members_after_the_end_were_cut_with_their_checksums(archive: Path, tmp_path: Path) -> None:
+    forged = forge(archive, tmp_path / "forged", lambda members: members.__delitem__(slice(-1, None)))
+    assert "damaged" in await refused(forged, tmp_path)
+
+
+def about(**changes: object) -> Callable[[Members], None]:
+    def change(members: Members) -> None:
+        said = json.dumps(json.loads(members[0][1]) | changes).encode()
+        members[0][0].size = len(said)
+        members[0] = (members[0][0], said)
+
+    return change
+
+
+async def test_a_newer_format_is_named(archive: Path, tmp_path: Path) -> None:
+    forged = forge(archive, tmp_path / "forged", about(format=2, parts=5))
+    said = await refused(forged, tmp_path)
+    assert "written by another version (format 2, this one knows 1)" in said
+
+
+@pytest.mark.parametrize("changes", [{"parts": 5}, {"parts": [5]}, {"made": None}])
+async def test_nonsense_about_itself_is_refused(archive: Path, tmp_path: Path, changes: dict[str, object]) -> None:
+    assert "damaged" in await refused(forge(archive, tmp_path / "forged", about(**changes)), tmp_path)
+
+
+async def test_parts_that_lead_elsewhere_are_refused(archive: Path, tmp_path: Path, folder: Folder) -> None:
+    """What a backup says that it has moves nothing that is not in it."""
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    parts = [*json.loads(members(archive)["state.json"])["parts"], "../outside", str(outside), ""]
+    forged = forge(archive, tmp_path / "forged", about(parts=parts))
+    await refused(forged, tmp_path)
+    assert outside.is_dir()
+
+
+async def test_something_behind_the_end_is_refused(archive: Path, tmp_path: Path) -> None:
+    (tmp_path / "longer").write_bytes(zstandard.compress(unpacked(archive) + b"more"))
+    assert "something follows its end" in await refused(tmp_path / "longer", tmp_path)
+
+
+@pytest.mark.parametrize("data", [b"", b"{}", zstandard.compress(b""), zstandard.compress(bytes(2048))])
+async def test_other_files_are_no_backups(tmp_path: Path, data: bytes) -> None:
+    (tmp_path / "other").write_bytes(data)
+    await refused(tmp_path / "other", tmp_path)
+
+
+async def test_another_tar_is_no_backup(tmp_path: Path) -> None:
+    plain = io.BytesIO()
+    with tarfile.open(fileobj=plain, mode="w", format=tarfile.USTAR_FORMAT) as tar:
+        tar.addfile(tarfile.TarInfo("readme"))
+    (tmp_path / "other").write_bytes(zstandard.compress(plain.getvalue()))
+    assert "no backup of a state" in await refused(tmp_path / "other", tmp_path)

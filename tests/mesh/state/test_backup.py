@@ -1,0 +1,197 @@
+"""Backups: what is in them and what is not, also while everything changes."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import sqlite3
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.content import Store
+from mesh.errors import ConfigurationError
+from mesh.state import Extent, NoState, StateRestless, back_up, examine_archive, take_inventory
+from mesh.state import backup as backup_module
+from mesh.work import Ledger, Phase
+from mesh.work.outbox import outgoing
+from schemas import cid_of_bytes
+from tests.mesh.state.conftest import ADDRESS, CHAIN, JOB, NONCE, OBJECTIVE, UNUSED, Folder, members, names_in
+from tests.mesh.work.samples import liability
+from tests.support.disks import room_for
+from tests.support.orders import result
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mesh.state.ledgers import LedgerFacts
+
+RECORDING = f"{ADDRESS}/{CHAIN}/recordings/{JOB.address}.mcap.part"
+
+
+async def test_a_backup_has_the_state_and_no_key(folder: Folder, tmp_path: Path) -> None:
+    done = await back_up(folder.path, tmp_path / "it", content=Extent.NEEDED)
+
+    found = members(tmp_path / "it")
+    objective = f"{ADDRESS}/content/{cid_of_bytes(OBJECTIVE)}"
+    assert list(found) == [
+        "state.json",
+        f"{ADDRESS}/{CHAIN}/ledger.sqlite",
+        RECORDING,
+        objective,
+        f"{ADDRESS}/content/.pins/{cid_of_bytes(OBJECTIVE)}/{JOB.address}",
+        NONCE,
+        "checksums.json",
+    ]
+    assert found[objective] == OBJECTIVE
+    assert found[RECORDING] == b"what it has said so far"
+    assert not any(b"key" in data for name, data in found.items() if name != "state.json")
+    assert (done.accounts, done.jobs, done.files) == ((ADDRESS,), 1, 1)
+    assert done.size == (tmp_path / "it").stat().st_size
+    assert (tmp_path / "it").stat().st_mode & 0o777 == 0o600
+
+
+@pytest.mark.parametrize(
+    ("content", "held"), [(Extent.ALL, {OBJECTIVE, UNUSED}), (Extent.NEEDED, {OBJECTIVE}), (Extent.NONE, set())]
+)
+async def test_content_goes_along_as_told(folder: Folder, tmp_path: Path, content: Extent, held: set[bytes]) -> None:
+    await back_up(folder.path, tmp_path / "it", content=content)
+    assert {data for name, data in members(tmp_path / "it").items() if "content/Qm" in name} == held
+
+
+async def test_what_jobs_need_and_nobody_holds_is_named(folder: Folder, tmp_path: Path) -> None:
+    missing = cid_of_bytes(b"gone")
+    async with Ledger(folder.ledger) as ledger:
+        await ledger.add_job(liability("two", objective=missing))
+    assert missing in (await back_up(folder.path, tmp_path / "it", content=Extent.NEEDED)).missing
+
+
+async def test_rotten_content_is_left_out_and_named(folder: Folder, tmp_path: Path) -> None:
+    held = folder.home / "content" / cid_of_bytes(OBJECTIVE)
+    held.chmod(0o644)
+    held.write_bytes(b"what is to be Done")
+    done = await back_up(folder.path, tmp_path / "it", content=Extent.ALL)
+    assert cid_of_bytes(OBJECTIVE) in done.missing
+    assert done.files == 1
+
+
+async def test_a_job_that_ends_during_the_backup_is_in_it_either_running_or_ended(
+    folder: Folder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Never running without its recording."""
+    ended = asyncio.Event()
+    copied = backup_module._copied
+
+    async def copied_and_then_ended(ledger: Path, copy: Path) -> LedgerFacts:
+        facts = await copied(ledger, copy)
+        if not ended.is_set():
+            ended.set()
+            await end_the_job(folder)
+        return facts
+
+    monkeypatch.setattr(backup_module, "_copied", copied_and_then_ended)
+    await back_up(folder.path, tmp_path / "it", content=Extent.NEEDED)
+
+    (tmp_path / "ledger").write_bytes(members(tmp_path / "it")[f"{ADDRESS}/{CHAIN}/ledger.sqlite"])
+    async with Ledger(tmp_path / "ledger") as ledger:
+        job = await ledger.job(JOB.address)
+        assert job is not None
+        assert job.phase is Phase.COMPLETE
+        assert [waiting.kind for waiting in await ledger.outbox(head=0)] == ["demand", "result"]
+
+
+async def end_the_job(folder: Folder) -> None:
+    """As an executor does: the Result first, then the recording goes."""
+    signed = result(liability=JOB.address)
+    async with Ledger(folder.ledger) as ledger:
+        await ledger.complete(JOB.address, success=True, result=signed.result, note="", outgoing=outgoing(signed))
+    (folder.recordings / f"{JOB.address}.mcap.part").unlink()
+
+
+async def test_jobs_that_never_rest_are_given_up_and_leave_no_file(
+    folder: Folder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(backup_module, "_runs_still", lambda *_: False)
+    with pytest.raises(StateRestless):
+        await back_up(folder.path, tmp_path / "it", content=Extent.NEEDED)
+    assert names_in(tmp_path) == ["data"]
+
+
+async def test_a_ledger_that_is_written_meanwhile_is_whole_in_the_backup(folder: Folder, tmp_path: Path) -> None:
+    async with Ledger(folder.ledger) as ledger:
+        writing = asyncio.create_task(write_without_end(ledger))
+        try:
+            for number in range(5):
+                await back_up(folder.path, tmp_path / f"{number}", content=Extent.NONE)
+        finally:
+            writing.cancel()
+            await asyncio.wait([writing])
+    counts = []
+    for number in range(5):
+        copy = tmp_path / f"{number}.sqlite"
+        copy.write_bytes(members(tmp_path / f"{number}")[f"{ADDRESS}/{CHAIN}/ledger.sqlite"])
+        async with Ledger(copy) as ledger:
+            phases = await ledger.jobs_by_phase()
+            assert phases.get("complete", 0) == await ledger.waiting() - 1, "a job's end and its Result are one"
+            counts.append(phases.get("complete", 0))
+        database = sqlite3.connect(copy)
+        assert database.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+        database.close()
+    assert counts == sorted(counts)
+    assert counts[-1] > 0
+
+
+async def write_without_end(ledger: Ledger) -> None:
+    number = 0
+    while True:
+        number += 1
+        job = liability(f"more {number}")
+        signed = result(liability=job.address)
+        await ledger.add_job(job)
+        await ledger.complete(job.address, success=True, result=signed.result, note="", outgoing=outgoing(signed))
+
+
+async def test_a_backup_replaces_an_earlier_one_only_when_it_is_whole(folder: Folder, tmp_path: Path) -> None:
+    (tmp_path / "it").write_bytes(b"the earlier one")
+    folder.ledger.write_bytes(b"no ledger at all")
+    with pytest.raises(ConfigurationError):
+        await back_up(folder.path, tmp_path / "it", content=Extent.NEEDED)
+    assert (tmp_path / "it").read_bytes() == b"the earlier one"
+    assert names_in(tmp_path) == ["data", "it"]
+
+
+async def test_a_folder_without_state_is_said_to_have_none(tmp_path: Path) -> None:
+    (tmp_path / "content").mkdir()
+    with pytest.raises(NoState):
+        await back_up(tmp_path, tmp_path / "it", content=Extent.NEEDED)
+
+
+async def test_a_full_disk_is_told_and_leaves_no_file(folder: Folder, tmp_path: Path) -> None:
+    with Store(folder.home / "content") as store:
+        store.put_bytes(os.urandom(3 << 20), pin="user")
+    with room_for(1 << 20), pytest.raises(Exception, match=r"(full|room)"):
+        await back_up(folder.path, tmp_path / "it", content=Extent.ALL)
+    assert not (tmp_path / "it").exists()
+
+
+async def test_the_inventory_tells_what_is_there(folder: Folder) -> None:
+    found = await take_inventory(folder.path)
+    (account,) = found.accounts
+    (chain,) = account.chains
+    assert (chain.chain, chain.block, chain.jobs, chain.waiting, chain.recordings) == (CHAIN, 99, {"running": 1}, 1, 1)
+    assert (account.files, account.bytes, account.pinned_bytes) == (2, len(OBJECTIVE + UNUSED), len(OBJECTIVE))
+    assert (account.in_use, found.transactions) == (False, 1)
+
+
+async def test_the_inventory_says_who_is_at_work(folder: Folder) -> None:
+    with Store(folder.home / "content"):
+        assert (await take_inventory(folder.path)).accounts[0].in_use
+
+
+async def test_a_backup_says_what_it_is(folder: Folder, tmp_path: Path) -> None:
+    await back_up(folder.path, tmp_path / "it", content=Extent.ALL)
+    found = examine_archive(tmp_path / "it")
+    assert found.files == {"content": 2, "ledgers": 1, "pins": 1, "recordings": 1, "transactions": 1}
+    assert found.content == "all"
+    assert json.loads(members(tmp_path / "it")["state.json"])["format"] == 1

@@ -1,0 +1,187 @@
+"""An agent loses its disk, is restored from a backup that was made in the middle of its work, and goes on."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+from typing import TYPE_CHECKING
+
+from mesh.recording import open_objective
+from mesh.state import Extent, back_up, restore
+from mesh.work import Phase
+from mesh.work.listener import Listener
+from schemas import String
+from tests.support.market import obliging
+from tests.support.objectives import objective
+from tests.support.waiting import until, until_found
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import pytest
+
+    from mesh.agent import Agent, Contract
+    from mesh.work.run import Run
+    from tests.support.market import Place
+
+COST = 1000
+STEPS = range(4)
+
+
+class Robot:
+    """A robot of the same account and memory in each of its lives, and all that any of them has said."""
+
+    def __init__(self, place: Place) -> None:
+        self._place = place
+        self.said: list[str] = []
+        self.stuck_at = ""
+        self.released = asyncio.Event()
+
+    def life(self) -> Agent:
+        robot = obliging(self._place.agent("robot"))
+
+        @robot.on("/say")
+        async def say(job: Run, message: String) -> None:
+            if message.data == self.stuck_at:
+                await self.released.wait()
+            self.said.append(message.data)
+            job.publish("/said", message.data)
+
+        return robot
+
+    def stuck(self, at: str) -> None:
+        """It does not get over this word until `released`."""
+        self.stuck_at, self.released = at, asyncio.Event()
+
+
+async def ask(place: Place, person: Agent, name: str) -> Contract:
+    """A job of four words."""
+    words = objective(*(("/say", f"{name} {step}") for step in STEPS))
+    return await person.demand(place.save(words, f"{name}.mcap"), cost=COST)
+
+
+async def in_phase(robot: Agent, address: str, phase: Phase) -> None:
+    async def reached() -> bool:
+        job = await robot.parts.ledger.job(address)
+        return job is not None and job.phase is phase
+
+    await until_found(reached, what=phase)
+
+
+async def recorded(contract: Contract) -> list[str]:
+    recording = open_objective(await contract.recording())
+    return [String.decode(message.payload).data for message in recording.messages() if message.topic == "/said"]
+
+
+def lose(disk: Path) -> None:
+    shutil.rmtree(disk)
+
+
+async def test_after_a_restore_every_job_ends_once(place: Place) -> None:
+    """One ended before the backup, one ran while it was made and ended after it, one began and ended after it, and one
+    ran when the disk was lost."""
+    before = await place.balance("robot")
+    robot, disk, archive = Robot(place), place.folder / "robot", place.folder / "backup"
+    async with place.provider(), place.agent("person") as person:
+        async with robot.life():
+            first = await ask(place, person, "first")
+            await first.outcome()
+            robot.stuck(at="second 2")
+            second = await ask(place, person, "second")
+            await until(lambda: "second 1" in robot.said)
+            await back_up(disk, archive, content=Extent.NEEDED)
+            robot.released.set()
+            await second.outcome()
+            await (await ask(place, person, "third")).outcome()
+            robot.stuck(at="fourth 2")
+            fourth = await ask(place, person, "fourth")
+            await until(lambda: "fourth 1" in robot.said)
+        lose(disk)
+        assert await place.balance("robot") == before + 3 * COST
+
+        restored = await restore(archive, disk)
+
+        assert {job.liability.address: job.phase for job in restored.jobs} == {second.address: Phase.RUNNING}
+        robot.stuck(at="")
+        async with robot.life() as life:
+            assert (await fourth.outcome()).success
+            await in_phase(life, fourth.address, Phase.FINALIZED)
+            await in_phase(life, second.address, Phase.FINALIZED)
+            assert [one.kind for one in await life.parts.ledger.outbox(head=0)] == []
+            assert len(await life.parts.ledger.jobs(Phase)) == 3, "the third had ended before the agent heard of it"
+            assert await recorded(fourth) == [f"fourth {step}" for step in STEPS]
+    assert await place.balance("robot") == before + 4 * COST
+    assert [word for word in robot.said if not word.startswith("fourth")] == [
+        f"{name} {step}" for name in ("first", "second", "third") for step in STEPS
+    ], "what the chain has paid is not played again"
+
+
+async def test_what_was_paid_since_the_backup_is_not_played_however_slowly_the_chain_is_read(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot, disk, archive = Robot(place), place.folder / "robot", place.folder / "backup"
+    async with place.provider(), place.agent("person") as person, robot.life():
+        robot.stuck(at="only 2")
+        contract = await ask(place, person, "only")
+        await until(lambda: "only 1" in robot.said)
+        await back_up(disk, archive, content=Extent.NEEDED)
+        robot.released.set()
+        await contract.outcome()
+    lose(disk)
+    await restore(archive, disk)
+    robot.stuck(at="")
+
+    async def never(_: Listener) -> None:
+        await asyncio.Event().wait()
+
+    monkeypatch.setattr(Listener, "run", never)
+    async with robot.life() as life:
+        await in_phase(life, contract.address, Phase.FINALIZED)
+        await life._working().executor.opened()
+    assert robot.said == [f"only {step}" for step in STEPS]
+
+
+async def test_a_job_that_ran_during_the_backup_goes_on_where_it_was(place: Place) -> None:
+    """When nothing has happened since, a restored agent is one that was started again."""
+    before = await place.balance("robot")
+    robot, disk, archive = Robot(place), place.folder / "robot", place.folder / "backup"
+    async with place.provider(), place.agent("person") as person:
+        async with robot.life():
+            robot.stuck(at="only 2")
+            contract = await ask(place, person, "only")
+            await until(lambda: "only 1" in robot.said)
+        await back_up(disk, archive, content=Extent.NEEDED)
+        lose(disk)
+        await restore(archive, disk)
+        robot.stuck(at="")
+        async with robot.life():
+            assert (await contract.outcome()).success
+            assert await recorded(contract) == [f"only {step}" for step in STEPS]
+    assert robot.said == [f"only {step}" for step in STEPS]
+    assert await place.balance("robot") == before + COST
+
+
+async def test_a_signed_result_is_sent_by_the_restored_agent_as_it_was(place: Place) -> None:
+    """The person is paid for by the Result that was signed before the backup, to the byte."""
+    robot, disk, archive = Robot(place), place.folder / "robot", place.folder / "backup"
+    async with place.agent("person") as person:
+        async with robot.life() as life:
+            async with place.provider():
+                robot.stuck(at="only 0")
+                contract = await ask(place, person, "only")
+            robot.released.set()
+            await in_phase(life, contract.address, Phase.COMPLETE)
+            signed = await life.parts.ledger.outbox(head=0)
+            await back_up(disk, archive, content=Extent.NEEDED)
+        lose(disk)
+        await restore(archive, disk)
+        async with robot.life() as life:
+            assert await life.parts.ledger.outbox(head=0) == signed
+            async with place.provider():
+                outcome = await contract.outcome()
+            await in_phase(life, contract.address, Phase.FINALIZED)
+            job = await life.parts.ledger.job(contract.address)
+            assert job is not None
+            assert job.result == outcome.result
+            assert await recorded(contract) == [f"only {step}" for step in STEPS], "its content came back, too"
+    assert robot.said == [f"only {step}" for step in STEPS]

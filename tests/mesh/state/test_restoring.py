@@ -1,0 +1,251 @@
+"""Restoring: where it goes, what it refuses, and that nothing is ever half there."""
+
+from __future__ import annotations
+
+import asyncio
+import fcntl
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.chain.journal import _locked
+from mesh.content import Store
+from mesh.errors import ConfigurationError
+from mesh.state import ArchiveUnusable, Existing, Extent, StateExists, StateInUse, back_up, restore, restoring
+from mesh.work import Ledger, Phase
+from mesh.work.ledger import VERSION, LedgerUnusable
+from schemas import cid_of_bytes
+from tests.mesh.state.conftest import ADDRESS, CHAIN, JOB, NONCE, OBJECTIVE, Folder, forge, members, names_in
+from tests.mesh.work.ledgers import mark_as_version
+from tests.support.disks import room_for
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+AGENT = """
+import sqlite3, sys, time
+connection = sqlite3.connect(sys.argv[1])
+connection.execute("SELECT * FROM jobs")
+print("open", flush=True)
+time.sleep(60)
+"""
+RESTORING = """
+import asyncio, pathlib, sys
+from mesh.state import restore
+print("begins", flush=True)
+asyncio.run(restore(*map(pathlib.Path, sys.argv[1:])))
+"""
+
+
+@contextmanager
+def program(text: str, *arguments: Path) -> Iterator[None]:
+    """A Python program that has said its first line, and is killed in the end."""
+    command = [sys.executable, "-c", text, *map(str, arguments)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline()
+            yield
+        finally:
+            process.kill()
+
+
+@pytest.fixture
+async def archive(folder: Folder, tmp_path: Path) -> Path:
+    await back_up(folder.path, tmp_path / "it", content=Extent.ALL)
+    return tmp_path / "it"
+
+
+async def test_a_restored_state_is_the_one_that_was_backed_up(archive: Path, folder: Folder, tmp_path: Path) -> None:
+    new = Folder(tmp_path / "new")
+
+    done = await restore(archive, new.path)
+
+    assert done.parts == (f"transactions/{CHAIN}/{ADDRESS.lower()}", ADDRESS)
+    assert [(job.liability, job.phase, job.position) for job in done.jobs] == [(JOB, Phase.RUNNING, 3)]
+    assert done.aside is None
+    async with Ledger(new.ledger) as ledger:
+        assert await ledger.cursor("listener") == 99
+        assert await ledger.waiting() == 1
+    for name in (NONCE, f"{ADDRESS}/{CHAIN}/recordings/{JOB.address}.mcap.part"):
+        assert (new.path / name).read_bytes() == (folder.path / name).read_bytes()
+    with Store(new.home / "content") as store:
+        assert store.get_block(cid_of_bytes(OBJECTIVE)) is not None
+        assert store.pins() == {cid_of_bytes(OBJECTIVE): {JOB.address}}
+        assert len(store.list()) == 2
+    assert names_in(new.path) == [ADDRESS, "transactions"]
+
+
+async def test_an_existing_state_is_not_touched(archive: Path, folder: Folder) -> None:
+    before = folder.contents()
+    with pytest.raises(StateExists) as caught:
+        await restore(archive, folder.path)
+    assert ADDRESS in str(caught.value)
+    assert folder.contents() == before
+
+
+async def test_another_account_s_state_is_no_hindrance(archive: Path, tmp_path: Path) -> None:
+    other = tmp_path / "new" / ("0x" + "11" * 20) / "content"
+    other.mkdir(parents=True)
+    await restore(archive, tmp_path / "new")
+    assert other.is_dir()
+    assert (tmp_path / "new" / NONCE).exists()
+
+
+async def test_the_old_state_can_be_set_aside_and_restored_by_hand(archive: Path, folder: Folder) -> None:
+    async with Ledger(folder.ledger) as ledger:
+        await ledger.set_phase(JOB.address, Phase.FINALIZED)
+    secrets = [folder.path / "development" / "robot.json"]
+
+    done = await restore(archive, folder.path, existing=Existing.SET_ASIDE)
+
+    assert done.aside is not None
+    async with Ledger(folder.ledger) as ledger:
+        assert await ledger.jobs_by_phase() == {"running": 1}
+    async with Ledger(done.aside / ADDRESS / CHAIN / "ledger.sqlite") as ledger:
+        assert await ledger.jobs_by_phase() == {"finalized": 1}
+    assert (done.aside / NONCE).exists()
+    assert all(secret.exists() for secret in secrets), "what is no part of a state stays where it is"
+
+
+@pytest.mark.parametrize("existing", list(Existing))
+async def test_a_ledger_that_an_agent_has_open_is_in_use(archive: Path, folder: Folder, existing: Existing) -> None:
+    async with Ledger(folder.ledger):
+        with pytest.raises(StateInUse):
+            await restore(archive, folder.path, existing=existing)
+    await restore(archive, folder.path, existing=Existing.SET_ASIDE)
+
+
+async def test_a_ledger_that_another_process_has_open_is_in_use(archive: Path, folder: Folder) -> None:
+    with program(AGENT, folder.ledger), pytest.raises(StateInUse):
+        await restore(archive, folder.path, existing=Existing.SET_ASIDE)
+
+
+async def test_a_store_that_is_open_is_in_use(archive: Path, folder: Folder) -> None:
+    with Store(folder.home / "content"), pytest.raises(StateInUse):
+        await restore(archive, folder.path, existing=Existing.SET_ASIDE)
+
+
+async def test_a_transaction_that_somebody_waits_for_is_in_use(archive: Path, folder: Folder) -> None:
+    descriptor = _locked(folder.path / NONCE, fcntl.LOCK_EX)
+    assert descriptor is not None
+    try:
+        with pytest.raises(StateInUse):
+            await restore(archive, folder.path, existing=Existing.SET_ASIDE)
+    finally:
+        os.close(descriptor)
+
+
+async def test_no_agent_opens_a_state_while_it_is_exchanged(
+    archive: Path, folder: Folder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exchange = restoring._exchange
+    refused: list[str] = []
+
+    def tried(*arguments: Path) -> Path | None:
+        done = subprocess.run([sys.executable, "-c", AGENT, str(folder.ledger)], capture_output=True, text=True)
+        refused.append(done.stderr)
+        return exchange(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(restoring, "_exchange", tried)
+    await restore(archive, folder.path, existing=Existing.SET_ASIDE)
+    assert "database is locked" in refused[0]
+
+
+async def test_when_one_part_can_t_be_placed_all_is_as_it_was(
+    archive: Path, folder: Folder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, move, moves = folder.contents(), restoring._move, []
+
+    def refuse_the_last(source: Path, target: Path, moved: list[tuple[Path, Path]]) -> None:
+        moves.append(target)
+        if len(moves) == 4:
+            raise ConfigurationError("the disk is gone")
+        move(source, target, moved)
+
+    monkeypatch.setattr(restoring, "_move", refuse_the_last)
+    with pytest.raises(ConfigurationError, match="the disk is gone"):
+        await restore(archive, folder.path, existing=Existing.SET_ASIDE)
+    assert folder.contents() == before
+
+
+async def test_a_newer_ledger_in_a_backup_is_named_and_nothing_changed(
+    folder: Folder, archive: Path, tmp_path: Path
+) -> None:
+    newer = tmp_path / "newer.sqlite"
+    newer.write_bytes(folder.ledger.read_bytes())
+    mark_as_version(newer, VERSION + 1)
+    forged = forge_ledger(archive, tmp_path / "forged", newer.read_bytes())
+    with pytest.raises(ConfigurationError, match=rf"newer version \(format {VERSION + 1}, this one knows {VERSION}\)"):
+        await restore(forged, tmp_path / "new")
+    assert names_in(tmp_path / "new") == []
+
+
+async def test_a_newer_ledger_is_not_backed_up(folder: Folder, tmp_path: Path) -> None:
+    mark_as_version(folder.ledger, VERSION + 1)
+    with pytest.raises(ConfigurationError) as caught:
+        await back_up(folder.path, tmp_path / "it", content=Extent.NONE)
+    assert caught.value.hint == "upgrade aira-mesh"
+    assert str(folder.ledger) in str(caught.value)
+
+
+@pytest.mark.parametrize("data", [b"no ledger", b"SQLite format 3\x00" + bytes(4096)])
+async def test_a_ledger_that_is_none_is_refused(archive: Path, tmp_path: Path, data: bytes) -> None:
+    with pytest.raises((LedgerUnusable, ArchiveUnusable)):
+        await restore(forge_ledger(archive, tmp_path / "forged", data), tmp_path / "new")
+    assert names_in(tmp_path / "new") == []
+
+
+def forge_ledger(archive: Path, forged: Path, data: bytes) -> Path:
+    """The same backup with another ledger, whose checksum is right."""
+    sums = json.loads(members(archive)["checksums.json"])
+    name = f"{ADDRESS}/{CHAIN}/ledger.sqlite"
+    sums[name] = hashlib.sha256(data).hexdigest()
+
+    def change(listed: list) -> None:  # type: ignore[type-arg]
+        for place, (header, _) in enumerate(listed):
+            new = {name: data, "checksums.json": json.dumps(sums).encode()}.get(header.name)
+            if new is not None:
+                header.size = len(new)
+                listed[place] = (header, new)
+
+    return forge(archive, forged, change)
+
+
+async def test_a_full_disk_is_told_and_changes_nothing(archive: Path, tmp_path: Path) -> None:
+    with room_for(4096), pytest.raises(Exception, match=r"(?i)full"):
+        await restore(archive, tmp_path / "new")
+    assert names_in(tmp_path / "new") == []
+
+
+async def test_a_folder_that_can_t_be_written_is_told(archive: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(ConfigurationError, match="can't restore to"):
+        await restore(archive, tmp_path / "file")
+
+
+async def test_a_folder_where_only_its_inside_can_be_written_will_do(archive: Path, tmp_path: Path) -> None:
+    """As the volume of a container, or a StateDirectory."""
+    target = tmp_path / "volume"
+    target.mkdir()
+    inode = target.stat().st_ino
+    await restore(archive, target)
+    assert target.stat().st_ino == inode
+
+
+async def test_killed_at_any_moment_it_leaves_whole_parts_only(archive: Path, tmp_path: Path) -> None:
+    for number in range(8):
+        target = Folder(tmp_path / f"new-{number}")
+        with program(RESTORING, archive, target.path):
+            await asyncio.sleep(number * 0.004)
+        if target.home.exists():
+            async with Ledger(target.ledger) as ledger:
+                assert await ledger.cursor("listener") == 99
+            assert (target.path / NONCE).exists()
