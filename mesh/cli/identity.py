@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -94,21 +95,36 @@ def show(folder: Path, roster: Path | None, as_json: bool) -> None:
 
 
 @command.command("renew", short_help="make a new certificate for the same member and key")
-@click.argument("folder", type=FOLDER)
+@click.argument("folders", metavar="FOLDER...", nargs=-1, required=True, type=FOLDER)
 @SITE
+@click.option("--within", type=DAYS, help="only those that expire within so many days [all]")
 @click.option("--days", type=DAYS, default=90, show_default=True, help="how long the new certificate is valid")
 @ROSTER
 @with_json
-def renew(folder: Path, site: Path, days: float, roster: Path | None, as_json: bool) -> None:
-    """Put a new certificate in the place of the one in FOLDER, for the same member and key.
+def renew(
+    folders: tuple[Path, ...], site: Path, within: float | None, days: float, roster: Path | None, as_json: bool
+) -> None:
+    """Put a new certificate in the place of the one in each FOLDER, for the same member and key; keys need not be
+    there.
 
-    Sessions go on: they take the new one when they connect the next time.
+    Sessions go on: they take the new one when they connect the next time. With --within it is for a timer: what lasts
+    longer is left as it is. When one fails, the others are renewed all the same. --json prints an object a FOLDER.
     """
-    try:
-        facts = _renew(folder, _site(site), days, roster)
-    except AiraError as error:
-        fail(error)
-    _print(facts, as_json)
+    failed: AiraError | None = None
+    for folder in folders:
+        try:
+            before = _member(folder).facts()
+            is_due = within is None or before.left < timedelta(days=within)
+            facts = _renew(folder, _site(site), days, roster) if is_due else before
+        except AiraError as error:
+            failed = failed or error
+            continue
+        if is_due or as_json:
+            _print(facts, as_json)
+        else:
+            click.echo(f"{visible(facts.holder.name)} is valid for {facts.left.days} more days")
+    if failed is not None:
+        fail(failed)
 
 
 @command.command("check", short_help="ask the router whether it heeds an identity")
@@ -215,9 +231,7 @@ def _standing(facts: Facts, path: Path) -> str:
 
 
 def _print(facts: Facts, as_json: bool, standing: str | None = None) -> None:
-    from datetime import UTC, datetime
-
-    left = facts.until - datetime.now(UTC)
+    left = facts.left
     expired = left.total_seconds() <= 0
     if as_json:
         print_json(

@@ -61,6 +61,11 @@ class Facts:
     until: datetime
     fingerprint: str
 
+    @property
+    def left(self) -> timedelta:
+        """How long it is valid yet; not positive once it has expired."""
+        return self.until - datetime.now(UTC)
+
 
 def new_key() -> Key:
     """A new private key."""

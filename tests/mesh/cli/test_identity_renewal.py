@@ -1,0 +1,61 @@
+"""`aira identity renew` as a timer calls it: several members at once, and those only that expire soon."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+from mesh.identity import read_roster
+from tests.mesh.cli.test_identity import ARM, OTHER, made, site
+from tests.support.commands import aira
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+__all__ = ["site"]
+
+
+def test_only_what_expires_soon_is_renewed_by_a_timer(tmp_path: Path, site: Path) -> None:
+    roster = tmp_path / "roster.toml"
+    soon = made(tmp_path / "soon", site, "--address", ARM, "--role", "agent", "--days", "29", "--roster", roster)
+    later = made(
+        tmp_path / "later", site, "--address", OTHER, "--role", "agent", "--days", "31", "--roster", roster, name="leg"
+    )
+    command = ("identity", "renew", tmp_path / "soon", tmp_path / "later", "--site", site, "--roster", roster)
+
+    done = aira(*command, "--within", "30", "--json")
+
+    renewed, left = map(json.loads, done.stdout.splitlines())
+    assert renewed["validUntil"] > str(soon["validUntil"])
+    assert left == later
+    assert [member.fingerprint for member in read_roster(roster).member] == [
+        renewed["fingerprint"],
+        later["fingerprint"],
+    ]
+    again = aira(*command, "--within", "30").stdout
+    assert again.splitlines() == ["arm is valid for 89 more days", "leg is valid for 30 more days"]
+
+
+def test_one_that_can_t_be_renewed_does_not_hold_up_the_others(tmp_path: Path, site: Path) -> None:
+    made(tmp_path / "arm", site, "--address", ARM, "--role", "agent", "--days", "1")
+
+    done = aira("identity", "renew", tmp_path / "nobody", tmp_path / "arm", "--site", site, "--within", "30")
+
+    assert done.returncode == 2
+    assert f"{tmp_path}/nobody/identity.pem: it can't be read" in done.stderr
+    assert "89 days left" in done.stdout
+
+
+def test_a_certificate_is_renewed_where_its_key_is_not(tmp_path: Path, site: Path) -> None:
+    """The site's key stays with the site, and the member's with the member: only certificates travel."""
+    folder = tmp_path / "arm"
+    before = made(folder, site, "--address", ARM, "--role", "agent", "--days", "1")
+    key = (folder / "identity.key").read_bytes()
+    (folder / "identity.key").unlink()
+
+    done = aira("identity", "renew", folder, "--site", site)
+
+    assert done.returncode == 0
+    (folder / "identity.key").write_bytes(key)
+    shown = json.loads(aira("identity", "show", folder, "--json").stdout)  # the two are a pair
+    assert shown["fingerprint"] != before["fingerprint"]
