@@ -12,8 +12,10 @@ INSTALLED := .venv/.installed
 LOCK := requirements/lock.txt
 TYPED := schemas mesh bridges peers tests bench examples
 BENCHES := $(shell grep -l __main__ bench/*.py)
+# Processes that run the tests. They wait more than they compute, so more than there are cores; 0 runs all in one.
+JOBS ?= 4
 
-.PHONY: help setup demo test lint peers bench contracts contracts-check slither firmware lock clean
+.PHONY: help setup demo test compose-test lint peers bench contracts contracts-check slither firmware lock clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -40,7 +42,10 @@ demo: $(INSTALLED) ## a whole market on this machine, in one process; ARGS="..."
 	@$(BIN)/aira demo $(ARGS)
 
 test: $(INSTALLED) ## all tests, with coverage; ARGS="-k name" chooses some
-	@$(BIN)/pytest --cov --cov-report=term $(ARGS)
+	@$(BIN)/pytest -n $(JOBS) --dist loadfile --cov --cov-report=term $(ARGS)
+
+compose-test: $(INSTALLED) ## the compose files with real containers (`make peers` installs podman); ARGS are pytest's
+	@$(BIN)/pytest tests/deploy $(ARGS)
 
 lint: $(INSTALLED) ## style, types, the import rule, and the built contracts where node is there
 	@$(BIN)/ruff check .
@@ -73,9 +78,15 @@ slither: contracts/node_modules/.package-lock.json ## look for weaknesses in the
 firmware: $(INSTALLED) ## compile the sketches of the examples into build/firmware (`make peers` installs the AVR tools)
 	@$(BIN)/python -m bridges.serial.firmware examples/*/*_frames examples/*/*_rosserial -o build/firmware -L examples/firmware
 
+COMPILE := uv pip compile pyproject.toml --universal --python-version 3.11 --generate-hashes --upgrade --quiet \
+	--no-header --no-annotate --no-emit-index-url --no-emit-find-links
+
+# Of the same versions, what the images need.
 lock: ## choose the exact versions anew (needs uv)
-	@uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 --generate-hashes --upgrade --quiet \
-		--no-header --no-annotate --no-emit-index-url --no-emit-find-links --output-file $(LOCK)
+	@$(COMPILE) --extra dev --output-file $(LOCK)
+	@$(COMPILE) --constraint $(LOCK) --extra serial --extra metrics --output-file requirements/edge.txt
+	@$(COMPILE) --constraint $(LOCK) --extra chain --extra identity --extra ipfs --extra metrics \
+		--output-file requirements/server.txt
 
 clean: ## remove what the targets above have made here; the peers' cache stays
 	@rm -rf .venv build dist *.egg-info .coverage .coverage.* htmlcov \

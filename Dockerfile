@@ -1,0 +1,74 @@
+# Three images of one file, each smaller than what it would be with all of the project in it:
+#
+#   edge    a device on a serial line: no client of a chain, no HTTP server but for its metrics
+#   server  router, provider, agent, person, operator, bridge (the default)
+#   chain   a server with anvil, and the script that makes the site of the demonstration
+#
+# Any base with Python 3.11 or later and its venv module does (Debian: python3, python3-venv, ca-certificates).
+ARG BASE=python:3.13-slim-bookworm
+# Where the program anvil comes from, /usr/local/bin/anvil.
+ARG FOUNDRY=ghcr.io/foundry-rs/foundry:v1.7.1
+
+FROM ${FOUNDRY} AS foundry
+
+# pip stays behind in the stages that build: the environment that is copied out of them has none.
+FROM ${BASE} AS tools
+WORKDIR /source
+COPY requirements/lock.txt requirements/
+RUN python3 -m venv /tools && python3 -m venv --without-pip /opt/aira \
+ && sed -n '/^setuptools==/,/[^\\]$/p' requirements/lock.txt > /tmp/setuptools.txt \
+ && /tools/bin/pip install --quiet --no-cache-dir --require-hashes -r /tmp/setuptools.txt
+
+FROM tools AS project
+COPY LICENSE README.md pyproject.toml ./
+COPY schemas schemas
+COPY mesh mesh
+COPY bridges bridges
+RUN /tools/bin/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir /wheels .
+
+FROM tools AS edge-environment
+COPY requirements/edge.txt requirements/
+RUN /tools/bin/pip --python /opt/aira/bin/python install --quiet --no-cache-dir --require-hashes -r requirements/edge.txt
+COPY --from=project /wheels /wheels
+RUN /tools/bin/pip --python /opt/aira/bin/python install --quiet --no-cache-dir --no-index --no-deps /wheels/*.whl
+
+FROM tools AS server-environment
+COPY requirements/server.txt requirements/
+RUN /tools/bin/pip --python /opt/aira/bin/python install --quiet --no-cache-dir --require-hashes -r requirements/server.txt
+COPY --from=project /wheels /wheels
+RUN /tools/bin/pip --python /opt/aira/bin/python install --quiet --no-cache-dir --no-index --no-deps /wheels/*.whl
+
+# A volume that is made at one of these folders belongs to the image's user.
+FROM ${BASE} AS runtime
+RUN groupadd --gid 10001 aira \
+ && useradd --uid 10001 --gid aira --no-create-home --home-dir /var/lib/aira --shell /usr/sbin/nologin aira \
+ && install -d -o aira -g aira -m 0700 /var/lib/aira /secrets
+ENV PATH=/opt/aira/bin:$PATH \
+    PYTHONUNBUFFERED=1 \
+    PYTHONDONTWRITEBYTECODE=1 \
+    AIRA_DATA_DIR=/var/lib/aira
+LABEL org.opencontainers.image.title="AIRA mesh" \
+      org.opencontainers.image.description="A market of work between robots and people" \
+      org.opencontainers.image.licenses="Apache-2.0"
+WORKDIR /var/lib/aira
+USER 10001:10001
+CMD ["aira", "--help"]
+
+FROM runtime AS edge
+COPY --from=edge-environment /opt/aira /opt/aira
+
+FROM runtime AS with-server
+COPY --from=server-environment /opt/aira /opt/aira
+
+FROM with-server AS chain
+USER root
+RUN install -d -o aira -g aira -m 0700 /chain /site \
+ && for one in authority router router-north router-south provider agent edge bridge person operator; do \
+        install -d -o aira -g aira -m 0700 "/site/$one"; \
+    done
+COPY --from=foundry /usr/local/bin/anvil /usr/local/bin/anvil
+COPY --chmod=0755 deploy/compose/make-site.sh /usr/local/bin/make-site
+USER 10001:10001
+
+# The last one is what is built when no target is named.
+FROM with-server AS server
