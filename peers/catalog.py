@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from peers.recipes import AptRecipe, CargoRecipe, NpmRecipe, PipRecipe
+from peers.recipes import AptRecipe, CargoRecipe, DebianRecipe, NpmRecipe, PipRecipe
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -25,12 +25,14 @@ BOARDS = AptRecipe(
     name="AVR compiler and simulator", packages=("gcc-avr", "avr-libc", "arduino-core-avr", "libsimavr-dev", "gcc")
 )
 BROWSER = AptRecipe(name="chromium", packages=("chromium", "chromium-driver"))
+UNITS = AptRecipe(name="systemd", packages=("systemd",))
 CONTAINERS = AptRecipe(
     name="podman", packages=("podman", "runc", "netavark", "aardvark-dns", "iptables", "debootstrap")
 )
+BASE = DebianRecipe(name="base image", release="bookworm", packages=("python3", "python3-venv", "ca-certificates"))
 
 # In this order they are installed: the quick ones first.
-RECIPES: tuple[Recipe, ...] = (CHAIN, KUBO, COMPOSE, SLITHER, IPFS, BOARDS, BROWSER, CONTAINERS, ROUTER)
+RECIPES: tuple[Recipe, ...] = (CHAIN, KUBO, COMPOSE, SLITHER, IPFS, BOARDS, BROWSER, UNITS, CONTAINERS, BASE, ROUTER)
 
 
 class PeerMissing(Exception):
@@ -69,7 +71,7 @@ def locate(name: str) -> Path:
     return PEERS[name].locate()
 
 
-def _within(recipe: NpmRecipe | PipRecipe | CargoRecipe, pattern: str) -> Callable[[], Path | None]:
+def _within(recipe: NpmRecipe | PipRecipe | CargoRecipe | DebianRecipe, pattern: str) -> Callable[[], Path | None]:
     return lambda: next(iter(sorted(recipe.folder.glob(pattern))), None)
 
 
@@ -137,6 +139,7 @@ _ALL = (
         search=_named_by("AIRA_KUBO"),
         absent="in no registry: name one with AIRA_KUBO=/path/to/ipfs",
     ),
+    Peer(name="systemd-analyze", purpose="checks systemd units", recipe=UNITS, search=_command("systemd-analyze")),
     Peer(name="avr-gcc", purpose="compiles firmware", recipe=BOARDS, search=_command("avr-gcc")),
     Peer(
         name="arduino-core",
@@ -159,6 +162,12 @@ _ALL = (
         purpose="makes the base image, since none can be pulled",
         recipe=CONTAINERS,
         search=_command("debootstrap"),
+    ),
+    Peer(
+        name="base-image",
+        purpose="Debian with Python as a tar file: what images are built on",
+        recipe=BASE,
+        search=_within(BASE, "root.tar"),
     ),
     Peer(
         name="podman-compose",

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from peers.running import Runner
 
 MANIFESTS = Path(__file__).parent
+CERTIFICATES = Path("/etc/ssl/certs/ca-certificates.crt")
 
 
 def cache_folder() -> Path:
@@ -154,6 +155,47 @@ class AptRecipe:
             # The lists are missing or older than the archive: only then are they worth fetching.
             run(["apt-get", "update"], timeout=300)
             run(install, timeout=900)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DebianRecipe:
+    """A small Debian in one tar file, to make a container image of where none can be pulled.
+
+    The certificates that this machine trusts go into it: an image built on it asks the registries by the same way.
+    """
+
+    name: str
+    release: str
+    packages: tuple[str, ...]
+    environment: Mapping[str, str] = field(default_factory=lambda: {"DEBIAN_FRONTEND": "noninteractive"})
+
+    @property
+    def folder(self) -> Path:
+        return cache_folder() / f"debian-{self.release}"
+
+    def is_complete(self) -> bool:
+        return _is_marked(self.folder, self._made_from())
+
+    def install(self, run: Runner) -> None:
+        if os.geteuid() != 0:
+            raise InstallFailed("needs root, as debootstrap does")
+        made_from = self._made_from()
+        _make_empty(self.folder)
+        root = self.folder / "root"
+        run(
+            ["debootstrap", "--variant=minbase", f"--include={','.join(self.packages)}", self.release, root],
+            timeout=900,
+        )
+        if CERTIFICATES.exists():
+            shutil.copy(CERTIFICATES, root / CERTIFICATES.relative_to("/"))
+        left_out = [f"--exclude=./{path}/*" for path in ("dev", "var/cache/apt", "var/lib/apt/lists")]
+        run(["tar", "--numeric-owner", *left_out, "-C", root, "-cf", self.folder / "root.tar", "."], timeout=300)
+        shutil.rmtree(root)
+        _mark(self.folder, made_from)
+
+    def _made_from(self) -> str:
+        words = " ".join((self.release, *self.packages)).encode()
+        return hashlib.sha256(words + (CERTIFICATES.read_bytes() if CERTIFICATES.exists() else b"")).hexdigest()
 
 
 def _fingerprint(files: list[Path]) -> str:

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from peers import install, where
-from peers.catalog import CHAIN, PEERS, ROUTER, PeerMissing, locate
-from peers.recipes import CargoRecipe
+from peers import install, recipes, where
+from peers.catalog import BASE, CHAIN, PEERS, ROUTER, PeerMissing, locate
+from peers.recipes import CargoRecipe, DebianRecipe
 
 ROOT = Path(__file__).parents[2]
 
@@ -72,6 +72,19 @@ def test_another_version_of_a_crate_is_not_complete(cache: Path) -> None:
     (ROUTER.folder / ".crates.toml").write_text(f'[v1]\n"{ROUTER.crate} {ROUTER.version} (registry)" = ["zenohd"]\n')
     assert ROUTER.is_complete()
     assert not CargoRecipe(crate=ROUTER.crate, version="1.10.0").is_complete()
+
+
+def test_a_base_image_is_made_again_for_other_packages_and_for_other_certificates(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    certificates = tmp_path / "certificates"
+    monkeypatch.setattr(recipes, "CERTIFICATES", certificates)
+    BASE.folder.mkdir(parents=True)
+    (BASE.folder / ".complete").write_text(BASE._made_from())
+    assert BASE.is_complete()
+    assert not DebianRecipe(name=BASE.name, release=BASE.release, packages=("python3",)).is_complete()
+    certificates.write_text("what this machine trusts since today")
+    assert not BASE.is_complete()
 
 
 def test_lock_files_leave_the_registry_to_the_machine() -> None:

@@ -1,7 +1,9 @@
-"""Simulated boards for tests, with firmware that is compiled once in a run."""
+"""Simulated boards for tests, with firmware that each process which runs tests compiles once."""
 
 from __future__ import annotations
 
+import atexit
+import shutil
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -28,8 +30,9 @@ def firmware(sketch: str, *defines: str) -> Path:
     """The compiled sketch in this folder of the project. Skips the test where the tools are missing."""
     for tool in ("avr-gcc", "arduino-core", "libsimavr"):
         require(tool)
-    elf = Path(mkdtemp(prefix="aira-firmware-")) / "firmware.elf"
-    return compile_sketch(ROOT / sketch, elf, libraries=[LIBRARIES], defines=defines)
+    folder = mkdtemp(prefix="aira-firmware-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return compile_sketch(ROOT / sketch, Path(folder) / "firmware.elf", libraries=[LIBRARIES], defines=defines)
 
 
 def board(sketch: str, *defines: str) -> SimulatedBoard:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 AIRA = (sys.executable, "-m", "mesh")
-SECONDS = 60.0
+SECONDS = 120.0
 SOON = 2.5
 """Seconds in which a signal ends a command: a fraction of one on a machine that has nothing else to do."""
 

@@ -12,16 +12,18 @@ if TYPE_CHECKING:
 
     import zenoh
 
-SECONDS = 10.0
+SECONDS = 30.0
 PAUSE = 0.005
 
 
-async def until(condition: Callable[[], object], *, what: str = "", seconds: float = SECONDS) -> None:
-    """Return when `condition()` is true; fail the test if it isn't within `seconds`."""
+async def until(
+    condition: Callable[[], object], *, what: str = "", seconds: float = SECONDS, pause: float = PAUSE
+) -> None:
+    """Return when `condition()` is true; fail the test if it isn't within `seconds`. It is asked after each `pause`."""
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, f"{what or 'the condition'} did not come about within {seconds:g} s"
-        await asyncio.sleep(PAUSE)
+        await asyncio.sleep(pause)
 
 
 async def until_found(search: Callable[[], Awaitable[object]], *, what: str = "", seconds: float = SECONDS) -> None:

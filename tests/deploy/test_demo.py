@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+from eth_keyfile.keyfile import decode_keyfile_json
+
+from tests.support.deployment import COMPOSE, Deployment, Images
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+SERVICES = ("setup", "chain", "router", "provider", "agent", "person")
+
+
+@pytest.fixture(scope="module")
+def demo(images: Images, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Deployment]:
+    with Deployment(images, tmp_path_factory.mktemp("demo")) as market:
+        market.up()
+        yield market
+
+
+async def test_a_market_comes_up_from_nothing_and_does_a_job_whose_story_is_in_the_logs(demo: Deployment) -> None:
+    await demo.ready()
+    assert "made" in demo.log("setup")
+    story = demo.log("person")
+    assert "demand by 0x" in story
+    assert "paid, result Qm" in story
+    assert demo.log("agent").count("the lamp is on") == 3
+    liability = story.split("contract ")[1].split()[0]
+    assert f"{liability}: finalized, success True" in demo.log("provider")
+    assert liability in demo.log("agent")
+
+
+async def test_nobody_has_more_rights_than_needed(demo: Deployment) -> None:
+    await demo.ready()
+    for service in SERVICES:
+        facts = demo.facts(service)
+        assert facts["Config"]["User"] == "10001:10001", service
+        assert facts["HostConfig"]["ReadonlyRootfs"], service
+        assert facts["EffectiveCaps"] in (None, []), service
+        assert not facts["HostConfig"]["Privileged"], service
+        assert "no-new-privileges" in " ".join(facts["HostConfig"]["SecurityOpt"]), service
+    for service in ("router", "provider", "agent", "chain"):
+        assert demo.execute(service, "id", "-u") == "10001\n"
+        assert demo.execute(service, "sh", "-c", "touch /usr/local/bin/mine 2>&1 || true").endswith(
+            "Read-only file system\n"
+        )
+
+
+async def test_no_key_and_no_password_is_in_an_environment_a_command_line_or_a_log(demo: Deployment) -> None:
+    await demo.ready()
+    hidden = secrets_of(demo)
+    assert len(hidden) == 10
+    for service in SERVICES:
+        facts = demo.facts(service)
+        config = facts["Config"]
+        shown = [*config["Env"], *config["Cmd"], *(config["Entrypoint"] or []), *facts["Args"], demo.log(service)]
+        for words in shown:
+            found = [name for name, secret in hidden.items() if secret.lower() in words.lower()]
+            assert not found, f"{service} shows {found}"
+
+
+async def test_each_service_sees_its_own_secrets_and_nobody_elses(demo: Deployment) -> None:
+    await demo.ready()
+    keys = set()
+    for service in ("router", "provider", "agent"):
+        keys.add(demo.execute(service, "cat", "/secrets/identity.key"))
+        (volume,) = [mount["Name"] for mount in demo.facts(service)["Mounts"] if mount["Destination"] == "/secrets"]
+        assert volume == f"{demo.name}_{service}-secrets"
+        assert demo.execute(service, "sh", "-c", "touch /secrets/more 2>&1 || true").endswith("Read-only file system\n")
+    assert len(keys) == 3
+
+
+async def test_taking_it_down_with_its_volumes_leaves_nothing(images: Images, demo: Deployment) -> None:
+    await demo.ready()
+    assert {left.split()[0] for left in demo.leftovers()} == {"container", "pod", "volume", "network"}
+    demo.down()
+    assert demo.leftovers() == []
+
+
+def test_an_edge_device_gets_no_client_of_a_chain(images: Images) -> None:
+    look = "import importlib.util as u, serial, mesh; print(*filter(u.find_spec, ['web3', 'eth_account', 'pip']))"
+    run = ["run", "--rm", "--network", "none", images.name("edge")]
+    assert images.engine(*run, "python", "-c", look) == "\n"
+    assert "Usage: aira edge" in images.engine(*run, "aira", "edge", "--help")
+
+
+def test_the_environments_file_says_all_that_can_be_told() -> None:
+    text = COMPOSE.read_text()
+    told = (COMPOSE.parent / ".env.example").read_text()
+    names = {part.split(":-")[0] for part in text.split("${")[1:]}
+    assert len(names) > 20
+    assert [name for name in sorted(names) if f"#{name}=" not in told] == []
+
+
+def secrets_of(market: Deployment) -> dict[str, str]:
+    """What nobody may see, by where it is: passwords, accounts' private keys, and a line of each certificate's key."""
+    found = {}
+    for service in ("router", "provider", "agent"):
+        found[f"{service}'s certificate"] = market.execute(service, "cat", "/secrets/identity.key").splitlines()[1]
+    for service in ("provider", "agent"):
+        keyfile = json.loads(market.execute(service, "cat", "/secrets/account.json"))
+        password = market.execute(service, "cat", "/secrets/password").strip()
+        found[f"{service}'s password"] = password
+        found[f"{service}'s keyfile"] = keyfile["crypto"]["ciphertext"]
+        found[f"{service}'s account"] = decode_keyfile_json(keyfile, password.encode()).hex()
+    found["the chain's password"] = market.execute("chain", "cat", "/var/lib/aira/development/password").strip()
+    return found

@@ -1,0 +1,76 @@
+"""A market with a job under way, and what may befall it: each time the job ends paid, once, and nobody lifts a hand.
+
+All faults happen to one market, one after the other: what one has left behind must not hurt the next.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.support.deployment import CUT_SECONDS, Deployment, Images, passed
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+PLAYED_SECONDS = 8
+
+
+@pytest.fixture(scope="module")
+def market(images: Images, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Deployment]:
+    with Deployment(images, tmp_path_factory.mktemp("faults")) as running:
+        running.up()
+        yield running
+
+
+@pytest.mark.parametrize("service", ["router", "provider", "agent"])
+async def test_a_job_is_paid_though_a_service_is_killed_and_comes_back(market: Deployment, service: str) -> None:
+    await market.ready()
+    job = market.ask(PLAYED_SECONDS)
+    await job.is_played()
+    market.kill(service)
+    assert not job.is_over()
+    market.start(service)
+    assert (await job.settled())["success"]
+
+
+async def test_a_job_is_paid_though_the_chain_is_killed_and_comes_back_with_its_state(market: Deployment) -> None:
+    await market.ready()
+    job = market.ask(PLAYED_SECONDS)
+    await job.is_played()
+    created = time.time()
+    await market.until(lambda: saved(market) > created, what="the chain's state to be saved", seconds=60)
+    market.kill("chain")
+    market.start("chain")
+    assert (await job.settled())["success"]
+
+
+async def test_a_job_is_paid_though_its_robot_is_cut_off_for_half_a_minute(market: Deployment) -> None:
+    await market.ready()
+    job = market.ask(PLAYED_SECONDS)
+    await job.is_played()
+    market.disconnect("agent")
+    # It plays on by itself; its Result reaches nobody until it is joined again.
+    await passed(CUT_SECONDS)
+    assert not job.is_over()
+    market.connect("agent")
+    assert (await job.settled())["success"]
+
+
+async def test_a_job_is_paid_though_its_robot_stands_still_for_a_while(market: Deployment) -> None:
+    await market.ready()
+    job = market.ask(PLAYED_SECONDS)
+    await job.is_played()
+    market.pause("agent")
+    # Longer than Zenoh's lease: the others take it for gone.
+    await passed(15)
+    assert not job.is_over()
+    market.unpause("agent")
+    assert (await job.settled())["success"]
+
+
+def saved(market: Deployment) -> float:
+    """When the chain's state was last written, seconds of this machine's clock."""
+    return float(market.execute("chain", "stat", "--format=%Y", "/var/lib/aira/chain.json"))

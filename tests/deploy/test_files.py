@@ -1,0 +1,150 @@
+"""What the compose files, the Dockerfile and the locks of the images promise, read without any engine."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mesh.settings import Settings
+from tests.support.peers import require
+
+ROOT = Path(__file__).parents[2]
+ONE_SITE, TWO_SITES = ROOT / "docker-compose.yml", ROOT / "docker-compose.two-sites.yml"
+STAGE = re.compile(r"^FROM (?P<base>\S+)(?: AS (?P<name>\S+))?$", re.MULTILINE)
+VARIABLE = re.compile(r"\$\{(\w+):-([^}]*)\}")
+FOREIGN = {"ipfs"}
+"""Services whose image is not ours."""
+
+
+@cache
+def compose(file: Path) -> dict[str, Any]:
+    """What is in a compose file, its aliases and merges resolved."""
+    python = require("podman-compose").with_name("python")
+    read = "import json, sys, yaml; print(json.dumps(yaml.safe_load(open(sys.argv[1]))))"
+    done = subprocess.run([python, "-c", read, file], capture_output=True, text=True, timeout=60, check=True)
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def services() -> dict[str, dict[str, Any]]:
+    found: dict[str, dict[str, Any]] = compose(ONE_SITE)["services"]
+    assert len(found) > 8
+    return found
+
+
+@cache
+def stages() -> dict[str, tuple[str, str]]:
+    """The stages of the Dockerfile: what each is made of, and its lines."""
+    text = (ROOT / "Dockerfile").read_text()
+    parts = STAGE.split(text)
+    return {name: (base, lines) for base, name, lines in zip(parts[1::3], parts[2::3], parts[3::3], strict=True)}
+
+
+def versions(lock: str) -> dict[str, set[str]]:
+    """The requirements of a lock, each with its hashes."""
+    text = (ROOT / "requirements" / lock).read_text().replace("\\\n", " ")
+    return {line.split(" --hash")[0].strip(): set(re.findall(r"--hash=(\S+)", line)) for line in text.splitlines()}
+
+
+@pytest.mark.parametrize("lock", ["edge.txt", "server.txt"])
+def test_the_images_are_made_of_the_versions_that_are_tested(lock: str) -> None:
+    tested, used = versions("lock.txt"), versions(lock)
+    assert len(used) > 10
+    for requirement, hashes in used.items():
+        assert hashes
+        assert hashes <= tested[requirement], requirement
+
+
+def test_an_edge_image_has_no_client_of_a_chain() -> None:
+    names = {requirement.split("==")[0] for requirement in versions("edge.txt")}
+    assert {"eclipse-zenoh", "pyserial"} <= names
+    assert not names & {"web3", "eth-account", "aiohttp", "cryptography", "pytest"}
+
+
+@pytest.mark.parametrize("target", ["edge", "server", "chain"])
+def test_no_image_runs_as_root(target: str) -> None:
+    users: list[str] = []
+    while target in stages():
+        target, lines = stages()[target]
+        users = re.findall(r"^USER (\S+)$", lines, re.MULTILINE) + users
+    assert users[-1] == "10001:10001"
+
+
+def test_each_service_is_of_an_image_that_the_dockerfile_makes() -> None:
+    for name, service in services().items():
+        if name not in FOREIGN:
+            assert service["build"]["target"] in stages(), name
+            assert f"-{service['build']['target']}:" in service["image"], name
+
+
+def test_no_service_may_more_than_it_needs() -> None:
+    for name, service in services().items():
+        assert service["read_only"] is True, name
+        assert service["cap_drop"] == ["ALL"], name
+        assert service["security_opt"] == ["no-new-privileges:true"], name
+        assert service["mem_limit"], name
+        assert not service.keys() & {"privileged", "cap_add", "network_mode", "pid", "container_name"}, name
+
+
+def test_a_variable_of_a_service_is_a_setting_and_names_files_only() -> None:
+    for name, service in services().items():
+        for variable, value in service.get("environment", {}).items():
+            if variable.startswith("AIRA_"):
+                assert variable.removeprefix("AIRA_").lower() in Settings.__struct_fields__, f"{name}: {variable}"
+            if re.search("KEY|PASSWORD|SECRET|TOKEN_|AUTHORIZATION", variable):
+                assert re.fullmatch(r"/secrets/[a-z.]+", value), f"{name}: {variable}"
+
+
+def test_a_service_gets_its_own_secrets_and_only_to_read() -> None:
+    seen: dict[str, str] = {}
+    for name, service in services().items():
+        for mount in service.get("volumes", []):
+            if "secrets" in mount and name != "setup":
+                assert mount.endswith("-secrets}:/secrets:ro"), f"{name}: {mount}"
+                assert seen.setdefault(mount, name) == name
+    assert len(seen) == 7
+
+
+def test_no_port_is_open_to_other_machines_unless_it_is_asked_for() -> None:
+    for name, service in services().items():
+        for port in service.get("ports", []):
+            assert re.fullmatch(r"\$\{MESH_\w+_PORT:-127\.0\.0\.1::\d+\}", port), f"{name}: {port}"
+
+
+def test_no_volume_is_called_as_the_beginning_of_another() -> None:
+    """Podman takes such a name for the other one, and then does not remove it."""
+    for file in (ONE_SITE, TWO_SITES):
+        names = list(compose(file)["volumes"])
+        assert not [(one, two) for one in names for two in names if one != two and two.startswith(one)]
+
+
+def test_the_second_file_builds_on_services_of_the_first() -> None:
+    for name, service in compose(TWO_SITES)["services"].items():
+        assert service["extends"]["file"] == ONE_SITE.name, name
+        assert service["extends"]["service"] in services(), name
+        assert set(service["networks"]) <= {"north", "south", "wan"}, name
+
+
+def test_the_example_of_env_says_of_every_variable_what_is_in_force_without_it() -> None:
+    used = dict(VARIABLE.findall(ONE_SITE.read_text()))
+    told = dict(re.findall(r"^#([A-Z]\w*)=(.*)$", (ROOT / ".env.example").read_text(), re.MULTILINE))
+    assert len(used) > 30
+    assert told == used
+
+
+def test_a_default_is_the_same_wherever_a_variable_is_used() -> None:
+    found: dict[str, str] = {}
+    for variable, default in VARIABLE.findall(ONE_SITE.read_text()):
+        assert found.setdefault(variable, default) == default, variable
+
+
+@pytest.mark.parametrize("script", sorted((ROOT / "deploy" / "compose").glob("*.sh")), ids=lambda script: script.name)
+def test_a_script_of_the_services_is_one_of_any_shell(script: Path) -> None:
+    assert script.read_text().startswith("#!/bin/sh\n")
+    subprocess.run(["sh", "-n", script], timeout=60, check=True)

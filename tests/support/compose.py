@@ -1,0 +1,197 @@
+"""A compose project for tests: brought up, hurt and mended by the services' names, and gone at the end."""
+
+from __future__ import annotations
+
+import secrets
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+from tests.support.bridges import steady_bridges
+from tests.support.containers import SECONDS
+from tests.support.peers import require
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from tests.support.containers import Engine
+
+BUILD_SECONDS = 600.0
+UP_SECONDS = 300.0
+"""For ten containers on a machine that has other things to do."""
+STOP_SECONDS = 5
+
+
+class Project:
+    """One project with a name of its own. Use it in `with`: whatever is left at the end is removed by force.
+
+    `variables` stand in for an `.env` file; the one that lies beside the compose file is not read.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        folder: Path,
+        *,
+        files: Sequence[Path],
+        profiles: Sequence[str] = (),
+        variables: Mapping[str, str] | None = None,
+    ) -> None:
+        self.engine = engine
+        self.name = f"aira-test-{secrets.token_hex(4)}"
+        environment = folder / f"{self.name}.env"
+        environment.write_text("".join(f"{name}={value}\n" for name, value in (variables or {}).items()))
+        options = [f"--file={file}" for file in files] + [f"--profile={profile}" for profile in profiles]
+        self._compose: list[str | Path] = [
+            require("podman-compose"),
+            f"--project-name={self.name}",
+            f"--env-file={environment}",
+            *options,
+        ]
+        self._place = files[0].parent
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self._sweep()
+
+    def compose(self, *words: str, seconds: float = SECONDS) -> str:
+        """A command of podman-compose; what it prints."""
+        return self.engine.run([*self._compose, *words], seconds=seconds, cwd=self._place)
+
+    def build(self, *services: str) -> None:
+        """Build the images of these services, or all.
+
+        On the host's network: the default one may be another engine's at the same time.
+        """
+        self.compose("--podman-build-args=--network=host", "build", *services, seconds=BUILD_SECONDS)
+
+    def up(self, *services: str) -> None:
+        """Bring up these services, or all; none is built."""
+        with steady_bridges():
+            self.compose("up", "--detach", "--no-build", *services, seconds=UP_SECONDS)
+
+    def down(self) -> None:
+        """Take all down with their volumes, as a user does. What that leaves, `leftovers` tells."""
+        self.compose("down", "--volumes", "--timeout", str(STOP_SECONDS), seconds=UP_SECONDS)
+
+    def leftovers(self) -> list[str]:
+        """What there is of this project: containers, pods, volumes, networks."""
+        found = []
+        for kind, names in self._mine().items():
+            found += [f"{kind} {name}" for name in names]
+        return found
+
+    def container(self, service: str) -> str:
+        """The name of the service's container."""
+        return f"{self.name}_{service}_1"
+
+    def containers(self) -> list[str]:
+        """The names of all containers, also of those that have ended."""
+        return self.engine("ps", "--all", "--filter", f"name={self.name}", "--format", "{{.Names}}").split()
+
+    def kill(self, service: str) -> None:
+        """End the service as a power cut would (SIGKILL)."""
+        self.engine("kill", "--signal", "KILL", self.container(service))
+        self.engine("wait", self.container(service))
+
+    def start(self, service: str) -> None:
+        """Start a service that was killed or stopped, with the state it had."""
+        with steady_bridges():
+            self.engine("start", self.container(service))
+
+    def stop(self, service: str) -> None:
+        """Ask the service to end."""
+        self.engine("stop", "--time", str(STOP_SECONDS), self.container(service))
+
+    def pause(self, service: str) -> None:
+        """Freeze the service: it keeps its connections and answers nobody, until `unpause`."""
+        self.engine("pause", self.container(service))
+
+    def unpause(self, service: str) -> None:
+        """Let a frozen service go on."""
+        self.engine("unpause", self.container(service))
+
+    def disconnect(self, service: str, network: str = "default") -> None:
+        """Pull the service's plug out of a network: its packets go nowhere, nobody is told."""
+        self.engine("network", "disconnect", f"{self.name}_{network}", self.container(service))
+
+    def connect(self, service: str, network: str = "default") -> None:
+        """Put the plug in again, by the service's name; the address may be another one."""
+        with steady_bridges():
+            self.engine("network", "connect", "--alias", service, f"{self.name}_{network}", self.container(service))
+
+    def networks(self, service: str) -> set[str]:
+        """The networks that the service is on, by their names in the compose file."""
+        return {name.removeprefix(f"{self.name}_") for name in self.facts(service)["NetworkSettings"]["Networks"]}
+
+    def variable(self, service: str, name: str) -> str:
+        """A variable of the service's environment."""
+        (value,) = [line for line in self.facts(service)["Config"]["Env"] if line.startswith(f"{name}=")]
+        return str(value).partition("=")[2]
+
+    def address(self, service: str) -> str:
+        """The service's IP address in one of its networks, which this machine reaches too."""
+        networks = self.facts(service)["NetworkSettings"]["Networks"]
+        return str(next(network["IPAddress"] for network in networks.values()))
+
+    def facts(self, service: str) -> Any:
+        """What the engine knows of the service's container."""
+        return self.engine.facts("inspect", "--format", "json", self.container(service))[0]
+
+    def is_running(self, service: str) -> bool:
+        """Whether its process runs."""
+        return bool(self.facts(service)["State"]["Running"])
+
+    def exit_code(self, service: str) -> int | None:
+        """What the service ended with; None while it runs."""
+        state = self.facts(service)["State"]
+        return None if state["Running"] or state["Status"] != "exited" else int(state["ExitCode"])
+
+    def log(self, service: str) -> str:
+        """All that the service has said, on both of its outputs."""
+        return log_text(Path(self.facts(service)["HostConfig"]["LogConfig"]["Path"]))
+
+    def execute(self, service: str, *words: str, seconds: float = SECONDS) -> str:
+        """Run a command inside the service's container; what it prints."""
+        return self.engine("exec", self.container(service), *words, seconds=seconds)
+
+    def _mine(self) -> dict[str, list[str]]:
+        """By name, not by label: what the engine made by itself has no label of the project's."""
+        named = ["--format", "{{.Name}}", "--filter", f"name={self.name}"]
+        return {
+            "container": self.containers(),
+            "pod": self.engine("pod", "ls", *named).split(),
+            "volume": self.engine("volume", "ls", *named).split(),
+            "network": self.engine("network", "ls", *named).split(),
+        }
+
+    def _sweep(self) -> None:
+        """Remove everything by force, also what is frozen, half made or needed by another."""
+        paused = self.engine(
+            "ps",
+            "--filter",
+            f"label=io.podman.compose.project={self.name}",
+            "--filter",
+            "status=paused",
+            "--format",
+            "{{.Names}}",
+        )
+        for name in paused.split():
+            self.engine("unpause", name)
+        for kind, names in self._mine().items():
+            if not names:
+                continue
+            if kind == "container":
+                self.engine("rm", "--force", "--depend", "--ignore", "--volumes", "--time", "0", *names)
+            else:
+                self.engine(kind, "rm", "--force", *names)
+
+
+def log_text(file: Path) -> str:
+    """What a container's log file holds: lines of time, stream, `F` or `P` (a part of a line) and the text."""
+    said = []
+    for line in file.read_text(errors="replace").splitlines() if file.exists() else []:
+        _, _, whole, text = line.split(" ", 3)
+        said.append(text + ("\n" if whole == "F" else ""))
+    return "".join(said)

@@ -1,0 +1,176 @@
+"""The project's compose files with real containers: a market that jobs are put to, and what its chain says of them."""
+
+from __future__ import annotations
+
+import json
+import secrets
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+from web3 import HTTPProvider, Web3
+
+from mesh.chain.events import ChainEvent, Finalized, NewLiability, Transfer, decode_log
+from schemas import ZERO_ADDRESS, Empty, cid_of_file
+from tests.support.compose import Project, log_text
+from tests.support.containers import BASE_IMAGE, FOUNDRY_IMAGE
+from tests.support.objectives import timed
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from tests.support.containers import Engine
+
+ROOT = Path(__file__).parents[2]
+COMPOSE = ROOT / "docker-compose.yml"
+TWO_SITES = ROOT / "docker-compose.two-sites.yml"
+MODEL = cid_of_file(ROOT / "examples/hello_mesh/model.md")
+LAMP = "the lamp is on"
+PAUSE = 0.3
+"""Seconds between two questions to the engine: each is a process, which takes time from those that it asks after."""
+COST = 7
+"""XRT that a job costs."""
+
+READY_SECONDS = 240.0
+"""From nothing until the services of a market know each other, on a busy machine."""
+CUT_SECONDS = 30.0
+"""For which a service or a site is off its network."""
+JOB_SECONDS = 180.0
+"""Given to a job that something is done to, besides what its objective plays."""
+
+
+@dataclass(frozen=True)
+class Images:
+    """The images of this tree, under a name of this run's own."""
+
+    engine: Engine
+    prefix: str
+
+    @classmethod
+    def build(cls, engine: Engine, folder: Path) -> Self:
+        """Build them, each by a service that runs it."""
+        images = cls(engine, f"localhost/aira-test-{secrets.token_hex(4)}")
+        with Project(engine, folder, files=[COMPOSE], profiles=["demo", "edge"], variables=images.variables) as project:
+            for service in ("chain", "router", "edge"):
+                project.build(service)
+        return images
+
+    @property
+    def variables(self) -> dict[str, str]:
+        """What the compose file is told of them."""
+        return {"MESH_IMAGE": self.prefix, "MESH_BASE_IMAGE": BASE_IMAGE, "MESH_FOUNDRY_IMAGE": FOUNDRY_IMAGE}
+
+    def name(self, target: str) -> str:
+        """The image of a target: edge, server or chain."""
+        return f"{self.prefix}-{target}:latest"
+
+    def forget(self) -> None:
+        """Take the names away. What they named stays for a while, so that the next run builds what has changed."""
+        for target in ("edge", "server", "chain"):
+            self.engine("untag", self.name(target))
+
+
+class Deployment(Project):
+    """The services of a compose file, all of the profile `demo`."""
+
+    def __init__(self, images: Images, folder: Path, *, file: Path = COMPOSE) -> None:
+        super().__init__(images.engine, folder, files=[file], profiles=["demo"], variables=images.variables)
+        self._folder = folder
+
+    async def ready(self) -> None:
+        """Return when the demonstration's own job is done: all services have found each other."""
+        await self.until(
+            lambda: self.exit_code("person") is not None, what="the first job's end", seconds=READY_SECONDS
+        )
+        assert self.exit_code("person") == 0, self.told("the first job")
+
+    def ask(self, seconds: int) -> Job:
+        """A person asks for a job that plays for so long, a message a second, and waits for its end."""
+        objective = self._folder / f"{seconds}.mcap"
+        objective.write_bytes(timed(("/blink", Empty(), second * 10**9) for second in range(seconds + 1)))
+        name = f"{self.name}_job_{secrets.token_hex(2)}"
+        before = self.happened(Finalized)
+        options = ["--detach", "--no-deps", "-T", f"--name={name}", f"--volume={objective}:/objective.mcap:ro"]
+        demand = ["aira", "demand", "--json", f"--model={MODEL}", "--objective=/objective.mcap", f"--cost={COST}"]
+        self.compose("run", *options, "person", *demand)
+        return Job(self, name, seconds=seconds, before=before, lamps=self.lamps())
+
+    async def until(self, condition: Callable[[], object], *, what: str, seconds: float) -> None:
+        """Return when a condition is true; fail with all that was said if it isn't within `seconds`."""
+        try:
+            await until(condition, what=what, seconds=seconds, pause=PAUSE)
+        except AssertionError as error:
+            raise AssertionError(self.told(str(error))) from None
+
+    def lamps(self) -> int:
+        """How often the robot's lamp went on so far."""
+        return self.log("agent").count(LAMP)
+
+    def account(self, role: str) -> str:
+        """The address of robot or person, as the chain says at its start."""
+        (line,) = {line for line in self.log("chain").splitlines() if line.startswith(f"{role} ")}
+        return line.split()[-1]
+
+    def happened(self, *kinds: type[ChainEvent]) -> list[Any]:
+        """All events of these kinds on the chain."""
+        node = Web3(HTTPProvider(f"http://{self.address('chain')}:8545", request_kwargs={"timeout": 10}))
+        told = [decode_log(log) for log in node.eth.get_logs({"fromBlock": 0, "toBlock": "latest"})]
+        return [event for event in told if isinstance(event, kinds)]
+
+    def told(self, what: str) -> str:
+        """What is being waited for, and what everybody has said of late: for who reads of a failure."""
+        ends = [f"--- {name}\n{self.log_of(name)[-1500:]}" for name in self.containers()]
+        return "\n".join([what, *ends])
+
+    def log_of(self, container: str) -> str:
+        """All that a container has said."""
+        facts = self.engine.facts("inspect", "--format", "json", container)[0]
+        return log_text(Path(facts["HostConfig"]["LogConfig"]["Path"]))
+
+
+async def passed(seconds: float) -> None:
+    """Return after so many seconds: for how long a trouble lasts is part of what is shown."""
+    began = time.monotonic()
+    await until(lambda: time.monotonic() - began > seconds, what="the end of the trouble", seconds=2 * seconds)
+
+
+@dataclass(frozen=True)
+class Job:
+    """A person's container that waits for the end of a job. `before` and `lamps`: how things stood before it."""
+
+    market: Deployment
+    container: str
+    seconds: int
+    before: Sequence[Finalized]
+    lamps: int
+
+    async def is_played(self, messages: int = 2) -> None:
+        """Return when the robot has played so many of its messages: the job is under way."""
+        played = self.lamps + messages
+        await self.market.until(lambda: self.market.lamps() >= played, what="its messages", seconds=JOB_SECONDS)
+
+    def is_over(self) -> bool:
+        """Whether the person knows the end."""
+        return self.market.engine("inspect", "--format", "{{.State.Status}}", self.container) == "exited\n"
+
+    async def settled(self) -> dict[str, Any]:
+        """Wait for the end; what the person was told, after a look at the chain: it paid once, and whom it said."""
+        await self.market.until(self.is_over, what="the job's end", seconds=self.seconds + JOB_SECONDS)
+        said = self.market.log_of(self.container)
+        code = self.market.engine("inspect", "--format", "{{.State.ExitCode}}", self.container)
+        assert code == "0\n", self.market.told(said)
+        told: dict[str, Any] = json.loads(said[said.index("{") :])
+        (end,) = [event for event in self.market.happened(Finalized) if event not in self.before]
+        assert (end.liability, end.success) == (told["liability"], told["success"])
+        made = [event.liability for event in self.market.happened(NewLiability)]
+        assert made.count(end.liability) == 1
+        assert len(made) == len(self.before) + 1
+        # What the same transaction mints is the provider's reward.
+        paid = [
+            event for event in self.market.happened(Transfer) if event.tx == end.tx and event.sender != ZERO_ADDRESS
+        ]
+        whose = self.market.account("robot" if end.success else "person")
+        assert [(event.recipient, event.value) for event in paid] == [(whose, COST * 10**9)]
+        return told

@@ -1,0 +1,65 @@
+"""How a run of several processes (`make test`) shares the tests out: a file at a time, the longest first."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from xdist.scheduler import LoadFileScheduling  # type: ignore[import-untyped]
+
+if TYPE_CHECKING:
+    from xdist.workermanage import WorkerController  # type: ignore[import-untyped]
+
+TOGETHER: Final[dict[str, tuple[str, ...]]] = {
+    "containers": ("tests/deploy/", "tests/support/test_compose.py", "tests/support/test_containers.py"),
+}
+"""Files, and folders of them, that never run beside each other: together they are one piece, as any other file is."""
+
+SECONDS: Final[dict[str, int]] = {
+    "containers": 400,
+    "tests/mesh/cli/test_serving.py": 100,
+    "tests/bridges/ipfs/test_resilience.py": 80,
+    "tests/bridges/ipfs/test_channel.py": 55,
+    "tests/mesh/operations/test_unfit_at_the_start.py": 55,
+    "tests/bridges/serial/test_firmware.py": 50,
+    "tests/mesh/cli/test_chain_up.py": 50,
+    "tests/mesh/operations/test_two_providers.py": 45,
+    "tests/mesh/cli/test_status.py": 35,
+    "tests/mesh/cli/test_verify.py": 35,
+    "tests/bridges/ipfs/test_content.py": 30,
+    "tests/mesh/demo/test_demo.py": 30,
+    "tests/bridges/ipfs/test_cli.py": 25,
+    "tests/bridges/ipfs/test_jobs.py": 25,
+    "tests/mesh/chain/test_reorganisation.py": 25,
+}
+"""What the longest files, and those that go together, take on a busy machine, roughly. All others are short."""
+
+
+class Sharing(LoadFileScheduling):  # type: ignore[misc]
+    """Gives each process whole files, so that what a module's tests have in common is made once."""
+
+    def remove_node(self, node: WorkerController) -> str | None:
+        """Pass on what a process leaves undone; the test with which it broke down, which nobody tries again."""
+        workload = self.assigned_work[node]
+        broken = next((test for unit in workload.values() for test, done in unit.items() if not done), None)
+        for unit in workload.values():
+            if broken in unit:
+                unit[broken] = True
+        self.assigned_work[node] = {name: unit for name, unit in workload.items() if not all(unit.values())}
+        super().remove_node(node)
+        return broken
+
+    def _split_scope(self, nodeid: str) -> str:
+        for name, places in TOGETHER.items():
+            if nodeid.startswith(places):
+                return name
+        return nodeid.split("::", 1)[0]
+
+    def _reschedule(self, node: WorkerController) -> None:
+        # One that is new may not have told yet what it has found.
+        if node in self.registered_collections:
+            super()._reschedule(node)
+
+    def _assign_work_unit(self, node: WorkerController) -> None:
+        longest = max(self.workqueue, key=lambda name: SECONDS.get(name, 0))
+        self.workqueue.move_to_end(longest, last=False)
+        super()._assign_work_unit(node)
