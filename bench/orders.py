@@ -16,7 +16,7 @@ TOKEN = "0x" + "22" * 20
 MODEL = cid_of_digest(bytes(32))
 
 
-def unsigned_demands(count: int, *, deadline: int = 2**40) -> Iterator[Demand]:
+def unsigned_demands(count: int, *, deadline: int = 2**40, lighthouse: str = ADDRESS) -> Iterator[Demand]:
     """Demands of one model that differ in objective and nonce."""
     for _ in range(count):
         yield Demand(
@@ -24,7 +24,7 @@ def unsigned_demands(count: int, *, deadline: int = 2**40) -> Iterator[Demand]:
             objective=cid_of_digest(secrets.token_bytes(32)),
             token=TOKEN,
             cost=1000,
-            lighthouse=ADDRESS,
+            lighthouse=lighthouse,
             validator=ZERO_ADDRESS,
             validator_fee=0,
             deadline=deadline,
@@ -32,7 +32,9 @@ def unsigned_demands(count: int, *, deadline: int = 2**40) -> Iterator[Demand]:
         )
 
 
-def signed_demands(count: int) -> list[Demand]:
+def signed_demands(count: int, *, lighthouse: str = ADDRESS) -> list[Demand]:
     """The same, each signed by one of sixteen people."""
     people = [Signer(secrets.token_bytes(32)) for _ in range(16)]
-    return [people[number % 16].sign(demand) for number, demand in enumerate(unsigned_demands(count))]
+    return [
+        people[number % 16].sign(demand) for number, demand in enumerate(unsigned_demands(count, lighthouse=lighthouse))
+    ]

@@ -1,0 +1,197 @@
+"""A provider under load: orders that it takes into its book a second, and whole jobs a minute on two kinds of chain."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import tempfile
+import time
+from contextlib import AsyncExitStack, asynccontextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from crowd import PATIENCE, SPAWN, router
+from mesh import Agent
+from mesh.background import Background
+from mesh.chain import EmbeddedChain
+from mesh.demo.anvil import find_anvil, serve_anvil
+from mesh.demo.market import found_market
+from mesh.demo.objective import write_objective
+from mesh.market.provider import Provider
+from mesh.network import Channel, Endpoints, Network
+from mesh.settings import Settings
+from orders import signed_demands
+from peers.catalog import PeerMissing, locate
+from schemas import cid_of_bytes
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from mesh.demo.market import Market
+    from schemas import Demand, Verified
+
+MODEL: Final = cid_of_bytes(b"what the robot of the benchmark can do")
+WINDOW: Final = 2000
+"""Orders under way at most, so that none is lost."""
+
+
+def taken_a_second(count: int) -> dict[str, float]:
+    """Signed demands without an offer that a provider takes into its book: checked, and kept open."""
+    with router() as (endpoint, _):
+        return asyncio.run(_taken(endpoint, count))
+
+
+async def _taken(endpoint: str, count: int) -> dict[str, float]:
+    async with embedded() as (node, market):
+        chain = market.chain(node, "provider")
+        ready, taken = SPAWN.Event(), SPAWN.Value("l", 0)
+        publishing = SPAWN.Process(
+            target=publish,
+            args=(endpoint, market.deployment.lighthouse_name, market.deployment.lighthouse, count, ready, taken),
+            daemon=True,
+        )
+        publishing.start()
+        assert await asyncio.to_thread(ready.wait, PATIENCE)
+        async with (
+            chain,
+            Network(Endpoints(connect=(endpoint,))) as network,
+            Provider(network.session, chain, market.deployment.lighthouse_name) as provider,
+            Background() as tasks,
+        ):
+            tasks.start(provider.run(), "provider")
+            await asyncio.sleep(0.5)  # the router learns of its subscriptions
+            taken.value = 1
+            while not len(provider.book):
+                await asyncio.sleep(0.001)
+            started, used = time.perf_counter(), time.process_time()
+            deadline = time.monotonic() + PATIENCE
+            while len(provider.book) < count:
+                taken.value = len(provider.book)
+                assert time.monotonic() < deadline, f"{len(provider.book)} of {count} orders were taken"
+                await asyncio.sleep(0.005)
+            seconds, used = time.perf_counter() - started, time.process_time() - used
+        publishing.terminate()
+        publishing.join()
+    return {
+        "orders": count,
+        "orders_per_second": round(count / seconds),
+        "of_a_core_percent": round(used / seconds * 100),
+    }
+
+
+def publish(endpoint: str, lighthouse: str, address: str, count: int, ready: Any, taken: Any) -> None:
+    """The publishing process: it says what it has when `taken` says that the provider is there."""
+    asyncio.run(_publish(endpoint, lighthouse, address, count, ready, taken))
+
+
+async def _publish(endpoint: str, lighthouse: str, address: str, count: int, ready: Any, taken: Any) -> None:
+    demands = signed_demands(count, lighthouse=address)
+    async with (
+        Network(Endpoints(connect=(endpoint,))) as network,
+        Channel(network.session, lighthouse, address=address) as channel,
+    ):
+        ready.set()
+        while not taken.value:
+            await asyncio.sleep(0.001)
+        for number, demand in enumerate(demands):
+            while number - taken.value >= WINDOW:
+                await asyncio.sleep(0.001)
+            channel.publish(demand)
+        await asyncio.sleep(PATIENCE)
+
+
+def jobs_a_minute(count: int, at_once: int) -> dict[str, dict[str, float] | str]:
+    """Whole jobs, from the demand to the payment, of one provider and one robot; so many demands are open at once."""
+    found: dict[str, dict[str, float] | str] = {}
+    with router() as (endpoint, _):
+        found["embedded"] = asyncio.run(_jobs(endpoint, embedded(), count, at_once))
+        try:
+            program = find_anvil(locate("anvil"))
+        except PeerMissing as missing:
+            found["anvil"] = str(missing)
+        else:
+            assert program is not None
+            found["anvil"] = asyncio.run(_jobs(endpoint, on_anvil(program), count, at_once))
+    return found
+
+
+@asynccontextmanager
+async def embedded() -> AsyncIterator[tuple[Any, Market]]:
+    """A market on an embedded chain, in this process."""
+    async with EmbeddedChain() as node:
+        yield node.provider, await found_market(node.provider, node.funded_keys)
+
+
+@asynccontextmanager
+async def on_anvil(program: Path) -> AsyncIterator[tuple[Any, Market]]:
+    """A market on an anvil that mines each transaction at once."""
+    async with serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=None) as node:
+        yield node.url, await found_market(node.url, node.funded_keys)
+
+
+async def _jobs(endpoint: str, place: Any, count: int, at_once: int) -> dict[str, float]:
+    async with AsyncExitStack() as stack:
+        node, market = await stack.enter_async_context(place)
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        network = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,))))
+        chain = await stack.enter_async_context(market.chain(node, "provider"))
+        provider = await stack.enter_async_context(Provider(network.session, chain, market.deployment.lighthouse_name))
+        tasks = await stack.enter_async_context(Background())
+        tasks.start(provider.run(), "provider")
+        await stack.enter_async_context(_robot(await _agent(stack, endpoint, node, market, "robot", folder)))
+        person = await stack.enter_async_context(await _agent(stack, endpoint, node, market, "person", folder))
+        write_objective(folder / "objective.mcap")
+        await _done(person, folder / "objective.mcap")  # what is done once only
+        turns, taken = asyncio.Semaphore(at_once), []
+
+        async def job() -> None:
+            async with turns:
+                started = time.perf_counter()
+                await _done(person, folder / "objective.mcap")
+                taken.append(time.perf_counter() - started)
+
+        started = time.perf_counter()
+        async with asyncio.TaskGroup() as jobs:
+            for _ in range(count):
+                jobs.create_task(job())
+        seconds = time.perf_counter() - started
+    return {
+        "jobs": count,
+        "at_once": at_once,
+        "jobs_per_minute": round(count / seconds * 60),
+        "a_job_takes_s": round(sum(taken) / count, 2),
+    }
+
+
+async def _agent(stack: AsyncExitStack, endpoint: str, node: Any, market: Market, role: str, folder: Path) -> Agent:
+    settings = Settings(
+        connect=(endpoint,),
+        data_dir=str(folder / role),
+        lighthouse_contract=market.deployment.lighthouse_name,
+        ens_contract=market.deployment.ens,
+        playback="at-once",
+    )
+    chain = await stack.enter_async_context(market.chain(node, role))
+    return Agent(MODEL, settings=settings, account=market.accounts[role], chain=chain)
+
+
+def _robot(robot: Agent) -> Agent:
+    @robot.on("*")
+    async def play(job: Any, message: Any) -> None:
+        job.publish("/said", "done")
+
+    @robot.on_demand
+    async def offer(demand: Verified[Demand]) -> None:
+        await robot.offer(demand)
+
+    return robot
+
+
+async def _done(person: Agent, objective: Path) -> None:
+    async with asyncio.timeout(PATIENCE):
+        contract = await person.demand(objective, cost=1)
+        outcome = await contract.outcome()
+    assert outcome.success, "a job failed"
+
+
+logging.getLogger("mesh").setLevel(logging.ERROR)
