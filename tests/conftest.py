@@ -14,6 +14,16 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
+    """Share the tests out in our way where whole files are asked for, as `make test` does."""
+    if config.getoption("dist") != "loadfile":
+        return None
+    from tests.support.sharing import Sharing
+
+    return Sharing(config, log)
+
+
 @pytest.fixture
 def router() -> Iterator[EmbeddedRouter]:
     """A Zenoh router inside this process."""

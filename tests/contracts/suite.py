@@ -91,7 +91,7 @@ class Suite:
     def attempt(self, call: Any, sender: Person | None = None) -> TxReceipt:
         """Send a transaction, whatever becomes of it."""
         fields = {"from": (sender or self.deployer).address, "gas": 8_000_000}
-        return self.web3.eth.wait_for_transaction_receipt(call.transact(fields))
+        return self.web3.eth.wait_for_transaction_receipt(call.transact(fields), poll_latency=0.005)
 
     def fund(self, person: Person, value: int, spender: str) -> None:
         """Give a person XRT (wn) that `spender` may take."""

@@ -3,110 +3,26 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import asynccontextmanager
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import pytest
-
 from mesh.agent import Phase
-from mesh.network import Endpoints, Network, ServiceFailed, call
 from mesh.recording import open_objective
-from schemas import ZERO_ADDRESS, Liability, String, cid_of_bytes
+from schemas import Liability, String
 from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey
-from schemas.rpc import (
-    Done,
-    FinishLiability,
-    LiabilityRead,
-    Nothing,
-    ReadLiability,
-    RestartLiability,
-    ResumeLiability,
-    StartLiability,
-)
-from tests.support.market import careless, obliging
-from tests.support.objectives import objective
-from tests.support.waiting import until, until_found, until_heard
+from schemas.rpc import Done, LiabilityRead, RestartLiability, ResumeLiability
+from tests.mesh.agent.controls import WORDS, Control, control, controlled, in_phase, person, ready
+from tests.support.market import obliging
+from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
     import zenoh
 
     from mesh.agent import Agent, Contract
-    from schemas import Record
     from tests.support.market import Place
 
-WORDS = ["a", "b", "c"]
+__all__ = ["control", "person"]
+
 HOUR_NS = 3600 * 10**9
-
-
-@dataclass
-class Control:
-    """A program elsewhere in the mesh that drives a robot and is its device."""
-
-    session: zenoh.Session
-    robot: Agent
-
-    async def ask(self, service: str, request: Record) -> Any:
-        return await call(self.session, self.robot.address, service, request)
-
-    async def start(self, address: str) -> Done:
-        done: Done = await self.ask("start", StartLiability(address))
-        return done
-
-    async def finish(self, address: str, *, success: bool = True) -> None:
-        assert await self.ask("finish", FinishLiability(address, success)) == Nothing()
-
-    async def read(self, address: str) -> LiabilityRead:
-        read: LiabilityRead = await self.ask("read", ReadLiability(address))
-        return read
-
-    async def say(self, address: str, topic: str, word: str) -> None:
-        """Publish on a topic of the job, as a device does."""
-        key = str(LiabilityTopicKey(self.robot.address, address, topic))
-        await until_heard(self.session, key)
-        self.session.put(key, String(word).encode(), encoding="ros1;std_msgs/String")
-
-    async def played(self, address: str) -> None:
-        """Wait until the robot has played the whole objective."""
-        runs = self.robot._working().executor._runs
-        await until(lambda: address in runs and runs[address].position == len(WORDS))
-
-
-@pytest.fixture
-async def control(place: Place) -> AsyncIterator[Control]:
-    """A robot without handlers, a provider, and whoever drives the robot."""
-    async with controlled(place, obliging(place.agent("robot"))) as control:
-        yield control
-
-
-@asynccontextmanager
-async def controlled(place: Place, robot: Agent) -> AsyncIterator[Control]:
-    async with place.provider(), robot, Network(Endpoints(connect=(place.endpoint,))) as network:
-        yield Control(network.session, robot)
-
-
-@pytest.fixture
-async def person(place: Place, control: Control) -> AsyncIterator[Agent]:
-    async with place.agent("person") as person:
-        yield person
-
-
-async def ready(control: Control, person: Agent, place: Place, *, step_ns: int = 0, cost: int = 0) -> Contract:
-    """A contract whose objective the robot has examined."""
-    path = place.save(objective(*(("/say", word) for word in WORDS), step_ns=step_ns))
-    contract = await person.demand(path, cost=cost)
-    await in_phase(control.robot, contract, Phase.READY)
-    return contract
-
-
-async def in_phase(robot: Agent, contract: Contract, phase: Phase) -> None:
-    async def reached() -> bool:
-        job = await robot.parts.ledger.job(contract.address)
-        return job is not None and job.phase is phase
-
-    await until_found(reached, what=phase)
 
 
 async def recorded(contract: Contract) -> list[tuple[str, str]]:
@@ -239,50 +155,6 @@ async def test_addresses_may_be_asked_for_in_lower_case(place: Place, control: C
     assert (await contract.outcome()).success
 
 
-async def test_what_the_phase_does_not_allow_is_answered_with_the_reason(
-    place: Place, control: Control, person: Agent
-) -> None:
-    contract = await ready(control, person, place)
-    address = contract.address
-    await control.start(address)
-    assert await control.start(address) == Done(False, f"can't start {address}: it is running")
-    resumed = await control.ask("resume", ResumeLiability(address))
-    assert resumed == Done(False, f"can't resume {address}: it is running")
-    await control.finish(address)
-    with pytest.raises(ServiceFailed, match=f"can't move to complete {address}: it is"):
-        await control.finish(address)
-    for service, request in (("start", StartLiability), ("restart", RestartLiability), ("resume", ResumeLiability)):
-        done = await control.ask(service, request(address))
-        assert not done.success
-        assert done.msg.startswith(f"can't {service} {address}: it is ")
-
-
-async def test_a_job_whose_objective_has_not_come_can_not_be_started(place: Place) -> None:
-    robot = careless(place.agent("robot", fetch_timeout=30.0))
-    async with controlled(place, robot) as control, place.agent("person") as person:
-        contract = await person.demand(cid_of_bytes(b"nobody's"))
-        await in_phase(robot, contract, Phase.INCOMING)
-        done = await control.start(contract.address)
-        assert done == Done(False, f"can't start {contract.address}: it is incoming")
-        await control.finish(contract.address, success=False)
-        assert not (await contract.outcome()).success
-
-
-async def test_unknown_liabilities_are_no_jobs(control: Control) -> None:
-    done = await control.start(ZERO_ADDRESS)
-    assert done == Done(False, f"can't start {ZERO_ADDRESS}: it is not a job of this agent")
-    assert await control.read(ZERO_ADDRESS) == LiabilityRead(False)
-    with pytest.raises(ServiceFailed, match="is not a job of this agent"):
-        await control.finish(ZERO_ADDRESS)
-
-
-@pytest.mark.parametrize("service", ["start", "restart", "resume", "finish", "read"])
-async def test_what_is_no_address_is_an_error_reply(control: Control, service: str) -> None:
-    requests = {"finish": FinishLiability("the kitchen", True), "read": ReadLiability("the kitchen")}
-    with pytest.raises(ServiceFailed, match="'the kitchen' is not an address"):
-        await control.ask(service, requests.get(service, StartLiability("the kitchen")))
-
-
 async def test_events_are_on_the_agents_keys_with_the_record(place: Place, control: Control, person: Agent) -> None:
     told: list[tuple[str, Liability]] = []
     subscriber: Any = control.session.declare_subscriber(
@@ -321,10 +193,3 @@ async def test_a_device_hears_the_objective_and_answers_within_the_job(
     subscriber.undeclare()
     echoed = [word for topic, word in await recorded(contract) if topic == "/echo"]
     assert echoed == WORDS
-
-
-async def test_an_agent_told_not_to_work_offers_only_to_read(place: Place) -> None:
-    async with controlled(place, place.agent("robot", enable_executor=False)) as control:
-        assert await control.read(ZERO_ADDRESS) == LiabilityRead(False)
-        with pytest.raises(ServiceFailed, match="nobody answers"):
-            await control.start(ZERO_ADDRESS)

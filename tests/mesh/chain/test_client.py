@@ -12,7 +12,6 @@ from mesh.chain import (
     Account,
     InsufficientFunds,
     InvalidName,
-    NewLighthouse,
     NoAccount,
     NoContracts,
     NotALiability,
@@ -298,11 +297,3 @@ async def test_a_closed_client_says_so(market: Market) -> None:
         await chain.balance_of()
     with pytest.raises(ClosedError):
         _ = chain.factory
-
-
-async def test_the_new_lighthouse_is_told_with_its_transaction(market: Market) -> None:
-    async with market.chain(market.provider) as chain:
-        made = await chain.create_lighthouse(minimal_stake=1, timeout_blocks=1, name="far")
-    assert isinstance(made, NewLighthouse)
-    assert made.name == "far"
-    assert made.tx.startswith("0x")

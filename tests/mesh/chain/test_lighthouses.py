@@ -190,3 +190,11 @@ async def test_watching_outlives_a_lost_node_and_a_reorganisation() -> None:
             await chain.create_lighthouse(minimal_stake=1, timeout_blocks=1, name="two")
             flaky.is_lost = False
             assert (await heard).name == "two"
+
+
+async def test_the_new_lighthouse_is_told_with_its_transaction(market: Market) -> None:
+    async with market.chain(market.provider) as chain:
+        made = await chain.create_lighthouse(minimal_stake=1, timeout_blocks=1, name="far")
+    assert isinstance(made, NewLighthouse)
+    assert made.name == "far"
+    assert made.tx.startswith("0x")

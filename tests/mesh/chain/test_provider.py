@@ -204,7 +204,7 @@ async def test_of_several_nodes_the_next_is_asked_when_one_goes(scheme: str) -> 
 
 async def test_a_frozen_node_is_passed_over_once_and_not_asked_first_again() -> None:
     async with Anvil() as frozen, Anvil() as other:
-        timing = replace(QUICK, request_timeout=1)
+        timing = replace(QUICK, request_timeout=2)
         async with Node(f"{frozen.url}, {other.url}", timing=timing) as node:
             await asyncio.to_thread(frozen.pause)
             # The signal may take a moment, and the first request still be answered.

@@ -3,82 +3,23 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
-import aiohttp
-import pytest
 from web3 import AsyncWeb3, WebSocketProvider
 
-from mesh.chain import (
-    XRT,
-    Account,
-    Chain,
-    Deployment,
-    EmbeddedChain,
-    JsonRpcServer,
-    Node,
-    Sender,
-    deploy,
-)
-from mesh.chain.embedded import EmbeddedProvider
+from mesh.chain import XRT, Account, Chain, Deployment, EmbeddedChain, JsonRpcServer, Node, Sender, deploy
 from schemas.keccak import keccak256
 from tests.mesh.chain.conftest import QUICK
-from tests.support.waiting import until
+from tests.mesh.chain.pushing import connected, node, server
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from web3.types import RPCEndpoint, RPCResponse
+
+__all__ = ["node", "server"]
 
 TRANSFER = "0x" + keccak256(b"Transfer(address,address,uint256)").hex()
-
-
-@pytest.fixture
-async def node() -> AsyncIterator[EmbeddedChain]:
-    async with EmbeddedChain() as node:
-        yield node
-
-
-@pytest.fixture
-async def server(node: EmbeddedChain) -> AsyncIterator[JsonRpcServer]:
-    async with JsonRpcServer(node.provider) as server:
-        yield server
-
-
-class Client:
-    """A client that hears all that comes on its socket."""
-
-    def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
-        self.socket = socket
-        self.heard: list[Any] = []
-
-    async def hear(self) -> Any:
-        """The next text."""
-        async with asyncio.timeout(30):
-            self.heard.append(json.loads((await self.socket.receive()).data))
-        return self.heard[-1]
-
-    async def ask(self, method: str, *params: Any) -> Any:
-        await self.socket.send_json({"jsonrpc": "2.0", "id": len(self.heard), "method": method, "params": params})
-        return await self.hear()
-
-    async def subscribe(self, *params: Any) -> str:
-        answer = await self.ask("eth_subscribe", *params)
-        return str(answer["result"])
-
-    async def notified(self, subscription: str) -> Any:
-        """The next notification, which is of that subscription."""
-        heard = await self.hear()
-        assert (heard["method"], heard["params"]["subscription"]) == ("eth_subscription", subscription)
-        return heard["params"]["result"]
-
-
-@asynccontextmanager
-async def connected(server: JsonRpcServer, **headers: str) -> AsyncIterator[Client]:
-    async with aiohttp.ClientSession() as session, session.ws_connect(server.ws_url, headers=headers) as socket:
-        yield Client(socket)
 
 
 @asynccontextmanager
@@ -196,95 +137,6 @@ async def test_a_subscription_is_of_one_connection(server: JsonRpcServer) -> Non
     async with connected(server) as one, connected(server) as other:
         subscription = await one.subscribe("newHeads")
         assert (await other.ask("eth_unsubscribe", subscription))["error"]["code"] == -32602
-
-
-@pytest.mark.parametrize(
-    ("params", "code"),
-    [
-        (["newPendingTransactions"], -32601),
-        ([], -32602),
-        ([7], -32602),
-        (["logs", "all"], -32602),
-        (["logs", {"address": "0x12"}], -32602),
-        (["logs", {"topics": 7}], -32602),
-        (["logs", {"topics": ["0x12"]}], -32602),
-    ],
-)
-async def test_what_can_not_be_subscribed_to_is_refused(server: JsonRpcServer, params: list[Any], code: int) -> None:
-    async with connected(server) as client:
-        assert (await client.ask("eth_subscribe", *params))["error"]["code"] == code
-
-
-async def test_nobody_subscribes_by_post(server: JsonRpcServer) -> None:
-    request = {"jsonrpc": "2.0", "id": 1, "method": "eth_subscribe", "params": ["newHeads"]}
-    async with aiohttp.ClientSession() as session, session.post(server.url, json=request) as response:
-        assert (await response.json())["error"]["code"] == -32601
-
-
-async def test_the_node_is_not_asked_when_nobody_is_subscribed(node: EmbeddedChain) -> None:
-    counting = Counting(node)
-    async with JsonRpcServer(counting) as server:
-        async with connected(server) as client:
-            await client.subscribe("newHeads")
-            asked = counting.asked
-            await until(lambda: counting.asked > asked + 3, seconds=30)
-        await until(lambda: not server._dialogues, seconds=30)
-        asked = counting.asked
-        await asyncio.sleep(0.3)
-        assert counting.asked <= asked + 1, "a look may have been under way"
-
-
-class Counting(EmbeddedProvider):
-    """An embedded chain that counts what it is asked, and can be lost."""
-
-    asked = 0
-    is_lost = False
-
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
-        self.asked += 1
-        if self.is_lost:
-            raise ConnectionError("the wire is cut")
-        return await super().make_request(method, params)
-
-
-async def test_nothing_is_missed_while_the_node_behind_is_lost(node: EmbeddedChain) -> None:
-    flaky = Counting(node)
-    async with JsonRpcServer(flaky) as server, connected(server) as client:
-        subscription = await client.subscribe("newHeads")
-        flaky.is_lost = True
-        await node.mine(3)
-        asked = flaky.asked
-        await until(lambda: flaky.asked > asked + 2, seconds=30)
-        flaky.is_lost = False
-        assert [int((await client.notified(subscription))["number"], 16) for _ in range(3)] == [1, 2, 3]
-
-
-async def test_leaving_the_server_closes_its_sockets(node: EmbeddedChain) -> None:
-    async with JsonRpcServer(node.provider) as server, asyncio.timeout(30):
-        session = aiohttp.ClientSession()
-        socket = await session.ws_connect(server.ws_url)
-        client = Client(socket)
-        await client.subscribe("newHeads")
-        leaving = asyncio.create_task(server.__aexit__(None, None, None))
-        assert (await socket.receive()).type is aiohttp.WSMsgType.CLOSE
-        await leaving
-        await session.close()
-
-
-async def test_a_page_may_not_open_a_socket_unless_its_origin_is_allowed(node: EmbeddedChain) -> None:
-    async with JsonRpcServer(node.provider, allowed_origins=["http://page"]) as server:
-        with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
-            async with connected(server, Origin="http://elsewhere"):
-                pass
-        assert caught.value.status == 403
-        async with connected(server, Origin="http://page") as client:
-            assert (await client.ask("eth_blockNumber"))["result"] == "0x0"
-
-
-async def test_a_browser_that_looks_in_is_told_what_this_is(server: JsonRpcServer) -> None:
-    async with aiohttp.ClientSession() as session, session.get(server.url) as response:
-        assert response.status == 426
-        assert "JSON-RPC" in await response.text()
 
 
 async def test_what_polls_whole_blocks_finds_its_transactions_in_them(

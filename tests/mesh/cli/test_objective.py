@@ -4,32 +4,23 @@ from __future__ import annotations
 
 import json
 import sys
-import threading
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
-import zenoh
-from click.testing import CliRunner
 
-from mesh.cli import main
-from mesh.content import Exchange, Store
-from mesh.network import Endpoints, Network, free_endpoint
+from mesh.content import Store
 from mesh.recording import Recorder, RecordingAbout, open_objective
 from schemas import cid_of_bytes, cid_of_file
-from schemas.payloads import JSON, RAW, STRING, String
+from schemas.payloads import JSON, STRING, String
+from tests.mesh.cli.calls import call, refused
 from tests.mesh.recording.files import T0, with_messages
 from tests.support.bags import Bag, Sent, string
-from tests.support.commands import Interrupted, aira, run
+from tests.support.commands import run
 from tests.support.objectives import objective
-from tests.support.routers import client_config
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
-    from click.testing import Result
-
-    from tests.support.routers import EmbeddedRouter
 
 LINES = b"""{"topic": "/blink"}
 {"topic": "/blink", "time": 0.5, "data": "blue"}
@@ -48,18 +39,6 @@ def sound(tmp_path: Path) -> Path:
     path = tmp_path / "sound.mcap"
     path.write_bytes(objective(("/go", "there"), ("/go", {"x": 1}), ("/stop", b"\1")))
     return path
-
-
-def call(*words: str | Path, given: bytes | None = None) -> Result:
-    return CliRunner().invoke(main, ["objective", *map(str, words)], input=given)
-
-
-def refused(done: Result, said: str, *, code: int = 2) -> None:
-    """One clear line, and what to do."""
-    assert done.exit_code == code, done.output
-    (line,) = [line for line in done.stderr.splitlines() if line.startswith("aira: ")]
-    assert said in line
-    assert "Traceback" not in done.stderr
 
 
 def test_lines_become_an_objective(tmp_path: Path) -> None:
@@ -264,109 +243,6 @@ def test_what_is_readable_of_a_cut_file_is_saved(tmp_path: Path) -> None:
     refused(call("recover", tmp_path / "it.mcap"), "is there already")
     (tmp_path / "text").write_bytes(b"hello")
     refused(call("recover", tmp_path / "text"), "it does not begin as an MCAP file does")
-
-
-class Holder:
-    """Somebody in the mesh who has a file."""
-
-    def __init__(self, endpoint: str, folder: Path, content: bytes) -> None:
-        self._endpoint = endpoint
-        self._folder = folder
-        self._content = content
-
-    async def __aenter__(self) -> str:
-        self._network = await Network(Endpoints(connect=(self._endpoint,))).__aenter__()
-        self._store = Store(self._folder)
-        cid = self._store.put_bytes(self._content)
-        self._exchange = await Exchange(self._network.session, self._store).__aenter__()
-        return cid
-
-    async def __aexit__(self, *exc_info: Any) -> None:
-        await self._exchange.__aexit__(None, None, None)
-        self._store.close()
-        await self._network.__aexit__(None, None, None)
-
-
-async def test_a_file_is_fetched_from_whoever_has_it(router: EmbeddedRouter, tmp_path: Path) -> None:
-    import asyncio
-
-    content = objective(("/go", "there"))
-    async with Holder(router.endpoint, tmp_path / "theirs", content) as cid:
-        words: list[str | Path] = ["objective", "get", cid, "--out", tmp_path / "it.mcap", "--connect", router.endpoint]
-        done = await asyncio.to_thread(aira, *words)
-        assert (done.returncode, done.stderr) == (0, "")
-        assert (tmp_path / "it.mcap").read_bytes() == content
-        done = await asyncio.to_thread(aira, "objective", "show", cid, "--connect", router.endpoint)
-        assert done.stdout.splitlines()[0].split() == ["cid", cid]
-
-
-def test_what_nobody_has_and_no_router_are_one_clear_line(router: EmbeddedRouter, tmp_path: Path) -> None:
-    words: list[str | Path] = ["get", cid_of_bytes(b"nobody's"), "--out", tmp_path / "it", "--fetch-timeout", "0.2"]
-    refused(call(*words, "--connect", router.endpoint), "is not to be had", code=1)
-    nowhere = ["--connect", free_endpoint(), "--connect-timeout", "0.2"]
-    refused(call(*words, *nowhere), "no Zenoh router at", code=1)
-    refused(call("pack", "--hear", "a/**", "--out", tmp_path / "it", *nowhere), "no Zenoh router at", code=1)
-
-
-class Speaker:
-    """A device that says the same thing again and again until it is left."""
-
-    def __init__(self, endpoint: str, key: str) -> None:
-        self._endpoint = endpoint
-        self._key = key
-        self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._speak, name="speaker of the test")
-
-    def __enter__(self) -> None:
-        self._thread.start()
-
-    def __exit__(self, *exc_info: object) -> None:
-        self._stopped.set()
-        self._thread.join()
-
-    def _speak(self) -> None:
-        with zenoh.open(client_config(self._endpoint)) as session:
-            while not self._stopped.wait(0.02):
-                session.put(self._key, String("on").encode(), encoding=STRING.zenoh_encoding)
-                session.put("elsewhere/x", b"\1")
-
-
-DEVICE = f"aira/agent/0x{'1' * 40}/device/lamp"
-
-
-@pytest.fixture
-def speaker(router: EmbeddedRouter) -> Iterator[None]:
-    with Speaker(router.endpoint, f"{DEVICE}/led/left"):
-        yield
-
-
-@pytest.mark.usefixtures("speaker")
-def test_what_is_said_now_becomes_an_objective(router: EmbeddedRouter, tmp_path: Path) -> None:
-    out = tmp_path / "heard.mcap"
-    words: list[str | Path] = ["--hear", f"{DEVICE}/**", "--hear", "elsewhere/*", "--seconds", "1.5", "--out", out]
-    done = call("pack", *words, "--connect", router.endpoint, "--json")
-    assert done.exit_code == 0, done.output
-    said = json.loads(done.stdout)
-    assert said["topics"] == ["/elsewhere/x", "/led/left"]
-    types = {topic.name: topic.type for topic in open_objective(out).topics}
-    assert types == {"/led/left": STRING, "/elsewhere/x": RAW}
-    assert said["cid"] == cid_of_file(out)
-
-
-@pytest.mark.usefixtures("speaker")
-def test_ctrl_c_ends_the_hearing_with_a_whole_file(router: EmbeddedRouter, tmp_path: Path) -> None:
-    out = tmp_path / "heard.mcap"
-    words: list[str | Path] = ["--hear", f"{DEVICE}/**", "--out", out, "--connect", router.endpoint]
-    done = Interrupted("objective", "pack", *words, after=3.0)
-    assert (done.code, done.output.split()[0]) == (0, cid_of_file(out)), done.errors
-    assert open_objective(out).count > 0
-
-
-def test_where_nobody_speaks_no_file_is_left(router: EmbeddedRouter, tmp_path: Path) -> None:
-    out = tmp_path / "it.mcap"
-    words: list[str | Path] = ["--hear", "silence/**", "--seconds", "0.2", "--out", out, "--connect", router.endpoint]
-    refused(call("pack", *words), "nobody said anything on silence/**", code=1)
-    assert not out.exists()
 
 
 def test_looking_at_files_loads_no_chain(sound: Path) -> None:

@@ -11,13 +11,13 @@ from click.testing import CliRunner
 
 from mesh.cli import main
 from mesh.content import Store
-from mesh.network import free_endpoint
 from mesh.recording import Recorder, RecordingAbout
 from schemas import String, cid_of_bytes
 from schemas.payloads import STRING
 from tests.support.commands import Interrupted
 from tests.support.listening import Listener
 from tests.support.objectives import objective, timed
+from tests.support.ports import free_endpoint
 from tests.support.routers import client_config
 from tests.support.waiting import at_most
 

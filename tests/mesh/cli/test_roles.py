@@ -16,11 +16,11 @@ from mesh.cli.provider import _serve as serve_provider
 from mesh.cli.router import _serve as serve_router
 from mesh.cli.up import _serve as serve_up
 from mesh.errors import AiraError, ConfigurationError, NetworkUnavailable
-from mesh.network import free_endpoint
 from mesh.settings import Settings
 from schemas import cid_of_bytes, cid_of_file
 from tests.support.market import obliging
 from tests.support.objectives import objective
+from tests.support.ports import free_endpoint
 from tests.support.waiting import until
 
 if TYPE_CHECKING:

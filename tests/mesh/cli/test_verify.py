@@ -19,7 +19,6 @@ from mesh.cli.replay import Replay, _replay
 from mesh.cli.up import _serve as serve_up
 from mesh.cli.verify import Files, _verify
 from mesh.errors import AiraError
-from mesh.network import free_endpoint
 from mesh.settings import Settings
 from schemas import cid_of_bytes
 from tests.mesh.evidence.jobs import LIABILITY, OTHER, made
@@ -27,6 +26,7 @@ from tests.support.commands import aira
 from tests.support.listening import Listener
 from tests.support.market import obliging
 from tests.support.objectives import objective
+from tests.support.ports import free_endpoint
 from tests.support.routers import client_config
 from tests.support.waiting import until
 

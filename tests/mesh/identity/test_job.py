@@ -57,12 +57,8 @@ async def test_a_running_job_is_done_and_paid_while_one_is_revoked_and_another_r
     done: list[str] = []
     robot, may_work = market.agent("robot", **tls(folders["robot"])), asyncio.Event()
     person = market.agent("person", **tls(folders["person"]))
-    provider = Serving(
-        *AIRA,
-        "provider",
-        says="serves ",
-        variables=market.variables("provider", **tls(folders["provider"])),
-    )
+    variables = market.variables("provider", **tls(folders["provider"]))
+    provider = Serving(*AIRA, "provider", says="serves ", variables=variables)
 
     @robot.on_demand
     async def offer(demand: Verified[Demand]) -> None:

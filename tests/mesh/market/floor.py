@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from mesh.demo.market import Market
     from schemas import Liability, SignedMessage
 
-QUICK = Timing(poll_interval=0.02, receipt_interval=0.01, attempts=1, retry_delay=0.01, request_timeout=2)
+QUICK = Timing(poll_interval=0.02, receipt_interval=0.01, attempts=1, retry_delay=0.01)
 STAKE = XRT
 
 _names = count(1)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from mesh.chain import Created, Reverted, Settled
-from mesh.market.earnings import Books, Earnings
+from mesh.market import earnings
+from mesh.market.earnings import REASONS, Books, Earnings
 
 ADDRESS = "0x19437Cb65760805A0e55339186F03B2d980eBBf9"
 OTHER = "0x27023154114b066515Ae678cb06E19417B8fcA73"
@@ -71,3 +72,30 @@ def test_the_account_is_one_line() -> None:
         "contracts: 1 made, 1 finalized; messages rejected: 1; "
         "earned 2.000042 XRT (2 in fees, 0.000042 minted for gas), spent 0.0005 ETH on 250,000 gas"
     )
+
+
+def test_what_was_entered_only_grows_and_what_was_taken_back_is_apart() -> None:
+    books = Books()
+    books.matched()
+    books.made(created(), fee=5)
+    books.ended(ADDRESS, settled())
+    books.unended(ADDRESS)
+    books.unmade(ADDRESS)
+    books.made(created(), fee=5)
+    seen = books.turnover()
+    assert seen.matches == 1
+    assert (seen.entered.created, seen.entered.finalized, seen.entered.fees) == (2, 1, 10)
+    assert (seen.taken_back.created, seen.taken_back.finalized, seen.taken_back.fees) == (1, 1, 5)
+    assert books.earnings().created == 1
+
+
+def test_reasons_that_strangers_make_up_are_told_apart_up_to_a_bound() -> None:
+    books = Books()
+    books.rejected("DeadlineReached")
+    for number in range(1000):
+        books.rejected(f"MadeUp{number}")
+    books.rejected("DeadlineReached")
+    rejected = books.earnings().rejected
+    assert len(rejected) == REASONS + 1
+    assert rejected["DeadlineReached"] == 2
+    assert rejected[earnings.OTHER] == 1000 - (REASONS - 1)

@@ -1,35 +1,22 @@
-"""A provider when things go wrong: other providers' turns, tokens that mean harm, a node that is away, no ETH."""
+"""A provider when things go wrong: other providers' turns, tokens that mean harm, what the chain takes back."""
 
 from __future__ import annotations
 
 import asyncio
-import math
-from contextlib import asynccontextmanager
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 from msgspec.structs import replace as replace_fields
-from web3.providers.async_base import AsyncBaseProvider
 
-from mesh.chain import GWEI, JsonRpcServer
-from mesh.demo.market import found_market
 from mesh.market import order_id, patience, sending, watching
-from schemas import cid_of_bytes, parse_cid, verify_message
-from tests.mesh.market.floor import QUICK, Floor
+from schemas import verify_message
 from tests.mesh.market.tokens import BURNS_ALL_GAS, deploy_token, refuses_with, says
-from tests.support.ports import free_port
+from tests.mesh.market.troubles import works_on
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
-    from web3.types import RPCEndpoint, RPCResponse
-
-    from mesh.market.provider import Provider
     from schemas import Liability
-    from tests.support.nodes import Anvil
-    from tests.support.routers import EmbeddedRouter
+    from tests.mesh.market.floor import Floor
 
 
 @pytest.fixture(autouse=True)
@@ -99,15 +86,6 @@ async def test_orders_that_were_used_while_it_was_not_our_turn_leave(floor: Floo
         assert floor.rejections == []
 
 
-async def works_on(floor: Floor, provider: Provider) -> bool:
-    """Whether the provider makes the contracts of those who mean well."""
-    demand = floor.demand()
-    floor.publish(demand, floor.offer())
-    await floor.liability_of(demand)
-    await until(lambda: provider.earnings().created > 0)
-    return True
-
-
 @pytest.mark.parametrize("name", ["NotYourTurn(address,uint256)", "NotAProvider(address)"])
 async def test_a_token_that_speaks_with_the_lighthouses_voice_stops_nobody(floor: Floor, name: str) -> None:
     token = await deploy_token(floor.chain, refuses_with(name))
@@ -144,170 +122,6 @@ async def test_a_nonce_that_contracts_can_not_read_stops_nobody(floor: Floor) ->
 
         floor.publish(demand := floor.demand())
         assert (await floor.liability_of(demand)).promisor == floor.address("robot")
-
-
-@asynccontextmanager
-async def served(floor: Floor, port: int) -> AsyncIterator[str]:
-    assert not isinstance(floor.node, str)
-    async with JsonRpcServer(floor.node, port=port) as server:
-        yield server.url
-
-
-class Moody(AsyncBaseProvider):
-    """The floor's node, whose simulations of what holds some bytes fail so many times as `fails` says."""
-
-    def __init__(self, floor: Floor, data: bytes, *, times: float = math.inf, fails: str = "silence") -> None:
-        super().__init__()
-        assert not isinstance(floor.node, str)
-        self._node, self._data, self._fails = floor.node, data.hex(), fails
-        self.left = times
-
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
-        if method == "eth_estimateGas" and self._data in params[0]["data"] and self.left > 0:
-            self.left -= 1
-            if self._fails == "silence":
-                raise ConnectionResetError
-            return {"jsonrpc": "2.0", "id": 1, "error": {"code": -32005, "message": "too many requests"}}
-        return await self._node.make_request(method, params)
-
-
-@pytest.mark.parametrize("fails", ["silence", "refusal"])
-async def test_a_node_that_fails_now_and_then_costs_no_order_and_no_result(floor: Floor, fails: str) -> None:
-    node = Moody(floor, b"", times=3, fails=fails)
-    async with floor.provider(endpoint=node) as provider:
-        demand = floor.demand()
-        floor.publish(demand, floor.offer())
-        liability = await floor.liability_of(demand)
-        assert node.left == 0
-
-        node.left = 3
-        floor.publish(floor.result(liability.address))
-        await until(lambda: provider.earnings().finalized == 1)
-        assert node.left == 0
-    assert floor.rejections == []
-
-
-@pytest.mark.parametrize("fails", ["silence", "refusal"])
-async def test_what_a_node_never_takes_makes_nobody_wait_and_is_rejected_in_the_end(
-    floor: Floor, fails: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    objective = cid_of_bytes(fails.encode())
-    async with floor.provider(endpoint=Moody(floor, parse_cid(objective), fails=fails)) as provider:
-        monkeypatch.setattr(patience, "PAUSE", 3600.0)
-        guilty, offer = (make(cost=0, objective=objective) for make in (floor.demand, floor.offer))
-        floor.publish(guilty, offer)
-        assert await works_on(floor, provider)
-        assert floor.rejections == []
-
-        monkeypatch.setattr(patience, "PAUSE", 0.01)
-        floor.publish(*(make(cost=0, objective=objective) for make in (floor.demand, floor.offer)))
-        await until(lambda: len(floor.rejections) == 2)
-        assert {one.reason for one in floor.rejections} == {
-            "NodeUnreachable" if fails == "silence" else "RequestRefused"
-        }
-
-
-async def test_no_more_than_so_much_waits_to_be_tried_again(floor: Floor, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(patience, "PAUSE", 3600.0)
-    monkeypatch.setattr(sending, "LATER", 1)
-    objective = cid_of_bytes(b"never")
-    async with floor.provider(endpoint=Moody(floor, parse_cid(objective))):
-        for _ in range(2):
-            floor.publish(*(make(cost=0, objective=objective) for make in (floor.demand, floor.offer)))
-        await until(lambda: len(floor.rejections) == 2)
-
-
-async def test_a_node_that_is_away_for_a_while_costs_no_order_and_no_result(
-    floor: Floor, caplog: pytest.LogCaptureFixture
-) -> None:
-    port = free_port()
-    node = served(floor, port)
-    async with floor.provider(endpoint=await node.__aenter__()) as provider:
-        first, second = floor.demand(cost=0), floor.demand(cost=0)
-        floor.publish(first, floor.offer(cost=0))
-        liability = await floor.liability_of(first)
-        await until(lambda: liability.address in provider._watching._open)
-
-        await node.__aexit__(None, None, None)
-        floor.publish(second, floor.offer(cost=0), floor.result(liability.address))
-        await until(lambda: "a transaction waits" in caplog.text and "can't be read on" in caplog.text)
-
-        async with served(floor, port):
-            await floor.liability_of(second)
-            await until(lambda: provider.earnings().finalized == 1)
-            last = floor.demand(cost=1, deadline=await floor.chain.block_number() + 2)
-            floor.publish(last)
-            await until(lambda: len(provider.book) == 1)
-            await floor.mine(2)
-            await until(lambda: len(provider.book) == 0)
-            assert caplog.text.count("can't be read on") == 1
-            assert caplog.text.count("a transaction waits") == 1
-    assert floor.rejections == []
-
-
-async def test_a_provider_without_eth_says_so_and_goes_on_when_it_has_some(
-    floor: Floor, caplog: pytest.LogCaptureFixture
-) -> None:
-    await floor.found_lighthouse(timeout_blocks=1000, rival=5)
-    async with floor.chain_of("rival") as rival:
-        balance, price = await rival.eth_balance(), await rival.node.web3.eth.gas_price
-        await rival.send_eth(floor.address("person"), balance - 100_000 * price)
-        async with floor.provider("rival"):
-            demand = floor.demand()
-            floor.publish(demand, floor.offer())
-            await until(lambda: "send ETH to the account" in caplog.text)
-
-            await floor.chain.send_eth(floor.address("rival"), balance - 10**18)
-
-            await floor.liability_of(demand)
-            assert floor.rejections == []
-
-
-async def test_a_transaction_that_is_not_mined_for_long_is_waited_for(
-    anvil: Anvil, router: EmbeddedRouter, caplog: pytest.LogCaptureFixture
-) -> None:
-    market = await found_market(anvil.url, anvil.private_keys)
-    hasty = replace(QUICK, receipt_timeout=0.2)
-    floor = Floor(market, router.endpoint, node=anvil.url, keys=anvil.private_keys)
-    async with floor, floor.provider(timing=hasty) as provider:
-        await floor.request("evm_setAutomine", False)
-        demand = floor.demand()
-        floor.publish(demand, floor.offer())
-        await until(lambda: "was not mined within" in caplog.text)
-
-        await floor.request("evm_setIntervalMining", 1)
-
-        await floor.liability_of(demand)
-        await until(lambda: len(provider.book) == 0)
-        assert floor.rejections == []
-
-
-async def test_gas_that_is_too_dear_is_waited_for_and_said_once(
-    anvil: Anvil, router: EmbeddedRouter, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level("INFO")
-    market = await found_market(anvil.url, anvil.private_keys)
-    floor = Floor(market, router.endpoint, node=anvil.url, keys=anvil.private_keys)
-    async with floor, floor.provider() as provider:
-        await base_fee(floor, 900 * GWEI)
-        demand = floor.demand()
-        floor.publish(demand, floor.offer())
-        await until(lambda: "gas costs" in caplog.text)
-        await asyncio.sleep(0.5)  # for some more attempts
-        assert caplog.text.count("gas costs") == 1
-
-        await base_fee(floor, GWEI)
-
-        await floor.liability_of(demand)
-        await until(lambda: provider.earnings().created == 1)
-        assert caplog.text.count("transactions go through again") == 1
-        assert floor.rejections == []
-
-
-async def base_fee(floor: Floor, wei: int) -> None:
-    """Have a block in which gas costs so much."""
-    await floor.request("anvil_setNextBlockBaseFeePerGas", hex(wei))
-    await floor.request("evm_mine")
 
 
 async def test_what_the_chain_takes_back_is_done_again(floor: Floor) -> None:

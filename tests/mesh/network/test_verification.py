@@ -162,7 +162,7 @@ def test_the_same_message_passes_once() -> None:
 
     assert [pass_through(checked, message) is not None for _ in range(3)] == [True, False, False]
     assert checked.statistics(received=3, dropped=0) == verification.Statistics(
-        received=3, invalid={}, duplicate=2, dropped=0
+        received=3, accepted=1, invalid={}, duplicate=2, dropped=0
     )
 
 

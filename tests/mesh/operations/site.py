@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 from mesh.agent import Agent
 from mesh.agent.parts import chain_of
-from mesh.chain import XRT, Account, Chain, write_keyfile
+from mesh.chain import XRT, Account, Chain
 from mesh.demo.market import ALLOWANCE, ROLES, found_market
 from mesh.settings import Settings
 from schemas import cid_of_bytes
+from tests.mesh.cli.chains import write_quick_keyfile
 from tests.support.commands import AIRA, Serving
 from tests.support.objectives import objective
 
@@ -77,7 +78,7 @@ class Site:
         keyfile, password = self.folder / f"{role}.json", self.folder / "password"
         if not keyfile.exists():
             password.write_text(PASSWORD + "\n")
-            write_keyfile(keyfile, self.keys[role], PASSWORD)
+            write_quick_keyfile(keyfile, self.keys[role], PASSWORD)
         fields = {
             "connect": self.endpoint,
             "data_dir": str(self.folder / "state"),

@@ -16,6 +16,7 @@ from tests.support.waiting import until, until_found
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from mesh.agent import Agent
     from mesh.chain import Chain
     from schemas import Demand, Liability, Verified
     from tests.support.nodes import Anvil
@@ -34,13 +35,9 @@ async def request(chain: Chain, method: str, *parameters: Any) -> Any:
     return (await chain.node.web3.provider.make_request(RPCEndpoint(method), list(parameters)))["result"]
 
 
-async def test_a_contract_that_the_chain_drops_is_made_again_and_its_job_paid_once(
-    anvil: Anvil, router: EmbeddedRouter, tmp_path: Path
-) -> None:
-    site = await Site.found(anvil.url, anvil.private_keys, router.endpoint, tmp_path)
-    robot, may_work = site.agent("robot"), asyncio.Event()
-    incoming: list[str] = []
-    done: list[str] = []
+def patient_robot(site: Site, may_work: asyncio.Event, incoming: list[str], done: list[str]) -> Agent:
+    """A robot that offers to do whatever is asked, waits for leave to do it, and notes contracts and work."""
+    robot = site.agent("robot")
 
     @robot.on_demand
     async def offer(demand: Verified[Demand]) -> None:
@@ -55,6 +52,18 @@ async def test_a_contract_that_the_chain_drops_is_made_again_and_its_job_paid_on
     async def say(job: object, message: Any) -> None:
         await may_work.wait()
         done.append(message.data)
+
+    return robot
+
+
+async def test_a_contract_that_the_chain_drops_is_made_again_and_its_job_paid_once(
+    anvil: Anvil, router: EmbeddedRouter, tmp_path: Path
+) -> None:
+    site = await Site.found(anvil.url, anvil.private_keys, router.endpoint, tmp_path)
+    may_work = asyncio.Event()
+    incoming: list[str] = []
+    done: list[str] = []
+    robot = patient_robot(site, may_work, incoming, done)
 
     async with site.provider() as provider, robot, site.agent("person") as person, asyncio.timeout(3 * PATIENCE):
         chain = person.parts.chain

@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 SECONDS = 60.0
 
 
+async def answer(_request: Nothing) -> Status:
+    return status()
+
+
 @pytest.mark.parametrize(
     ("role", "may_ask", "sees_events"), [("operator", 1, True), ("watcher", 0, True), ("person", 0, False)]
 )
@@ -33,9 +37,6 @@ async def test_what_each_role_sees(tmp_path: Path, role: str, may_ask: int, sees
     arm = site.enlist(Member(name="arm", address=ROBOT.address, roles=("agent",)))
     own = STRANGER.address if role != "person" else PERSON.address
     who = site.enlist(Member(name="who", address=own, roles=(role,)))  # type: ignore[arg-type]
-
-    async def answer(_request: Nothing) -> Status:
-        return status()
 
     with site.open_router("wheel"):
         async with (

@@ -3,60 +3,21 @@
 from __future__ import annotations
 
 import asyncio
-import logging
-import os
 from typing import TYPE_CHECKING, Any
 
-import msgspec
 import pytest
 
-from mesh.agent import JobFailed, Phase
-from mesh.recording import open_objective
-from mesh.running import _cause
-from mesh.work.ledger import LedgerUnusable
-from mesh.work.run import NOTE_TOPIC
-from schemas import Empty, String, cid_of_bytes, cid_of_file
-from tests.support.market import Place, careless, obliging
+from mesh.agent import Phase
+from schemas import Empty, String, cid_of_file
+from tests.mesh.work.executions import COST, doing_nothing, heard, recorded
+from tests.support.market import Place, obliging
 from tests.support.objectives import MILLISECOND, objective, timed
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
-    from mesh.agent import Agent, Contract
-    from mesh.recording import Objective, Played
+    from mesh.recording import Played
     from mesh.work.run import Run
     from schemas import Liability
-
-COST = 1000
-"""What a job pays here, wn."""
-
-
-class Speed(msgspec.Struct):
-    """What a handler asks for."""
-
-    wheel: int
-
-
-async def recorded(contract: Contract) -> Objective:
-    """The recording of an ended contract."""
-    return open_objective(await contract.recording())
-
-
-def heard(recording: Objective, topic: str) -> list[bytes]:
-    return [played.payload for played in recording.messages() if played.topic == topic]
-
-
-def notes(recording: Objective) -> list[str]:
-    return [String.decode(payload).data for payload in heard(recording, NOTE_TOPIC)]
-
-
-def doing_nothing(robot: Agent) -> Agent:
-    """The same robot with a handler for any topic."""
-
-    @robot.on("*")
-    async def nothing(job: Run, message: Any) -> None:
-        pass
-
-    return robot
 
 
 async def test_an_objective_is_played_in_order_to_the_handlers_and_the_robot_is_paid(place: Place) -> None:
@@ -122,106 +83,6 @@ async def test_at_once_means_without_waiting_for_recorded_times(place: Place) ->
     path = place.save(timed([("/tick", Empty(), hour * 3600 * 1000 * MILLISECOND) for hour in range(3)]))
     async with place.at_work(robot) as person, asyncio.timeout(20):
         assert (await (await person.demand(path)).outcome()).success
-
-
-async def refusal(place: Place, robot: Agent, content: bytes | str, **terms: Any) -> tuple[str, str]:
-    """Have a robot fail at an objective: its note in the ledger and in the recording. The money must come back."""
-    async with place.at_work(robot) as person:
-        before = await place.balance("robot"), await place.balance("person")
-        source = place.save(content) if isinstance(content, bytes) else content
-        contract = await person.demand(source, cost=COST, **terms)
-        outcome = await contract.outcome()
-        assert not outcome.success
-        assert (await place.balance("robot"), await place.balance("person")) == before
-        job = await robot.parts.ledger.job(contract.address)
-        assert job is not None
-        assert job.success is False
-        recording = await recorded(contract)
-    return job.note, "\n".join(notes(recording))
-
-
-@pytest.mark.parametrize("error", [JobFailed("the lamp is broken"), ValueError("the lamp is broken")], ids=repr)
-async def test_a_handler_that_raises_fails_its_job_and_the_promisee_is_refunded(place: Place, error: Exception) -> None:
-    robot = obliging(place.agent("robot"))
-    calls = 0
-
-    @robot.on("/go")
-    async def go(job: Run, message: Any) -> None:
-        nonlocal calls
-        calls += 1
-        raise error
-
-    note, recorded_note = await refusal(place, robot, objective(("/go", Empty()), ("/go", Empty())))
-    assert note == recorded_note == "the lamp is broken"
-    assert calls == 1
-
-
-async def test_a_handler_whose_inner_task_was_cancelled_has_not_done_its_job(place: Place) -> None:
-    robot = obliging(place.agent("robot"))
-
-    @robot.on("/go")
-    async def go(job: Run, message: Any) -> None:
-        inner = asyncio.create_task(asyncio.sleep(60))
-        inner.cancel()
-        await inner
-
-    note, _ = await refusal(place, robot, objective(("/go", Empty())))
-    assert note == "the handler of /go was cancelled"
-
-
-async def test_a_message_of_another_type_than_the_handlers_is_refused_before_anything_is_played(place: Place) -> None:
-    robot = careless(place.agent("robot"))
-    speeds: list[Speed] = []
-
-    @robot.on("/go", Speed)
-    async def go(job: Run, message: Speed) -> None:
-        speeds.append(message)
-
-    note, _ = await refusal(place, robot, objective(("/go", Speed(3)), ("/go", {"wheel": "fast"})))
-    assert "(unfit-message): message 1 on /go: not a Speed" in note
-    assert speeds == []
-
-
-async def test_a_topic_without_handler_is_refused_before_anything_is_played(place: Place) -> None:
-    robot = careless(place.agent("robot"))
-    done: list[object] = []
-
-    @robot.on("/go")
-    async def go(job: Run, message: Any) -> None:
-        done.append(message)
-
-    note, _ = await refusal(place, robot, objective(("/go", Empty()), ("/fly", Empty())))
-    assert "unknown-topic" in note
-    assert "/fly" in note
-    assert done == []
-
-
-async def test_what_is_no_recording_is_refused(place: Place) -> None:
-    note, _ = await refusal(place, doing_nothing(careless(place.agent("robot"))), b"please go to the kitchen\n")
-    assert "not-a-recording" in note
-
-
-async def test_an_objective_that_nobody_holds_is_given_up_and_refunded(place: Place) -> None:
-    robot = doing_nothing(careless(place.agent("robot", fetch_timeout=0.2)))
-    note, _ = await refusal(place, robot, cid_of_bytes(b"held by nobody"))
-    assert "is not to be had" in note
-
-
-async def test_an_objective_over_the_size_limit_is_refused(place: Place) -> None:
-    robot = doing_nothing(careless(place.agent("robot", objective_size_limit=2000)))
-    note, _ = await refusal(place, robot, objective(("/blob", os.urandom(4000))))
-    assert "2000 allowed" in note
-
-
-async def test_a_job_whose_objective_is_missing_does_not_hold_up_the_next(place: Place) -> None:
-    robot = doing_nothing(careless(place.agent("robot", fetch_timeout=30.0)))
-    async with place.at_work(robot) as person, asyncio.timeout(25):
-        missing = await person.demand(cid_of_bytes(b"nobody has this"))
-        good = await person.demand(place.save(objective(("/go", Empty()))))
-        assert (await good.outcome()).success
-        job = await robot.parts.ledger.job(missing.address)
-        assert job is not None
-        assert job.phase is Phase.INCOMING
 
 
 async def test_jobs_are_done_one_after_the_other(place: Place) -> None:
@@ -324,22 +185,6 @@ async def test_an_agent_told_not_to_work_leaves_liabilities_alone(place: Place) 
         assert not (await place.chains["person"].liability(contract.address)).is_finalized
 
 
-async def test_a_failure_that_was_meant_is_logged_without_a_traceback(
-    place: Place, caplog: pytest.LogCaptureFixture
-) -> None:
-    robot = obliging(place.agent("robot"))
-
-    @robot.on("/go")
-    async def go(job: Run, message: Any) -> None:
-        raise JobFailed("the battery is empty")
-
-    with caplog.at_level(logging.WARNING, "mesh.work"):
-        async with place.at_work(robot) as person:
-            await (await person.demand(place.save(objective(("/go", Empty()))))).outcome()
-    (line,) = [record for record in caplog.records if "the battery is empty" in record.message]
-    assert not line.exc_info
-
-
 async def test_played_messages_are_on_the_mesh(place: Place) -> None:
     robot = doing_nothing(obliging(place.agent("robot")))
     played: list[tuple[str, bytes, str]] = []
@@ -386,36 +231,3 @@ async def test_a_late_device_message_of_a_played_topic_keeps_its_role(place: Pla
         contract = await person.demand(place.save(objective(("/go", "go"))))
         messages: list[Played] = list((await recorded(contract)).messages())
     assert [String.decode(message.payload).data for message in messages] == ["go", "gone"]
-
-
-async def test_a_ledger_that_can_not_be_written_ends_the_agent_and_fails_no_job(place: Place) -> None:
-    """As on a full disk: when there is room again, the restarted agent goes on with the job."""
-    writable = [False]
-    done: list[str] = []
-    before = await place.chains["person"].block_number()
-
-    def robot() -> Agent:
-        made = obliging(place.agent("robot"))
-
-        @made.on("/go")
-        async def go(job: Run, message: Any) -> None:
-            if not writable[0]:
-                await made.parts.ledger._run("PRAGMA query_only = ON")
-            done.append(message.data)
-
-        return made
-
-    async with place.provider(), place.agent("person") as person:
-
-        async def asked(robot: Agent) -> None:
-            async with robot:
-                await (await person.demand(place.save(objective(("/go", "there"))))).outcome()
-
-        with pytest.raises(ExceptionGroup) as caught:
-            await asyncio.wait_for(asked(robot()), 30)
-        assert isinstance(_cause(caught.value), LedgerUnusable), "one line, and no traceback"
-        writable[0] = True
-        (made,) = await place.chains["person"].liabilities(promisee=place.address("person"), from_block=before)
-        async with robot():
-            assert (await asyncio.wait_for((await person.contract(made.address)).outcome(), 30)).success
-    assert set(done) == {"there"}

@@ -4,40 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import sqlite3
-import subprocess
-import sys
-import threading
 from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.errors import ClosedError, ConfigurationError
 from mesh.work import Ledger, Phase
 from mesh.work import ledger as ledger_module
-from mesh.work.ledger import VERSION, LedgerUnusable
 from mesh.work.outbox import outgoing
-from schemas import cid_of_bytes
+from tests.mesh.work.ledgers import RESULT, ledger, path
 from tests.mesh.work.samples import liability, message
-from tests.support.disks import room_for
 from tests.support.orders import demand
-from tests.support.waiting import until
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
     from pathlib import Path
 
-RESULT = cid_of_bytes(b"a recording")
-
-
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "state" / "ledger.sqlite"
-
-
-@pytest.fixture
-async def ledger(path: Path) -> AsyncIterator[Ledger]:
-    async with Ledger(path) as opened:
-        yield opened
+__all__ = ["ledger", "path"]
 
 
 async def test_a_new_job_is_incoming_and_holds_the_record(ledger: Ledger) -> None:
@@ -205,121 +186,6 @@ async def test_what_is_remembered_of_the_chain_is_kept_with_the_cursor(ledger: L
     assert (await ledger.cursor("listener"), await ledger.history("listener")) == (42, b"blocks")
 
 
-async def test_everything_survives_reopening(path: Path) -> None:
-    async with Ledger(path) as ledger:
-        await ledger.add_job(liability())
-        await ledger.complete(liability().address, success=True, result=RESULT, note="", outgoing=message())
-        await ledger.set_cursor("listener", 42)
-    async with Ledger(path) as ledger:
-        assert [job.result for job in await ledger.jobs()] == [RESULT]
-        assert await ledger.outbox(head=0) == [message()]
-        assert await ledger.cursor("listener") == 42
-
-
-WRITER = """
-import asyncio, sys
-from pathlib import Path
-from mesh.work import Ledger
-async def main():
-    async with Ledger(Path(sys.argv[1])) as ledger:
-        for block in range(10**6):
-            await ledger.set_cursor("listener", block)
-            print(block, flush=True)
-asyncio.run(main())
-"""
-
-
-def write_until_killed(path: Path) -> int:
-    """The last block that a process has told of having written, before SIGKILL."""
-    process = subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    with process, process.stdout as told:
-        blocks = [told.readline() for _ in range(50)]
-        process.kill()
-        return int([*blocks, *told.read().splitlines()][-1])
-
-
-async def test_what_was_written_survives_a_kill(path: Path) -> None:
-    last = await asyncio.to_thread(write_until_killed, path)
-    async with Ledger(path) as ledger:
-        cursor = await ledger.cursor("listener")
-    assert cursor is not None
-    assert cursor >= last
-
-
-def mark_as_version(path: Path, version: int) -> None:
-    database = sqlite3.connect(path)
-    database.execute(f"PRAGMA user_version = {version}")
-    database.close()
-
-
-def version_of(path: Path) -> int:
-    database = sqlite3.connect(path)
-    version: int = database.execute("PRAGMA user_version").fetchone()[0]
-    database.close()
-    return version
-
-
-async def test_a_ledger_of_a_newer_version_is_refused_and_not_touched(path: Path) -> None:
-    async with Ledger(path):
-        pass
-    mark_as_version(path, VERSION + 1)
-    error = await refused(path)
-    assert "was written by a newer version (format 2, this one knows 1)" in str(error)
-    assert error.hint == "upgrade aira-mesh"
-    assert version_of(path) == VERSION + 1
-
-
-async def refused(path: Path) -> ConfigurationError:
-    before = set(threading.enumerate())
-    with pytest.raises(ConfigurationError) as caught:
-        async with Ledger(path):
-            pass
-    # One that is left behind would keep the interpreter alive.
-    await until(lambda: set(threading.enumerate()) <= before)
-    assert "\n" not in str(caught.value)
-    return caught.value
-
-
-@pytest.fixture
-def no_database(path: Path) -> Path:
-    path.parent.mkdir()
-    path.write_bytes(b"dear diary, " * 100)
-    return path
-
-
-@pytest.fixture
-def no_file(path: Path) -> Path:
-    path.mkdir(parents=True)
-    return path
-
-
-async def test_a_file_that_is_no_database_is_one_clear_line(no_database: Path) -> None:
-    error = await refused(no_database)
-    assert str(error) == f"can't use the ledger {no_database}: file is not a database"
-    assert error.hint
-
-
-async def test_a_folder_in_the_files_place_is_one_clear_line(no_file: Path) -> None:
-    assert str(await refused(no_file)) == f"can't use the ledger {no_file}: unable to open database file"
-
-
-async def test_a_folder_that_can_not_be_made_is_one_clear_line(no_database: Path) -> None:
-    assert str(no_database) in str(await refused(no_database / "ledger.sqlite"))
-
-
-async def test_a_closed_ledger_says_so(path: Path) -> None:
-    ledger = Ledger(path)
-    with pytest.raises(ClosedError):
-        await ledger.cursor("listener")
-    async with ledger:
-        with pytest.raises(ClosedError, match="open already"):
-            await ledger.__aenter__()
-        await ledger.set_cursor("listener", 1)
-    with pytest.raises(ClosedError):
-        await ledger.add_job(liability())
-
-
 async def test_an_order_that_became_a_contract_is_kept_for_when_it_did_not(ledger: Ledger) -> None:
     one, other = outgoing(demand(deadline=50)), outgoing(demand())
     for order in (one, other):
@@ -346,20 +212,3 @@ async def test_only_the_latest_orders_are_kept(ledger: Ledger, monkeypatch: pyte
 async def test_what_is_not_in_the_outbox_is_not_spent(ledger: Ledger) -> None:
     await ledger.spend("an order of before", "0xA")
     assert not await ledger.unspend("0xA")
-
-
-async def test_a_full_disk_is_one_clear_line_and_nothing_is_half_written(ledger: Ledger, path: Path) -> None:
-    await ledger.add_job(liability())
-    address, signed = liability().address, message()
-    room = path.with_name(path.name + "-wal").stat().st_size
-    with room_for(room):
-        with pytest.raises(LedgerUnusable, match=f"^can't use the ledger {path}: ") as caught:
-            await ledger.set_phase(address, Phase.READY)
-        with pytest.raises(LedgerUnusable):
-            await ledger.complete(address, success=True, result=RESULT, note="", outgoing=signed)
-    assert "make room" in caught.value.hint
-    job = await ledger.job(address)
-    assert job is not None
-    assert (job.phase, await ledger.outbox(head=0)) == (Phase.INCOMING, [])
-    await ledger.complete(address, success=True, result=RESULT, note="", outgoing=signed)
-    assert await ledger.outbox(head=0) == [signed]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import sqlite3
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -12,72 +11,26 @@ from mesh.agent import Agent, Phase
 from mesh.recording import open_objective
 from mesh.work import Ledger
 from mesh.work import outbox as outbox_module
-from mesh.work.outbox import outgoing
 from schemas import String, cid_of_file
-from tests.mesh.work.samples import liability
+from tests.mesh.work.restarts import COST, WORDS, Paying, in_phase, made_by_a_provider_that_goes, paid, speaking, words
 from tests.support.market import careless, obliging
-from tests.support.objectives import objective
 from tests.support.orders import result
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from mesh.agent import Contract
     from mesh.work.run import Run
     from schemas import Liability
     from tests.support.market import Place
 
-COST = 1000
-WORDS = [str(number) for number in range(6)]
+__all__ = ["paid"]
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(outbox_module, "RESEND", 0.1)
-
-
-def words(place: Place) -> Path:
-    """An objective of six words."""
-    return place.save(objective(*(("/say", word) for word in WORDS)))
-
-
-def speaking(robot: Agent, said: list[str], *, stuck_at: str = "") -> Agent:
-    """The same robot, which takes note of what it plays and never gets over `stuck_at`."""
-
-    @robot.on("/say")
-    async def say(job: Run, message: String) -> None:
-        if message.data == stuck_at:
-            await asyncio.Event().wait()
-        said.append(message.data)
-        job.publish("/said", message.data)
-
-    return robot
-
-
-async def in_phase(robot: Agent, contract: Contract, phase: Phase) -> None:
-    async def reached() -> bool:
-        job = await robot.parts.ledger.job(contract.address)
-        return job is not None and job.phase is phase
-
-    await until_found(reached, what=phase)
-
-
-class Paying:
-    """Compares what a robot has with what it should have got."""
-
-    def __init__(self, place: Place, before: int) -> None:
-        self._place = place
-        self._before = before
-
-    async def once(self) -> bool:
-        return await self._place.balance("robot") == self._before + COST
-
-
-@pytest.fixture
-async def paid(place: Place) -> Paying:
-    return Paying(place, await place.balance("robot"))
 
 
 async def test_a_ready_job_is_done_after_a_restart(place: Place, paid: Paying) -> None:
@@ -122,62 +75,6 @@ async def test_a_running_job_can_be_stopped_again_and_again(place: Place, paid: 
             assert (await contract.outcome()).success
     assert said == WORDS
     assert await paid.once()
-
-
-async def test_a_job_that_awaits_its_finish_keeps_its_recording_over_a_restart(place: Place) -> None:
-    """Without handlers: what the device has said until the restart is in the Result."""
-    async with place.provider(), place.agent("person") as person:
-        async with obliging(place.agent("robot")) as robot:
-            contract = await person.demand(words(place))
-            await in_phase(robot, contract, Phase.READY)
-            executor = robot._working().executor
-            await executor.start(contract.address)
-            executor._runs[contract.address].publish("/said", "before")
-            await until(lambda: executor._runs[contract.address].position == len(WORDS))
-        async with place.agent("robot") as robot:
-            executor = robot._working().executor
-            await executor.resume(contract.address)
-            executor._runs[contract.address].publish("/said", "after")
-            await robot.finish(contract.address, success=True)
-            assert (await contract.outcome()).success
-            recording = open_objective(await contract.recording())
-    messages = [(message.topic, String.decode(message.payload).data) for message in recording.messages()]
-    assert [data for topic, data in messages if topic == "/said"] == ["before", "after"]
-    assert [data for topic, data in messages if topic == "/say"] == WORDS, "nothing is played twice"
-
-
-async def test_a_finished_job_is_paid_when_the_provider_comes_late(place: Place, paid: Paying) -> None:
-    said: list[str] = []
-    async with place.agent("person") as person, speaking(obliging(place.agent("robot")), said) as robot:
-        contract = await made_by_a_provider_that_goes(place, person)
-        await in_phase(robot, contract, Phase.COMPLETE)
-        assert not await paid.once()
-        async with place.provider():
-            assert (await contract.outcome()).success
-            await in_phase(robot, contract, Phase.FINALIZED)
-        assert await robot.parts.ledger.outbox(head=0) == []
-    assert await paid.once()
-
-
-async def test_a_finished_job_is_paid_after_a_restart(place: Place, paid: Paying) -> None:
-    said: list[str] = []
-    async with place.agent("person") as person:
-        async with speaking(obliging(place.agent("robot")), said) as robot:
-            contract = await made_by_a_provider_that_goes(place, person)
-            await in_phase(robot, contract, Phase.COMPLETE)
-        async with speaking(place.agent("robot"), said) as robot, place.provider():
-            outcome = await contract.outcome()
-            await in_phase(robot, contract, Phase.FINALIZED)
-            recording = await contract.recording()
-        assert cid_of_file(recording) == outcome.result
-    assert said == WORDS, "a finished job is not done again"
-    assert await paid.once()
-
-
-async def made_by_a_provider_that_goes(place: Place, person: Agent) -> Contract:
-    """A contract whose Result finds no provider."""
-    async with place.provider():
-        return await person.demand(words(place), cost=COST)
 
 
 async def test_a_job_that_the_chain_ended_meanwhile_is_not_done(place: Place) -> None:
@@ -231,71 +128,6 @@ async def test_a_liability_that_has_ended_before_the_agent_heard_of_it_is_no_job
             await reading(robot)
             assert await robot.parts.ledger.job(contract.address) is None
     assert said == []
-
-
-async def test_a_result_is_out_of_the_outbox_before_its_job_is_marked_as_finalized(place: Place) -> None:
-    """A crash between the two would else have it sent for ever: the block is handled again, the marked job skipped."""
-    ours = liability(promisor=place.address("robot"))
-    signed = result(liability=ours.address)
-
-    async with place.agent("robot", enable_executor=False) as robot:
-        ledger = robot.parts.ledger
-        await ledger.add_job(ours)
-        await ledger.complete(ours.address, success=True, result=signed.result, note="", outgoing=outgoing(signed))
-        refuse_to_finalize(robot.parts.directory / "ledger.sqlite")
-        with pytest.raises(sqlite3.IntegrityError, match="crash"):
-            await robot._working().finalized(ours.address, success=True, result=signed.result)
-        assert await ledger.outbox(head=0) == []
-        job = await ledger.job(ours.address)
-        assert job is not None
-        assert job.phase is Phase.COMPLETE
-
-
-async def test_a_payment_that_the_chain_took_back_is_asked_for_again(place: Place, paid: Paying) -> None:
-    said: list[str] = []
-    async with place.agent("person") as person, speaking(obliging(place.agent("robot")), said) as robot:
-        async with place.provider():
-            contract = await person.demand(words(place), cost=COST)
-            await in_phase(robot, contract, Phase.FINALIZED)
-            assert await paid.once()
-        await place.forget_blocks(1)
-        assert not await paid.once()
-        await in_phase(robot, contract, Phase.COMPLETE)
-        async with place.provider():
-            await in_phase(robot, contract, Phase.FINALIZED)
-        assert await robot.parts.ledger.outbox(head=0) == []
-    assert await paid.once()
-    assert said == WORDS
-
-
-async def test_an_end_without_a_result_of_ours_is_not_taken_back(place: Place) -> None:
-    ours = liability(promisor=place.address("robot"))
-    async with place.agent("robot") as robot:
-        await robot.parts.ledger.add_job(ours)
-        await robot.parts.ledger.set_phase(ours.address, Phase.FINALIZED)
-        await robot._working().taken_back(ours.address)
-        await robot._working().taken_back(liability("of somebody else").address)
-        assert [job.phase for job in await robot.parts.ledger.jobs(Phase)] == [Phase.FINALIZED]
-        assert await robot.parts.ledger.outbox(head=0) == []
-
-
-async def test_a_contract_that_is_made_again_elsewhere_is_one_job_and_paid_once(place: Place, paid: Paying) -> None:
-    """A reorganisation took the contract; the provider makes it again of the same orders, at another address."""
-    said: list[str] = []
-    async with place.agent("person") as person, place.provider():
-        async with obliging(place.agent("robot")) as robot:
-            contract = await person.demand(words(place), cost=COST)
-            first = contract.address
-            await in_phase(robot, contract, Phase.READY)
-            await place.forget_blocks(1)
-            await until(lambda: contract.address != first)
-            assert await robot.parts.ledger.job(first) is None
-            await in_phase(robot, contract, Phase.READY)
-        async with speaking(place.agent("robot"), said) as robot:
-            assert (await contract.outcome()).success
-            await in_phase(robot, contract, Phase.FINALIZED)
-    assert said == WORDS
-    assert await paid.once()
 
 
 async def told_again(robot: Agent, contract: Contract) -> None:
@@ -361,16 +193,6 @@ async def test_a_finished_job_that_rested_sends_its_result_again(place: Place, p
             assert (await contract.outcome()).success
     assert said == WORDS
     assert await paid.once()
-
-
-def refuse_to_finalize(ledger: Path) -> None:
-    """Have SQLite fail when a job is marked, as a full disk or a crash would."""
-    database = sqlite3.connect(ledger)
-    database.execute(
-        "CREATE TRIGGER crash BEFORE UPDATE ON jobs WHEN NEW.phase = 'finalized'"
-        " BEGIN SELECT RAISE(ABORT, 'crash'); END"
-    )
-    database.close()
 
 
 async def test_a_chain_started_anew_is_another_memory(place: Place) -> None:

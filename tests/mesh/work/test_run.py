@@ -1,82 +1,26 @@
-"""A run: an objective played, and all that is said on the job's topics recorded."""
+"""A run: an objective played, message by message, to a handler."""
 
 from __future__ import annotations
 
 import asyncio
 from typing import TYPE_CHECKING, Any
 
-import msgspec
 import pytest
-import zenoh
 
 from mesh.errors import ClosedError
-from mesh.recording import AtOnce, RecordedTimes, Recorder, RecordingAbout, json_type, open_objective
-from mesh.work.run import AHEAD, FLUSH, NOTE_TOPIC, HandlerCancelled, Plan, Run
-from schemas import Empty, InvalidPayload, String
-from tests.mesh.work.samples import liability
-from tests.support.bags import Bag, Sent
+from mesh.recording import RecordedTimes
+from mesh.work.run import AHEAD, NOTE_TOPIC, HandlerCancelled, Run
+from schemas import InvalidPayload, String
+from tests.mesh.work.runs import Making, making, session
 from tests.support.objectives import objective
-from tests.support.routers import EmbeddedRouter, client_config
-from tests.support.waiting import until, until_heard
+from tests.support.waiting import until
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator
-    from pathlib import Path
+    from collections.abc import Awaitable, Callable
 
-    from mesh.recording import Objective, Played
+    from mesh.recording import Played
 
-AGENT = "0x" + "ab" * 20
-AT_ONCE = AtOnce()
-TOPICS = f"aira/agent/{AGENT}/liability/{liability().address.lower()}/topic"
-
-
-@pytest.fixture
-def session(router: EmbeddedRouter) -> Iterator[zenoh.Session]:
-    """The agent's session."""
-    with zenoh.open(client_config(router.endpoint)) as opened:
-        yield opened
-
-
-@pytest.fixture
-def device(router: EmbeddedRouter) -> Iterator[zenoh.Session]:
-    """The session of a device, elsewhere in the mesh."""
-    with zenoh.open(client_config(router.endpoint)) as opened:
-        yield opened
-
-
-class Making:
-    """Makes runs in a folder."""
-
-    def __init__(self, session: zenoh.Session, folder: Path) -> None:
-        self._session = session
-        self._folder = folder
-        self.path = folder / "run.mcap"
-
-    def run(
-        self,
-        content: bytes = b"",
-        *,
-        position: int = 0,
-        topics: frozenset[str] | None = None,
-        pace: AtOnce | RecordedTimes = AT_ONCE,
-    ) -> Run:
-        """A run of the objective in `content`, not yet open."""
-        played: Objective | None = None
-        if content:
-            (self._folder / "objective.mcap").write_bytes(content)
-            played = open_objective(self._folder / "objective.mcap")
-        plan = Plan(liability=liability(), objective=played, pace=pace, position=position, topics=topics)
-        return Run(self._session, AGENT, plan, Recorder(self.path, RecordingAbout()))
-
-    def recorded(self) -> list[tuple[str, bytes, str]]:
-        """What is in the closed recording: topic, payload, type."""
-        messages = open_objective(self.path).messages()
-        return [(message.topic, message.payload, message.type.zenoh_encoding) for message in messages]
-
-
-@pytest.fixture
-def making(session: zenoh.Session, tmp_path: Path) -> Making:
-    return Making(session, tmp_path)
+__all__ = ["making", "session"]
 
 
 class Performing:
@@ -99,105 +43,6 @@ class Positions(list[int]):
 
     async def __call__(self, position: int) -> None:
         self.append(position)
-
-
-async def test_what_the_agent_publishes_is_recorded_with_its_type(making: Making) -> None:
-    run = making.run()
-    run.open()
-    run.publish("/led", "on")
-    run.publish("/camera/left", b"\x01")
-    run.publish("/pose", {"x": 1})
-    run.publish("/tick", Empty())
-    summary = await run.close()
-    assert summary.messages == 4
-    assert making.recorded() == [
-        ("/led", String("on").encode(), "ros1;std_msgs/String"),
-        ("/camera/left", b"\x01", "application/octet-stream"),
-        ("/pose", b'{"x":1}', "application/json"),
-        ("/tick", b"", "ros1;std_msgs/Empty"),
-    ]
-
-
-class Wheel(msgspec.Struct):
-    """What a wheel says."""
-
-    turns: int
-
-
-async def test_a_struct_is_recorded_with_the_schema_of_its_class(making: Making) -> None:
-    run = making.run()
-    run.open()
-    run.publish("/wheel", Wheel(3))
-    await run.close()
-    (topic,) = open_objective(making.path).topics
-    assert topic.type == json_type(Wheel)
-    assert making.recorded() == [("/wheel", b'{"turns":3}', "application/json;Wheel")]
-
-
-async def test_a_type_that_the_objective_describes_is_recorded_with_that_description(making: Making) -> None:
-    scan = Sent("/scan", b"\0", 1, type="my/Scan", definition="float32 angle\n")
-    run = making.run(Bag([scan]).encode())
-    run.open()
-    making._session.put(f"{TOPICS}/scanned", b"\1", encoding="ros1;my/Scan")
-    await run.close()
-    (topic,) = open_objective(making.path).topics
-    assert (topic.name, topic.type.schema_data) == ("/scanned", b"float32 angle\n")
-
-
-async def test_what_another_session_puts_before_the_end_is_recorded(making: Making, device: zenoh.Session) -> None:
-    run = making.run()
-    run.open()
-    await until_heard(device, f"{TOPICS}/wheel")
-    for number in range(500):
-        device.put(f"{TOPICS}/wheel", b"%d" % number, encoding="application/json")
-    device.put(f"{TOPICS}/unknown/type", b"?", encoding="ros1;wheels/Wheel")
-    # The agent has it all when what came after has arrived.
-    arrived: list[object] = []
-    with making._session.declare_subscriber("after", arrived.append):
-        await until_heard(device, "after")
-        device.put("after", b"")
-        await until(lambda: arrived)
-    await run.close()
-    recorded = making.recorded()
-    assert recorded[:500] == [("/wheel", b"%d" % number, "application/json") for number in range(500)]
-    assert recorded[500] == ("/unknown/type", b"?", "ros1;wheels/Wheel")
-
-
-async def test_closing_waits_until_all_that_was_published_is_recorded(making: Making) -> None:
-    run = making.run()
-    run.open()
-    for number in range(5000):
-        run.publish("/count", {"n": number})
-    assert (await run.close()).messages == 5000
-
-
-async def test_a_forged_end_mark_of_another_session_does_not_cut_the_recording(
-    making: Making, device: zenoh.Session
-) -> None:
-    run = making.run()
-    run.open()
-    await until_heard(device, f"{TOPICS}/x")
-    device.put(f"{TOPICS}{NOTE_TOPIC}", b"", encoding=FLUSH)
-    device.put(f"{TOPICS}{NOTE_TOPIC}", b"forged", encoding=FLUSH)
-    with making._session.declare_subscriber(f"{TOPICS}/**", zenoh.handlers.RingChannel(8)) as copies:
-        await until_heard(device, "aira/agent/*/liability/*/topic/y")
-        device.put(f"{TOPICS}/x", b"arrived")
-        await until(copies.try_recv)
-    assert not run._flushed.is_set()
-    await run.close()
-    assert (b"arrived") in [payload for _, payload, _ in making.recorded()]
-
-
-async def test_what_can_not_be_recorded_is_counted_and_the_rest_recorded(making: Making, device: zenoh.Session) -> None:
-    run = making.run()
-    run.open()
-    await until_heard(device, f"{TOPICS}/good")
-    device.put(f"{TOPICS}/bad topic", b"")
-    device.put(f"{TOPICS}/good", b"good")
-    await until(lambda: run.refused)
-    await run.close()
-    assert run.refused == 1
-    assert [topic for topic, _, _ in making.recorded()] == ["/good"]
 
 
 async def test_only_chosen_topics_are_recorded_and_all_are_played(making: Making) -> None:

@@ -1,0 +1,41 @@
+"""Agents for tests of what they hear and how they end."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh import Settings
+from mesh.network import Channel, Endpoints, Network
+from tests.support.market import MODEL
+from tests.support.orders import LIGHTHOUSE, MARKET
+from tests.support.waiting import until_heard
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from tests.support.routers import EmbeddedRouter
+
+SOON = 0.02
+
+
+@pytest.fixture
+def settings(router: EmbeddedRouter) -> Settings:
+    """Settings of an agent that only watches."""
+    return Settings(connect=(router.endpoint,), lighthouse_contract=MARKET)
+
+
+@pytest.fixture
+async def channel(router: EmbeddedRouter) -> AsyncIterator[Channel]:
+    """The market's channel, of somebody else."""
+    async with (
+        Network(Endpoints(connect=(router.endpoint,))) as network,
+        Channel(network.session, MARKET, address=LIGHTHOUSE) as channel,
+    ):
+        yield channel
+
+
+async def heard_on(channel: Channel, kind: str) -> None:
+    """Wait until somebody listens to a kind of message."""
+    await until_heard(channel._session, f"aira/{MARKET}/{kind}/{MODEL}/x")

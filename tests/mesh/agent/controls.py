@@ -1,0 +1,97 @@
+"""A robot that is driven over Zenoh, and who drives it."""
+
+from __future__ import annotations
+
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from mesh.agent import Phase
+from mesh.network import Endpoints, Network, call
+from schemas import String
+from schemas.keys import LiabilityTopicKey
+from schemas.rpc import Done, FinishLiability, LiabilityRead, Nothing, ReadLiability, StartLiability
+from tests.support.market import obliging
+from tests.support.objectives import objective
+from tests.support.waiting import until, until_found, until_heard
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    import zenoh
+
+    from mesh.agent import Agent, Contract
+    from schemas import Record
+    from tests.support.market import Place
+
+WORDS = ["a", "b", "c"]
+
+
+@dataclass
+class Control:
+    """A program elsewhere in the mesh that drives a robot and is its device."""
+
+    session: zenoh.Session
+    robot: Agent
+
+    async def ask(self, service: str, request: Record) -> Any:
+        return await call(self.session, self.robot.address, service, request)
+
+    async def start(self, address: str) -> Done:
+        done: Done = await self.ask("start", StartLiability(address))
+        return done
+
+    async def finish(self, address: str, *, success: bool = True) -> None:
+        assert await self.ask("finish", FinishLiability(address, success)) == Nothing()
+
+    async def read(self, address: str) -> LiabilityRead:
+        read: LiabilityRead = await self.ask("read", ReadLiability(address))
+        return read
+
+    async def say(self, address: str, topic: str, word: str) -> None:
+        """Publish on a topic of the job, as a device does."""
+        key = str(LiabilityTopicKey(self.robot.address, address, topic))
+        await until_heard(self.session, key)
+        self.session.put(key, String(word).encode(), encoding="ros1;std_msgs/String")
+
+    async def played(self, address: str) -> None:
+        """Wait until the robot has played the whole objective."""
+        runs = self.robot._working().executor._runs
+        await until(lambda: address in runs and runs[address].position == len(WORDS))
+
+
+@pytest.fixture
+async def control(place: Place) -> AsyncIterator[Control]:
+    """A robot without handlers, a provider, and whoever drives the robot."""
+    async with controlled(place, obliging(place.agent("robot"))) as control:
+        yield control
+
+
+@asynccontextmanager
+async def controlled(place: Place, robot: Agent) -> AsyncIterator[Control]:
+    async with place.provider(), robot, Network(Endpoints(connect=(place.endpoint,))) as network:
+        yield Control(network.session, robot)
+
+
+@pytest.fixture
+async def person(place: Place, control: Control) -> AsyncIterator[Agent]:
+    async with place.agent("person") as person:
+        yield person
+
+
+async def ready(control: Control, person: Agent, place: Place, *, step_ns: int = 0, cost: int = 0) -> Contract:
+    """A contract whose objective the robot has examined."""
+    path = place.save(objective(*(("/say", word) for word in WORDS), step_ns=step_ns))
+    contract = await person.demand(path, cost=cost)
+    await in_phase(control.robot, contract, Phase.READY)
+    return contract
+
+
+async def in_phase(robot: Agent, contract: Contract, phase: Phase) -> None:
+    async def reached() -> bool:
+        job = await robot.parts.ledger.job(contract.address)
+        return job is not None and job.phase is phase
+
+    await until_found(reached, what=phase)

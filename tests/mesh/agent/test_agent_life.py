@@ -1,0 +1,171 @@
+"""An agent's beginning and end, and what it bears in between."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from mesh import Agent, Settings
+from mesh.agent import Phase
+from mesh.errors import ClosedError, NetworkUnavailable
+from mesh.network import Channel, Endpoints, Network
+from tests.mesh.agent.agents import SOON, channel, heard_on, settings
+from tests.support.market import obliging
+from tests.support.objectives import objective
+from tests.support.orders import LIGHTHOUSE, MARKET, demand
+from tests.support.ports import free_endpoint
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from mesh.work.run import Run
+    from schemas import Demand, Verified
+    from tests.support.market import Place
+    from tests.support.routers import EmbeddedRouter
+
+__all__ = ["channel", "settings"]
+
+
+async def test_an_agent_that_does_not_run_says_so(settings: Settings) -> None:
+    agent = Agent(settings=settings)
+    for use in ("channel", "parts", "address"):
+        with pytest.raises(ClosedError, match="the agent is not running"):
+            getattr(agent, use)
+    async with agent:
+        assert agent.channel.lighthouse == MARKET
+    with pytest.raises(ClosedError):
+        agent.channel  # noqa: B018
+
+
+async def test_an_agent_runs_once_at_a_time_and_may_run_again(settings: Settings) -> None:
+    agent = Agent(settings=settings)
+    for _ in range(2):
+        async with agent:
+            with pytest.raises(ClosedError, match="running already"):
+                await agent.__aenter__()
+            assert agent.channel.lighthouse == MARKET
+
+
+async def test_an_agent_that_could_not_start_may_be_started_later(router: EmbeddedRouter) -> None:
+    await asyncio.to_thread(router.stop)
+    agent = Agent(settings=Settings(connect=(router.endpoint,), connect_timeout=0.2))
+    before = set(asyncio.all_tasks())
+    with pytest.raises(NetworkUnavailable) as caught:
+        await agent.__aenter__()
+    assert "aira router" in caught.value.hint
+    assert asyncio.all_tasks() == before
+    await asyncio.to_thread(router.start)
+    async with agent:
+        assert await agent.channel.present() == []
+
+
+async def test_leaving_ends_every_task_and_thread(place: Place) -> None:
+    async with place.agent("person"):
+        pass  # whatever Zenoh and asyncio keep for later is there now
+    tasks = asyncio.all_tasks()
+    threads = {thread for thread in threading.enumerate() if not thread.name.startswith("asyncio_")}
+    robot = obliging(place.agent("robot"))
+
+    @robot.every(SOON)
+    async def tick() -> None:
+        pass
+
+    async with robot:
+        assert asyncio.all_tasks() > tasks
+    assert asyncio.all_tasks() == tasks
+
+    def left() -> set[threading.Thread]:
+        running = {thread for thread in threading.enumerate() if not thread.name.startswith("asyncio_")}
+        return {thread for thread in running - threads if not thread.daemon}
+
+    await until(lambda: not left())
+
+
+async def test_leaving_cancels_a_handler_that_is_at_work(settings: Settings) -> None:
+    agent = Agent(settings=settings)
+    at_work, ended = asyncio.Event(), asyncio.Event()
+
+    @agent.every(3600)
+    async def work() -> None:
+        try:
+            at_work.set()
+            await asyncio.Event().wait()
+        finally:
+            ended.set()
+
+    async with agent:
+        await at_work.wait()
+    assert ended.is_set()
+
+
+async def test_an_error_of_the_body_comes_out_as_it_is(settings: Settings) -> None:
+    with pytest.raises(ZeroDivisionError):
+        async with Agent(settings=settings):
+            raise ZeroDivisionError
+
+
+async def test_agents_of_one_loop_are_independent(settings: Settings, channel: Channel) -> None:
+    heard: dict[str, list[Demand]] = {"one": [], "two": []}
+    agents = [listening(Agent(settings=settings), heard[name]) for name in heard]
+    async with agents[0]:
+        async with agents[1]:
+            await heard_on(channel, "demand")
+            channel.publish(demand())
+            await until(lambda: all(heard.values()))
+        channel.publish(demand())
+        await until(lambda: len(heard["one"]) == 2)
+    assert len(heard["two"]) == 1
+
+
+def listening(agent: Agent, heard: list[Demand]) -> Agent:
+    @agent.on_demand
+    async def hear(message: Verified[Demand]) -> None:
+        heard.append(message.message)
+
+    return agent
+
+
+async def test_a_job_handler_that_uses_the_agent_while_it_ends_does_not_fail_its_job(place: Place) -> None:
+    """A refund because of a Ctrl-C would be a job lost: it is to be resumed."""
+    robot = obliging(place.agent("robot"))
+    begun = asyncio.Event()
+
+    @robot.on("/go")
+    async def go(job: Run, message: Any) -> None:
+        while True:
+            begun.set()
+            robot.channel.put(f"aira/agent/{robot.address.lower()}/device/arm/state", b"")
+            await asyncio.sleep(0)
+
+    async with place.provider(), place.agent("person") as person:
+        async with robot:
+            contract = await person.demand(place.save(objective(("/go", "x"))))
+            await begun.wait()
+        async with place.agent("robot", enable_executor=False) as observer:
+            job = await observer.parts.ledger.job(contract.address)
+            assert job is not None
+            assert (job.phase, job.position) == (Phase.RUNNING, 0)
+
+
+async def test_a_lost_router_does_not_end_an_agent(settings: Settings, router: EmbeddedRouter) -> None:
+    agent = Agent(settings=settings)
+    heard: list[Demand] = []
+    async with listening(agent, heard):
+        await asyncio.to_thread(router.stop)
+        await asyncio.to_thread(router.start)
+        async with (
+            Network(Endpoints(connect=(router.endpoint,))) as network,
+            Channel(network.session, MARKET, address=LIGHTHOUSE) as channel,
+        ):
+            await heard_on(channel, "demand")
+            channel.publish(demand())
+            await until(lambda: heard)
+
+
+async def test_no_router_is_told_with_its_endpoint() -> None:
+    endpoint = free_endpoint()
+    with pytest.raises(NetworkUnavailable, match=endpoint):
+        async with Agent(settings=Settings(connect=(endpoint,), connect_timeout=0.1)):
+            pass

@@ -1,0 +1,234 @@
+"""Rejections that may be untrue, and contracts that the chain takes back."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from mesh.agent import Agent, ContractTakenBack, OrderExpired, OrderRejected
+from mesh.chain import Chain, Timing
+from mesh.network import Endpoints, Network
+from mesh.work import outbox as outbox_module
+from schemas import Demand, Offer, RejectKey, cid_of_bytes, cid_of_file, decode, message_hash
+from schemas.rejection import Rejection
+from tests.mesh.agent.trades import OBJECTIVE, all_posted, job, known, posted, waiting, working
+from tests.support.market import MODEL, Place
+from tests.support.waiting import until, until_found
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outbox_module, "RESEND", 0.1)
+
+
+async def test_a_demand_that_nobody_takes_expires_at_its_deadline(place: Place) -> None:
+    async with place.provider(), place.agent("person") as person:
+        deadline = await place.chains["person"].block_number() + 5
+        demand = asyncio.create_task(person.demand(OBJECTIVE, lifetime=5))
+        await posted(person)
+        await place.node.mine(4)
+        head = deadline - 1
+        await until(lambda: person.parts.clock.head >= head)
+        assert not demand.done()
+        await place.node.mine(1)
+        with pytest.raises(OrderExpired, match=f"until block {deadline}") as caught:
+            await demand
+        assert caught.value.deadline == deadline
+        assert await waiting(person) == []
+
+
+async def test_a_demand_that_the_contracts_refuse_is_rejected_with_their_reason(place: Place) -> None:
+    robot = working(place.agent("robot"))
+    async with place.provider(), robot, place.agent("person", generation=5) as person:
+        with pytest.raises(OrderRejected, match="ValidatorWithoutCode") as caught:
+            await person.demand(OBJECTIVE, validator=place.address("provider"))
+        assert caught.value.rejection.reason == "ValidatorWithoutCode"
+        assert caught.value.rejection.provider == place.address("provider")
+        assert await waiting(person) == []
+
+
+def rejection(place: Place, role: str, order: str, *, reason: str = "Unwanted") -> Rejection:
+    """What an account says of an order."""
+    account = place.market.accounts[role]
+    unsigned = Rejection(order=order, reason=reason, detail="go away", provider=account.address)
+    return unsigned.signed_by(account.signer)
+
+
+def untrue_rejections(place: Place, order: str) -> list[Rejection]:
+    """Of another order; in a provider's name, unsigned, or signed by somebody else; by who is no provider."""
+    true = rejection(place, "provider", order)
+    forged = rejection(place, "robot", order)
+    return [
+        rejection(place, "provider", "00" * 32),
+        replace(true, signature=""),
+        replace(forged, provider=true.provider),
+        forged,
+    ]
+
+
+async def test_a_rejection_is_believed_of_the_lighthouses_providers_only(
+    place: Place, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with place.agent("person") as person, Network(Endpoints(connect=(place.endpoint,))) as stranger:
+        demand = asyncio.create_task(person.demand(OBJECTIVE))
+        await posted(person)
+        (identity,) = person._working().trader._matches
+        key = str(RejectKey(person.channel.lighthouse, identity, place.address("provider")))
+        stranger.session.put(key, b"no rejection at all")
+        for untrue in untrue_rejections(place, identity):
+            stranger.session.put(key, untrue.encode())
+        arrived: list[object] = []
+        with person.parts.network.session.declare_subscriber("last", arrived.append):
+            await until(lambda: stranger.session.put("last", b"") or arrived)
+        assert not demand.done()
+        await until(lambda: "who is no provider, says of an order: Unwanted" in caplog.text)
+        assert not demand.done()
+        stranger.session.put(key, rejection(place, "provider", identity).encode())
+        with pytest.raises(OrderRejected, match=r"rejects the order \(Unwanted\): go away"):
+            await demand
+
+
+async def test_a_rejection_of_what_is_a_contract_already_means_nothing(place: Place) -> None:
+    """Another provider was quicker, and this one says so before the person has read of the contract on the chain.
+
+    A person of generation 5 would sign a second demand, and pay for two contracts.
+    """
+    slowly, me = Timing(poll_interval=2.0), place.market.accounts["person"]
+    settings = place.settings("person", generation=5)
+    chain = Chain(place.node.provider, account=me, ens=place.market.deployment.ens, timing=slowly)
+    async with (
+        chain,
+        Agent(MODEL, settings=settings, account=me, chain=chain) as person,
+        working(place.agent("robot")),
+        Network(Endpoints(connect=(place.endpoint,))) as network,
+    ):
+        before = await chain.nonce_of(me.address)
+        demand = asyncio.create_task(person.demand(OBJECTIVE))
+        await posted(person)
+        (identity,) = person._working().trader._matches
+        async with place.provider() as provider:
+            await until(lambda: provider.earnings().created == 1)
+            key = str(RejectKey(person.channel.lighthouse, identity, place.address("provider")))
+            network.session.put(key, rejection(place, "provider", identity, reason="WrongSigner").encode())
+            contract = await demand
+        demand_hash, _ = await chain.order_hashes(contract.address)
+        assert demand_hash.hex() == identity
+        assert await chain.nonce_of(me.address) == before + 1
+
+
+async def test_a_provider_without_room_is_asked_again(place: Place, caplog: pytest.LogCaptureFixture) -> None:
+    async with place.agent("person") as person, Network(Endpoints(connect=(place.endpoint,))) as network:
+        demand = asyncio.create_task(person.demand(cid_of_file(job(place))))
+        await posted(person)
+        (identity,) = person._working().trader._matches
+        key = str(RejectKey(person.channel.lighthouse, identity, place.address("provider")))
+        network.session.put(key, rejection(place, "provider", identity, reason="full").encode())
+        await until(lambda: "has no room for the order" in caplog.text)
+        assert await waiting(person) == ["demand"]
+        async with place.provider(), working(place.agent("robot")):
+            assert (await demand).liability.promisee == place.address("person")
+
+
+async def test_orders_of_a_contract_that_the_chain_took_back_are_sent_again(place: Place) -> None:
+    """The provider who made it is gone, and another one has never heard of them."""
+    async with working(place.agent("robot")) as robot, place.agent("person") as person:
+        async with place.provider():
+            contract = await person.demand(cid_of_bytes(b"a job that nobody can begin"))
+            await known(robot, contract.address)
+        first = contract.address
+        await place.forget_blocks(1)
+        await until_found(lambda: all_posted(person, 1), what="the demand posted again")
+        await until_found(lambda: all_posted(robot, 1), what="the offer posted again")
+        async with place.provider():
+            await until(lambda: contract.address != first)
+            await until_found(lambda: all_posted(person, 0))
+
+
+async def test_a_contract_that_the_chain_took_back_and_nobody_makes_again_ends_at_its_deadline(place: Place) -> None:
+    async with working(place.agent("robot")) as robot, place.agent("person") as person:
+        async with place.provider():
+            contract = await person.demand(cid_of_bytes(b"a job that is made once"), lifetime=50)
+            await known(robot, contract.address)
+        outcomes = [
+            asyncio.create_task((await agent.contract(contract.address)).outcome()) for agent in (person, robot)
+        ]
+        await place.forget_blocks(1)
+        await until_found(lambda: all_posted(person, 1), what="the demand posted again")
+        await until_found(lambda: all_posted(robot, 1), what="the offer posted again")
+        assert not any(outcome.done() for outcome in outcomes)
+        await place.node.mine(60)
+        for outcome in outcomes:
+            with pytest.raises(ContractTakenBack, match="was not made again until block") as caught:
+                await asyncio.wait_for(outcome, 30)
+            assert caught.value.liability == contract.address
+        with pytest.raises(ContractTakenBack):
+            await contract.recording()
+        trader = person._working().trader
+        assert (trader._unmade, trader._endings, trader._contracts) == ({}, {}, {})
+
+
+async def test_a_contract_that_is_made_again_does_not_end_at_the_deadline(place: Place) -> None:
+    async with working(place.agent("robot")) as robot, place.agent("person") as person:
+        async with place.provider():
+            contract = await person.demand(cid_of_bytes(b"a job that is made twice"), lifetime=50)
+            await known(robot, contract.address)
+        first = contract.address
+        outcome = asyncio.create_task(contract.outcome())
+        await place.forget_blocks(1)
+        await until_found(lambda: all_posted(person, 1), what="the demand posted again")
+        async with place.provider():
+            await until(lambda: contract.address != first or not person._working().trader._unmade)
+            await until_found(lambda: all_posted(person, 0))
+        await place.node.mine(60)
+        head = await place.chains["person"].block_number()
+        await until(lambda: person.parts.clock.head >= head)
+        assert not outcome.done()
+        outcome.cancel()
+
+
+async def test_a_contract_on_our_terms_that_a_stranger_has_signed_leaves_our_demand_open(place: Place) -> None:
+    """He copies the demand with its nonce, so its hash is the same, and takes an offer of the same account."""
+    async with place.agent("person", enable_executor=False) as person:
+        demanding = asyncio.create_task(person.demand(OBJECTIVE))
+        await posted(person)
+        (waiting_demand,) = await person.parts.ledger.outbox(head=0)
+        ours = decode(waiting_demand.payload)
+        assert isinstance(ours, Demand)
+        stolen = place.market.accounts["provider"].signer.sign(replace(ours, signature=""))
+        terms = {
+            name: getattr(ours, name) for name in ("model", "objective", "token", "cost", "lighthouse", "validator")
+        }
+        fresh: dict[str, Any] = {"deadline": ours.deadline, "nonce": "ab" * 32, "lighthouse_fee": 0}
+        offer = person.parts.signer.sign(Offer(**terms, **fresh))
+        chain = place.chains["provider"]
+        made = await chain.create_liability(place.market.deployment.lighthouse, stolen, offer)
+        assert (await chain.order_hashes(made.liability))[0] == message_hash(ours)
+
+        head = await chain.block_number()
+        await until(lambda: person.parts.clock.head >= head)
+        assert not demanding.done()
+        assert await waiting(person) == ["demand"]
+        demanding.cancel()
+        await asyncio.wait([demanding])
+
+
+async def test_an_offer_that_can_not_be_signed_anew_stops_nothing(
+    place: Place, caplog: pytest.LogCaptureFixture
+) -> None:
+    """One of two offers of generation 5 was taken; for the fee of the other one the robot has too little by then."""
+    everything = await place.balance("robot")
+    async with place.agent("robot", generation=5) as robot, place.agent("person", generation=5) as person:
+        await robot.offer(objective=OBJECTIVE)
+        await robot.offer(objective=cid_of_bytes(b"something dear"), lighthouse_fee=everything)
+        await place.chains["robot"].transfer(place.address("person"), 5)
+        async with place.provider():
+            await person.demand(OBJECTIVE)
+            await until(lambda: "is given up" in caplog.text)
+            await until_found(lambda: all_posted(robot, 0))
+            again = cid_of_bytes(b"something else")
+            await robot.offer(objective=again)
+            assert (await person.demand(again)).liability.promisor == place.address("robot")
+    await place.chains["person"].transfer(place.address("robot"), 5)

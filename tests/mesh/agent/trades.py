@@ -1,0 +1,51 @@
+"""What is traded in the tests, and when it is known."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from schemas import cid_of_bytes
+from tests.support.market import Place, careless
+from tests.support.objectives import objective
+from tests.support.waiting import until_found
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mesh.agent import Agent
+    from mesh.work.run import Run
+
+OBJECTIVE = cid_of_bytes(b"something to be done")
+
+
+def working(robot: Agent) -> Agent:
+    """The same robot, which does whatever it is asked and played."""
+
+    @robot.on("*")
+    async def nothing(job: Run, message: Any) -> None:
+        pass
+
+    return careless(robot)
+
+
+def job(place: Place) -> Path:
+    return place.save(objective(("/go", "there")))
+
+
+async def waiting(agent: Agent) -> list[str]:
+    """The kinds of what is in an agent's outbox."""
+    return [message.kind for message in await agent.parts.ledger.outbox(head=0)]
+
+
+async def posted(agent: Agent) -> None:
+    """Wait until an agent has something in its outbox."""
+    await until_found(lambda: waiting(agent), what="a posted order")
+
+
+async def known(robot: Agent, address: str) -> None:
+    """Wait until a robot has heard of its job: it reads the chain by itself."""
+    await until_found(lambda: robot.parts.ledger.job(address), what="a job")
+
+
+async def all_posted(agent: Agent, count: int) -> bool:
+    return len(await waiting(agent)) == count

@@ -1,0 +1,176 @@
+"""Transactions that an earlier life has left behind, and the journal that tells of them."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.chain import GWEI, Account, Node, Sender, TransactionTimeout
+from mesh.errors import ConfigurationError
+from tests.mesh.chain.conftest import QUICK
+from tests.mesh.chain.lives import NEVER, SHORT, anvil, ask, life, stranger, until_waiting, waiting
+from tests.support.nodes import Anvil
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+__all__ = ["anvil"]
+
+
+def _files(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob("*") if path.is_file()]
+
+
+async def test_what_was_mined_long_ago_is_not_what_is_meant_now(anvil: Anvil) -> None:
+    async with life(anvil, replace(SHORT, repeat_within=0)) as (node, sender):
+        friend = stranger()
+        with pytest.raises(TransactionTimeout):
+            await sender.send(to=friend, data=b"", value=5)
+        await ask(node, "evm_mine")
+        await ask(node, "evm_setAutomine", True)
+        await sender.send(to=friend, data=b"", value=5)
+        assert await node.eth_balance(friend) == 10
+
+
+async def test_what_an_earlier_life_left_in_the_pool_is_not_collided_with(anvil: Anvil) -> None:
+    friend = stranger()
+    async with life(anvil, SHORT) as (_, sender):
+        with pytest.raises(TransactionTimeout):
+            await sender.send(to=friend, data=b"", value=1)
+    async with life(anvil) as (node, sender):
+        sending = asyncio.create_task(sender.send(to=friend, data=b"", value=2))
+        assert sorted(await until_waiting(node, 2)) == [0, 1]
+        await ask(node, "evm_mine")
+        await sending
+        assert await node.eth_balance(friend) == 3
+
+
+async def test_the_journal_tells_a_later_life_what_the_node_forgot(anvil: Anvil, tmp_path: Path) -> None:
+    friend = stranger()
+    async with life(anvil, SHORT, journal=tmp_path) as (node, sender):
+        with pytest.raises(TransactionTimeout) as caught:
+            await sender.send(to=friend, data=b"", value=5)
+        await ask(node, "anvil_dropTransaction", caught.value.tx)
+    async with life(anvil, journal=tmp_path) as (node, sender):
+        sending = asyncio.create_task(sender.send(to=friend, data=b"", value=5))
+        assert await until_waiting(node, 1) == {0: caught.value.tx}
+        await ask(node, "evm_mine")
+        assert (await sending).tx == caught.value.tx
+        assert await node.eth_balance(friend) == 5
+    assert _files(tmp_path) == [], "what is settled is not kept"
+
+
+async def test_a_forgotten_transaction_gives_its_number_to_another(anvil: Anvil, tmp_path: Path) -> None:
+    friend = stranger()
+    async with life(anvil, SHORT, journal=tmp_path) as (node, sender):
+        with pytest.raises(TransactionTimeout) as caught:
+            await sender.send(to=friend, data=b"", value=5)
+        await ask(node, "anvil_dropTransaction", caught.value.tx)
+    async with life(anvil, journal=tmp_path) as (node, sender):
+        sending = asyncio.create_task(sender.send(to=friend, data=b"", value=7))
+        assert list(await until_waiting(node, 1)) == [0]
+        await ask(node, "evm_mine")
+        await sending
+        assert await node.eth_balance(friend) == 7
+
+
+async def test_what_waits_behind_a_stuck_transaction_of_an_earlier_life_gets_it_moving(
+    anvil: Anvil, tmp_path: Path
+) -> None:
+    friend = stranger()
+    async with life(anvil, SHORT, journal=tmp_path) as (node, sender):
+        with pytest.raises(TransactionTimeout) as stuck:
+            await sender.send(to=friend, data=b"", value=1)
+    async with life(anvil, replace(QUICK, replace_after=0.1), journal=tmp_path) as (node, sender):
+        sending = asyncio.create_task(sender.send(to=friend, data=b"", value=2))
+        async with asyncio.timeout(10):
+            while (await until_waiting(node, 2))[0] == stuck.value.tx:
+                await asyncio.sleep(0.01)
+        await ask(node, "evm_mine")
+        await sending
+        assert await node.eth_balance(friend) == 3
+
+
+async def test_a_journal_is_of_one_chain(tmp_path: Path) -> None:
+    """A development chain that is started afresh has the same chain id, and none of the old transactions."""
+    friend = stranger()
+    for born in ("1700000000", "1700000001"):
+        async with (
+            Anvil(arguments=(NEVER, "--timestamp", born)) as anvil,
+            life(anvil, SHORT, journal=tmp_path) as (node, sender),
+        ):
+            with pytest.raises(TransactionTimeout):
+                await sender.send(to=friend, data=b"", value=1)
+            assert len(await waiting(node)) == 1
+    assert [path.name for path in _files(tmp_path)] == ["000000000000.jsonl"] * 2
+
+
+async def test_a_number_that_another_transaction_took_at_last_is_replaced(anvil: Anvil) -> None:
+    """Somebody sends with the same key and number through another node, and wins."""
+    account, friend = Account.from_key(anvil.private_keys[0]), stranger()
+    async with Node(anvil.url, timing=QUICK) as node:
+        sending = asyncio.create_task(Sender(node, account).send(to=friend, data=b"", value=5))
+        await until_waiting(node, 1)
+        prices = {"type": 2, "maxFeePerGas": 100 * GWEI, "maxPriorityFeePerGas": 50 * GWEI}
+        fields = {"to": friend, "data": "0x", "value": 70, "gas": 21_000, "chainId": node.chain_id, "nonce": 0}
+        rival = account.sign_transaction(fields | prices)
+        await ask(node, "eth_sendRawTransaction", "0x" + rival.raw.hex())
+        await ask(node, "evm_mine")
+        assert list(await until_waiting(node, 1)) == [1]
+        await ask(node, "evm_mine")
+        await sending
+        assert await node.eth_balance(friend) == 75
+
+
+CHILD = """
+import asyncio, sys
+from pathlib import Path
+from mesh.chain import Account, Node, Sender, Timing
+from mesh.chain.transports import HttpTransport
+
+class Forgetful(HttpTransport):
+    async def make_request(self, method, params):
+        if method == "eth_getTransactionCount":
+            params = [params[0], "latest"]
+        return await super().make_request(method, params)
+
+async def main(url, key, friend, journal, count):
+    wire = Forgetful(url)
+    timing = Timing(poll_interval=0.05, receipt_interval=0.01)
+    async with Node(wire, timing=timing, journal=Path(journal)) as node:
+        sender = Sender(node, Account.from_key(bytes.fromhex(key)))
+        await asyncio.gather(*(sender.send(to=friend, data=b"", value=1) for _ in range(int(count))))
+    await wire.close()
+
+asyncio.run(main(*sys.argv[1:]))
+"""
+
+
+async def test_processes_that_share_a_journal_never_take_the_same_number(tmp_path: Path) -> None:
+    """Even where the node does not count what waits."""
+    friend = stranger()
+
+    async def child(url: str, key: bytes) -> tuple[int | None, str]:
+        arguments = (url, key.hex(), friend, str(tmp_path), "6")
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", CHILD, *arguments, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT
+        )
+        out, _ = await process.communicate()
+        return process.returncode, out.decode()
+
+    async with Anvil(arguments=("--block-time", "1")) as anvil, Node(anvil.url, timing=QUICK) as node:
+        ended = await asyncio.gather(*(child(anvil.url, anvil.private_keys[0]) for _ in range(3)))
+        assert ended == [(0, "")] * 3
+        assert await node.eth_balance(friend) == 18
+
+
+async def test_a_journal_that_can_not_be_written_is_one_clear_error(anvil: Anvil, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    async with life(anvil, journal=tmp_path / "file") as (_, sender):
+        with pytest.raises(ConfigurationError, match="can't keep sent transactions"):
+            await sender.send(to=stranger(), data=b"", value=1)

@@ -1,0 +1,26 @@
+"""Calls of `aira objective` in this process, and what a refused one says."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from click.testing import CliRunner
+
+from mesh.cli import main
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from click.testing import Result
+
+
+def call(*words: str | Path, given: bytes | None = None) -> Result:
+    return CliRunner().invoke(main, ["objective", *map(str, words)], input=given)
+
+
+def refused(done: Result, said: str, *, code: int = 2) -> None:
+    """One clear line, and what to do."""
+    assert done.exit_code == code, done.output
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("aira: ")]
+    assert said in line
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,72 @@
+"""What a Result and two files prove by themselves, without a chain."""
+
+from __future__ import annotations
+
+import pytest
+
+from mesh.evidence import Claim
+from schemas import Demand, cid_of_bytes, encode
+from tests.mesh.evidence.findings import job, wrong
+from tests.mesh.evidence.jobs import OTHER, ROBOT, THIEF, Job
+
+__all__ = ["job"]
+
+
+def test_a_held_result_message_proves_who_signed_it(job: Job) -> None:
+    verdict = job.verify(job.message(), finalized=None)
+    assert verdict.holds
+    signature = verdict.of("signature")
+    assert signature is not None
+    assert signature.detail == f"the promisor, {ROBOT.address}, signed it with success true"
+
+
+@pytest.mark.parametrize(
+    ("fields", "why"),
+    [
+        ({"signer": THIEF}, f"{THIEF.address} signed it, and the promisor is {ROBOT.address}"),
+        ({"liability": OTHER}, "for another liability"),
+        ({"result": cid_of_bytes(b"another")}, "for another recording"),
+    ],
+)
+def test_a_result_message_of_another_signer_liability_or_recording_proves_nothing(
+    job: Job, fields: dict[str, object], why: str
+) -> None:
+    said = wrong(job.verify(job.message(**fields)))  # type: ignore[arg-type]
+    assert set(said) == {"signature"}
+    assert why in said["signature"]
+
+
+@pytest.mark.parametrize("content", [b"", b"{}", b"\xff", b'{"liability": 1}'])
+def test_what_is_no_result_message_is_said_to_be_none(job: Job, content: bytes) -> None:
+    assert wrong(job.verify(content))["signature"].startswith("the Result message: ")
+
+
+def test_a_demand_is_no_result(job: Job) -> None:
+    demand = Demand(
+        model=cid_of_bytes(b"m"),
+        objective=cid_of_bytes(b"o"),
+        token=OTHER,
+        cost=1,
+        lighthouse=OTHER,
+        validator=OTHER,
+        validator_fee=0,
+        deadline=1,
+        nonce="0" * 64,
+    )
+    assert "is no Result" in wrong(job.verify(encode(ROBOT.sign(demand))))["signature"]
+
+
+def test_two_files_alone_show_that_they_belong_together_and_leave_the_rest_open(job: Job) -> None:
+    job.claim = Claim()
+    verdict = job.verify()
+    assert verdict.holds
+    untold = {finding.name for finding in verdict.findings if finding.holds is None}
+    assert untold == {"finalized", "signature", "result-file", "objective-file", "liability", "agent", "lighthouse"}
+
+
+def test_two_files_and_the_message_are_enough_for_an_arbiter_without_a_chain(job: Job) -> None:
+    job.claim = Claim()
+    verdict = job.verify(job.message())
+    assert verdict.holds
+    untold = {finding.name for finding in verdict.findings if finding.holds is None}
+    assert untold == {"finalized", "objective-file", "lighthouse"}

@@ -1,0 +1,126 @@
+"""The order book against one that is as simple as can be, by chance."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+
+from mesh.market import Added, Match, OrderBook, Refusal, order_id
+from schemas import Demand, Offer, Verified, verify_message
+from tests.support.orders import LIGHTHOUSE, PERSON, ROBOT, TOKEN, terms, verified_demand, verified_offer
+
+if TYPE_CHECKING:
+    from mesh.market.book import Order
+
+
+class NaiveBook:
+    """The rules, in lists that are searched from end to end."""
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+        self.head = 0
+        self.open: list[Verified[Order]] = []
+
+    def add(self, order: Verified[Order]) -> Match | Added | Refusal:
+        if order.message.lighthouse != LIGHTHOUSE:
+            return Refusal.LIGHTHOUSE
+        if order.message.deadline <= self.head:
+            return Refusal.EXPIRED
+        if order in self.open:
+            return Refusal.DUPLICATE
+        for other in self.open:
+            if type(other.message) is not type(order.message) and agree(other.message, order.message):
+                self.open.remove(other)
+                pair = (order, other) if isinstance(order.message, Demand) else (other, order)
+                return Match(*pair)  # type: ignore[arg-type]
+        if len(self.open) >= self.limit:
+            return Refusal.FULL
+        self.open.append(order)
+        return Added(order)
+
+    def remove(self, order: Verified[Order]) -> Verified[Order] | None:
+        if order not in self.open:
+            return None
+        self.open.remove(order)
+        return order
+
+    def expire(self, head: int) -> list[Verified[Order]]:
+        self.head = max(self.head, head)
+        due = sorted((o for o in self.open if o.message.deadline <= head), key=lambda order: order.message.deadline)
+        self.open = [order for order in self.open if order not in due]
+        return due
+
+
+def agree(one: Order, other: Order) -> bool:
+    fields = ("model", "objective", "token", "cost", "lighthouse", "validator", "generation")
+    return all(getattr(one, field) == getattr(other, field) for field in fields)
+
+
+def pool() -> list[Verified[Any]]:
+    """Orders that often agree, expire together, are signed by two people, or belong elsewhere."""
+    orders: list[Verified[Any]] = []
+    for cost in (1, 2):
+        for deadline in (3, 4, 8, 9):
+            for twin in range(2):
+                same = terms(cost=cost, deadline=deadline, nonce=f"{twin + 1:064d}")
+                for signer in (PERSON, ROBOT):
+                    orders.append(verify_message(signer.sign(Demand(**same, validator_fee=0))))
+                    orders.append(verify_message(signer.sign(Offer(**same, lighthouse_fee=0))))
+            fifth: dict[str, Any] = {"cost": cost, "deadline": deadline, "nonce": 1}
+            orders.append(verified_demand(sender=PERSON.address, **fifth))
+            orders.append(verified_offer(sender=ROBOT.address, **fifth))
+    return [*orders, verified_demand(lighthouse=TOKEN)]
+
+
+POOL = pool()
+
+
+class BookAgainstNaiveBook(RuleBasedStateMachine):
+    """Whatever is done to a book, it says and holds what the naive one does."""
+
+    @initialize(limit=st.sampled_from([1, 3, 8, 100]))
+    def begin(self, limit: int) -> None:
+        self.book = OrderBook(LIGHTHOUSE, limit=limit)
+        self.naive = NaiveBook(limit)
+
+    @rule(order=st.sampled_from(POOL))
+    def add(self, order: Verified[Any]) -> None:
+        assert self.book.add(order) == self.naive.add(order)
+
+    @rule(order=st.sampled_from(POOL))
+    def remove(self, order: Verified[Any]) -> None:
+        assert self.book.remove(order_id(order)) == self.naive.remove(order)
+
+    @rule(head=st.integers(0, 10))
+    def expire(self, head: int) -> None:
+        assert by_deadline(self.book.expire(head)) == by_deadline(self.naive.expire(head))
+
+    @rule()
+    def make_lists_anew(self) -> None:
+        self.book._list_anew()
+
+    @invariant()
+    def holds_the_same(self) -> None:
+        assert list(self.book.orders()) == self.naive.open
+        assert len(self.book) == len(self.naive.open)
+        assert self.book.head == self.naive.head
+        assert [order for order in POOL if order_id(order) in self.book] == [
+            order for order in POOL if order in self.naive.open
+        ]
+
+
+def by_deadline(orders: list[Verified[Any]]) -> list[tuple[int, set[bytes]]]:
+    """Deadlines in the order in which they came, with what expired at each."""
+    deadlines = [order.message.deadline for order in orders]
+    assert deadlines == sorted(deadlines)
+    return [
+        (deadline, {order_id(order) for order in orders if order.message.deadline == deadline})
+        for deadline in dict.fromkeys(deadlines)
+    ]
+
+
+TestBookAgainstNaiveBook = BookAgainstNaiveBook.TestCase
+TestBookAgainstNaiveBook.settings = settings(max_examples=60, stateful_step_count=60, deadline=None)

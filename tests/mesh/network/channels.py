@@ -1,0 +1,49 @@
+"""Channels of a test, and what arrives on them."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+from mesh.network import Channel, message_key
+from schemas import Demand, SignedMessage, Verified
+from tests.support.orders import LIGHTHOUSE, MARKET, demand
+from tests.support.waiting import until_heard
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    import zenoh
+
+    from mesh.network import Subscription
+
+
+@asynccontextmanager
+async def opened(session: zenoh.Session, **options: Any) -> AsyncIterator[Channel]:
+    async with Channel(session, MARKET, **({"address": LIGHTHOUSE} | options)) as channel:
+        yield channel
+
+
+@asynccontextmanager
+async def listening(
+    here: zenoh.Session, there: zenoh.Session, kind: type[Any] = Demand, **options: Any
+) -> AsyncIterator[tuple[Subscription[Any], Channel]]:
+    """A subscription `here` and the channel `there` of one who is heard by it."""
+    selection = {name: options.pop(name) for name in ("model", "liability") if name in options}
+    async with opened(here, **options) as ours, opened(there) as theirs, ours.subscribe(kind, **selection) as messages:
+        await until_heard(there, messages._selector)
+        yield messages, theirs
+
+
+async def take(messages: Subscription[Any], count: int) -> list[Verified[Any]]:
+    async with asyncio.timeout(10):
+        return [await anext(messages) for _ in range(count)]
+
+
+def contents(verified: list[Verified[Any]]) -> list[SignedMessage]:
+    return [one.message for one in verified]
+
+
+ORDER = demand()
+KEY = message_key(MARKET, ORDER)

@@ -1,0 +1,70 @@
+"""A robot that is stopped in the middle, and whether it is paid."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.support.objectives import objective
+from tests.support.waiting import until_found
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mesh.agent import Agent, Contract, Phase
+    from mesh.work.run import Run
+    from schemas import String
+    from tests.support.market import Place
+
+COST = 1000
+WORDS = [str(number) for number in range(6)]
+
+
+def words(place: Place) -> Path:
+    """An objective of six words."""
+    return place.save(objective(*(("/say", word) for word in WORDS)))
+
+
+def speaking(robot: Agent, said: list[str], *, stuck_at: str = "") -> Agent:
+    """The same robot, which takes note of what it plays and never gets over `stuck_at`."""
+
+    @robot.on("/say")
+    async def say(job: Run, message: String) -> None:
+        if message.data == stuck_at:
+            await asyncio.Event().wait()
+        said.append(message.data)
+        job.publish("/said", message.data)
+
+    return robot
+
+
+async def in_phase(robot: Agent, contract: Contract, phase: Phase) -> None:
+    async def reached() -> bool:
+        job = await robot.parts.ledger.job(contract.address)
+        return job is not None and job.phase is phase
+
+    await until_found(reached, what=phase)
+
+
+class Paying:
+    """Compares what a robot has with what it should have got."""
+
+    def __init__(self, place: Place, before: int) -> None:
+        self._place = place
+        self._before = before
+
+    async def once(self) -> bool:
+        return await self._place.balance("robot") == self._before + COST
+
+
+@pytest.fixture
+async def paid(place: Place) -> Paying:
+    return Paying(place, await place.balance("robot"))
+
+
+async def made_by_a_provider_that_goes(place: Place, person: Agent) -> Contract:
+    """A contract whose Result finds no provider."""
+    async with place.provider():
+        return await person.demand(words(place), cost=COST)

@@ -1,0 +1,64 @@
+"""Runs on a router of the test's own."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+import zenoh
+
+from mesh.recording import AtOnce, RecordedTimes, Recorder, RecordingAbout, open_objective
+from mesh.work.run import Plan, Run
+from tests.mesh.work.samples import liability
+from tests.support.routers import EmbeddedRouter, client_config
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from mesh.recording import Objective
+
+AGENT = "0x" + "ab" * 20
+AT_ONCE = AtOnce()
+
+
+@pytest.fixture
+def session(router: EmbeddedRouter) -> Iterator[zenoh.Session]:
+    """The agent's session."""
+    with zenoh.open(client_config(router.endpoint)) as opened:
+        yield opened
+
+
+class Making:
+    """Makes runs in a folder."""
+
+    def __init__(self, session: zenoh.Session, folder: Path) -> None:
+        self._session = session
+        self._folder = folder
+        self.path = folder / "run.mcap"
+
+    def run(
+        self,
+        content: bytes = b"",
+        *,
+        position: int = 0,
+        topics: frozenset[str] | None = None,
+        pace: AtOnce | RecordedTimes = AT_ONCE,
+    ) -> Run:
+        """A run of the objective in `content`, not yet open."""
+        played: Objective | None = None
+        if content:
+            (self._folder / "objective.mcap").write_bytes(content)
+            played = open_objective(self._folder / "objective.mcap")
+        plan = Plan(liability=liability(), objective=played, pace=pace, position=position, topics=topics)
+        return Run(self._session, AGENT, plan, Recorder(self.path, RecordingAbout()))
+
+    def recorded(self) -> list[tuple[str, bytes, str]]:
+        """What is in the closed recording: topic, payload, type."""
+        messages = open_objective(self.path).messages()
+        return [(message.topic, message.payload, message.type.zenoh_encoding) for message in messages]
+
+
+@pytest.fixture
+def making(session: zenoh.Session, tmp_path: Path) -> Making:
+    return Making(session, tmp_path)

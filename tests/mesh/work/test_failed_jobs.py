@@ -1,0 +1,184 @@
+"""Jobs that fail: what is refused, what breaks, and what is said of it."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import pytest
+
+from mesh.agent import JobFailed, Phase
+from mesh.running import _cause
+from mesh.work.ledger import LedgerUnusable
+from mesh.work.run import NOTE_TOPIC
+from schemas import Empty, String, cid_of_bytes
+from tests.mesh.work.executions import COST, doing_nothing, heard, recorded
+from tests.support.market import Place, careless, obliging
+from tests.support.objectives import objective
+
+if TYPE_CHECKING:
+    from mesh.agent import Agent
+    from mesh.recording import Objective
+    from mesh.work.run import Run
+
+
+class Speed(msgspec.Struct):
+    """What a handler asks for."""
+
+    wheel: int
+
+
+def notes(recording: Objective) -> list[str]:
+    return [String.decode(payload).data for payload in heard(recording, NOTE_TOPIC)]
+
+
+async def refusal(place: Place, robot: Agent, content: bytes | str, **terms: Any) -> tuple[str, str]:
+    """Have a robot fail at an objective: its note in the ledger and in the recording. The money must come back."""
+    async with place.at_work(robot) as person:
+        before = await place.balance("robot"), await place.balance("person")
+        source = place.save(content) if isinstance(content, bytes) else content
+        contract = await person.demand(source, cost=COST, **terms)
+        outcome = await contract.outcome()
+        assert not outcome.success
+        assert (await place.balance("robot"), await place.balance("person")) == before
+        job = await robot.parts.ledger.job(contract.address)
+        assert job is not None
+        assert job.success is False
+        recording = await recorded(contract)
+    return job.note, "\n".join(notes(recording))
+
+
+@pytest.mark.parametrize("error", [JobFailed("the lamp is broken"), ValueError("the lamp is broken")], ids=repr)
+async def test_a_handler_that_raises_fails_its_job_and_the_promisee_is_refunded(place: Place, error: Exception) -> None:
+    robot = obliging(place.agent("robot"))
+    calls = 0
+
+    @robot.on("/go")
+    async def go(job: Run, message: Any) -> None:
+        nonlocal calls
+        calls += 1
+        raise error
+
+    note, recorded_note = await refusal(place, robot, objective(("/go", Empty()), ("/go", Empty())))
+    assert note == recorded_note == "the lamp is broken"
+    assert calls == 1
+
+
+async def test_a_handler_whose_inner_task_was_cancelled_has_not_done_its_job(place: Place) -> None:
+    robot = obliging(place.agent("robot"))
+
+    @robot.on("/go")
+    async def go(job: Run, message: Any) -> None:
+        inner = asyncio.create_task(asyncio.sleep(60))
+        inner.cancel()
+        await inner
+
+    note, _ = await refusal(place, robot, objective(("/go", Empty())))
+    assert note == "the handler of /go was cancelled"
+
+
+async def test_a_message_of_another_type_than_the_handlers_is_refused_before_anything_is_played(place: Place) -> None:
+    robot = careless(place.agent("robot"))
+    speeds: list[Speed] = []
+
+    @robot.on("/go", Speed)
+    async def go(job: Run, message: Speed) -> None:
+        speeds.append(message)
+
+    note, _ = await refusal(place, robot, objective(("/go", Speed(3)), ("/go", {"wheel": "fast"})))
+    assert "(unfit-message): message 1 on /go: not a Speed" in note
+    assert speeds == []
+
+
+async def test_a_topic_without_handler_is_refused_before_anything_is_played(place: Place) -> None:
+    robot = careless(place.agent("robot"))
+    done: list[object] = []
+
+    @robot.on("/go")
+    async def go(job: Run, message: Any) -> None:
+        done.append(message)
+
+    note, _ = await refusal(place, robot, objective(("/go", Empty()), ("/fly", Empty())))
+    assert "unknown-topic" in note
+    assert "/fly" in note
+    assert done == []
+
+
+async def test_what_is_no_recording_is_refused(place: Place) -> None:
+    note, _ = await refusal(place, doing_nothing(careless(place.agent("robot"))), b"please go to the kitchen\n")
+    assert "not-a-recording" in note
+
+
+async def test_an_objective_that_nobody_holds_is_given_up_and_refunded(place: Place) -> None:
+    robot = doing_nothing(careless(place.agent("robot", fetch_timeout=0.2)))
+    note, _ = await refusal(place, robot, cid_of_bytes(b"held by nobody"))
+    assert "is not to be had" in note
+
+
+async def test_an_objective_over_the_size_limit_is_refused(place: Place) -> None:
+    robot = doing_nothing(careless(place.agent("robot", objective_size_limit=2000)))
+    note, _ = await refusal(place, robot, objective(("/blob", os.urandom(4000))))
+    assert "2000 allowed" in note
+
+
+async def test_a_job_whose_objective_is_missing_does_not_hold_up_the_next(place: Place) -> None:
+    robot = doing_nothing(careless(place.agent("robot", fetch_timeout=30.0)))
+    async with place.at_work(robot) as person, asyncio.timeout(25):
+        missing = await person.demand(cid_of_bytes(b"nobody has this"))
+        good = await person.demand(place.save(objective(("/go", Empty()))))
+        assert (await good.outcome()).success
+        job = await robot.parts.ledger.job(missing.address)
+        assert job is not None
+        assert job.phase is Phase.INCOMING
+
+
+async def test_a_failure_that_was_meant_is_logged_without_a_traceback(
+    place: Place, caplog: pytest.LogCaptureFixture
+) -> None:
+    robot = obliging(place.agent("robot"))
+
+    @robot.on("/go")
+    async def go(job: Run, message: Any) -> None:
+        raise JobFailed("the battery is empty")
+
+    with caplog.at_level(logging.WARNING, "mesh.work"):
+        async with place.at_work(robot) as person:
+            await (await person.demand(place.save(objective(("/go", Empty()))))).outcome()
+    (line,) = [record for record in caplog.records if "the battery is empty" in record.message]
+    assert not line.exc_info
+
+
+async def test_a_ledger_that_can_not_be_written_ends_the_agent_and_fails_no_job(place: Place) -> None:
+    """As on a full disk: when there is room again, the restarted agent goes on with the job."""
+    writable = [False]
+    done: list[str] = []
+    before = await place.chains["person"].block_number()
+
+    def robot() -> Agent:
+        made = obliging(place.agent("robot"))
+
+        @made.on("/go")
+        async def go(job: Run, message: Any) -> None:
+            if not writable[0]:
+                await made.parts.ledger._run("PRAGMA query_only = ON")
+            done.append(message.data)
+
+        return made
+
+    async with place.provider(), place.agent("person") as person:
+
+        async def asked(robot: Agent) -> None:
+            async with robot:
+                await (await person.demand(place.save(objective(("/go", "there"))))).outcome()
+
+        with pytest.raises(ExceptionGroup) as caught:
+            await asyncio.wait_for(asked(robot()), 30)
+        assert isinstance(_cause(caught.value), LedgerUnusable), "one line, and no traceback"
+        writable[0] = True
+        (made,) = await place.chains["person"].liabilities(promisee=place.address("person"), from_block=before)
+        async with robot():
+            assert (await asyncio.wait_for((await person.contract(made.address)).outcome(), 30)).success
+    assert set(done) == {"there"}

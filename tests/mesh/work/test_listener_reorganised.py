@@ -1,0 +1,153 @@
+"""The listener where the chain takes back what it has told."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from web3.providers.async_base import AsyncBaseProvider
+
+from mesh.chain import Approval, Chain, ChainWentBack, History, NewLiability, Timing, Transfer
+from mesh.work import Ledger
+from mesh.work import listener as listener_module
+from mesh.work.listener import Listener
+from tests.mesh.work.diaries import Diary, contract, finalize, ledger, listening, started
+from tests.support.market import QUICK
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from web3.types import RPCEndpoint, RPCResponse
+
+    from tests.support.market import Place
+
+__all__ = ["ledger"]
+
+
+async def test_a_chain_that_is_shorter_than_what_was_read_is_refused(place: Place, ledger: Ledger) -> None:
+    await ledger.set_cursor(Listener.NAME, 10**6)
+    listener = Listener(place.chains["robot"], ledger, place.address("robot"), Diary())
+    with pytest.raises(ChainWentBack):
+        await listener.run()
+
+
+async def test_an_end_that_the_chain_took_back_is_told(place: Place, ledger: Ledger) -> None:
+    async with listening(place, ledger) as diary:
+        await started(ledger)
+        address, *_ = await contract(place)
+        await finalize(place, address)
+        await until(lambda: diary.ends)
+        await place.forget_blocks(1)
+        await until(lambda: diary.taken_back_ends)
+        await finalize(place, address)
+        await until(lambda: len(diary.ends) == 2)
+    assert diary.taken_back_ends == [address]
+    assert diary.ends[0][0] == diary.ends[1][0] == address
+    assert len(diary.liabilities) == 1, "what came before is as it was"
+
+
+async def test_an_end_that_was_taken_back_while_the_agent_was_down_is_told(place: Place, ledger: Ledger) -> None:
+    async with listening(place, ledger) as diary:
+        await started(ledger)
+        address, *_ = await contract(place)
+        await finalize(place, address)
+        head = await place.chains["robot"].block_number()
+        await until(lambda: diary.head >= head)
+    await place.forget_blocks(1)
+    async with listening(place, ledger) as diary:
+        await until(lambda: diary.taken_back_ends)
+    assert diary.taken_back_ends == [address]
+
+
+async def test_a_contract_that_the_chain_took_back_is_told_and_told_again_when_it_is_made(
+    place: Place, ledger: Ledger
+) -> None:
+    async with listening(place, ledger) as diary:
+        await started(ledger)
+        first, demand, offer = await contract(place)
+        await until(lambda: diary.liabilities)
+        await place.forget_blocks(1)
+        await until(lambda: diary.taken_back_contracts)
+        lighthouse = place.market.deployment.lighthouse_name
+        again = await place.chains["provider"].create_liability(lighthouse, demand, offer)
+        await until(lambda: len(diary.liabilities) == 2)
+    assert diary.taken_back_contracts == [first]
+    assert [liability.address for liability, *_ in diary.liabilities] == [first, again.liability]
+    assert diary.taken_back_ends == []
+
+
+async def test_token_events_are_told_and_taken_back(place: Place, ledger: Ledger) -> None:
+    person = place.chains["person"]
+    async with listening(place, ledger) as diary:
+        await started(ledger)
+        await person.approve(place.address("robot"), 11)
+        await person.transfer(place.address("robot"), 12)
+        await until(lambda: len(diary.token_events) == 2)
+        await place.forget_blocks(1)
+        await until(lambda: diary.taken_back_token_events)
+    approval, transfer = diary.token_events
+    assert isinstance(approval, Approval)
+    assert (approval.owner, approval.spender, approval.value) == (place.address("person"), place.address("robot"), 11)
+    assert isinstance(transfer, Transfer)
+    assert (transfer.sender, transfer.recipient, transfer.value) == (
+        place.address("person"),
+        place.address("robot"),
+        12,
+    )
+    assert diary.taken_back_token_events == [transfer]
+
+
+async def test_as_much_of_the_chain_is_remembered_as_may_be_replaced_whatever_was_so_before(
+    place: Place, ledger: Ledger
+) -> None:
+    for depth in (3, 7, 2):
+        timing = Timing(poll_interval=0.03, reorg_depth=depth)
+        async with (
+            Chain(place.node.provider, ens=place.market.deployment.ens, timing=timing) as chain,
+            listening(place, ledger, chain=chain) as diary,
+        ):
+            await started(ledger)
+            for _ in range(2 * depth):
+                await contract(place)
+                head = await chain.block_number()
+                await until(lambda diary=diary, head=head: diary.head >= head)  # type: ignore[misc]
+        history = History.decode(await ledger.history(Listener.NAME))
+        assert (history.depth, len(history.blocks)) == (depth, depth + 1)
+
+
+async def test_a_contract_that_a_reorganisation_took_before_it_was_read_is_left_out(
+    place: Place, ledger: Ledger
+) -> None:
+    diary = Diary()
+    listener = Listener(place.chains["robot"], ledger, place.address("robot"), diary)
+    await listener._new_liability(NewLiability(place.address("robot"), "0x"))
+    assert diary.liabilities == []
+
+
+class Behind(AsyncBaseProvider):
+    """The place's node as one of several behind a balancer: for some calls, it lacks the newest contract."""
+
+    def __init__(self, place: Place) -> None:
+        super().__init__()
+        self._node = place.node.provider
+        self.contract, self.calls = "", 0
+
+    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+        if method == "eth_call" and params[0]["to"] == self.contract and self.calls > 0:
+            self.calls -= 1
+            return {"jsonrpc": "2.0", "id": 1, "result": "0x"}
+        return await self._node.make_request(method, params)
+
+
+async def test_a_node_that_is_behind_loses_no_contract(
+    place: Place, ledger: Ledger, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(listener_module, "RETRY", 0.05)
+    node = Behind(place)
+    robot, ens = place.market.accounts["robot"], place.market.deployment.ens
+    async with Chain(node, account=robot, ens=ens, timing=QUICK) as chain:
+        await ledger.set_cursor(Listener.NAME, await chain.block_number())
+        address, *_ = await contract(place)
+        node.contract, node.calls = address, 2
+        async with listening(place, ledger, chain=chain) as diary:
+            await until(lambda: diary.liabilities)
+    assert ([made.address for made, *_ in diary.liabilities], node.calls <= 0) == ([address], True)

@@ -1,0 +1,156 @@
+"""Payments that come late, are taken back, or are asked for again after a restart."""
+
+from __future__ import annotations
+
+import sqlite3
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.agent import Phase
+from mesh.recording import open_objective
+from mesh.work import outbox as outbox_module
+from mesh.work.outbox import outgoing
+from schemas import String, cid_of_file
+from tests.mesh.work.restarts import COST, WORDS, Paying, in_phase, made_by_a_provider_that_goes, paid, speaking, words
+from tests.mesh.work.samples import liability
+from tests.support.market import obliging
+from tests.support.orders import result
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.support.market import Place
+
+__all__ = ["paid"]
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outbox_module, "RESEND", 0.1)
+
+
+async def test_a_job_that_awaits_its_finish_keeps_its_recording_over_a_restart(place: Place) -> None:
+    """Without handlers: what the device has said until the restart is in the Result."""
+    async with place.provider(), place.agent("person") as person:
+        async with obliging(place.agent("robot")) as robot:
+            contract = await person.demand(words(place))
+            await in_phase(robot, contract, Phase.READY)
+            executor = robot._working().executor
+            await executor.start(contract.address)
+            executor._runs[contract.address].publish("/said", "before")
+            await until(lambda: executor._runs[contract.address].position == len(WORDS))
+        async with place.agent("robot") as robot:
+            executor = robot._working().executor
+            await executor.resume(contract.address)
+            executor._runs[contract.address].publish("/said", "after")
+            await robot.finish(contract.address, success=True)
+            assert (await contract.outcome()).success
+            recording = open_objective(await contract.recording())
+    messages = [(message.topic, String.decode(message.payload).data) for message in recording.messages()]
+    assert [data for topic, data in messages if topic == "/said"] == ["before", "after"]
+    assert [data for topic, data in messages if topic == "/say"] == WORDS, "nothing is played twice"
+
+
+async def test_a_finished_job_is_paid_when_the_provider_comes_late(place: Place, paid: Paying) -> None:
+    said: list[str] = []
+    async with place.agent("person") as person, speaking(obliging(place.agent("robot")), said) as robot:
+        contract = await made_by_a_provider_that_goes(place, person)
+        await in_phase(robot, contract, Phase.COMPLETE)
+        assert not await paid.once()
+        async with place.provider():
+            assert (await contract.outcome()).success
+            await in_phase(robot, contract, Phase.FINALIZED)
+        assert await robot.parts.ledger.outbox(head=0) == []
+    assert await paid.once()
+
+
+async def test_a_finished_job_is_paid_after_a_restart(place: Place, paid: Paying) -> None:
+    said: list[str] = []
+    async with place.agent("person") as person:
+        async with speaking(obliging(place.agent("robot")), said) as robot:
+            contract = await made_by_a_provider_that_goes(place, person)
+            await in_phase(robot, contract, Phase.COMPLETE)
+        async with speaking(place.agent("robot"), said) as robot, place.provider():
+            outcome = await contract.outcome()
+            await in_phase(robot, contract, Phase.FINALIZED)
+            recording = await contract.recording()
+        assert cid_of_file(recording) == outcome.result
+    assert said == WORDS, "a finished job is not done again"
+    assert await paid.once()
+
+
+async def test_a_result_is_out_of_the_outbox_before_its_job_is_marked_as_finalized(place: Place) -> None:
+    """A crash between the two would else have it sent for ever: the block is handled again, the marked job skipped."""
+    ours = liability(promisor=place.address("robot"))
+    signed = result(liability=ours.address)
+
+    async with place.agent("robot", enable_executor=False) as robot:
+        ledger = robot.parts.ledger
+        await ledger.add_job(ours)
+        await ledger.complete(ours.address, success=True, result=signed.result, note="", outgoing=outgoing(signed))
+        refuse_to_finalize(robot.parts.directory / "ledger.sqlite")
+        with pytest.raises(sqlite3.IntegrityError, match="crash"):
+            await robot._working().finalized(ours.address, success=True, result=signed.result)
+        assert await ledger.outbox(head=0) == []
+        job = await ledger.job(ours.address)
+        assert job is not None
+        assert job.phase is Phase.COMPLETE
+
+
+async def test_a_payment_that_the_chain_took_back_is_asked_for_again(place: Place, paid: Paying) -> None:
+    said: list[str] = []
+    async with place.agent("person") as person, speaking(obliging(place.agent("robot")), said) as robot:
+        async with place.provider():
+            contract = await person.demand(words(place), cost=COST)
+            await in_phase(robot, contract, Phase.FINALIZED)
+            assert await paid.once()
+        await place.forget_blocks(1)
+        assert not await paid.once()
+        await in_phase(robot, contract, Phase.COMPLETE)
+        async with place.provider():
+            await in_phase(robot, contract, Phase.FINALIZED)
+        assert await robot.parts.ledger.outbox(head=0) == []
+    assert await paid.once()
+    assert said == WORDS
+
+
+async def test_an_end_without_a_result_of_ours_is_not_taken_back(place: Place) -> None:
+    ours = liability(promisor=place.address("robot"))
+    async with place.agent("robot") as robot:
+        await robot.parts.ledger.add_job(ours)
+        await robot.parts.ledger.set_phase(ours.address, Phase.FINALIZED)
+        await robot._working().taken_back(ours.address)
+        await robot._working().taken_back(liability("of somebody else").address)
+        assert [job.phase for job in await robot.parts.ledger.jobs(Phase)] == [Phase.FINALIZED]
+        assert await robot.parts.ledger.outbox(head=0) == []
+
+
+async def test_a_contract_that_is_made_again_elsewhere_is_one_job_and_paid_once(place: Place, paid: Paying) -> None:
+    """A reorganisation took the contract; the provider makes it again of the same orders, at another address."""
+    said: list[str] = []
+    async with place.agent("person") as person, place.provider():
+        async with obliging(place.agent("robot")) as robot:
+            contract = await person.demand(words(place), cost=COST)
+            first = contract.address
+            await in_phase(robot, contract, Phase.READY)
+            await place.forget_blocks(1)
+            await until(lambda: contract.address != first)
+            assert await robot.parts.ledger.job(first) is None
+            await in_phase(robot, contract, Phase.READY)
+        async with speaking(place.agent("robot"), said) as robot:
+            assert (await contract.outcome()).success
+            await in_phase(robot, contract, Phase.FINALIZED)
+    assert said == WORDS
+    assert await paid.once()
+
+
+def refuse_to_finalize(ledger: Path) -> None:
+    """Have SQLite fail when a job is marked, as a full disk or a crash would."""
+    database = sqlite3.connect(ledger)
+    database.execute(
+        "CREATE TRIGGER crash BEFORE UPDATE ON jobs WHEN NEW.phase = 'finalized'"
+        " BEGIN SELECT RAISE(ABORT, 'crash'); END"
+    )
+    database.close()
