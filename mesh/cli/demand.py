@@ -12,7 +12,7 @@ import click
 from mesh.cli.amounts import AMOUNT, XRT
 from mesh.cli.options import with_settings
 from mesh.cli.printing import print_json, say, with_json
-from mesh.errors import AiraError, ConfigurationError, InputError
+from mesh.errors import AiraError, ConfigurationError, InputError, RemoteError
 from mesh.running import run_to_end
 from mesh.settings import CHAIN_SETTINGS, NETWORK_SETTINGS
 from schemas import InvalidCid, parse_cid
@@ -70,8 +70,8 @@ class Amount(click.ParamType[str]):
 def command(settings: Settings, **order: Any) -> None:
     """Publish a Demand, wait for the contract, the work and the payment. Ctrl-C stops waiting; the contract goes on.
 
-    With --json one object is printed when the contract has ended, also if its recording (--out) can't be had; the
-    object then has an `error`, and the exit code is 1.
+    The exit code is 1 when it was not done and the money came back, and when the recording (--out) can't be had.
+    With --json one object is printed when the contract has ended, whichever way; it has an `error` if the code is 1.
     """
     run_to_end(lambda: _demand(settings, **order))
 
@@ -118,6 +118,9 @@ async def _ending(contract: Contract, out: Path | None, *, as_json: bool) -> Non
     if not as_json:
         say(f"{'paid' if outcome.success else 'refunded'}, result {outcome.result or 'none'}")
     failure: AiraError | None = None
+    if not outcome.success:
+        failure = RemoteError("the job was not done, and its cost came back", hint=_why(contract, outcome.result))
+        facts["error"] = str(failure)
     if out is not None:
         facts["recording"] = None
         try:
@@ -132,6 +135,13 @@ async def _ending(contract: Contract, out: Path | None, *, as_json: bool) -> Non
         say(f"recording {out}")
     if failure is not None:
         raise failure
+
+
+def _why(contract: Contract, result: str) -> str:
+    """Where to look for the reason."""
+    if result:
+        return f"its recording may say why: aira objective show {result}"
+    return f"it ended without a result: aira liability show {contract.address}"
 
 
 async def _keep(contract: Contract, out: Path) -> None:

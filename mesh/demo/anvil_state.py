@@ -1,5 +1,6 @@
 """A chain that anvil keeps in a file. It writes the file in place, again and again: who is killed at such a moment
-leaves half a chain. So the last whole one is kept beside it, and taken from there."""
+leaves half a chain. So the last whole one is kept beside it, and taken from there. A chain that was killed while its
+contracts were made holds half a market; it has nothing that anybody could miss, and is begun anew."""
 
 from __future__ import annotations
 
@@ -7,17 +8,20 @@ import asyncio
 import json
 import logging
 import os
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final, NoReturn
 
 from mesh.errors import ConfigurationError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 log = logging.getLogger(__name__)
 
 STATE_SECONDS: Final = 2
 """Between two savings of the state: what a power cut costs is at most two of these."""
+MADE: Final = "the contracts are made"
 
 
 def prepare_state(state: Path) -> None:
@@ -28,6 +32,10 @@ def prepare_state(state: Path) -> None:
     """
     try:
         state.parent.mkdir(parents=True, exist_ok=True)
+        if being_founded(state).exists():
+            log.warning("%s was cut off before its contracts were made and saved: the chain begins anew", state)
+            for file in (state, kept(state), being_founded(state)):
+                file.unlink(missing_ok=True)
         if not state.exists() or _is_chain(state.read_bytes()):
             return
         whole = kept(state).read_bytes() if kept(state).exists() else b""
@@ -50,9 +58,25 @@ async def keep_state(state: Path) -> NoReturn:
             raise ConfigurationError(f"can't keep the chain in {kept(state)}: {error.strerror}") from None
 
 
+@contextmanager
+def founding(state: Path | None) -> Iterator[None]:
+    """While the body makes the contracts, and until they are saved, a chain that ends is begun anew.
+
+    Raises `ConfigurationError` when that can't be written down.
+    """
+    _mark(state, "the contracts are being made\n")
+    yield
+    _mark(state, f"{MADE}, and not saved yet\n")
+
+
 def kept(state: Path) -> Path:
     """Where the last whole state is."""
     return state.with_name(f"{state.name}.kept")
+
+
+def being_founded(state: Path) -> Path:
+    """The file that is there until a chain with all its contracts is saved."""
+    return state.with_name(f"{state.name}.founding")
 
 
 def _keep(state: Path, seen: int) -> int:
@@ -60,7 +84,22 @@ def _keep(state: Path, seen: int) -> int:
     written = state.stat().st_mtime_ns if state.exists() else seen
     if written != seen and _is_chain(content := state.read_bytes()):
         _replace(kept(state), content)
+        _be_founded(being_founded(state), saved=written)
     return written
+
+
+def _mark(state: Path | None, words: str) -> None:
+    if state is not None:
+        try:
+            being_founded(state).write_text(words)
+        except OSError as error:
+            raise ConfigurationError(f"can't keep the chain in {state}: {error.strerror}") from None
+
+
+def _be_founded(mark: Path, *, saved: int) -> None:
+    """Remove the mark once the contracts are made and in what was `saved` (nanoseconds since the epoch)."""
+    if mark.exists() and mark.stat().st_mtime_ns < saved and mark.read_text().startswith(MADE):
+        mark.unlink()
 
 
 def _replace(path: Path, content: bytes) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from mesh.chain import NoContracts, serve_embedded, write_keyfile
 from mesh.demo.anvil import serve_anvil
+from mesh.demo.anvil_state import founding
 from mesh.demo.market import ROLES, Market, find_market, found_market
 from mesh.errors import ConfigurationError
 
@@ -116,7 +117,10 @@ async def _market_of(url: str, keys: tuple[bytes, ...], state: Path | None) -> M
         raise ConfigurationError(
             f"the chain in {state} has no market on it, and is not new", hint="name another file, or remove it"
         ) from None
-    return found or await found_market(url, keys)
+    if found is not None:
+        return found
+    with founding(state):
+        return await found_market(url, keys)
 
 
 def _write_keyfiles(folder: Path, private_keys: tuple[bytes, ...]) -> None:

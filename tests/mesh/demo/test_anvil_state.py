@@ -8,8 +8,10 @@ import pytest
 
 from mesh.chain import Account, Node, Sender
 from mesh.demo.anvil import serve_anvil
-from mesh.demo.anvil_state import kept, prepare_state
+from mesh.demo.anvil_state import being_founded, founding, kept, prepare_state
+from mesh.demo.development import serve_chain
 from mesh.errors import ConfigurationError
+from mesh.settings import Settings
 from tests.support.peers import require
 from tests.support.waiting import until
 
@@ -41,6 +43,27 @@ async def test_a_chain_whose_writing_was_cut_off_goes_on_from_the_last_whole_one
     ):
         assert await client.eth_balance(NOBODY) == 7
     assert "was cut off while it was written: the chain goes on from the last whole one" in caplog.text
+
+
+async def test_a_chain_that_was_killed_while_its_contracts_were_made_begins_anew(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    program, state = require("anvil"), tmp_path / "state.json"
+    settings = Settings(data_dir=str(tmp_path))
+    async with (
+        serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=state) as node,
+        Node(node.url) as client,
+    ):
+        await Sender(client, Account.from_key(node.funded_keys[0])).send(to=NOBODY, data=b"", value=7)
+        with pytest.raises(RuntimeError, match="killed"), founding(state):
+            raise RuntimeError("killed")
+    async with serve_chain(settings, host="127.0.0.1", port=0, block_time=None, anvil=program, state=state) as chain:
+        assert "cut off before its contracts were made and saved: the chain begins anew" in caplog.text
+        assert being_founded(state).exists()
+        await until(lambda: not being_founded(state).exists(), what="the contracts to be saved", seconds=30)
+        made = chain.market.deployment.lighthouse
+    async with serve_chain(settings, host="127.0.0.1", port=0, block_time=None, anvil=program, state=state) as chain:
+        assert chain.market.deployment.lighthouse == made
 
 
 def test_without_a_whole_copy_half_a_chain_is_one_clear_line_and_stays_as_it_is(tmp_path: Path) -> None:
