@@ -73,7 +73,7 @@ class Purse:
                 f"{shown}: gas for no transaction",
                 do="send it ETH if it is to agree to fees, or to call off jobs; to work and be paid it needs none",
             )
-        return broken(f"{shown}: gas for no transaction", do=f"send it {_amount(AMPLE * one, ETH)} or more for gas")
+        return broken(f"{shown}: gas for no transaction", do=f"send it {at_least(AMPLE * one, ETH)} or more for gas")
 
     async def check_tokens(self) -> Finding:
         """That there is something to pay with."""
@@ -139,6 +139,12 @@ def _amount(count: int, coin: Coin) -> str:
     whole, part = divmod(count, 10**coin.decimals)
     digits = f"{part:0{coin.decimals}}"[:DIGITS].rstrip("0") if coin.decimals else ""
     return f"{whole:,}{'.' if digits else ''}{digits} {coin.symbol}"
+
+
+def at_least(count: int, coin: Coin) -> str:
+    """So many of a coin's smallest unit, or a little more: what is shown is never too little."""
+    last = 10 ** max(0, coin.decimals - DIGITS)
+    return _amount(-(-count // last) * last, coin)
 
 
 def _is_read_by_others(path: Path) -> bool:

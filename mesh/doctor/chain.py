@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import time
-from contextlib import AsyncExitStack
 from email.utils import parsedate_to_datetime
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from mesh.chain import GWEI, Chain, FeePolicy, Node, Timing
-from mesh.chain.errors import NoContracts
+from mesh.chain.errors import NoContracts, RequestRefused
 from mesh.chain.recognition import is_ours
 from mesh.doctor.clock import RECENT, against_chain, against_node, spoken
 from mesh.doctor.findings import Finding, broken, doubtful, sound
 
 if TYPE_CHECKING:
-    from types import TracebackType
+    from collections.abc import Awaitable
+    from contextlib import AsyncExitStack
 
     from mesh.settings import Settings
+
+T = TypeVar("T")
 
 QUICK: Final = Timing(request_timeout=3.0, attempts=1)
 """A node that does not answer at once is a finding."""
@@ -25,16 +27,16 @@ DEVELOPMENT: Final = ("anvil", "eth-tester", "ethereumtester", "hardhat", "ganac
 
 
 class Ledgers:
-    """The nodes and the contracts that the settings name: `async with`, then its checks.
+    """The nodes and the contracts that the settings name, to be checked.
 
-    `check_chain` opens the nodes for the checks behind it, and `check_contracts` the contracts. `expected` is the
-    chain's number (EIP-155), 0 for any.
+    `check_chain` opens the nodes onto `stack` for the checks behind it, and `check_contracts` the contracts. `expected`
+    is the chain's number (EIP-155), 0 for any.
     """
 
-    def __init__(self, settings: Settings, *, expected: int = 0) -> None:
+    def __init__(self, settings: Settings, stack: AsyncExitStack, *, expected: int = 0) -> None:
         self._settings = settings
+        self._stack = stack
         self._expected = expected
-        self._stack = AsyncExitStack()
         fees = FeePolicy(ceiling=round(settings.max_fee_gwei * GWEI))
         self.node = Node(settings.node, timing=QUICK, fees=fees)
         self.chain = Chain(
@@ -46,21 +48,15 @@ class Ledgers:
             contracts=settings.contracts,
         )
 
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        await self._stack.aclose()
-
     async def check_node(self, endpoint: str) -> Finding:
         """That one node answers, has all blocks, and goes on. Raises `NodeUnreachable`."""
         async with Node(endpoint, timing=QUICK) as node:
-            client = str(await node.web3.client_version)
+            client = await _if_told(node.web3.client_version, otherwise="")
             block = await node.web3.eth.get_block("latest")
-            syncing: Any = await node.web3.eth.syncing
-            number, age = int(block["number"]), time.time() - int(block["timestamp"])
+            syncing = await _if_told(node.web3.eth.syncing, otherwise=False)
+            told = await _told_time(endpoint)
+            # By its own clock: ours may be wrong, which is for another check to say.
+            number, age = int(block["number"]), (time.time() if told is None else told) - int(block["timestamp"])
             if syncing:
                 return broken(
                     f"{endpoint} is not done with syncing: it is at block {number:,}",
@@ -72,7 +68,8 @@ class Ledgers:
                     do="is the node connected to others, and has it room on its disk? see its log",
                 )
             old = f"{spoken(max(age, 0))} old"
-            return sound(f"{endpoint} answers: chain {node.chain_id}, block {number:,}, {old}, {client}")
+            about = f"chain {node.chain_id}, block {number:,}, {old}"
+            return sound(f"{endpoint} answers: {about}{f', {client}' if client else ''}")
 
     async def check_chain(self) -> Finding:
         """That all nodes are on one chain, the right one. Raises `WrongChain`, `NodeUnreachable`."""
@@ -134,7 +131,24 @@ class Ledgers:
 
 
 async def check_node_clock(endpoint: str) -> Finding:
-    """The clock of the node's machine, as it says in its HTTP header, against this one. Raises `NodeUnreachable`."""
+    """The clock of the node's machine against this one."""
+    told = await _told_time(endpoint)
+    return sound("the node does not tell its time") if told is None else against_node(told, time.time())
+
+
+async def _if_told(asked: Awaitable[Any], *, otherwise: T) -> T:
+    """What a node answers; what is taken for it where it refuses to, as gateways do that know some methods only."""
+    try:
+        answer: T = await asked
+    except RequestRefused:
+        return otherwise
+    return answer
+
+
+async def _told_time(endpoint: str) -> float | None:
+    """The time of the node's machine, as it says in its HTTP header (seconds since 1970); None if it does not."""
+    if not endpoint.startswith("http"):
+        return None
     from aiohttp import ClientError, ClientSession, ClientTimeout
 
     request = {"jsonrpc": "2.0", "id": 1, "method": "eth_chainId", "params": []}
@@ -143,13 +157,9 @@ async def check_node_clock(endpoint: str) -> Finding:
             ClientSession(timeout=ClientTimeout(total=QUICK.request_timeout)) as session,
             session.post(endpoint, json=request) as answer,
         ):
-            told, now = answer.headers.get("Date", ""), time.time()
-    except (ClientError, OSError, TimeoutError):
-        return sound("the node does not tell its time")
-    try:
-        return against_node(parsedate_to_datetime(told).timestamp(), now)
-    except ValueError:
-        return sound("the node does not tell its time")
+            return parsedate_to_datetime(answer.headers.get("Date", "")).timestamp()
+    except (ClientError, OSError, TimeoutError, ValueError):
+        return None
 
 
 def nodes_of(settings: Settings) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 from mesh.doctor.findings import Finding, broken, of_error
 from mesh.errors import AiraError
+from mesh.network.crossing import call_in_loop
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
@@ -89,8 +90,7 @@ async def aside(function: Callable[..., T], *arguments: Any) -> T:
             result = function(*arguments)
         except BaseException as error:
             raised = error
-        if not loop.is_closed():
-            loop.call_soon_threadsafe(settle, result, raised)
+        call_in_loop(loop, settle, result, raised)
 
     threading.Thread(target=run, name=getattr(function, "__name__", "check"), daemon=True).start()
     return await outcome

@@ -6,6 +6,7 @@ import errno
 import os
 import pwd
 import shutil
+import stat
 import tempfile
 import time
 from typing import TYPE_CHECKING, Final
@@ -20,6 +21,7 @@ PROBE: Final = 64 * 1024
 LEAST: Final = 100 * 1024**2
 """Bytes without which ledger and recordings soon come to an end."""
 FULL: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+FORBIDDEN: Final = (errno.EACCES, errno.EPERM)
 SLOW: Final = 1.0
 """Seconds for a small file, beyond which a disk is not fit for a ledger that is synced at each step."""
 
@@ -34,7 +36,7 @@ def look_at_folder(folder: Path) -> Finding:
             probe.flush()
             os.fsync(probe.fileno())
     except OSError as error:
-        return _refused(there, error)
+        return _refused(folder, there, error)
     took = time.monotonic() - began
     if took > SLOW:
         return doubtful(
@@ -49,7 +51,7 @@ def look_at_folder(folder: Path) -> Finding:
 def look_at_room(folder: Path, *, content_limit: int, least: int = LEAST) -> Finding:
     """Whether the files, which may grow to `content_limit` bytes, have room, and there are `least` bytes free now."""
     free = shutil.disk_usage(_nearest(folder)).free
-    kept = sum(entry.stat().st_size for entry in folder.glob("*/content/*") if entry.is_file())
+    kept = sum(map(_size, folder.glob("*/content/*")))
     shown = f"{_gigabytes(free)} free, {_gigabytes(kept)} kept of at most {_gigabytes(content_limit)}"
     if free < least:
         return broken(f"{shown} in {folder}", do="free some space, or give --data-dir on another disk")
@@ -58,22 +60,37 @@ def look_at_room(folder: Path, *, content_limit: int, least: int = LEAST) -> Fin
     return sound(shown)
 
 
-def _refused(folder: Path, error: OSError) -> Finding:
+def _refused(folder: Path, there: Path, error: OSError) -> Finding:
+    """Why `there`, which is the folder or where it is to be made, takes no file."""
     if error.errno in FULL:
         return broken(
-            f"the disk of {folder} is full: {error.strerror}",
+            f"the disk of {there} is full: {error.strerror}",
             do="free some space there, or give --data-dir on another disk",
         )
-    owner, user = _owner(folder), _user(os.geteuid())
+    other = "give another folder with --data-dir"
+    if error.errno not in FORBIDDEN:
+        return broken(f"{there} can't be written: {error.strerror}", do=other)
+    user = os.geteuid()
+    # What is above the folder may be the system's, and is to stay so.
+    own = f"sudo chown -R {user} {folder}" if there == folder else f"sudo install -d -o {user} {folder}"
     return broken(
-        f"{folder} can't be written: {error.strerror}; it belongs to {owner}, and this is {user}",
-        do=f"sudo chown -R {user} {folder}, or give another folder with --data-dir",
+        f"{there} can't be written: {error.strerror}; it belongs to {_owner(there)}, and this is {_user(user)}",
+        do=f"{own}, or {other}",
     )
 
 
 def _nearest(folder: Path) -> Path:
-    """The folder, or the first one above it that there is."""
-    return next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    """The folder, or the first one above it that there is, as far as this user sees."""
+    return next(path for path in (folder, *folder.absolute().parents) if os.path.exists(path))
+
+
+def _size(path: Path) -> int:
+    """Bytes of a file; none of one that is deleted meanwhile, or that this user does not see."""
+    try:
+        about = path.stat()
+    except OSError:
+        return 0
+    return about.st_size if stat.S_ISREG(about.st_mode) else 0
 
 
 def _owner(path: Path) -> str:

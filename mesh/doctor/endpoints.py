@@ -15,7 +15,7 @@ from mesh.doctor.certificate import context_of, end_of, shown_by, texts_of
 from mesh.doctor.clock import SOON, days_left
 from mesh.doctor.findings import Finding, broken, doubtful, sound
 from mesh.network.endpoints import check_locators, tls_of
-from mesh.network.handshake import refusal
+from mesh.network.handshake import EVERYWHERE, refusal
 
 if TYPE_CHECKING:
     from mesh.doctor.case import Case
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 SECONDS: Final = 3.0
 """In which a router answers, or is taken for dead."""
 PLACE: Final = re.compile(r"(?P<kind>tcp|tls)/(?:\[(?P<six>[^\]]+)\]|(?P<host>[^:]+)):(?P<port>[0-9]+)")
-EVERYWHERE: Final = {"0.0.0.0": "127.0.0.1", "::": "::1"}
-"""Hosts to listen at, and where this machine reaches what listens there."""
+LOOPBACK: Final = dict(zip(EVERYWHERE, ("127.0.0.1", "::1"), strict=True))
+"""Where this machine reaches who listens everywhere."""
 OWN_FILES: Final = "give --tls-ca, --tls-certificate and --tls-key of its site; `aira identity show` tells of them"
 
 
@@ -37,7 +37,7 @@ def look_at(locator: str, settings: Settings) -> Finding:
     if place is None:
         return sound(f"{locator} can't be tried by itself; the session shows whether it answers")
     host, port = place["six"] or place["host"], int(place["port"])
-    host = EVERYWHERE.get(host, host)
+    host = LOOPBACK.get(host, host)
     try:
         socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     except (socket.gaierror, UnicodeError):
@@ -53,6 +53,12 @@ def look_at(locator: str, settings: Settings) -> Finding:
         return _unanswered(locator, error)
     answers = f"{locator} answers in {(time.monotonic() - began) * 1000:.1f} ms"
     return sound(answers) if place["kind"] == "tcp" else _shown(locator, tls_of(settings), (host, port), answers)
+
+
+def is_everywhere(locator: str) -> bool:
+    """Whether a router that listens there can't be asked by a name that its certificate has."""
+    place = PLACE.match(locator)
+    return place is not None and place["kind"] == "tls" and (place["six"] or place["host"]) in EVERYWHERE
 
 
 def look_at_certificate(case: Case) -> Finding:
@@ -88,7 +94,7 @@ def _shown(locator: str, tls: Tls | None, place: tuple[str, int], answers: str) 
         return broken(f"{locator}: the router wants to know who comes, and there is no certificate", do=OWN_FILES)
     if (why := refusal(tls, locator, SECONDS)) is not None:
         return broken(f"{locator}: {why}", do=f"is this router of the site of {tls.ca}? {OWN_FILES}")
-    certificate = _certificate_of(tls, place)
+    certificate = _certificate_of(tls, place, named=not is_everywhere(locator))
     if certificate is None:
         return broken(
             f"{locator}: something listens there that makes no handshake (TLS 1.3)",
@@ -99,9 +105,11 @@ def _shown(locator: str, tls: Tls | None, place: tuple[str, int], answers: str) 
     return _lasting(shown, end_of(certificate), whose="router")
 
 
-def _certificate_of(tls: Tls, place: tuple[str, int]) -> dict[str, Any] | None:
-    """The certificate that a router shows, which is of our site; None where there is none."""
+def _certificate_of(tls: Tls, place: tuple[str, int], *, named: bool) -> dict[str, Any] | None:
+    """The certificate that a router shows, which is of our site, and if it is `named` for that host; None where there
+    is none."""
     context = context_of(tls, ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname = named
     try:
         with (
             socket.create_connection(place, SECONDS) as connection,

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import secrets
 import time
-from contextlib import AsyncExitStack
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, NamedTuple, Self
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from mesh.doctor.clock import against_router
 from mesh.doctor.findings import Finding, broken, doubtful, sound
@@ -23,7 +22,7 @@ from mesh.network.endpoints import SECURE
 from schemas.chunks import address_chunk, lighthouse_chunk, name_chunk
 
 if TYPE_CHECKING:
-    from types import TracebackType
+    from contextlib import AsyncExitStack
 
     from mesh.doctor.case import Case
 
@@ -64,25 +63,17 @@ class Keys(NamedTuple):
 
 
 class Wire:
-    """Two sessions of a case's identity at one router: `async with Wire(case, locator)`, then its checks, of which the
-    first opens them."""
+    """Two sessions of a case's identity at the router of `locator`, to be checked; `check_session` opens them onto
+    `stack` for the checks behind it."""
 
-    def __init__(self, case: Case, locator: str) -> None:
+    def __init__(self, case: Case, locator: str, stack: AsyncExitStack) -> None:
         self._case = case
         self._locator = locator
         self._address = ANYBODY if case.identity is None else case.identity.address
         self._roles = case.shown_roles
         self._keys = Keys("", {})
-        self._stack = AsyncExitStack()
+        self._stack = stack
         self._pair: Pair | None = None
-
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        await self._stack.aclose()
 
     async def check_session(self) -> Finding:
         """That a session opens, and to which router. Raises `NetworkUnavailable`, `NotAdmitted`, `InvalidKey`."""

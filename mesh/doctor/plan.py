@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from mesh.doctor.checks import Check, aside
 from mesh.doctor.findings import of_error
-from mesh.errors import AiraError
+from mesh.errors import AiraError, ConfigurationError
 from mesh.settings import DEFAULTS
 
 if TYPE_CHECKING:
@@ -23,6 +23,14 @@ ELSEWHERE: Final = {"ipfs": "bridges.ipfs.check", "serial": "bridges.serial.chec
 """Modules of other worlds whose `checks(case)` are loaded by name, as imports go the other way."""
 
 
+class NoRouter(ConfigurationError):
+    """The settings name no router, or of a router nowhere to listen."""
+
+    def __init__(self, role: str) -> None:
+        option = "--listen" if role == "router" else "--connect"
+        super().__init__("the settings name no router", hint=f"give {option} tcp/127.0.0.1:7447, or another address")
+
+
 @asynccontextmanager
 async def checks_for(case: Case) -> AsyncIterator[list[Check]]:
     """The checks of a case, to be made before this ends: it closes what they have opened."""
@@ -31,21 +39,21 @@ async def checks_for(case: Case) -> AsyncIterator[list[Check]]:
         checks: list[Check] = []
         if "roster" in fields:
             checks.append(_roster(case))
-        checks += await _network(case, stack)
+        checks += _network(case, stack)
         if "chain" in fields:
-            checks += await _guarded("node", _chain(case, stack))
+            checks += _guarded("node", partial(_chain, case, stack))
         if "disk" in fields:
             checks += _disk(case)
         for field, module in ELSEWHERE.items():
             if field in fields:
-                checks += await _guarded(field, _elsewhere(module, case))
+                checks += _guarded(field, partial(_elsewhere, module, case))
         yield checks
 
 
-async def _guarded(name: str, planning: Awaitable[list[Check]]) -> list[Check]:
+def _guarded(name: str, plan: Callable[[], list[Check]]) -> list[Check]:
     """The checks of a field, or one that says why there are none: a package is missing, a setting can't be meant."""
     try:
-        return await planning
+        return plan()
     except (AiraError, ModuleNotFoundError) as error:
         return [Check(name, partial(_raise, error))]
 
@@ -60,25 +68,27 @@ def _roster(case: Case) -> Check:
     return Check("roster", partial(aside, look_at_roster, case))
 
 
-async def _network(case: Case, stack: AsyncExitStack) -> list[Check]:
-    from mesh.doctor.endpoints import look_at, look_at_certificate
+def _network(case: Case, stack: AsyncExitStack) -> list[Check]:
+    from mesh.doctor.endpoints import is_everywhere, look_at, look_at_certificate
 
+    if not case.connect:
+        return [Check("router", partial(_raise, NoRouter(case.role)))]
     certificate = [Check("certificate", partial(aside, look_at_certificate, case))] if case.has_identity else []
     needs = _each(*certificate)
     routers = [Check("router", partial(aside, look_at, locator, case.settings), needs) for locator in case.connect]
     sessions: list[Check] = []
     for locator, router in zip(case.connect, routers, strict=True):
-        sessions += await _at_router(case, locator, needs=(*needs, (router,)), stack=stack)
+        if is_everywhere(locator):
+            continue  # Zenoh opens none to a host that the certificate does not name
+        sessions += _at_router(case, locator, needs=(*needs, (router,)), stack=stack)
     return [*certificate, *routers, *sessions]
 
 
-async def _at_router(
-    case: Case, locator: str, *, needs: tuple[tuple[Check, ...], ...], stack: AsyncExitStack
-) -> list[Check]:
+def _at_router(case: Case, locator: str, *, needs: tuple[tuple[Check, ...], ...], stack: AsyncExitStack) -> list[Check]:
     """What is tried at one router; where there are several, each says which it is."""
     from mesh.doctor.network import Wire
 
-    wire = await stack.enter_async_context(Wire(case, locator))
+    wire = Wire(case, locator, stack)
     label = f"{locator}: " if len(case.connect) > 1 else ""
     session = Check("session", partial(_labelled, label, wire.check_session), needs)
     if case.role == "router":  # what it may do elsewhere is for the routers to which it links
@@ -97,11 +107,11 @@ async def _labelled(label: str, make: Callable[[], Awaitable[Finding]]) -> Findi
     return finding._replace(found=f"{label}{finding.found}")
 
 
-async def _chain(case: Case, stack: AsyncExitStack) -> list[Check]:
+def _chain(case: Case, stack: AsyncExitStack) -> list[Check]:
     from mesh.doctor.chain import Ledgers, check_node_clock, nodes_of
 
     settings = case.settings
-    ledgers = await stack.enter_async_context(Ledgers(settings, expected=case.chain_id))
+    ledgers = Ledgers(settings, stack, expected=case.chain_id)
     nodes = [Check("node", partial(ledgers.check_node, endpoint)) for endpoint in nodes_of(settings)]
     chain = Check("chain", ledgers.check_chain, needs=(tuple(nodes),))
     clocks = [
@@ -156,7 +166,7 @@ def _disk(case: Case) -> list[Check]:
     return [written, Check("disk space", partial(aside, room), needs=_each(written))]
 
 
-async def _elsewhere(module: str, case: Case) -> list[Check]:
+def _elsewhere(module: str, case: Case) -> list[Check]:
     found: list[Check] = import_module(module).checks(case)
     return found
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import zenoh
 
+from mesh.errors import RemoteError
 from mesh.network.crossing import call_in_loop
 
 if TYPE_CHECKING:
@@ -18,6 +19,8 @@ SECONDS: Final = 2.0
 """In which the router would have passed on what it heeds."""
 AGAIN: Final = 0.05
 """Seconds between two puts, or two looks."""
+MEASURED: Final = b"now"
+"""What is written to be timed: what was written before may come late."""
 GRACE: Final = 0.2
 """Seconds in which what was written before something that was heard must have come, too."""
 
@@ -46,13 +49,13 @@ class Pair:
             self._hear(declared, key, heard.put_nowait)
             if not await self._comes_through(key, heard):
                 return None
-            while not heard.empty():
-                heard.get_nowait()
             began = time.monotonic()
-            self._put(key)
+            self._put(key, MEASURED)
             try:
                 async with asyncio.timeout(SECONDS):
                     sample, at, now = await heard.get()
+                    while sample.payload.to_bytes() != MEASURED:
+                        sample, at, now = await heard.get()
             except TimeoutError:
                 return None
             if sample.timestamp is not None:
@@ -71,7 +74,7 @@ class Pair:
         """Those of the `foreign` keys at which the reader may hear, and those of them at which it does hear the writer.
 
         `own` is a key that the reader surely may hear, `barrier` one that the writer surely may write: when that was
-        heard, all that was written before has been heard, or never will be.
+        heard, all that was written before has been heard, or never will be. Raises `RemoteError` if it is not heard.
         """
         heard: set[str] = set()
         with ExitStack() as declared:
@@ -84,7 +87,11 @@ class Pair:
                 self._put(key)
             if barrier is not None:
                 self._put(barrier)
-                await _within(SECONDS, lambda: barrier in heard)
+                if not await _within(SECONDS, lambda: barrier in heard):
+                    raise RemoteError(
+                        f"what may be written did not come back within {SECONDS:g} s, so what may not tells nothing",
+                        hint="is the router overloaded, or the network? try again",
+                    )
                 await asyncio.sleep(GRACE)
             else:
                 await asyncio.sleep(SECONDS)
@@ -117,8 +124,8 @@ class Pair:
 
         declared.enter_context(self._reader.declare_subscriber(key, heard))
 
-    def _put(self, key: str) -> None:
-        self._writer.put(key, b"", congestion_control=zenoh.CongestionControl.BLOCK)
+    def _put(self, key: str, payload: bytes = b"") -> None:
+        self._writer.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
 
 def _is_matching(publisher: Any) -> bool:

@@ -17,5 +17,8 @@ def call_in_loop(
 
     It is called in `context`: what is logged knows whose it is, which Zenoh's threads do not.
     """
-    if not loop.is_closed():
+    try:
         loop.call_soon_threadsafe(function, *arguments, context=context)
+    except RuntimeError:
+        if not loop.is_closed():
+            raise

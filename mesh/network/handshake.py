@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 MAKE: Final = "`aira identity new` makes it"
 LOCATOR: Final = re.compile(r"tls/(?:\[(?P<six>[^\]]+)\]|(?P<host>[^:]+)):(?P<port>[0-9]+)")
+EVERYWHERE: Final = ("0.0.0.0", "::")
+"""Hosts at which a router listens for whoever comes by any of its names: no certificate is for one of these."""
 VERDICT: Final = 1.0
 """Seconds in which a router, after the handshake, says that it does not take the certificate."""
 ALERTS: Final = {
@@ -61,6 +63,7 @@ def refusal(tls: Tls, locator: str, seconds: float) -> str | None:
         return None
     host = place["six"] or place["host"]
     context = _context(tls, ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname = host not in EVERYWHERE
     try:
         with socket.create_connection((host, int(place["port"])), seconds) as connection:
             return _verdict(context, connection, host)

@@ -7,9 +7,14 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.mesh.cli.chains import Town
+from tests.mesh.doctor.wards import Ward
+from tests.support.sites import Site
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
+
+    from tests.support.routers import EmbeddedRouter
 
 
 @pytest.fixture(scope="module")
@@ -19,3 +24,14 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Town]:
         for file in (founded.folder / "password", *(person.keyfile for person in founded.people.values())):
             file.chmod(0o600)
         yield founded
+
+
+@pytest.fixture
+def ward(town: Town, router: EmbeddedRouter, tmp_path: Path) -> Ward:
+    return Ward(town, router.endpoint, tmp_path)
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Site:
+    (tmp_path / "one").mkdir()
+    return Site(tmp_path / "one")

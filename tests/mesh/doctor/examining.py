@@ -13,7 +13,9 @@ from mesh.settings import Settings
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from mesh.identity.folders import MemberFolder
     from mesh.network import Endpoints
+    from tests.support.sites import Site
 
 SECONDS = 60.0
 
@@ -63,3 +65,8 @@ def settings_of(endpoints: Endpoints, **options: Any) -> Settings:
     if tls is not None and tls.pair is not None:
         files |= {"tls_certificate": str(tls.certificate), "tls_key": str(tls.key)}
     return Settings(connect=endpoints.connect, **files, **options)
+
+
+def case_of(site: Site, folder: MemberFolder, **options: str) -> Case:
+    """An operator's case, of whom only the network matters, with the identity in a folder."""
+    return Case(settings=settings_of(site.client(folder), **options), asked_role="operator")

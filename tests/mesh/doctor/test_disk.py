@@ -20,10 +20,11 @@ if TYPE_CHECKING:
 AS_NOBODY = """
 import os, sys
 from pathlib import Path
-from mesh.doctor.disk import look_at_folder
+from mesh.doctor.disk import look_at_folder, look_at_room
+folder = Path(sys.argv[1])
 if os.geteuid() == 0:
     os.setgroups([]), os.setgid(65534), os.setuid(65534)
-print(*look_at_folder(Path(sys.argv[1])), sep="\\n")
+print(*{look}, sep="\\n")
 """
 
 
@@ -47,13 +48,41 @@ def test_a_folder_of_another_user_is_named_with_both_and_the_cure(tmp_path: Path
     for parent in tmp_path.parents:
         if parent.stat().st_uid == os.geteuid() and parent != parent.parent:
             parent.chmod(parent.stat().st_mode | 0o011)
-    done = run(sys.executable, "-c", AS_NOBODY, tmp_path)
+    done = run(sys.executable, "-c", AS_NOBODY.format(look="look_at_folder(folder)"), tmp_path)
 
     verdict, found, do = done.stdout.splitlines()
     assert verdict == "Verdict.FAIL", done.stderr
     assert f"{tmp_path} can't be written: Permission denied; it belongs to " in found
     assert do.startswith("sudo chown -R ")
     assert "--data-dir" in do
+
+
+def test_what_is_above_a_folder_that_is_yet_to_be_made_stays_whose_it_is(tmp_path: Path) -> None:
+    folder = tmp_path / "aira" / "state"
+    for parent in tmp_path.parents:
+        if parent.stat().st_uid == os.geteuid() and parent != parent.parent:
+            parent.chmod(parent.stat().st_mode | 0o011)
+    for mode in (0o555, 0o500):
+        tmp_path.chmod(mode)
+        done = run(sys.executable, "-c", AS_NOBODY.format(look="look_at_folder(folder)"), folder)
+        _, found, do = done.stdout.splitlines()
+        assert f"{tmp_path} can't be written: Permission denied" in found
+        assert do.startswith("sudo install -d -o ")
+        assert do.endswith(f" {folder}, or give another folder with --data-dir")
+
+
+def test_files_that_this_user_does_not_see_are_not_counted(tmp_path: Path) -> None:
+    store = tmp_path / "0xAb" / "content"
+    store.mkdir(parents=True)
+    (store / "Qm").write_bytes(bytes(16))
+    (store / "dangling").symlink_to(tmp_path / "nowhere")
+    store.chmod(0o744)
+    for folder in (tmp_path, *tmp_path.parents):
+        if folder.stat().st_uid == os.geteuid() and folder != folder.parent:
+            folder.chmod(folder.stat().st_mode | 0o055)
+    done = run(sys.executable, "-c", AS_NOBODY.format(look="look_at_room(folder, content_limit=1)"), tmp_path)
+
+    assert done.stdout.splitlines()[:1] == ["Verdict.OK"], done.stderr
 
 
 async def test_a_data_dir_that_is_a_file_is_named(tmp_path: Path) -> None:
@@ -63,7 +92,8 @@ async def test_a_data_dir_that_is_a_file_is_named(tmp_path: Path) -> None:
         found = await examined(Case(settings=settings, asked_role="bridge"))
 
     assert "data folder" in found.failed
-    assert "can't be written: Not a directory" in found.one("data folder").found
+    assert found.one("data folder").found.endswith("can't be written: Not a directory")
+    assert found.one("data folder").do == "give another folder with --data-dir"
     assert "disk space" not in found
 
 

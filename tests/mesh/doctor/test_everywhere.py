@@ -1,0 +1,67 @@
+"""A router that listens on every address of its machine: asked as itself, by none of its certificate's names."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+import zenoh
+from msgspec.structs import replace
+
+from mesh.doctor import Case
+from mesh.identity import Member
+from mesh.identity.routers import router_endpoints
+from mesh.settings import Settings
+from tests.mesh.doctor.examining import examined
+from tests.support.sites import Site
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mesh.doctor.case import Role
+
+HOSTS = pytest.mark.parametrize("hosts", [("127.0.0.1",), ("router.site.example",)])
+
+
+def settings_everywhere(site: Site, hosts: tuple[str, ...]) -> Settings:
+    """Those of a router that others know by `hosts`, and that listens on every address."""
+    site.enlist(Member(name="arm", address="0x" + "0a" * 20, roles=("agent",)))
+    router = site.certify("everywhere", "0x" + "98" * 20, "router", hosts=hosts)
+    listen = (f"tls/0.0.0.0:{site.port}",)
+    return replace(site.settings(), listen=listen, tls_certificate=str(router.certificate), tls_key=str(router.key))
+
+
+@HOSTS
+async def test_a_router_on_every_address_is_sound(site: Site, hosts: tuple[str, ...]) -> None:
+    settings = settings_everywhere(site, hosts)
+    session = zenoh.open(router_endpoints(settings).config())
+    try:
+        found = await examined(Case(settings=settings))
+    finally:
+        session.close()  # type: ignore[no-untyped-call]
+
+    assert found.failed == [], dict(found)
+    assert "takes our certificate and shows that of everywhere" in found.one("router").found
+
+
+async def test_a_router_of_a_foreign_site_on_every_address_is_named(site: Site, tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    other = Site(tmp_path / "other")
+    settings = settings_everywhere(site, ("127.0.0.1",))
+    foreign = replace(settings_everywhere(other, ("127.0.0.1",)), listen=settings.listen)
+    session = zenoh.open(router_endpoints(foreign).config())
+    try:
+        found = await examined(Case(settings=settings))
+    finally:
+        session.close()  # type: ignore[no-untyped-call]
+
+    assert "is not to be trusted" in found.cause("router")
+
+
+@pytest.mark.parametrize(("role", "option"), [("operator", "--connect"), ("edge", "--connect"), ("router", "--listen")])
+async def test_settings_without_a_router_are_named(role: Role, option: str) -> None:
+    found = await examined(Case(settings=Settings(connect=(), listen=()), asked_role=role))
+
+    finding = found.one("router")
+    assert (finding.ok, finding.found) == (False, "the settings name no router")
+    assert option in finding.do

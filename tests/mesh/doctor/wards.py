@@ -1,0 +1,42 @@
+"""A chain with contracts and people, of whom one is examined."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from mesh.doctor import Case
+from mesh.settings import Settings
+from tests.mesh.cli.chains import PASSWORD, Town
+from tests.mesh.doctor.examining import Found, examined
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mesh.doctor.case import Role
+
+
+class Ward:
+    """Where the town's people are examined: with a router, and folders of their own."""
+
+    def __init__(self, town: Town, endpoint: str, folder: Path) -> None:
+        self.town = town
+        self.endpoint = endpoint
+        self.folder = folder
+
+    def settings(self, who: str = "", **options: Any) -> Settings:
+        named: dict[str, Any] = {
+            "connect": (self.endpoint,),
+            "web3_http_provider": self.town.url,
+            "data_dir": str(self.folder),
+        }
+        if who:
+            (self.folder / "password").write_text(PASSWORD + "\n")
+            (self.folder / "password").chmod(0o600)
+            named |= {
+                "keyfile": str(self.town.people[who].keyfile),
+                "keyfile_password_file": str(self.folder / "password"),
+            }
+        return Settings(**(named | options))
+
+    async def examined(self, role: Role | None, who: str = "", *, chain_id: int = 0, **options: Any) -> Found:
+        return await examined(Case(settings=self.settings(who, **options), asked_role=role, chain_id=chain_id))
