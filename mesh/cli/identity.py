@@ -12,7 +12,7 @@ from mesh.cli.options import with_settings
 from mesh.cli.printing import print_facts, print_json, visible, with_json
 from mesh.errors import AiraError, ConfigurationError, InputError
 from mesh.identity.roles import ROLES
-from mesh.running import fail, run_to_end
+from mesh.running import fail, run_to_end, tell
 from mesh.settings import NETWORK_SETTINGS
 
 if TYPE_CHECKING:
@@ -108,7 +108,8 @@ def renew(
     there.
 
     Sessions go on: they take the new one when they connect the next time. With --within it is for a timer: what lasts
-    longer is left as it is. When one fails, the others are renewed all the same. --json prints an object a FOLDER.
+    longer is left as it is. When one fails, the others are renewed all the same. With --roster nobody who was revoked
+    gets a new one. --json prints an object a FOLDER.
     """
     failed: AiraError | None = None
     for folder in folders:
@@ -117,7 +118,9 @@ def renew(
             is_due = within is None or before.left < timedelta(days=within)
             facts = _renew(folder, _site(site), days, roster) if is_due else before
         except AiraError as error:
-            failed = failed or error
+            if failed is not None:
+                tell(failed)
+            failed = error
             continue
         if is_due or as_json:
             _print(facts, as_json)
@@ -191,12 +194,13 @@ def _renew(folder: Path, site: SiteFolder, days: float, roster: Path | None) -> 
     from mesh.identity.roster_file import with_fingerprint, write_roster
 
     member = _member(folder)
-    before = member.facts().fingerprint
+    before: Facts = member.facts()
+    address, old = before.holder.address, before.fingerprint
     if roster is not None:
-        with_fingerprint(roster, before, before)  # raises where the member is not in it
+        with_fingerprint(roster, address, old=old, new=old)  # raises for who may have none
     facts: Facts = member.renew(site=site, days=days)
     if roster is not None:
-        write_roster(roster, with_fingerprint(roster, before, facts.fingerprint))
+        write_roster(roster, with_fingerprint(roster, address, old=old, new=facts.fingerprint))
     return facts
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 from typing import TYPE_CHECKING
 
 from mesh.errors import ConfigurationError
 from mesh.identity.errors import RosterError
-from mesh.identity.roster import Roster, entry_of, roster_from
+from mesh.identity.roster import entry_of, roster_from
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -25,16 +26,25 @@ def with_member(path: Path, member: Member) -> str:
     return text
 
 
-def with_fingerprint(path: Path, old: str, new: str) -> str:
-    """The text of the roster with a renewed certificate's fingerprint in place of the old one's.
+def with_fingerprint(path: Path, address: str, *, old: str, new: str) -> str:
+    """The text of the roster with the fingerprint of a renewed certificate in place of the old one's; as it is, where
+    it names none of this member.
 
-    Raises `RosterError` if nobody has the old one.
+    Raises `RosterError` where he may have no new one: he is not in it, was revoked, or has another certificate there.
     """
     before = _text(path)
-    roster: Roster = roster_from(before, where=str(path))
-    if old not in (member.fingerprint for member in roster.member) or old not in before:
-        raise RosterError(str(path), f"no member has the certificate with the fingerprint {old}")
-    return before.replace(old, new)
+    member = roster_from(before, where=str(path)).find(address)
+    if member is None:
+        raise RosterError(str(path), f"no member has the address {address}")
+    where = f"{path}, member {member.name!r}"
+    if member.revoked:
+        raise RosterError(
+            where, "it is revoked, so its certificate is not renewed", hint="delete the folder of its certificate"
+        )
+    if member.fingerprint not in ("", old):
+        hint = "is this folder an old one? If the roster is what is old, write this fingerprint there"
+        raise RosterError(where, f"it has another certificate than the one with the fingerprint {old}", hint=hint)
+    return re.sub(":?".join(re.findall("..", old)), new, before, flags=re.IGNORECASE)
 
 
 def write_roster(path: Path, text: str) -> None:
@@ -42,7 +52,10 @@ def write_roster(path: Path, text: str) -> None:
     fresh = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        fresh.write_text(text, encoding="utf-8")
+        with fresh.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
         if path.exists():
             fresh.chmod(path.stat().st_mode & 0o777)
         fresh.replace(path)

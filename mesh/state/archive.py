@@ -33,6 +33,8 @@ ABOUT: Final = "state.json"
 CHECKSUMS: Final = "checksums.json"
 LARGEST_TEXT: Final = 64 << 20
 """Bytes that `state.json` and `checksums.json` have at most: a quarter of a million files."""
+DIGITS: Final = 64
+"""Of a SHA-256 in `checksums.json`."""
 PIECE: Final = 1 << 20
 """Bytes read and written at once."""
 
@@ -76,7 +78,9 @@ class ArchiveWriter:
 
     def __enter__(self) -> Self:
         try:
-            descriptor = os.open(self._temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+            with suppress(FileNotFoundError):
+                self._temporary.unlink()  # in a folder of all, such as /tmp, what is there may be a stranger's
+            descriptor = os.open(self._temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         except OSError as error:
             raise ConfigurationError(f"can't write {self._path}: {error.strerror}") from None
         self._file = os.fdopen(descriptor, "wb")
@@ -112,7 +116,13 @@ class ArchiveWriter:
         self._sums[name] = digest.hexdigest()
 
     def _finish(self) -> None:
-        self._add_text(CHECKSUMS, msgspec.json.encode(self._sums))
+        sums = msgspec.json.encode(self._sums)
+        if len(sums) > LARGEST_TEXT:
+            raise ConfigurationError(
+                f"{len(self._sums):,} files are more than a backup can list",
+                hint="leave content out that is fetched again anyway: --content needed, or none",
+            )
+        self._add_text(CHECKSUMS, sums)
         self._stream.write(bytes(2 * tarfile.BLOCKSIZE))
         self._stream.close()  # type: ignore[no-untyped-call]
         self._file.flush()
@@ -150,10 +160,13 @@ def read_archive(path: Path, keep: Keep) -> About:
     Names are those of a state and no others, each once. Raises `ArchiveUnusable`; what was kept is then worth nothing.
     """
     with _Reading(path) as reading:
-        about, sums = reading.about(), {}
+        about, sums, listed = reading.about(), {}, 0
         while (header := reading.header()).name != CHECKSUMS:
             if part_of(header.name) not in about.parts or header.name in sums:
                 raise ArchiveUnusable(path, f"it holds {header.name[:200]!r}, which is no part of a state")
+            listed += len(header.name) + DIGITS
+            if listed > LARGEST_TEXT:
+                raise ArchiveUnusable(path, "it holds more files than its checksums could list")
             with keep(header.name, header.size) as sink:
                 sums[header.name] = reading.copy(header.size, sink)
         text = reading.text(header)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 from mesh.errors import ConfigurationError
 from mesh.state.errors import StateInUse
 from mesh.work import Ledger
-from mesh.work.ledger import VERSION, LedgerUnusable
+from mesh.work.database import VERSION, LedgerUnusable
 from mesh.work.lifecycle import UNFINISHED
 from schemas import Demand, Offer, decode
 
@@ -23,6 +23,11 @@ if TYPE_CHECKING:
 
     from mesh.work import Job
 
+ACTIVE: Final = (
+    "SELECT CASE type WHEN 'table' THEN 'virtual table' ELSE type END FROM sqlite_master"
+    " WHERE type IN ('view', 'trigger') OR sql LIKE 'CREATE VIRTUAL%'"
+)
+"""What would do something when a stranger's ledger is read or written."""
 CURSOR: Final = "listener"
 """`mesh.work.Listener.NAME`, whose module loads web3."""
 
@@ -58,13 +63,16 @@ def copy_ledger(ledger: Path, copy: Path) -> None:
 
 
 def check_ledger(ledger: Path) -> None:
-    """Raise `LedgerUnusable` for a ledger that is damaged, `ConfigurationError` for one of a newer version."""
+    """Raise `LedgerUnusable` for a ledger that is damaged or more than tables, `ConfigurationError` for one of a newer
+    version."""
     try:
         with closing(sqlite3.connect(ledger)) as database:
             (found,) = database.execute("PRAGMA integrity_check(1)").fetchone()
             if found != "ok":
                 raise LedgerUnusable(ledger, found)
             _check_version(database, ledger)
+            if (kind := database.execute(ACTIVE).fetchone()) is not None:
+                raise LedgerUnusable(ledger, f"it holds a {kind[0]}, as no ledger does")
     except sqlite3.Error as error:
         raise LedgerUnusable(ledger, error) from None
 

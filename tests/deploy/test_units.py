@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pwd
 import re
 import shlex
 import shutil
@@ -145,6 +146,39 @@ def test_a_unit_says_nothing_that_the_common_file_says_otherwise(unit: str) -> N
     common = {line.partition("=")[0] for line in lines((UNITS / "aira-.service.d/10-every-service.conf").read_text())}
     own = {line.partition("=")[0] for line in lines((UNITS / unit).read_text())}
     assert own & common <= {"Environment", "After", "Wants"}
+
+
+def test_a_renewal_that_fails_waits_for_its_timer() -> None:
+    """The common file has services started again after some seconds, for ever."""
+    common, own = (UNITS / folder for folder in ("aira-.service.d", "aira-identity-renew.service.d"))
+    read = [line for path in (*sorted(common.iterdir()), *sorted(own.iterdir())) for line in lines(path.read_text())]
+    said = [line for line in read if line.startswith("Restart=")]
+    assert len(said) == 2
+    assert said[-1] == "Restart=no"
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="files are given to another user")
+def test_what_root_makes_in_a_state_belongs_to_its_service(tmp_path: Path) -> None:
+    state, elsewhere = tmp_path / "lib/arm", tmp_path / "elsewhere"
+    state.mkdir(parents=True)
+    elsewhere.touch()
+    (state / "link").symlink_to(elsewhere)
+    program = tmp_path / "aira"
+    program.write_text('#!/bin/sh\necho x > "$AIRA_DATA_DIR/made"\nexit 3\n')
+    program.chmod(0o755)
+    changes = {"/opt/aira/bin/aira": str(program), "/var/lib/aira": str(tmp_path / "lib"), "aira:aira": "daemon:daemon"}
+    script = (UNITS / "aira-as").read_text()
+    for text, here in changes.items():
+        assert text in script
+        script = script.replace(text, here)
+
+    done = subprocess.run(["sh", "-c", script, "aira-as", "arm", "state", "restore"], capture_output=True, text=True)
+
+    assert (done.returncode, done.stderr) == (3, "")
+    made = (state / "made").stat()
+    assert made.st_uid == pwd.getpwnam("daemon").pw_uid
+    assert made.st_mode & 0o777 == 0o600
+    assert elsewhere.stat().st_uid == 0
 
 
 def test_the_installer_writes_no_file_of_yours_over(machine: Path) -> None:

@@ -46,6 +46,27 @@ def test_one_that_can_t_be_renewed_does_not_hold_up_the_others(tmp_path: Path, s
     assert "89 days left" in done.stdout
 
 
+def test_the_revoked_are_not_renewed_and_each_failure_is_told(tmp_path: Path, site: Path) -> None:
+    """The roster shuts an address out; a new certificate for it would outlive the day on which it is let in again."""
+    roster = tmp_path / "roster.toml"
+    for name, address in (("gone", ARM), ("leg", OTHER)):
+        made(
+            tmp_path / name, site, "--address", address, "--role", "agent", "--days", "1", "--roster", roster, name=name
+        )
+    roster.write_text(roster.read_text().replace('name = "gone"', 'name = "gone"\nrevoked = true'))
+    before = (tmp_path / "gone" / "identity.pem").read_bytes()
+
+    folders = [tmp_path / "nobody", tmp_path / "gone", tmp_path / "leg"]
+    done = aira("identity", "renew", *folders, "--site", site, "--roster", roster, "--within", "30")
+
+    assert done.returncode == 2
+    assert "nobody/identity.pem: it can't be read" in done.stderr
+    assert "member 'gone': it is revoked, so its certificate is not renewed" in done.stderr
+    assert (tmp_path / "gone" / "identity.pem").read_bytes() == before
+    assert "89 days left" in done.stdout
+    assert [member.revoked for member in read_roster(roster).member] == [True, False]
+
+
 def test_a_certificate_is_renewed_where_its_key_is_not(tmp_path: Path, site: Path) -> None:
     """The site's key stays with the site, and the member's with the member: only certificates travel."""
     folder = tmp_path / "arm"

@@ -116,13 +116,36 @@ def test_members_are_added_without_touching_what_is_there(tmp_path: Path) -> Non
     write_roster(file, with_member(file, arm))
     file.write_text("# ours\n" + file.read_text().rstrip("\n"))
     write_roster(file, with_member(file, Member(name="two", address=OTHER, roles=("watcher",))))
-    write_roster(file, with_fingerprint(file, "ab" * 32, "cd" * 32))
+    write_roster(file, with_fingerprint(file, ARM, old="ab" * 32, new="cd" * 32))
 
     assert file.read_text().startswith("# ours\n[[member]]\n")
     assert [(one.name, one.fingerprint) for one in read_roster(file).member] == [("arm", "cd" * 32), ("two", "")]
     assert [path.name for path in file.parent.iterdir()] == ["roster.toml"]
-    with pytest.raises(RosterError, match="no member has the certificate"):
-        with_fingerprint(file, "ab" * 32, "ef" * 32)
+    with pytest.raises(RosterError, match="member 'arm': it has another certificate than the one"):
+        with_fingerprint(file, ARM, old="ab" * 32, new="ef" * 32)
+
+
+def test_a_fingerprint_is_replaced_however_it_is_written(tmp_path: Path) -> None:
+    file = tmp_path / "roster.toml"
+    arm = Member(name="arm", address=ARM, roles=("agent",), fingerprint="ab" * 32)
+    write_roster(file, entry_of(arm).replace("ab" * 32, ":".join(["AB"] * 32)))
+
+    write_roster(file, with_fingerprint(file, ARM, old="ab" * 32, new="cd" * 32))
+
+    assert [one.fingerprint for one in read_roster(file).member] == ["cd" * 32]
+
+
+def test_a_member_without_a_fingerprint_is_renewed_and_a_revoked_one_or_a_stranger_is_not(tmp_path: Path) -> None:
+    file = tmp_path / "roster.toml"
+    write_roster(file, entry_of(Member(name="arm", address=ARM, roles=("agent",))))
+    before = file.read_text()
+
+    assert with_fingerprint(file, ARM, old="ab" * 32, new="cd" * 32) == before
+    with pytest.raises(RosterError, match=f"no member has the address {OTHER}"):
+        with_fingerprint(file, OTHER, old="ab" * 32, new="cd" * 32)
+    file.write_text(before + "revoked = true\n")
+    with pytest.raises(RosterError, match="member 'arm': it is revoked, so its certificate is not renewed"):
+        with_fingerprint(file, ARM, old="ab" * 32, new="cd" * 32)
 
 
 def test_the_revoked_are_not_admitted() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import shutil
 import tarfile
 import tracemalloc
@@ -12,7 +13,9 @@ from typing import TYPE_CHECKING
 import pytest
 import zstandard
 
+from mesh.errors import ConfigurationError
 from mesh.state import ArchiveUnusable, Extent, back_up, examine_archive, restore, restoring
+from mesh.state import archive as archives
 from tests.mesh.state.conftest import ADDRESS, CHAIN, Folder, forge, members, names_in, unpacked
 
 if TYPE_CHECKING:
@@ -20,6 +23,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     Members = list[tuple[tarfile.TarInfo, bytes]]
+
+CID = "Qm" + "1" * 44
 
 
 @pytest.fixture
@@ -108,6 +113,39 @@ async def test_more_than_the_disk_has_is_refused_at_its_header(
 
     monkeypatch.setattr(restoring, "SPARE", shutil.disk_usage(tmp_path).free - (4 << 30))
     assert "more room than the disk has" in await refused(forge(archive, tmp_path / "forged", change), tmp_path)
+
+
+async def test_more_files_than_the_checksums_could_list_are_refused_before_their_end(
+    archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Empty ones cost a forger a few bits each, and the disk a name."""
+
+    def change(members: Members) -> None:
+        del members[-1]
+        members += [(tarfile.TarInfo(f"{ADDRESS}/content/.pins/{CID}/{number}"), b"") for number in range(100)]
+
+    forged = forge(archive, tmp_path / "forged", change)
+    monkeypatch.setattr(archives, "LARGEST_TEXT", 10_000)
+    assert "more files than its checksums could list" in await refused(forged, tmp_path)
+
+
+async def test_a_backup_that_could_not_be_read_again_is_not_made(
+    folder: Folder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(archives, "LARGEST_TEXT", 500)
+    with pytest.raises(ConfigurationError, match="files are more than a backup can list"):
+        await back_up(folder.path, tmp_path / "it", content=Extent.ALL)
+    assert names_in(tmp_path) == ["data"]
+
+
+async def test_a_file_that_a_stranger_put_in_the_way_gets_nothing(folder: Folder, tmp_path: Path) -> None:
+    """In a folder of all, such as /tmp: under the name that the backup has until it is whole."""
+    prepared = tmp_path / f".it.{os.getpid()}"
+    prepared.touch(mode=0o666)
+    with prepared.open("rb") as kept_open:
+        await back_up(folder.path, tmp_path / "it", content=Extent.NONE)
+        assert kept_open.read() == b""
+    assert (tmp_path / "it").stat().st_mode & 0o777 == 0o600
 
 
 def changed(archive: Path, forged: Path, place: float) -> Path:

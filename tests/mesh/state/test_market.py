@@ -11,9 +11,9 @@ from mesh.state import Extent, back_up, restore
 from mesh.work import Phase
 from mesh.work.listener import Listener
 from schemas import String
-from tests.support.market import obliging
+from tests.support.market import in_phase, obliging
 from tests.support.objectives import objective
-from tests.support.waiting import until, until_found
+from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -60,14 +60,6 @@ async def ask(place: Place, person: Agent, name: str) -> Contract:
     return await person.demand(place.save(words, f"{name}.mcap"), cost=COST)
 
 
-async def in_phase(robot: Agent, address: str, phase: Phase) -> None:
-    async def reached() -> bool:
-        job = await robot.parts.ledger.job(address)
-        return job is not None and job.phase is phase
-
-    await until_found(reached, what=phase)
-
-
 async def recorded(contract: Contract) -> list[str]:
     recording = open_objective(await contract.recording())
     return [String.decode(message.payload).data for message in recording.messages() if message.topic == "/said"]
@@ -105,8 +97,8 @@ async def test_after_a_restore_every_job_ends_once(place: Place) -> None:
         robot.stuck(at="")
         async with robot.life() as life:
             assert (await fourth.outcome()).success
-            await in_phase(life, fourth.address, Phase.FINALIZED)
-            await in_phase(life, second.address, Phase.FINALIZED)
+            await in_phase(life, fourth, Phase.FINALIZED)
+            await in_phase(life, second, Phase.FINALIZED)
             assert [one.kind for one in await life.parts.ledger.outbox(head=0)] == []
             assert len(await life.parts.ledger.jobs(Phase)) == 3, "the third had ended before the agent heard of it"
             assert await recorded(fourth) == [f"fourth {step}" for step in STEPS]
@@ -136,7 +128,7 @@ async def test_what_was_paid_since_the_backup_is_not_played_however_slowly_the_c
 
     monkeypatch.setattr(Listener, "run", never)
     async with robot.life() as life:
-        await in_phase(life, contract.address, Phase.FINALIZED)
+        await in_phase(life, contract, Phase.FINALIZED)
         await life._working().executor.opened()
     assert robot.said == [f"only {step}" for step in STEPS]
 
@@ -170,7 +162,7 @@ async def test_a_signed_result_is_sent_by_the_restored_agent_as_it_was(place: Pl
                 robot.stuck(at="only 0")
                 contract = await ask(place, person, "only")
             robot.released.set()
-            await in_phase(life, contract.address, Phase.COMPLETE)
+            await in_phase(life, contract, Phase.COMPLETE)
             signed = await life.parts.ledger.outbox(head=0)
             await back_up(disk, archive, content=Extent.NEEDED)
         lose(disk)
@@ -179,7 +171,7 @@ async def test_a_signed_result_is_sent_by_the_restored_agent_as_it_was(place: Pl
             assert await life.parts.ledger.outbox(head=0) == signed
             async with place.provider():
                 outcome = await contract.outcome()
-            await in_phase(life, contract.address, Phase.FINALIZED)
+            await in_phase(life, contract, Phase.FINALIZED)
             job = await life.parts.ledger.job(contract.address)
             assert job is not None
             assert job.result == outcome.result

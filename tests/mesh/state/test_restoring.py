@@ -7,9 +7,10 @@ import fcntl
 import hashlib
 import json
 import os
+import sqlite3
 import subprocess
 import sys
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING
 
 import pytest
@@ -19,7 +20,7 @@ from mesh.content import Store
 from mesh.errors import ConfigurationError
 from mesh.state import ArchiveUnusable, Existing, Extent, StateExists, StateInUse, back_up, restore, restoring
 from mesh.work import Ledger, Phase
-from mesh.work.ledger import VERSION, LedgerUnusable
+from mesh.work.database import VERSION, LedgerUnusable
 from schemas import cid_of_bytes
 from tests.mesh.state.conftest import ADDRESS, CHAIN, JOB, NONCE, OBJECTIVE, Folder, forge, members, names_in
 from tests.mesh.work.ledgers import mark_as_version
@@ -200,6 +201,27 @@ async def test_a_newer_ledger_is_not_backed_up(folder: Folder, tmp_path: Path) -
 async def test_a_ledger_that_is_none_is_refused(archive: Path, tmp_path: Path, data: bytes) -> None:
     with pytest.raises((LedgerUnusable, ArchiveUnusable)):
         await restore(forge_ledger(archive, tmp_path / "forged", data), tmp_path / "new")
+    assert names_in(tmp_path / "new") == []
+
+
+@pytest.mark.parametrize(
+    ("statement", "kind"),
+    [
+        ("CREATE VIEW more AS SELECT 1", "view"),
+        ("CREATE TRIGGER more AFTER INSERT ON jobs BEGIN DELETE FROM outbox; END", "trigger"),
+        ("CREATE VIRTUAL TABLE more USING fts5(words)", "virtual table"),
+    ],
+)
+async def test_a_ledger_that_does_something_when_it_is_used_is_refused(
+    archive: Path, tmp_path: Path, statement: str, kind: str
+) -> None:
+    ledger = tmp_path / "active.sqlite"
+    ledger.write_bytes(members(archive)[f"{ADDRESS}/{CHAIN}/ledger.sqlite"])
+    with closing(sqlite3.connect(ledger)) as database:
+        database.execute(statement)
+        database.commit()
+    with pytest.raises(LedgerUnusable, match=f"it holds a {kind}, as no ledger does"):
+        await restore(forge_ledger(archive, tmp_path / "forged", ledger.read_bytes()), tmp_path / "new")
     assert names_in(tmp_path / "new") == []
 
 
