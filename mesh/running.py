@@ -47,20 +47,26 @@ def run_until_stopped(
 
 
 def fail(error: AiraError) -> NoReturn:
-    """Say what is wrong and what to do in a line each, and exit: 2 for what the caller gave, 1 for the rest.
+    """Say what is wrong, and exit: 2 for what the caller gave, 1 for the rest."""
+    tell(error)
+    sys.exit(2 if isinstance(error, InputError | ConfigurationError) else 1)
+
+
+def tell(error: AiraError) -> None:
+    """Say what is wrong and what to do in a line each, without what opens doors in the addresses that it names.
 
     Where a server logs in JSON, that is an event of its log.
     """
     from mesh.telemetry.context import facts  # here, as few commands come to this
+    from mesh.telemetry.events import without_secrets
     from mesh.telemetry.logs import writes_json
 
     if writes_json():
         log.error("%s", error, extra=facts(hint=error.hint))
-    else:
-        print(f"aira: {error}", file=sys.stderr)
-        if error.hint:
-            print(f"      {error.hint}", file=sys.stderr)
-    sys.exit(2 if isinstance(error, InputError | ConfigurationError) else 1)
+        return
+    print(f"aira: {without_secrets(str(error))}", file=sys.stderr)
+    if error.hint:
+        print(f"      {without_secrets(error.hint)}", file=sys.stderr)
 
 
 def _run(main: Callable[[], Coroutine[Any, Any, object]]) -> bool:

@@ -108,6 +108,8 @@ def _lack(settings: Settings) -> ConfigurationError | None:
             missing.append(str(path))
         except PermissionError:
             closed.append(str(path))
+        except OSError:
+            continue  # a folder, as an engine makes of a file that is missing: who reads it says what is the matter
     if closed:
         return FilesNotReadable(closed)
     return FilesMissing(missing) if missing else None

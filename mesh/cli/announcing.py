@@ -13,7 +13,10 @@ if TYPE_CHECKING:
 
 
 def announce(log: Logger, words: str, **known: object) -> None:
-    """Say what a server has become, at every level of the log. Those of `known` that are text are for programs."""
+    """Say what a server has become, at every level of the log; an event has all lines of it as one.
+
+    Those of `known` that are text are for programs.
+    """
     from mesh.cli.printing import say
 
     own = own_log()
@@ -21,6 +24,7 @@ def announce(log: Logger, words: str, **known: object) -> None:
         say(words)
     if own is not None:
         texts = {name: value for name, value in known.items() if isinstance(value, str)}
-        record = log.makeRecord(log.name, logging.INFO, __file__, 0, words, (), None, extra=facts(**texts))
+        line = "; ".join(" ".join(part.split()) for part in words.splitlines())
+        record = log.makeRecord(log.name, logging.INFO, __file__, 0, "%s", (line,), None, extra=facts(**texts))
         record.is_said = True
         log.handle(record)

@@ -87,7 +87,7 @@ def _asked(host: str, port: int, *, timeout: float) -> Health:
     try:
         connection.request("GET", "/health")
         return Health.decode(connection.getresponse().read(LONGEST))
-    except (OSError, HTTPException) as error:
+    except (OSError, HTTPException, UnicodeError) as error:
         why = getattr(error, "strerror", None) or str(error) or type(error).__name__
         raise RemoteError(
             f"nobody tells its health at {where}: {why}",

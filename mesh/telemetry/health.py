@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
+from mesh.telemetry.events import without_secrets
 from mesh.telemetry.families import Family, by_label
 from schemas.status import ALIVE, OFF
 
@@ -24,8 +25,12 @@ class Health(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, parts: Mapping[str, str]) -> Health:
-        """The health of who has these parts: name → state."""
-        return cls(all(is_well(state) for state in parts.values()), dict(parts))
+        """The health of who has these parts: name → state.
+
+        What opens doors in the addresses that a state names is left out: whoever reaches the page reads it.
+        """
+        told = {part: without_secrets(state) for part, state in parts.items()}
+        return cls(all(is_well(state) for state in parts.values()), told)
 
     def encode(self) -> bytes:
         """As `/health` answers it: one JSON object."""

@@ -83,6 +83,7 @@ def start_log(*, level: str = "info", form: str = "human", role: str = "") -> No
     if handler.writes_json:
         sys.excepthook = _uncaught
         threading.excepthook = _uncaught_in_thread
+        sys.unraisablehook = _unraisable
     elif least <= logging.DEBUG:
         import zenoh  # its own log, in its own format
 
@@ -124,6 +125,14 @@ def introduce(who: Speaker) -> None:
 def _uncaught(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
     if not isinstance(error, KeyboardInterrupt):
         log.critical("the program failed", exc_info=(kind, error, trace))
+
+
+def _unraisable(found: sys.UnraisableHookArgs) -> None:
+    """What nobody can catch, as it is raised in a finalizer or a callback of C."""
+    error = found.exc_value
+    if error is not None:
+        words = found.err_msg or "raised where nobody can catch it"
+        log.error("%s: %r", words, found.object, exc_info=(type(error), error, error.__traceback__))
 
 
 def _uncaught_in_thread(arguments: threading.ExceptHookArgs) -> None:

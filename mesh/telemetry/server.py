@@ -59,7 +59,7 @@ class Server:
     def __enter__(self) -> Self:
         try:
             self._http = _Http(self._address, self._pages)
-        except (OSError, OverflowError) as error:
+        except (OSError, OverflowError, UnicodeError) as error:
             where = f"{self._address[0]}:{self._address[1]}"
             why = getattr(error, "strerror", None) or error
             raise ConfigurationError(

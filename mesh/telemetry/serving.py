@@ -7,6 +7,7 @@ import concurrent.futures
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Final, NamedTuple, Self, TypeVar
 
+from mesh.errors import ClosedError
 from mesh.telemetry.health import STARTING, Health, up
 
 if TYPE_CHECKING:
@@ -101,15 +102,22 @@ class Telemetry:
 
     async def measure(self) -> Iterable[Family]:
         """The figures of all that is shown, and whether its parts are well."""
-        families = [family for shown in tuple(self._shown) for family in await shown.measure()]
+        families: list[Family] = []
+        for shown in tuple(self._shown):
+            try:
+                families += await shown.measure()
+            except Exception:
+                if shown in self._shown:
+                    raise
+                continue  # it was being closed
         return [*families, up(self.parts())]
 
     def _families(self) -> Iterable[Family]:
-        """The figures, on a thread of the server's. Raises `TimeoutError`."""
+        """The figures, on a thread of the server's. Raises `TimeoutError`, `ClosedError`."""
         return self._in_loop(self.measure())
 
     def _health(self) -> Health:
-        """How it is, on a thread of the server's."""
+        """How it is, on a thread of the server's. Raises `ClosedError`."""
         try:
             return Health.of(self._in_loop(self._parts()))
         except TimeoutError:
@@ -119,9 +127,15 @@ class Telemetry:
         return self.parts()
 
     def _in_loop(self, work: Coroutine[Any, Any, T]) -> T:
-        asked = asyncio.run_coroutine_threadsafe(work, self._loop)
+        try:
+            asked = asyncio.run_coroutine_threadsafe(work, self._loop)
+        except RuntimeError:  # the loop is closed
+            work.close()
+            raise ClosedError("the program has come to its end") from None
         try:
             return asked.result(ANSWERED_WITHIN)
+        except concurrent.futures.CancelledError:
+            raise ClosedError("the program comes to its end") from None
         except concurrent.futures.TimeoutError:
             asked.cancel()
             raise TimeoutError(f"the event loop has not answered within {ANSWERED_WITHIN:g} s") from None

@@ -120,6 +120,11 @@ def test_an_error_without_hint_is_one_line() -> None:
     assert ended("run_until_stopped(lambda: fail(RemoteError('gone')))").stderr == "aira: gone\n"
 
 
+def test_an_error_does_not_show_what_opens_doors() -> None:
+    said = ended("run_to_end(lambda: fail(RemoteError('none at http://me:hunter2@node/v3/0123456789abcdef')))").stderr
+    assert said == "aira: none at http://node/v3/…\n"
+
+
 def test_tasks_that_fail_together_for_one_reason_are_one_line() -> None:
     done = ended("run_to_end(lambda: fail_together(InputError('one'), InputError('other')))")
     assert (done.returncode, done.stderr) == (2, "aira: one\n")

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from mesh.chain import Account
+from mesh.errors import ConfigurationError
 from mesh.settings import Settings
 from mesh.starting import lacking
 
@@ -36,6 +38,15 @@ def test_files_are_waited_for_until_all_of_them_are_there(tmp_path: Path, caplog
 def test_with_an_end_to_its_patience_no_file_is_waited_for(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     assert list(lacking(settings(tmp_path, patience=10))) == []
     assert caplog.messages == []
+
+
+def test_a_folder_in_a_file_s_place_is_left_to_who_reads_it(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "account.json").mkdir()
+    (tmp_path / "password").write_text("secret\n")
+    assert list(lacking(settings(tmp_path))) == []
+    assert caplog.messages == []
+    with pytest.raises(ConfigurationError, match="Is a directory"):
+        Account.from_keyfile(tmp_path / "account.json", tmp_path / "password")
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root makes files that another user may not read")

@@ -141,6 +141,26 @@ def test_where_nobody_answers_is_one_clear_line_and_code_1(listen: str) -> None:
     assert done.stderr.startswith(f"aira: nobody tells its health at {listen}: Connection refused\n")
 
 
+def test_a_host_that_can_not_be_one_is_one_clear_line_and_code_1() -> None:
+    done = aira("health", "--url", "http://no..host:9464")
+
+    assert done.returncode == 1
+    assert done.stderr.startswith("aira: nobody tells its health at no..host:9464: ")
+
+
+def test_a_demand_leaves_metrics_to_the_servers_with_the_same_settings(listen: str, tmp_path: Path) -> None:
+    objective = tmp_path / "nothing.mcap"
+    objective.write_bytes(b"")
+    host, _, port = listen.rpartition(":")
+    with socket.create_server((host, int(port))):
+        options = ("--model", "Qm" + "a" * 44, "--objective", objective, "--keyfile", tmp_path / "none.json")
+        password = ("--keyfile-password-file", tmp_path / "none")
+        done = aira("demand", *options, *password, AIRA_METRICS_LISTEN=listen)
+
+    assert done.returncode != 0
+    assert "password file" in done.stderr
+
+
 def test_who_does_not_answer_in_time_is_one_clear_line_and_code_1() -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
         done = aira("health", "--url", f"http://127.0.0.1:{silent.getsockname()[1]}", "--timeout", "0.2")

@@ -90,3 +90,9 @@ def test_who_has_a_part_that_waits_is_not_well(parts: dict[str, str], ok: bool) 
     assert health.ok is ok
     assert Health.decode(health.encode()) == health
     assert sum(sample.value for sample in up(parts).samples) == (2 if ok else 1)
+
+
+def test_health_keeps_what_opens_doors_to_itself() -> None:
+    why = "waits: no node answers at https://me:hunter2@node.example/v3/0123456789abcdef0123 (401)"
+
+    assert Health.of({"start": why}).parts == {"start": "waits: no node answers at https://node.example/v3/… (401)"}

@@ -96,6 +96,18 @@ del task
     assert "ZeroDivisionError" in event["error"]
 
 
+def test_what_nobody_can_catch_is_one_line() -> None:
+    body = """
+class Fragile:
+    def __del__(self):
+        raise ZeroDivisionError("in the end")
+Fragile()
+"""
+    (event,) = told(body)
+    assert (event["level"], event["error"]) == ("error", "ZeroDivisionError: in the end")
+    assert "Fragile" in event["message"]
+
+
 def test_a_warning_is_one_line() -> None:
     (event,) = told('warnings.warn("old fashioned", DeprecationWarning, stacklevel=1)', PYTHONWARNINGS="always")
     assert event["logger"] == "py.warnings"

@@ -54,8 +54,8 @@ async def logs(place: Place, role: str, **asked: Any) -> LogsRead:
     return reply
 
 
-async def test_agent_and_provider_tell_what_concerns_a_contract(place: Place, kept: Log) -> None:
-    robot = obliging(place.agent("robot"))
+def talkative(robot: Agent) -> Agent:
+    """Have it log from its handlers, one of them in a thread."""
 
     @robot.on("*")
     async def work(job: Any, message: Any) -> None:
@@ -65,6 +65,12 @@ async def test_agent_and_provider_tell_what_concerns_a_contract(place: Place, ke
     @robot.on_liability
     async def phase(phase: Any, liability: Any) -> None:
         log.info("it is %s", phase)
+
+    return obliging(robot)
+
+
+async def test_agent_and_provider_tell_what_concerns_a_contract(place: Place, kept: Log) -> None:
+    robot = talkative(place.agent("robot"))
 
     async with place.at_work(robot) as person:
         contract = await person.demand(place.save(objective(("/go", "x"))), cost=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import subprocess
 import sys
@@ -166,9 +167,10 @@ def test_a_port_that_is_taken_is_one_clear_line(url: str) -> None:
     assert "--metrics-listen" in raised.value.hint
 
 
-def test_a_host_that_is_none_is_one_clear_line() -> None:
-    with pytest.raises(ConfigurationError, match=r"can't tell metrics and health at 192\.0\.2\.1:\d+: "):
-        open_server(f"192.0.2.1:{free_port()}", some, lambda: WELL).__enter__()
+@pytest.mark.parametrize("host", ["192.0.2.1", "no..host", "a" * 70])
+def test_a_host_that_is_none_is_one_clear_line(host: str) -> None:
+    with pytest.raises(ConfigurationError, match=f"can't tell metrics and health at {re.escape(host)}:\\d+: "):
+        open_server(f"{host}:{free_port()}", some, lambda: WELL).__enter__()
 
 
 @pytest.mark.parametrize("listen", ["9464", ":9464", "host:", "host:x", "host:65536", "host:-1", "::1:9464", "[]:1"])

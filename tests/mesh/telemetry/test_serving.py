@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.errors import ChainError, ConfigurationError
+from mesh.errors import ChainError, ClosedError, ConfigurationError
 from mesh.telemetry import serving
 from mesh.telemetry.families import Family, counter, gauge, labelled
 from mesh.telemetry.serving import Telemetry
@@ -96,6 +96,50 @@ async def test_what_can_not_be_measured_now_is_no_failure_of_the_server(caplog: 
             page = await asyncio.to_thread(get, telemetry.url, "/metrics")
             assert (page.status, page.text) == (503, "this can't be told now; the server's log says why\n")
     assert "the ledger is full" in caplog.text
+
+
+async def test_who_is_closed_while_it_is_measured_has_no_figures_and_no_failure(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    began, closed = asyncio.Event(), asyncio.Event()
+
+    async def measure() -> Iterable[Family]:
+        began.set()
+        await closed.wait()
+        raise ClosedError("the store is closed")
+
+    async with Telemetry(HERE) as telemetry:
+        with telemetry.showing(measure=measure, health=lambda: {"channel": ALIVE}):
+            asked = asyncio.create_task(asyncio.to_thread(get, telemetry.url, "/metrics"))
+            await began.wait()
+        closed.set()
+        page = await asked
+        assert (page.status, "aira_part_up" in page.text) == (200, True)
+    assert caplog.records == []
+
+
+async def test_a_question_that_the_end_of_the_program_cancels_is_no_failure(caplog: pytest.LogCaptureFixture) -> None:
+    async def measure() -> Iterable[Family]:
+        task = asyncio.current_task()
+        assert task is not None
+        task.cancel()
+        await asyncio.sleep(0)
+        return ()
+
+    async with Telemetry(HERE) as telemetry:
+        with telemetry.showing(measure=measure, health=lambda: {"channel": ALIVE}):
+            page = await asyncio.to_thread(get, telemetry.url, "/metrics")
+            assert page.status == 503
+    assert [record.exc_info for record in caplog.records] == [None]
+
+
+def test_a_question_after_the_end_of_the_loop_is_no_failure(caplog: pytest.LogCaptureFixture) -> None:
+    telemetry = Telemetry(HERE)
+    asyncio.run(telemetry.__aenter__())
+    page = get(telemetry.url, "/health")
+    asyncio.run(telemetry.__aexit__(None, None, None))
+    assert page.status == 503
+    assert [record.exc_info for record in caplog.records] == [None]
 
 
 async def test_two_servers_can_not_have_one_port() -> None:

@@ -1,0 +1,37 @@
+"""What a server says when it begins is one event, also where it is several lines for people."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import pytest
+
+from tests.support.commands import run
+
+PROGRAM = """
+import logging
+from mesh.cli.announcing import announce
+from mesh.telemetry.logs import own_log, start_log
+from schemas.logs import ReadLogs
+start_log(form={form!r}, role="up")
+words = "router      tcp/here 100%\\nchain       http://there"
+announce(logging.getLogger("a.server"), words, chain="http://there", count=1)
+print(own_log().ring.read(ReadLogs()).entries[0].message)
+"""
+LINE = "router tcp/here 100%; chain http://there"
+
+
+@pytest.mark.parametrize("form", ["human", "json"])
+def test_the_event_is_one_line_and_people_see_all_of_them(form: str) -> None:
+    done = run(sys.executable, "-c", PROGRAM.format(form=form))
+
+    assert done.returncode == 0, done.stderr
+    *said, kept = done.stdout.splitlines()
+    assert kept == LINE
+    if form == "human":
+        assert (said, done.stderr) == (["router      tcp/here 100%", "chain       http://there"], "")
+    else:
+        event = json.loads(done.stderr)
+        assert (said, event["message"], event["chain"]) == ([], LINE, "http://there")
+        assert "count" not in event
