@@ -36,7 +36,6 @@ SETTLING: Final = 1.0
 PATIENCE: Final = 120.0
 WINDOW: Final = 2000
 """Messages under way at most, so that none is lost."""
-MIB: Final = 1 << 20
 
 
 def memory(pid: int) -> float:

@@ -124,10 +124,6 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             if not getattr(self, option):
                 msgspec.structs.force_setattr(self, option, name.format(self.generation))
 
-    def with_lighthouse(self, name: str) -> Settings:
-        """The same settings on another lighthouse (an ENS name)."""
-        return msgspec.structs.replace(self, lighthouse_contract=name)
-
     @property
     def node(self) -> str:
         """The node's address, or several with commas. Raises `ConfigurationError` when there is none."""

@@ -10,8 +10,9 @@ if TYPE_CHECKING:
     from bridges.serial.boards import BoardFailed, PinChange, SimulatedBoard
     from bridges.serial.calling import CallingDialect
     from bridges.serial.device import Answer, Device
+    from bridges.serial.device_id import DeviceId
     from bridges.serial.dialect import Ending
-    from bridges.serial.edge import DeviceId, Edge
+    from bridges.serial.edge import Edge
     from bridges.serial.errors import CallFailed, CallInDoubt, CallNotDone, CallRefused, LineError, PortMissing
     from bridges.serial.ports import PortName
     from bridges.serial.rosserial import RosserialDialect
@@ -25,7 +26,7 @@ _HOMES: Final = {
     "CallRefused": "bridges.serial.errors",
     "CallingDialect": "bridges.serial.calling",
     "Device": "bridges.serial.device",
-    "DeviceId": "bridges.serial.edge",
+    "DeviceId": "bridges.serial.device_id",
     "Edge": "bridges.serial.edge",
     "Ending": "bridges.serial.dialect",
     "LineError": "bridges.serial.errors",

@@ -103,26 +103,20 @@ def command(
     A command on a topic of a job reaches all of the agent's devices that have a topic of that name; --map gives those
     of this device other names.
     """
-    from bridges.serial.edge import DeviceId
+    from bridges.serial.device_id import DeviceId
     from bridges.serial.names import Names
-    from bridges.serial.serving import serve, telling, wait_for_files
+    from bridges.serial.serving import Wiring, serve, telling, wait_for_files
     from mesh.network.endpoints import Endpoints
 
     start_log_of(settings, "edge")
+    device = DeviceId(agent=agent, name=name)
     endpoints = Endpoints.from_settings(settings)
     try:
         with telling(settings.metrics_listen) as told:
             wait_for_files(settings)
-            serve(
-                DeviceId(agent=agent, name=name),
-                port,
-                endpoints=endpoints,
-                protocol=protocol,
-                baud=baud,
-                patience=patience,
-                parameters=parameters,
-                names=Names(renamed),
-                told=told,
+            wiring = Wiring(
+                port=port, protocol=protocol, baud=baud, patience=patience, parameters=parameters, names=Names(renamed)
             )
+            serve(device, wiring, endpoints=endpoints, told=told)
     except AiraError as error:
         fail(error)

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import msgspec
 import zenoh
 
+from bridges.serial.device_id import PRESENT, DeviceId
 from bridges.serial.dialect import Ending
-from bridges.serial.edge import PATIENCE, PRESENT, DeviceId
+from bridges.serial.edge import PATIENCE
 from bridges.serial.errors import REASONS, CallFailed, CallInDoubt, CallNotDone
 from mesh.network import Pump
 from schemas import LiabilityTopicKey, payload_type

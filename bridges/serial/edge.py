@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -21,6 +20,7 @@ import msgspec
 import zenoh
 
 from bridges.serial.converting import converted
+from bridges.serial.device_id import ABOUT, PRESENT, DeviceId
 from bridges.serial.dialect import BoardTopic, Command, Ended, Ending, Flow, Gone, Logged, Ready, Said
 from bridges.serial.errors import BoardBusy, UnfitMessage
 from bridges.serial.jobs import Jobs
@@ -45,26 +45,8 @@ log = logging.getLogger(__name__)
 
 PATIENCE: Final = 30.0
 """Seconds for which a command waits for a board that is not there, or busy."""
-PRESENT: Final = "/present"
-"""The topic of the token."""
-ABOUT: Final = "/about"
-"""The topic on which the edge agent answers what device it serves."""
 TOLD: Final = b"told"
 """What is attached to all that an edge agent puts."""
-CABLE: Final = "/aira/device"
-"""The topic of a job, with the device's name behind it, on which its recording has when the device went and came."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class DeviceId:
-    """What the mesh knows a board by: its agent's address, and a name."""
-
-    agent: str
-    name: str
-
-    def key(self, topic: str) -> str:
-        """The key of a topic outside any job. Raises `InvalidKey`."""
-        return str(DeviceTopicKey(self.agent, self.name, topic))
 
 
 class Edge:
@@ -169,7 +151,7 @@ class Edge:
 
     def _declare(self, name: str) -> list[Any]:
         """Hear commands and calls on a topic, within jobs and outside."""
-        keys = (self._device.key(name), f"aira/agent/{self._device.agent.lower()}/liability/*/topic{name}")
+        keys = self._device.keys_of(name)
         return [
             *(self._session.declare_subscriber(key, self._heard_command) for key in keys),
             *(self._session.declare_queryable(key, self._heard_call) for key in keys),
@@ -247,7 +229,7 @@ class Edge:
             self._ask(topic, self._device.key(name), payload)
             return
         job = self._jobs.current
-        key = str(LiabilityTopicKey(self._device.agent, job, name)) if job else self._device.key(name)
+        key = self._device.key_of_job(job, name) if job else self._device.key(name)
         self._put(key, payload, topic.type)
 
     def _ask(self, topic: BoardTopic, key: str, payload: bytes) -> None:
@@ -263,9 +245,7 @@ class Edge:
     def _note(self, text: str) -> None:
         """Have the recording of the job that goes on, if there is one, say what became of the device."""
         if self._jobs.current:
-            topic = f"{CABLE}/{self._device.name}"
-            key = str(LiabilityTopicKey(self._device.agent, self._jobs.current, topic))
-            self._put(key, String(text).encode(), STRING)
+            self._put(self._device.cable(self._jobs.current), String(text).encode(), STRING)
 
     def _ended(self, ended: Ended) -> None:
         query = self._asked.pop(ended.command, None)

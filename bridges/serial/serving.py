@@ -8,9 +8,11 @@ import signal
 import sys
 import time
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
-from bridges.serial.edge import DeviceId, Edge
+from bridges.serial.device_id import PRESENT
+from bridges.serial.edge import Edge
 from bridges.serial.ports import PortName
 from bridges.serial.telling import tell_log
 from mesh.cli.announcing import announce
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 
     import zenoh
 
+    from bridges.serial.device_id import DeviceId
     from bridges.serial.dialect import Dialect
     from bridges.serial.names import Names
     from mesh.network.endpoints import Endpoints
@@ -35,6 +38,21 @@ log = logging.getLogger(__name__)
 
 Protocol = Literal["frames", "rosserial"]
 Told: TypeAlias = "Callable[[Edge, zenoh.Session], None]"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wiring:
+    """How a board is reached, and what is spoken with it.
+
+    `baud` in bits per second, `patience` in seconds; `parameters` are what a rosserial sketch may ask for.
+    """
+
+    port: str
+    protocol: Protocol
+    baud: int
+    patience: float
+    parameters: Mapping[str, object]
+    names: Names
 
 
 def dialect_of(protocol: Protocol, *, baud: int, parameters: Mapping[str, object]) -> Dialect:
@@ -72,31 +90,20 @@ def telling(listen: str) -> Iterator[Told]:
         yield figures.begin
 
 
-def serve(
-    device: DeviceId,
-    port: str,
-    *,
-    endpoints: Endpoints,
-    protocol: Protocol,
-    baud: int,
-    patience: float,
-    parameters: Mapping[str, object],
-    names: Names,
-    told: Told,
-) -> None:
+def serve(device: DeviceId, wiring: Wiring, *, endpoints: Endpoints, told: Told) -> None:
     """Serve a board until Ctrl-C or SIGTERM. On the main thread of a process of its own. `told` is of `telling`.
 
     Raises `NetworkUnavailable`, `InputError` for a port that can't be named, `InvalidKey` for such a device.
     """
-    name = PortName(port)
-    dialect = dialect_of(protocol, baud=baud, parameters=parameters)
-    device.key("/present")
+    name = PortName(wiring.port)
+    dialect = dialect_of(wiring.protocol, baud=wiring.baud, parameters=wiring.parameters)
+    device.key(PRESENT)
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(INTERRUPTED))
     with Opening(endpoints).run() as session:
-        edge = Edge(session, device, name, dialect, baud=baud, patience=patience, names=names)
+        edge = Edge(session, device, name, dialect, baud=wiring.baud, patience=wiring.patience, names=wiring.names)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda number, frame: edge.stop())
-        words = f"edge of {device.agent}: {device.name} on {name}, {protocol}, Zenoh id {session.zid()}"
+        words = f"edge of {device.agent}: {device.name} on {name}, {wiring.protocol}, Zenoh id {session.zid()}"
         told(edge, session)
         introduce(Speaker("edge", parse_address(device.agent)))
         announce(log, words, device=device.name)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from bridges.serial.device_id import LOG
 from mesh.errors import AiraError
 from mesh.telemetry.log_service import LogService
 from schemas.logs import ReadLogs
@@ -16,10 +17,7 @@ if TYPE_CHECKING:
 
     import zenoh
 
-    from bridges.serial.edge import DeviceId
-
-LOG: Final = "/log"
-"""The topic that answers as the service `logs` does."""
+    from bridges.serial.device_id import DeviceId
 
 
 @contextmanager

@@ -136,15 +136,8 @@ async def working(settings: Settings, account: Account, chain: Chain | None) -> 
         directory = home / await _name_of(chain)
         clock = Clock(await chain.block_number())
         network = await stack.enter_async_context(Network(endpoints_of(settings)))
-        lighthouse = settings.lighthouse_contract
         channel = await stack.enter_async_context(
-            Channel(
-                network.session,
-                lighthouse,
-                address=await chain.resolve(lighthouse),
-                resolver=chain.resolve,
-                head=lambda: clock.head,
-            )
+            await _channel_of(settings.lighthouse_contract, network, chain=chain, clock=clock)
         )
         ledger = await stack.enter_async_context(Ledger(directory / "ledger.sqlite"))
         store = await asyncio.to_thread(
@@ -165,6 +158,12 @@ async def working(settings: Settings, account: Account, chain: Chain | None) -> 
             clock=clock,
             directory=directory,
         )
+
+
+async def _channel_of(lighthouse: str, network: Network, *, chain: Chain, clock: Clock) -> Channel:
+    """The channel of a lighthouse, not yet open, with names and blocks as the chain has them."""
+    address = await chain.resolve(lighthouse)
+    return Channel(network.session, lighthouse, address=address, resolver=chain.resolve, head=lambda: clock.head)
 
 
 async def _name_of(chain: Chain) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from msgspec.structs import replace
 
 from mesh.cli.amounts import AMOUNT, XRT
 from mesh.cli.options import with_settings
@@ -88,7 +89,8 @@ async def _demand(
         raise InputError("a validator's fee without a validator", hint="name the validator with --validator")
     if out is not None:
         await asyncio.to_thread(_check_writable, out)
-    async with Agent(terms.pop("model"), settings=settings) as agent:
+    # Metrics are a server's, and one may run beside this with the same settings.
+    async with Agent(terms.pop("model"), settings=replace(settings, metrics_listen="")) as agent:
         contract = await _contract(agent, source, validator_fee=fee, quiet=as_json, **terms)
         await _ending(contract, out, as_json=as_json)
 

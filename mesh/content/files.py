@@ -143,7 +143,7 @@ def directory_lock(directory: Path) -> Iterator[None]:
 
 
 def is_taken(path: Path) -> bool:
-    """Whether somebody writes the temporary file at `path` now."""
+    """Whether somebody has locked the file at `path`, in this process or another: who writes it, or has it in use."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except FileNotFoundError:

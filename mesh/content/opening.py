@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from mesh.content.chunking import enter_blocks
 from mesh.content.errors import StoreDamaged
-from mesh.content.files import PART_PREFIX, PUT_PREFIX, TemporaryFile, directory_lock, stamp, sync_directory
+from mesh.content.files import PART_PREFIX, PUT_PREFIX, TemporaryFile, directory_lock, is_taken, stamp, sync_directory
 from mesh.content.index import BlockIndex
 from mesh.errors import InvalidCid
 from schemas.cid import parse_cid
@@ -57,17 +57,7 @@ def open_directory(directory: Path) -> tuple[BlockIndex, int]:
 
 def is_in_use(directory: Path) -> bool:
     """Whether a store has the directory open, in this process or another."""
-    try:
-        descriptor = os.open(directory / _IN_USE, os.O_RDONLY | os.O_CLOEXEC)
-    except FileNotFoundError:
-        return False
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    finally:
-        os.close(descriptor)
-    return False
+    return is_taken(directory / _IN_USE)
 
 
 def held_in(directory: Path) -> tuple[str, ...]:

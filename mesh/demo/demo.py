@@ -37,7 +37,7 @@ COST: Final = 42 * XRT
 """What the person pays, wn."""
 MODEL: Final = cid_of_bytes(b"aira-mesh demo: a lamp that blinks for each message\n")
 """The behaviour model of the demo's robot: any content has a name."""
-PATIENCE: Final = 30.0
+PATIENCE: Final = 60.0
 """Seconds until a demand that nobody takes is given up; for the job, beyond the time that its objective takes."""
 
 

@@ -8,25 +8,24 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import time
 from contextlib import asynccontextmanager
-from contextvars import ContextVar
 from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from mesh.errors import AiraError, ClosedError, ContentError, InputError
+from mesh.errors import ClosedError, ContentError, InputError
 from mesh.telemetry.context import concerning, of_its_liability
-from mesh.work.ledger import Job, LedgerUnusable
 from mesh.work.lifecycle import Phase, WrongPhase, advance
 from mesh.work.objectives import Objectives
+from mesh.work.playbacks import Playbacks
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable
 
     from mesh.recording import Objective
+    from mesh.work.ledger import Job
     from mesh.work.lifecycle import Witness
-    from mesh.work.run import Performer, Run
+    from mesh.work.run import Performer
     from mesh.work.workshop import Workshop
     from schemas import Liability
 
@@ -34,13 +33,8 @@ log = logging.getLogger(__name__)
 
 STARTED: Final = (Phase.READY, Phase.RUNNING)
 """Phases in which a job may be begun anew or gone on with."""
-PROGRESS: Final = 0.5
-"""Seconds between two notes of a playback's position in the ledger."""
 PATIENCE: Final = 10.0
 """Seconds without a new block of an objective after which no job is taken on for it."""
-
-_playing: ContextVar[str] = ContextVar("playing", default="")
-"""The job that the running code plays, or is a handler of."""
 
 
 class Executor:
@@ -56,8 +50,7 @@ class Executor:
         self._witness = witness
         self._objectives = Objectives(workshop, performer=performer)
         self._ready: asyncio.Queue[str] = asyncio.Queue()
-        self._runs: dict[str, Run] = {}
-        self._plays: dict[str, asyncio.Task[None]] = {}
+        self._playbacks = Playbacks(workshop, performer=performer, witness=witness, finish=self._end)
         self._tasks: asyncio.TaskGroup | None = None
         self._opened = asyncio.Event()
         self._changing = asyncio.Lock()
@@ -74,7 +67,7 @@ class Executor:
                 await self._serve_ready()
         finally:
             self._tasks = None
-            await self._suspend()
+            await self._playbacks.suspend()
 
     @property
     def is_running(self) -> bool:
@@ -99,7 +92,7 @@ class Executor:
         async with self._changing:
             job = await self._shop.ledger.job(address)
             if job is not None:
-                await self._abandon(address)
+                await self._playbacks.abandon(address)
                 self._objectives.forget(address)
             yield job
             if job is not None:
@@ -121,7 +114,7 @@ class Executor:
         await self._objective_at_hand(address)
         async with self._changing:
             job = await self._startable(address, asked="restart")
-            await self._abandon(address)
+            await self._playbacks.abandon(address)
             # In this order: a crash between the two may not leave a position past what the recording holds.
             await self._shop.ledger.set_position(address, 0)
             await asyncio.to_thread(self._shop.discard_recording, address)
@@ -133,7 +126,7 @@ class Executor:
         await self._objective_at_hand(address)
         async with self._changing:
             job = await self._startable(address, asked="resume")
-            if address in self._runs:
+            if address in self._playbacks:
                 raise WrongPhase(address, asked="resume", phase=job.phase)
             await self._begin(job, job.position)
 
@@ -157,8 +150,7 @@ class Executor:
         async with self._changing:
             job = await self._job(address, asked="finish")
             advance(address, job.phase, Phase.COMPLETE)
-            await self._stop_playing(address)
-            run = self._runs.pop(address, None) or await self._shop.new_run(job.liability)
+            run = await self._playbacks.stop(address) or await self._shop.new_run(job.liability)
             summary = await run.close(note)
             cid = await asyncio.to_thread(self._shop.store.put_file, summary.path, pin=address)
             await self._shop.owe_result(address, success=success, result=cid, note=note)
@@ -196,7 +188,7 @@ class Executor:
             objective = await self._objectives.examine(liability.objective)
         except (ContentError, InputError) as error:
             log.warning("refused: %s", error)
-            await self._unless_ended(self.finish(address, success=False, note=str(error)))
+            await self._end(address, success=False, note=str(error))
             return
         async with self._changing:
             job = await self._shop.ledger.job(address)
@@ -224,74 +216,16 @@ class Executor:
             await asyncio.wait([playing])
 
     async def _play_of(self, address: str) -> asyncio.Task[None] | None:
-        """The playback of a job, if it goes on."""
         async with self._changing:
-            if (playing := self._plays.get(address)) is not None and playing.done():
-                del self._plays[address]
-                return None
-            return playing
+            return self._playbacks.under_way(address)
 
     async def _begin(self, job: Job, position: int) -> None:
-        address, tasks = job.liability.address, self._begun()
-        objective = self._objectives[address]
-        run = self._runs[address] = await self._shop.new_run(job.liability, objective=objective, position=position)
-        await self._shop.ledger.set_phase(address, Phase.RUNNING, position=position)
-        run.open()
-        log.info("running, from message %d of %d", position, objective.count)
-        self._plays[address] = tasks.create_task(self._play(run), name=f"play {address}")
+        objective = self._objectives[job.liability.address]
+        await self._playbacks.begin(job, objective, self._begun(), position=position)
 
-    async def _play(self, run: Run) -> None:
-        """Play to the end; with a performer, finish as it went."""
-        address = run.liability.address
-        _playing.set(address)
-        noted, success, note = time.monotonic(), True, ""
-
-        async def progress(position: int) -> None:
-            nonlocal noted
-            if time.monotonic() - noted >= PROGRESS:
-                noted = time.monotonic()
-                await self._shop.ledger.set_position(address, position)
-
-        try:
-            await self._witness(Phase.RUNNING, run.liability)
-            await run.play(self._performer, progress=progress)
-        except LedgerUnusable:  # not the job's fault, which is gone on with later
-            raise
-        except Exception as error:
-            success, note = False, str(error) or type(error).__name__
-            log.warning("the job failed: %s", note, exc_info=not isinstance(error, AiraError))
-        await self._shop.ledger.set_position(address, run.position)
-        if self._performer is not None or not success:
-            await self._unless_ended(self.finish(address, success=success, note=note))
-
-    async def _suspend(self) -> None:
-        """Leave the running jobs as another run of the agent can go on with them."""
-        for address in tuple(self._runs):
-            with concerning(address):
-                try:
-                    await self._put_away(address)
-                except AiraError as error:
-                    log.error("how far it has come is not written down: %s", error)
-
-    async def _abandon(self, address: str) -> None:
-        """Stop whatever runs for a job, keeping its files."""
-        await self._stop_playing(address)
-        if address in self._runs:
-            await self._put_away(address)
-
-    async def _put_away(self, address: str) -> None:
-        """Note how far a run has come and close it."""
-        run = self._runs.pop(address)
-        try:
-            await self._shop.ledger.set_position(address, run.position)
-        finally:
-            await run.close()
-
-    async def _stop_playing(self, address: str) -> None:
-        """Cancel the playback of a job and wait for its end, unless it is the playback, or its handler, that asks."""
-        if _playing.get() != address and (playing := self._plays.pop(address, None)) is not None:
-            playing.cancel()
-            await asyncio.wait([playing])
+    async def _end(self, address: str, *, success: bool, note: str) -> None:
+        """Finish a job, unless somebody else has done so."""
+        await self._unless_ended(self.finish(address, success=success, note=note))
 
     def _begun(self) -> asyncio.TaskGroup:
         if self._tasks is None:

@@ -6,53 +6,20 @@ Every write is committed and synced before the call returns, so that what an age
 
 from __future__ import annotations
 
-import asyncio
 import time
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final, Self
 
-import aiosqlite
 import msgspec
 
-from mesh.errors import ClosedError, ConfigurationError
+from mesh.work.database import Database
 from mesh.work.lifecycle import UNFINISHED, Phase
 from schemas import Liability
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable
     from pathlib import Path
     from types import TracebackType
 
-VERSION: Final = 1
-SCHEMA: Final = """
-CREATE TABLE IF NOT EXISTS jobs (
-    liability TEXT PRIMARY KEY,
-    phase TEXT NOT NULL,
-    record BLOB NOT NULL,
-    success INTEGER,
-    result TEXT,
-    position INTEGER NOT NULL DEFAULT 0,
-    note TEXT NOT NULL DEFAULT '',
-    aside INTEGER NOT NULL DEFAULT 0,
-    changed REAL NOT NULL
-);
-CREATE TABLE IF NOT EXISTS outbox (
-    identity TEXT PRIMARY KEY,
-    kind TEXT NOT NULL,
-    payload BLOB NOT NULL,
-    deadline INTEGER,
-    posted REAL NOT NULL
-);
-CREATE TABLE IF NOT EXISTS spent (
-    identity TEXT PRIMARY KEY,
-    kind TEXT NOT NULL,
-    payload BLOB NOT NULL,
-    deadline INTEGER,
-    posted REAL NOT NULL,
-    liability TEXT NOT NULL
-);
-CREATE TABLE IF NOT EXISTS cursors (name TEXT PRIMARY KEY, block INTEGER NOT NULL, history BLOB NOT NULL DEFAULT x'');
-"""
 POST: Final = "INSERT OR IGNORE INTO outbox (identity, kind, payload, deadline, posted) VALUES (?, ?, ?, ?, ?)"
 SPENT_KEPT: Final = 4096
 """Orders that are kept after they became contracts; the chain replaces its last blocks only."""
@@ -82,15 +49,6 @@ class Outgoing(msgspec.Struct, frozen=True, kw_only=True):
     deadline: int | None
 
 
-class LedgerUnusable(ConfigurationError):
-    """The ledger can't be read or written: a full disk, a folder of somebody else's, a file that is no ledger."""
-
-    def __init__(self, path: Path, why: object) -> None:
-        hint = "make room on that disk, let this user write there, or give another folder with --data-dir"
-        super().__init__(f"can't use the ledger {path}: {why}", hint=hint)
-        self.path = path
-
-
 class Ledger:
     """The ledger in the file at `path`, made when missing: `async with Ledger(path) as ledger`.
 
@@ -98,51 +56,20 @@ class Ledger:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-        self._database: aiosqlite.Connection | None = None
-        self._writing = asyncio.Lock()
+        self._database = Database(path)
 
     async def __aenter__(self) -> Self:
-        if self._database is not None:
-            raise ClosedError("this ledger is open already")
-        try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._database = await aiosqlite.connect(self._path, isolation_level=None)
-            await self._prepare()
-        except (OSError, aiosqlite.Error) as error:
-            await self._close()
-            raise LedgerUnusable(self._path, error) from None
-        except BaseException:
-            await self._close()
-            raise
+        await self._database.open()
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        await self._close()
-
-    async def _close(self) -> None:
-        """A connection that is left open keeps its thread, and with it the interpreter, alive."""
-        database, self._database = self._database, None
-        if database is not None:
-            await database.close()
-
-    async def _prepare(self) -> None:
-        await self._run("PRAGMA journal_mode = WAL")
-        await self._run("PRAGMA synchronous = FULL")
-        version = (await self._rows("PRAGMA user_version"))[0][0]
-        if version > VERSION:
-            raise ConfigurationError(
-                f"the ledger {self._path} was written by a newer version (format {version}, this one knows {VERSION})",
-                hint="upgrade aira-mesh",
-            )
-        await self._open().executescript(SCHEMA)
-        await self._run(f"PRAGMA user_version = {VERSION}")
+        await self._database.close()
 
     async def add_job(self, liability: Liability) -> bool:
         """Write down a new job as INCOMING, or take up one that was set aside; False when it was known."""
-        return await self._run(
+        return await self._database.run(
             "INSERT INTO jobs (liability, phase, record, changed) VALUES (?, ?, ?, ?)"
             " ON CONFLICT (liability) DO UPDATE SET aside = 0 WHERE aside",
             (liability.address, Phase.INCOMING, liability.encode(), time.time()),
@@ -150,36 +77,38 @@ class Ledger:
 
     async def set_aside(self, liability: str) -> None:
         """There is no such job, until `add_job` takes it up again with all that is known of it."""
-        await self._run("UPDATE jobs SET aside = 1 WHERE liability = ?", (liability,))
+        await self._database.run("UPDATE jobs SET aside = 1 WHERE liability = ?", (liability,))
 
     async def set_phase(self, liability: str, phase: Phase, *, position: int | None = None) -> None:
         """Write down where the job at `liability` (address) stands, and how many messages it has played."""
-        await self._run(
+        await self._database.run(
             "UPDATE jobs SET phase = ?, position = COALESCE(?, position), changed = ? WHERE liability = ?",
             (phase, position, time.time(), liability),
         )
 
     async def set_position(self, liability: str, position: int) -> None:
         """Write down how many messages the job at `liability` (address) has played; its phase stays."""
-        await self._run("UPDATE jobs SET position = ? WHERE liability = ?", (position, liability))
+        await self._database.run("UPDATE jobs SET position = ? WHERE liability = ?", (position, liability))
 
     async def complete(self, liability: str, *, success: bool, result: str, note: str, outgoing: Outgoing) -> None:
         """Write down the job's end and the signed Result that tells of it, both or neither (when cancelled, too)."""
         ended = "UPDATE jobs SET phase = ?, success = ?, result = ?, note = ?, changed = ? WHERE liability = ?"
-        await self._together(
+        await self._database.run_together(
             (ended, (Phase.COMPLETE, success, result, note, time.time(), liability)), (POST, _posted(outgoing))
         )
 
     async def job(self, liability: str) -> Job | None:
         """The job at `liability` (EIP-55 address), if it is ours."""
-        rows = await self._rows("SELECT * FROM jobs WHERE liability = ? AND NOT aside", (liability,))
+        rows = await self._database.rows("SELECT * FROM jobs WHERE liability = ? AND NOT aside", (liability,))
         return _job(rows[0]) if rows else None
 
     async def jobs(self, phases: Iterable[Phase] = UNFINISHED) -> list[Job]:
         """The jobs in the given phases, oldest first."""
         wanted = tuple(phases)
         marks = ",".join("?" * len(wanted))
-        rows = await self._rows(f"SELECT * FROM jobs WHERE phase IN ({marks}) AND NOT aside ORDER BY rowid", wanted)
+        rows = await self._database.rows(
+            f"SELECT * FROM jobs WHERE phase IN ({marks}) AND NOT aside ORDER BY rowid", wanted
+        )
         return [_job(row) for row in rows]
 
     async def jobs_by_phase(self) -> dict[str, int]:
@@ -188,19 +117,21 @@ class Ledger:
 
     async def standing(self) -> list[tuple[str, int, float]]:
         """Each phase that has any jobs: how many, and since when (Unix time) the one that came first stands there."""
-        return await self._rows("SELECT phase, COUNT(*), MIN(changed) FROM jobs WHERE NOT aside GROUP BY phase")
+        return await self._database.rows(
+            "SELECT phase, COUNT(*), MIN(changed) FROM jobs WHERE NOT aside GROUP BY phase"
+        )
 
     async def post(self, outgoing: Outgoing) -> None:
         """Keep a signed message for sending until `settle`."""
-        await self._run(POST, _posted(outgoing))
+        await self._database.run(POST, _posted(outgoing))
 
     async def settle(self, identity: str) -> bool:
         """The effect of the message was seen: send it no more. False when it was not in the outbox."""
-        return await self._run("DELETE FROM outbox WHERE identity = ?", (identity,))
+        return await self._database.run("DELETE FROM outbox WHERE identity = ?", (identity,))
 
     async def spend(self, identity: str, liability: str) -> None:
         """The order became the contract at the address `liability`: send it no more, but keep it for `unspend`."""
-        await self._together(
+        await self._database.run_together(
             ("INSERT OR REPLACE INTO spent SELECT *, ? FROM outbox WHERE identity = ?", (liability, identity)),
             ("DELETE FROM outbox WHERE identity = ?", (identity,)),
             ("DELETE FROM spent WHERE rowid <= (SELECT MAX(rowid) FROM spent) - ?", (SPENT_KEPT,)),
@@ -208,21 +139,21 @@ class Ledger:
 
     async def spent_until(self, liability: str) -> int | None:
         """The deadline (block) of the orders that became the contract at this address; None when none is known."""
-        ((deadline,),) = await self._rows("SELECT MIN(deadline) FROM spent WHERE liability = ?", (liability,))
+        ((deadline,),) = await self._database.rows("SELECT MIN(deadline) FROM spent WHERE liability = ?", (liability,))
         return None if deadline is None else int(deadline)
 
     async def unspend(self, liability: str) -> bool:
         """There is no contract at this address after all: its orders are to be sent again. False when it had none."""
         columns = "identity, kind, payload, deadline, posted"
-        await self._run(
+        await self._database.run(
             f"INSERT OR IGNORE INTO outbox ({columns}) SELECT {columns} FROM spent WHERE liability = ?", (liability,)
         )
-        return await self._run("DELETE FROM spent WHERE liability = ?", (liability,))
+        return await self._database.run("DELETE FROM spent WHERE liability = ?", (liability,))
 
     async def outbox(self, *, head: int) -> list[Outgoing]:
         """What is to be sent, oldest first; forgets what has passed its deadline at block `head`."""
-        await self._run("DELETE FROM outbox WHERE deadline <= ?", (head,))
-        rows = await self._rows("SELECT identity, kind, payload, deadline FROM outbox ORDER BY rowid")
+        await self._database.run("DELETE FROM outbox WHERE deadline <= ?", (head,))
+        rows = await self._database.rows("SELECT identity, kind, payload, deadline FROM outbox ORDER BY rowid")
         return [Outgoing(identity=row[0], kind=row[1], payload=row[2], deadline=row[3]) for row in rows]
 
     async def waiting(self) -> int:
@@ -231,63 +162,23 @@ class Ledger:
 
     async def waiting_by_kind(self) -> dict[str, int]:
         """The same for each kind that is there: `demand`, `offer`, `result`."""
-        return dict(await self._rows("SELECT kind, COUNT(*) FROM outbox GROUP BY kind"))
+        return dict(await self._database.rows("SELECT kind, COUNT(*) FROM outbox GROUP BY kind"))
 
     async def cursor(self, name: str) -> int | None:
         """The last block handled by `name`; None when there was none."""
-        rows = await self._rows("SELECT block FROM cursors WHERE name = ?", (name,))
+        rows = await self._database.rows("SELECT block FROM cursors WHERE name = ?", (name,))
         return int(rows[0][0]) if rows else None
 
     async def history(self, name: str) -> bytes:
         """What `name` remembered of the chain at its cursor; empty when it remembered nothing."""
-        rows = await self._rows("SELECT history FROM cursors WHERE name = ?", (name,))
+        rows = await self._database.rows("SELECT history FROM cursors WHERE name = ?", (name,))
         return bytes(rows[0][0]) if rows else b""
 
     async def set_cursor(self, name: str, block: int, *, history: bytes = b"") -> None:
         """All of `block` has been handled by `name`, which remembers `history` of the chain."""
-        await self._run(
+        await self._database.run(
             "INSERT OR REPLACE INTO cursors (name, block, history) VALUES (?, ?, ?)", (name, block, history)
         )
-
-    def _open(self) -> aiosqlite.Connection:
-        if self._database is None:
-            raise ClosedError("the ledger is not open", hint="use it inside `async with`")
-        return self._database
-
-    async def _run(self, statement: str, values: tuple[Any, ...] = ()) -> bool:
-        async with self._writing:
-            with self._usable():
-                cursor = await self._open().execute(statement, values)
-        changed = cursor.rowcount > 0
-        await cursor.close()
-        return changed
-
-    async def _together(self, *statements: tuple[str, tuple[Any, ...]]) -> None:
-        """Run all statements or, when cancelled too, none."""
-        database = self._open()
-        async with self._writing:
-            try:
-                with self._usable():
-                    await database.execute("BEGIN IMMEDIATE")
-                    for statement, values in statements:
-                        await database.execute(statement, values)
-                    await database.commit()
-            except BaseException:
-                # What was cancelled is executed all the same: nothing may stay open behind it.
-                await database.rollback()
-                raise
-
-    async def _rows(self, statement: str, values: tuple[Any, ...] = ()) -> list[Any]:
-        with self._usable():
-            return list(await self._open().execute_fetchall(statement, values))
-
-    @contextmanager
-    def _usable(self) -> Iterator[None]:
-        """Raise `LedgerUnusable` for what the disk does not let the database do."""
-        try:
-            yield
-        except aiosqlite.OperationalError as error:
-            raise LedgerUnusable(self._path, error) from None
 
 
 def _job(row: Any) -> Job:

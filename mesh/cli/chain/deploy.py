@@ -9,6 +9,7 @@ import click
 
 from mesh.cli.amounts import XRT
 from mesh.cli.lighthouse.checks import check_lighthouse
+from mesh.cli.lighthouse.rules import with_rules
 from mesh.cli.opening import for_signing
 from mesh.cli.printing import print_facts, print_json, say, with_json
 from mesh.errors import ConfigurationError
@@ -24,14 +25,7 @@ DEPLOYMENT_GAS: Final = 9_500_000
 
 @click.command("deploy")
 @click.option("--lighthouse", default="airalab", show_default=True, help="name of the first lighthouse, one label")
-@click.option("--minimal-stake", default="1", show_default=True, help="what a provider stakes at least, XRT (or 5wn)")
-@click.option(
-    "--timeout-blocks",
-    type=click.IntRange(1, 2**32 - 1),
-    default=25,
-    show_default=True,
-    help="silence, in blocks, after which another provider may take the turn",
-)
+@with_rules
 @click.option(
     "--refund-delay",
     type=click.IntRange(1, 2**32 - 1),

@@ -8,6 +8,7 @@ import click
 
 from mesh.cli.amounts import XRT
 from mesh.cli.lighthouse.checks import check_lighthouse
+from mesh.cli.lighthouse.rules import with_rules
 from mesh.cli.opening import for_signing, patience, signing
 from mesh.cli.printing import plural, print_facts, print_json, with_json
 from mesh.errors import ChainError
@@ -20,14 +21,7 @@ if TYPE_CHECKING:
 
 @click.command("create")
 @click.argument("name")
-@click.option("--minimal-stake", default="1", show_default=True, help="what a provider stakes at least, XRT (or 5wn)")
-@click.option(
-    "--timeout-blocks",
-    type=click.IntRange(1, 2**32 - 1),
-    default=25,
-    show_default=True,
-    help="silence, in blocks, after which another provider may take the turn",
-)
+@with_rules
 @with_json
 @for_signing()
 def command(settings: Settings, **plan: Any) -> None:

@@ -1,0 +1,142 @@
+"""The file of a ledger: SQLite, opened with its tables, written by one call after the other and synced by each."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Final
+
+import aiosqlite
+
+from mesh.errors import ClosedError, ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+VERSION: Final = 1
+SCHEMA: Final = """
+CREATE TABLE IF NOT EXISTS jobs (
+    liability TEXT PRIMARY KEY,
+    phase TEXT NOT NULL,
+    record BLOB NOT NULL,
+    success INTEGER,
+    result TEXT,
+    position INTEGER NOT NULL DEFAULT 0,
+    note TEXT NOT NULL DEFAULT '',
+    aside INTEGER NOT NULL DEFAULT 0,
+    changed REAL NOT NULL
+);
+CREATE TABLE IF NOT EXISTS outbox (
+    identity TEXT PRIMARY KEY,
+    kind TEXT NOT NULL,
+    payload BLOB NOT NULL,
+    deadline INTEGER,
+    posted REAL NOT NULL
+);
+CREATE TABLE IF NOT EXISTS spent (
+    identity TEXT PRIMARY KEY,
+    kind TEXT NOT NULL,
+    payload BLOB NOT NULL,
+    deadline INTEGER,
+    posted REAL NOT NULL,
+    liability TEXT NOT NULL
+);
+CREATE TABLE IF NOT EXISTS cursors (name TEXT PRIMARY KEY, block INTEGER NOT NULL, history BLOB NOT NULL DEFAULT x'');
+"""
+
+
+class LedgerUnusable(ConfigurationError):
+    """The ledger can't be read or written: a full disk, a folder of somebody else's, a file that is no ledger."""
+
+    def __init__(self, path: Path, why: object) -> None:
+        hint = "make room on that disk, let this user write there, or give another folder with --data-dir"
+        super().__init__(f"can't use the ledger {path}: {why}", hint=hint)
+        self.path = path
+
+
+class Database:
+    """The database in the file at `path`. Calls run in a thread of its own, in their order.
+
+    All raise `LedgerUnusable`, and `ClosedError` before `open` and after `close`.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._connection: aiosqlite.Connection | None = None
+        self._writing = asyncio.Lock()
+
+    async def open(self) -> None:
+        """Open the file, made when missing. Raises `ConfigurationError` for one of a newer version."""
+        if self._connection is not None:
+            raise ClosedError("this ledger is open already")
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._connection = await aiosqlite.connect(self._path, isolation_level=None)
+            await self._prepare()
+        except (OSError, aiosqlite.Error) as error:
+            await self.close()
+            raise LedgerUnusable(self._path, error) from None
+        except BaseException:
+            await self.close()
+            raise
+
+    async def close(self) -> None:
+        """Close it, if it is open: a connection that is left open keeps its thread, and the interpreter, alive."""
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            await connection.close()
+
+    async def run(self, statement: str, values: tuple[Any, ...] = ()) -> bool:
+        """Run one statement, which is on the disk when this returns. Whether it changed any rows."""
+        async with self._writing:
+            with self._usable():
+                cursor = await self._opened().execute(statement, values)
+        changed = cursor.rowcount > 0
+        await cursor.close()
+        return changed
+
+    async def run_together(self, *statements: tuple[str, tuple[Any, ...]]) -> None:
+        """Run all statements or, when cancelled too, none."""
+        connection = self._opened()
+        async with self._writing:
+            try:
+                with self._usable():
+                    await connection.execute("BEGIN IMMEDIATE")
+                    for statement, values in statements:
+                        await connection.execute(statement, values)
+                    await connection.commit()
+            except BaseException:
+                # What was cancelled is executed all the same: nothing may stay open behind it.
+                await connection.rollback()
+                raise
+
+    async def rows(self, statement: str, values: tuple[Any, ...] = ()) -> list[Any]:
+        """The rows that a statement finds."""
+        with self._usable():
+            return list(await self._opened().execute_fetchall(statement, values))
+
+    async def _prepare(self) -> None:
+        await self.run("PRAGMA journal_mode = WAL")
+        await self.run("PRAGMA synchronous = FULL")
+        version = (await self.rows("PRAGMA user_version"))[0][0]
+        if version > VERSION:
+            raise ConfigurationError(
+                f"the ledger {self._path} was written by a newer version (format {version}, this one knows {VERSION})",
+                hint="upgrade aira-mesh",
+            )
+        await self._opened().executescript(SCHEMA)
+        await self.run(f"PRAGMA user_version = {VERSION}")
+
+    def _opened(self) -> aiosqlite.Connection:
+        if self._connection is None:
+            raise ClosedError("the ledger is not open", hint="use it inside `async with`")
+        return self._connection
+
+    @contextmanager
+    def _usable(self) -> Iterator[None]:
+        """Raise `LedgerUnusable` for what the disk does not let the database do."""
+        try:
+            yield
+        except aiosqlite.OperationalError as error:
+            raise LedgerUnusable(self._path, error) from None
