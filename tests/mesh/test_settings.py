@@ -225,12 +225,6 @@ def test_without_a_data_folder_the_users_own_is_taken(monkeypatch: pytest.Monkey
     assert Settings().state_directory == Path.home() / ".local/share/aira"
 
 
-def test_another_lighthouse_changes_nothing_else() -> None:
-    settings = Settings(generation=5).with_lighthouse("mine.lighthouse.5.robonomics.eth")
-
-    assert settings == Settings(generation=5, lighthouse_contract="mine.lighthouse.5.robonomics.eth")
-
-
 def test_every_option_has_its_meaning_in_words() -> None:
     assert set(MEANING) == set(Settings.__struct_fields__)
 

@@ -10,6 +10,7 @@ import time
 from typing import TYPE_CHECKING
 
 from tests.support.processes import Server
+from tests.support.waiting import wait_until
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 AIRA = (sys.executable, "-m", "mesh")
 SECONDS = 120.0
-SOON = 2.5
+SOON = 15
 """Seconds in which a signal ends a command: a fraction of one on a machine that has nothing else to do."""
 
 
@@ -82,6 +83,13 @@ class Serving(Server):
     def is_ready(self) -> bool:
         """Whether it has said so."""
         return self._says in self.log()
+
+    def wait_until_said(self, words: str) -> None:
+        """Return when it has said these words, now or before."""
+        try:
+            wait_until(lambda: words in self.log(), what=repr(words), seconds=SECONDS)
+        except AssertionError as late:
+            raise AssertionError(f"{late}:\n{self.log()}") from None
 
     def end(self, how: signal.Signals) -> tuple[int, float]:
         """Send a signal and wait for the end; its exit code, and the seconds that it took."""

@@ -21,11 +21,13 @@ from mesh.market.provider import Provider
 from mesh.network import Endpoints, Network
 from mesh.settings import Settings
 from schemas import cid_of_bytes
+from tests.support.waiting import until_found
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
     from pathlib import Path
 
+    from mesh.agent import Contract, Phase
     from schemas import Demand, Verified
     from tests.support.routers import EmbeddedRouter
 
@@ -157,6 +159,16 @@ def careless(robot: Agent) -> Agent:
         await trader.offer(trader.mirrored(demand.message), lighthouse_fee=0)
 
     return robot
+
+
+async def in_phase(robot: Agent, contract: Contract, phase: Phase) -> None:
+    """Wait until a job has come to that phase at the robot."""
+
+    async def reached() -> bool:
+        job = await robot.parts.ledger.job(contract.address)
+        return job is not None and job.phase is phase
+
+    await until_found(reached, what=phase)
 
 
 @pytest.fixture

@@ -6,10 +6,11 @@ from hashlib import sha256
 from itertools import count
 from typing import Any, Final
 
-from schemas import ZERO_ADDRESS, Demand, Offer, Result, Signer, Verified, cid_of_bytes, verify_message
+from schemas import ZERO_ADDRESS, Demand, Liability, Offer, Result, Signer, Verified, cid_of_bytes, verify_message
 
 MARKET: Final = "airalab.lighthouse.3.robonomics.eth"
 LIGHTHOUSE: Final = "0x19437Cb65760805A0e55339186F03B2d980eBBf9"
+CONTRACT: Final = "0x5FbDB2315678afecb367f032d93F642f64180aa3"
 TOKEN: Final = "0x27023154114b066515Ae678cb06E19417B8fcA73"
 MODEL: Final = cid_of_bytes(b"a model")
 OTHER_MODEL: Final = cid_of_bytes(b"another model")
@@ -51,6 +52,27 @@ def result(*, signer: Signer = ROBOT, **changes: Any) -> Result:
     """A signed result, of a liability at some address unless it is given."""
     fields: dict[str, Any] = {"liability": LIGHTHOUSE, "result": RECORDING, "success": True}
     return signer.sign(Result(**(fields | changes)))
+
+
+def liability(**changes: Any) -> Liability:
+    """The contract, at an address that no chain knows, of such a demand and such an offer; its job has not ended."""
+    fields: dict[str, Any] = {
+        "address": CONTRACT,
+        "model": MODEL,
+        "objective": OBJECTIVE,
+        "result": "",
+        "promisee": PERSON.address,
+        "promisor": ROBOT.address,
+        "lighthouse": LIGHTHOUSE,
+        "lighthouse_fee": 0,
+        "token": TOKEN,
+        "cost": 42,
+        "validator": ZERO_ADDRESS,
+        "validator_fee": 0,
+        "is_success": False,
+        "is_finalized": False,
+    }
+    return Liability(**(fields | changes))
 
 
 def verified_demand(*, signer: Signer = PERSON, **changes: Any) -> Verified[Demand]:

@@ -26,6 +26,14 @@ async def until(
         await asyncio.sleep(pause)
 
 
+def wait_until(condition: Callable[[], object], *, what: str = "", seconds: float = SECONDS) -> None:
+    """As `until`, where there is no event loop."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, f"{what or 'the condition'} did not come about within {seconds:g} s"
+        time.sleep(PAUSE)
+
+
 async def until_found(search: Callable[[], Awaitable[object]], *, what: str = "", seconds: float = SECONDS) -> None:
     """As `until`, for a question that is itself waited for."""
     deadline = time.monotonic() + seconds

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
 import aiohttp
@@ -18,31 +19,46 @@ from tests.support.orders import demand, offer
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
     from pathlib import Path
 
+    from bridges.ipfs import ChannelBridge
+    from tests.bridges.ipfs.bridges import Mesh
     from tests.support.routers import EmbeddedRouter
 
 SECONDS = 60.0
 
 
+@asynccontextmanager
+async def bridged(
+    one: RecentDaemon, two: RecentDaemon, endpoint: str, topic: str, folder: Path
+) -> AsyncIterator[tuple[Bare, Mesh, ChannelBridge]]:
+    """Somebody at the second of two daemons, the mesh, and a bridge between that and the first."""
+    one.others, two.others = [two], [one]
+    async with (
+        Bare(two.api) as bob,
+        on_mesh(endpoint, topic) as mesh,
+        bridging(endpoint, one.api, topic, folder / "journal.sqlite") as bridge,
+    ):
+        await bob.listen(topic)
+        await until(lambda: bridge.status().state == "connected", seconds=SECONDS)
+        await until_seen(mesh, bridge.address)
+        yield bob, mesh, bridge
+
+
 async def test_messages_pass_both_ways(router: EmbeddedRouter, topic: str, tmp_path: Path) -> None:
-    async with RecentDaemon() as one, RecentDaemon() as two:
-        one.others, two.others = [two], [one]
-        async with (
-            Bare(two.api) as bob,
-            on_mesh(router.endpoint, topic) as mesh,
-            bridging(router.endpoint, one.api, topic, tmp_path / "journal.sqlite") as bridge,
-        ):
-            await bob.listen(topic)
-            await until(lambda: bridge.status().state == "connected", seconds=SECONDS)
-            await until_seen(mesh, bridge.address)
-            assert (bridge.status().daemon, bridge.status().dialect) == ("kubo 0.44.0", "multibase")
-            await bob.publish(topic, legacy_json(order := demand()))
-            await until(lambda: mesh.heard, seconds=SECONDS)
-            mesh.channel.publish(answer := offer())
-            await until(lambda: len(bob.heard) == 2, seconds=SECONDS)
-            assert mesh.payloads[0] == encode(order)
-            assert bob.heard == [legacy_json(order), legacy_json(answer)]
+    async with (
+        RecentDaemon() as one,
+        RecentDaemon() as two,
+        bridged(one, two, router.endpoint, topic, tmp_path) as (bob, mesh, bridge),
+    ):
+        assert (bridge.status().daemon, bridge.status().dialect) == ("kubo 0.44.0", "multibase")
+        await bob.publish(topic, legacy_json(order := demand()))
+        await until(lambda: mesh.heard, seconds=SECONDS)
+        mesh.channel.publish(answer := offer())
+        await until(lambda: len(bob.heard) == 2, seconds=SECONDS)
+        assert mesh.payloads[0] == encode(order)
+        assert bob.heard == [legacy_json(order), legacy_json(answer)]
 
 
 async def test_several_channels_do_not_overtake_each_other_at_one_daemon() -> None:
@@ -55,22 +71,17 @@ async def test_several_channels_do_not_overtake_each_other_at_one_daemon() -> No
 async def test_a_flood_of_the_mesh_comes_to_other_nodes_that_check_it_in_the_wrong_order(
     router: EmbeddedRouter, topic: str, tmp_path: Path
 ) -> None:
-    async with RecentDaemon() as one, RecentDaemon(busy=0.01) as two:
-        one.others, two.others = [two], [one]
-        async with (
-            Bare(two.api) as bob,
-            on_mesh(router.endpoint, topic) as mesh,
-            bridging(router.endpoint, one.api, topic, tmp_path / "journal.sqlite") as bridge,
-        ):
-            await bob.listen(topic)
-            await until(lambda: bridge.status().state == "connected", seconds=SECONDS)
-            await until_seen(mesh, bridge.address)
-            orders = [demand(cost=number) for number in range(50)]
-            for order in orders:
-                mesh.channel.publish(order)
-            await until(lambda: bridge.status().to_ipfs.carried == len(orders), seconds=SECONDS)
-            await until(lambda: len(bob.heard) + two.lost == len(orders), seconds=SECONDS)
-            assert bob.heard == [legacy_json(order) for order in orders]
+    async with (
+        RecentDaemon() as one,
+        RecentDaemon(busy=0.01) as two,
+        bridged(one, two, router.endpoint, topic, tmp_path) as (bob, mesh, bridge),
+    ):
+        orders = [demand(cost=number) for number in range(50)]
+        for order in orders:
+            mesh.channel.publish(order)
+        await until(lambda: bridge.status().to_ipfs.carried == len(orders), seconds=SECONDS)
+        await until(lambda: len(bob.heard) + two.lost == len(orders), seconds=SECONDS)
+        assert bob.heard == [legacy_json(order) for order in orders]
 
 
 async def test_what_somebody_else_has_overtaken_is_published_again(

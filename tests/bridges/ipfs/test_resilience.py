@@ -77,8 +77,9 @@ async def test_a_daemon_that_comes_late_goes_and_comes_back_costs_nothing_that_w
 
         await bob.publish(topic, legacy_json(answer := offer()))
         await until(lambda: encode(answer) in mesh.payloads, seconds=SECONDS)
-    # The one message that was on its way when the daemon died may have gone out; nobody can know.
-    assert len(bob.heard) - 1 - len(set(bob.heard[:-1])) <= 1
+    # What was on its way when the daemon died may have gone out, and what a busy one did not answer in time; nobody
+    # can know. All else goes out once.
+    assert len(bob.heard) - 1 - len(set(bob.heard[:-1])) <= 3
 
 
 async def test_a_daemon_that_is_frozen_is_lost_and_taken_up_again_when_it_goes_on(

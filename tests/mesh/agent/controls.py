@@ -13,9 +13,9 @@ from mesh.network import Endpoints, Network, call
 from schemas import String
 from schemas.keys import LiabilityTopicKey
 from schemas.rpc import Done, FinishLiability, LiabilityRead, Nothing, ReadLiability, StartLiability
-from tests.support.market import obliging
+from tests.support.market import in_phase, obliging
 from tests.support.objectives import objective
-from tests.support.waiting import until, until_found, until_heard
+from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -58,7 +58,7 @@ class Control:
 
     async def played(self, address: str) -> None:
         """Wait until the robot has played the whole objective."""
-        runs = self.robot._working().executor._runs
+        runs = self.robot._working().executor._playbacks
         await until(lambda: address in runs and runs[address].position == len(WORDS))
 
 
@@ -87,11 +87,3 @@ async def ready(control: Control, person: Agent, place: Place, *, step_ns: int =
     contract = await person.demand(path, cost=cost)
     await in_phase(control.robot, contract, Phase.READY)
     return contract
-
-
-async def in_phase(robot: Agent, contract: Contract, phase: Phase) -> None:
-    async def reached() -> bool:
-        job = await robot.parts.ledger.job(contract.address)
-        return job is not None and job.phase is phase
-
-    await until_found(reached, what=phase)

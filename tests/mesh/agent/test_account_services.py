@@ -47,7 +47,6 @@ TERMS: dict[str, Any] = {
     "deadline": 10**9,
 }
 RESULT: dict[str, Any] = {"liability": ZERO_ADDRESS, "result": cid_of_bytes(b"result"), "success": True}
-SIGNED = {"nonce": "ab" * 32, "signature": "ab" * 65}
 
 
 @pytest.fixture

@@ -10,8 +10,8 @@ from mesh.recording import open_objective
 from schemas import Liability, String
 from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey
 from schemas.rpc import Done, LiabilityRead, RestartLiability, ResumeLiability
-from tests.mesh.agent.controls import WORDS, Control, control, controlled, in_phase, person, ready
-from tests.support.market import obliging
+from tests.mesh.agent.controls import WORDS, Control, control, controlled, person, ready
+from tests.support.market import in_phase, obliging
 from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ async def test_a_playback_in_progress_is_ended_by_finish(place: Place) -> None:
     async with controlled(place, robot) as control, place.agent("person") as person, asyncio.timeout(20):
         contract = await ready(control, person, place, step_ns=HOUR_NS)
         await control.start(contract.address)
-        await until(lambda: robot._working().executor._runs[contract.address].position == 1)
+        await until(lambda: robot._working().executor._playbacks[contract.address].position == 1)
         await control.finish(contract.address)
         assert (await contract.outcome()).success
         assert await recorded(contract) == [("/say", WORDS[0])]

@@ -18,8 +18,8 @@ from schemas.rpc import (
     ResumeLiability,
     StartLiability,
 )
-from tests.mesh.agent.controls import Control, control, controlled, in_phase, person, ready
-from tests.support.market import careless
+from tests.mesh.agent.controls import Control, control, controlled, person, ready
+from tests.support.market import careless, in_phase
 
 if TYPE_CHECKING:
     from mesh.agent import Agent

@@ -50,27 +50,30 @@ async def test_what_an_earlier_life_left_in_the_pool_is_not_collided_with(anvil:
         assert await node.eth_balance(friend) == 3
 
 
-async def test_the_journal_tells_a_later_life_what_the_node_forgot(anvil: Anvil, tmp_path: Path) -> None:
-    friend = stranger()
-    async with life(anvil, SHORT, journal=tmp_path) as (node, sender):
+async def dropped(anvil: Anvil, friend: str, *, journal: Path) -> str:
+    """The hash of a transfer of 5 wei in an earlier life, which the node has forgotten."""
+    async with life(anvil, SHORT, journal=journal) as (node, sender):
         with pytest.raises(TransactionTimeout) as caught:
             await sender.send(to=friend, data=b"", value=5)
         await ask(node, "anvil_dropTransaction", caught.value.tx)
+    return caught.value.tx
+
+
+async def test_the_journal_tells_a_later_life_what_the_node_forgot(anvil: Anvil, tmp_path: Path) -> None:
+    friend = stranger()
+    forgotten = await dropped(anvil, friend, journal=tmp_path)
     async with life(anvil, journal=tmp_path) as (node, sender):
         sending = asyncio.create_task(sender.send(to=friend, data=b"", value=5))
-        assert await until_waiting(node, 1) == {0: caught.value.tx}
+        assert await until_waiting(node, 1) == {0: forgotten}
         await ask(node, "evm_mine")
-        assert (await sending).tx == caught.value.tx
+        assert (await sending).tx == forgotten
         assert await node.eth_balance(friend) == 5
     assert _files(tmp_path) == [], "what is settled is not kept"
 
 
 async def test_a_forgotten_transaction_gives_its_number_to_another(anvil: Anvil, tmp_path: Path) -> None:
     friend = stranger()
-    async with life(anvil, SHORT, journal=tmp_path) as (node, sender):
-        with pytest.raises(TransactionTimeout) as caught:
-            await sender.send(to=friend, data=b"", value=5)
-        await ask(node, "anvil_dropTransaction", caught.value.tx)
+    await dropped(anvil, friend, journal=tmp_path)
     async with life(anvil, journal=tmp_path) as (node, sender):
         sending = asyncio.create_task(sender.send(to=friend, data=b"", value=7))
         assert list(await until_waiting(node, 1)) == [0]

@@ -8,7 +8,6 @@ import os
 import signal
 import socket
 import sys
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,8 +21,10 @@ from mesh.demo.development import serve_chain
 from mesh.settings import Settings
 from tests.mesh.cli.chains import columns, refused
 from tests.support.commands import AIRA, SOON, Serving, aira
+from tests.support.development import variables_of
 from tests.support.peers import require
 from tests.support.ports import answers, free_port
+from tests.support.waiting import wait_until
 
 if TYPE_CHECKING:
     from click.testing import Result
@@ -72,13 +73,7 @@ def test_anvil_is_taken_where_it_is_on_the_path_and_stopped_with_the_command(
         assert said["engine"].startswith("anvil (")
         assert said["chain"] == f"http://127.0.0.1:{port}"
         anvil = child_of(server.pid)
-        keys = tmp_path / "development"
-        person = {
-            "AIRA_WEB3_HTTP_PROVIDER": said["chain"],
-            "AIRA_KEYFILE": str(keys / "person.json"),
-            "AIRA_KEYFILE_PASSWORD_FILE": str(keys / "password"),
-            "AIRA_DATA_DIR": str(tmp_path / "person"),
-        }
+        person = variables_of("person", tmp_path, url=said["chain"], data_dir=str(tmp_path / "person"))
         assert "anvil/" in aira("chain", "status", **person).stdout
         assert aira("xrt", "transfer", NOBODY, "1.5", **person).returncode == 0
         assert aira("xrt", "balance", **person).stdout == "998.5 XRT\n"
@@ -95,20 +90,13 @@ def test_anvil_does_not_outlive_a_command_that_is_killed(tmp_path: Path) -> None
     with up(tmp_path, "--anvil", require("anvil"), port=port) as server:
         anvil = child_of(server.pid)
         server.kill()
-        deadline = time.monotonic() + 30
-        while is_running(anvil):
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
-    assert not answers(port)
+        wait_until(lambda: not is_running(anvil) and not answers(port), what="the end of anvil")
 
 
 def test_a_crash_of_anvil_is_told_and_ends_the_command(tmp_path: Path) -> None:
     with up(tmp_path, "--anvil", require("anvil"), port=free_port()) as server:
         os.kill(child_of(server.pid), signal.SIGKILL)
-        deadline = time.monotonic() + 30
-        while is_running(server.pid):
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
+        wait_until(lambda: not is_running(server.pid), what="the end of the command")
         assert "aira: anvil ended by itself, by signal 9\n" in server.log()
         assert "Traceback" not in server.log()
         assert server._running().wait(30) == 1
@@ -184,14 +172,7 @@ async def test_a_transaction_that_is_not_mined_can_be_left_and_is_not_sent_twice
     settings = Settings(data_dir=str(tmp_path))
     anvil = require("anvil")
     async with serve_chain(settings, host="127.0.0.1", port=0, block_time=None, anvil=anvil) as served:
-        keys = tmp_path / "development"
-        person = {
-            "AIRA_WEB3_HTTP_PROVIDER": served.url,
-            "AIRA_KEYFILE": str(keys / "person.json"),
-            "AIRA_KEYFILE_PASSWORD_FILE": str(keys / "password"),
-            "AIRA_DATA_DIR": str(tmp_path / "person"),
-            "AIRA_POLL_INTERVAL": "0.1",
-        }
+        person = variables_of("person", tmp_path, url=served.url, data_dir=str(tmp_path / "person"))
         command = ("xrt", "transfer", NOBODY, "2")
         async with Chain(served.url) as chain:
             await chain.node.web3.provider.make_request(RPCEndpoint("evm_setAutomine"), [False])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import time
 from typing import TYPE_CHECKING
 
 import pytest
@@ -14,7 +13,6 @@ from mesh.chain.artifacts import load_artifact
 from schemas import Liability
 from tests.mesh.cli.chains import REFUND_DELAY, Town, columns, refused
 from tests.support.commands import AIRA, Interrupted, Serving, aira
-from tests.support.waiting import SECONDS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -219,9 +217,9 @@ def watching(town: Town) -> Iterator[Serving]:
 
 def test_watching_all_tells_of_each_that_is_made_and_ends(town: Town, watching: Serving) -> None:
     address = town.agree(cost=COST)
-    until_said(watching, f"{address}  made ")
+    watching.wait_until_said(f"{address}  made ")
     town.finish(address)
-    until_said(watching, f"{address}  paid ")
+    watching.wait_until_said(f"{address}  paid ")
     person = town.people["robot"].address
     assert f"{person[:6]}…{person[-4:]} for you, 1.5 XRT" in watching.log()
     code, _ = watching.end(signal.SIGINT)
@@ -231,16 +229,16 @@ def test_watching_all_tells_of_each_that_is_made_and_ends(town: Town, watching: 
 
 def test_watching_all_tells_what_a_reorganisation_takes_back(town: Town, watching: Serving) -> None:
     address = town.agree(cost=COST)
-    until_said(watching, f"{address}  made ")
+    watching.wait_until_said(f"{address}  made ")
     town.replace_blocks(1)
-    until_said(watching, f"the chain was reorganised: {address} was not made after all")
+    watching.wait_until_said(f"the chain was reorganised: {address} was not made after all")
 
 
 def test_watching_all_waits_for_a_node_that_is_lost(town: Town, watching: Serving) -> None:
     with town.unreachable():
-        until_said(watching, "waiting for it")
+        watching.wait_until_said("waiting for it")
     address = town.agree(cost=COST)
-    until_said(watching, f"{address}  made ")
+    watching.wait_until_said(f"{address}  made ")
     assert watching.log().count("waiting for it") == 1
     assert "Traceback" not in watching.log()
 
@@ -250,7 +248,7 @@ def test_watching_one_shows_it_once_it_has_ended(town: Town) -> None:
     command = (*AIRA, "liability", "watch", address)
     with Serving(*command, says="waiting for its end", variables=town.variables()) as watcher:
         town.finish(address, success=False)
-        until_said(watcher, "state       failed: ")
+        watcher.wait_until_said("state       failed: ")
 
 
 def test_watching_all_for_programs_is_an_object_a_line(town: Town) -> None:
@@ -274,10 +272,3 @@ def test_a_real_process_says_the_same(town: Town) -> None:
     done = aira("liability", "show", town.deployment.xrt, **town.variables())
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr == f"aira: {town.deployment.xrt} is not a liability of this factory\n"
-
-
-def until_said(server: Serving, words: str) -> None:
-    deadline = time.monotonic() + 3 * SECONDS
-    while words not in server.log():
-        assert time.monotonic() < deadline, server.log()
-        time.sleep(0.01)

@@ -18,6 +18,7 @@ from mesh.cli.up import _serve as serve_up
 from mesh.errors import AiraError, ConfigurationError, NetworkUnavailable
 from mesh.settings import Settings
 from schemas import cid_of_bytes, cid_of_file
+from tests.support.development import settings_of
 from tests.support.market import obliging
 from tests.support.objectives import objective
 from tests.support.ports import free_endpoint
@@ -75,8 +76,8 @@ async def test_a_job_from_up_to_the_recording(tmp_path: Path, printed: Printed) 
     up = start(serve_up(Settings(listen=(endpoint,), data_dir=str(tmp_path)), port=0, block_time=0.1))
     await said(up, "provider    0x", printed)
     assert printed.value("router") == endpoint
-    person = settings_of("person", endpoint, printed.value("chain"), tmp_path)
-    robot = settings_of("robot", endpoint, printed.value("chain"), tmp_path)
+    person = settings_of("person", tmp_path, url=printed.value("chain"), endpoint=endpoint)
+    robot = settings_of("robot", tmp_path, url=printed.value("chain"), endpoint=endpoint)
     path, out = tmp_path / "job.mcap", tmp_path / "new" / "result.mcap"
     path.write_bytes(objective(("/go", "there")))
     order: dict[str, Any] = ORDER | {"cost": "7wn"}
@@ -107,20 +108,6 @@ def moving(robot: Agent) -> Agent:
     return robot
 
 
-def settings_of(role: str, endpoint: str, url: str, folder: Path) -> Settings:
-    keys = folder / "development"
-    return Settings(
-        connect=(endpoint,),
-        connect_timeout=1.0,
-        web3_http_provider=url,
-        data_dir=str(folder / role),
-        poll_interval=0.05,
-        playback="at-once",
-        keyfile=str(keys / f"{role}.json"),
-        keyfile_password_file=str(keys / "password"),
-    )
-
-
 async def test_a_router_and_a_provider_apart(tmp_path: Path, printed: Printed) -> None:
     endpoint = free_endpoint()
     router = start(serve_router(Settings(listen=(endpoint,))))
@@ -128,7 +115,7 @@ async def test_a_router_and_a_provider_apart(tmp_path: Path, printed: Printed) -
     up = start(serve_up(Settings(listen=(free_endpoint(),), data_dir=str(tmp_path)), port=0, block_time=60))
     await said(up, "provider    0x", printed)
     url = printed.value("chain")
-    provider = start(serve_provider(settings_of("provider", endpoint, url, tmp_path)))
+    provider = start(serve_provider(settings_of("provider", tmp_path, url=url, endpoint=endpoint)))
     await said(provider, "serves airalab.lighthouse.3.robonomics.eth, Zenoh id ", printed)
     for server in (provider, up, router):
         await stopped(server)
@@ -137,7 +124,7 @@ async def test_a_router_and_a_provider_apart(tmp_path: Path, printed: Printed) -
 async def test_a_demand_that_comes_to_nothing_leaves_no_recording_behind(tmp_path: Path, printed: Printed) -> None:
     up = start(serve_up(Settings(listen=(free_endpoint(),), data_dir=str(tmp_path)), port=0, block_time=60))
     await said(up, "provider    0x", printed)
-    nowhere = settings_of("person", free_endpoint(), printed.value("chain"), tmp_path)
+    nowhere = settings_of("person", tmp_path, url=printed.value("chain"), endpoint=free_endpoint(), connect_timeout=1.0)
     out, kept = tmp_path / "new.mcap", tmp_path / "old.mcap"
     kept.write_bytes(b"an earlier one")
     order: dict[str, Any] = ORDER | {"objective": MODEL, "as_json": True}

@@ -7,7 +7,6 @@ import re
 import signal
 import socket
 import sys
-import time
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +16,7 @@ import pytest
 from mesh.recording import open_objective
 from schemas import cid_of_file
 from tests.support.commands import AIRA, SOON, Interrupted, Serving, aira
+from tests.support.development import variables_of
 from tests.support.objectives import objective
 from tests.support.ports import free_port
 
@@ -65,15 +65,8 @@ class Development:
         self.up = Serving(*AIRA, "up", *arguments, "--block-time", block_time, says="provider    0x")
 
     def variables(self, role: str) -> dict[str, str]:
-        keys = self.folder / "development"
-        return {
-            "AIRA_CONNECT": self.endpoint,
-            "AIRA_WEB3_HTTP_PROVIDER": self.url,
-            "AIRA_DATA_DIR": str(self.folder / "state"),
-            "AIRA_KEYFILE": str(keys / f"{role}.json"),
-            "AIRA_KEYFILE_PASSWORD_FILE": str(keys / "password"),
-            "AIRA_POLL_INTERVAL": "0.1",
-        }
+        state = str(self.folder / "state")
+        return variables_of(role, self.folder, url=self.url, connect=self.endpoint, data_dir=state)
 
     def demand(self, *arguments: str | Path) -> CompletedProcess[str]:
         return aira("demand", *arguments, **self.variables("person"))
@@ -134,11 +127,11 @@ def test_a_robot_that_is_killed_goes_on_where_it_was(development: Development, t
                 variables=development.variables("person"),
             )
         )
-        until_said(robot, "did 7")
+        robot.wait_until_said("did 7")
         robot.kill()
         killed = did(robot)
         robot.start()
-        until_said(person, "recording ")
+        person.wait_until_said("recording ")
         assert "paid, result" in person.log()
         resumed = did(robot)
     assert resumed[-1] == words[-1]
@@ -152,26 +145,13 @@ def did(robot: Serving) -> list[str]:
     return re.findall(r"^did (\d+)$", robot.log(), re.MULTILINE)
 
 
-def until_said(server: Serving, words: str) -> None:
-    deadline = time.monotonic() + 30
-    while words not in server.log():
-        assert time.monotonic() < deadline, server.log()
-        time.sleep(0.01)
-
-
 def test_the_parts_run_apart_as_well(tmp_path: Path) -> None:
     endpoint, port = f"tcp/127.0.0.1:{free_port()}", free_port()
     router = Serving(*AIRA, "router", "--listen", endpoint, says="listens at")
     chain = Serving(*AIRA, "chain", "up", "--port", str(port), "--data-dir", tmp_path, says="password ")
     with router, chain:
         assert f"chain       http://127.0.0.1:{port}" in chain.log()
-        keys = tmp_path / "development"
-        variables = {
-            "AIRA_CONNECT": endpoint,
-            "AIRA_WEB3_HTTP_PROVIDER": f"http://127.0.0.1:{port}",
-            "AIRA_KEYFILE": str(keys / "provider.json"),
-            "AIRA_KEYFILE_PASSWORD_FILE": str(keys / "password"),
-        }
+        variables = variables_of("provider", tmp_path, url=f"http://127.0.0.1:{port}", connect=endpoint)
         with Serving(*AIRA, "provider", says="serves airalab", variables=variables) as provider:
             for server in (provider, chain, router):
                 code, seconds = server.end(signal.SIGINT)

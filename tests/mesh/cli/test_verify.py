@@ -23,6 +23,7 @@ from mesh.settings import Settings
 from schemas import cid_of_bytes
 from tests.mesh.evidence.jobs import LIABILITY, OTHER, made
 from tests.support.commands import aira
+from tests.support.development import settings_of
 from tests.support.listening import Listener
 from tests.support.market import obliging
 from tests.support.objectives import objective
@@ -133,21 +134,6 @@ def test_as_a_program(job: Job) -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def settings_of(role: str, endpoint: str, url: str, folder: Path) -> Settings:
-    keys = folder / "development"
-    return Settings(
-        connect=(endpoint,),
-        connect_timeout=5.0,
-        fetch_timeout=5.0,
-        web3_http_provider=url,
-        data_dir=str(folder / role),
-        poll_interval=0.05,
-        playback="at-once",
-        keyfile=str(keys / f"{role}.json"),
-        keyfile_password_file=str(keys / "password"),
-    )
-
-
 @asynccontextmanager
 async def served_market(folder: Path, capsys: pytest.CaptureFixture[str]) -> AsyncIterator[tuple[str, str]]:
     """`aira up` in this process: the router's endpoint and the chain's URL."""
@@ -186,7 +172,10 @@ async def test_a_job_of_the_market_is_verified_from_its_address_alone(
     order: dict[str, Any] = {"model": MODEL, "cost": "7wn", "validator_fee": "0", "lifetime": 1000}
     nothing, other = (Files(objective=file, result=None, message=None) for file in (None, easier))
     async with asyncio.timeout(180), served_market(tmp_path, capsys) as (endpoint, url):
-        robot, person = (settings_of(role, endpoint, url, tmp_path) for role in ("robot", "person"))
+        robot, person = (
+            settings_of(role, tmp_path, url=url, endpoint=endpoint, connect_timeout=5.0, fetch_timeout=5.0)
+            for role in ("robot", "person")
+        )
         folder = str(tmp_path / "arbiter")
         nobody = Settings(connect=(endpoint,), fetch_timeout=10.0, web3_http_provider=url, data_dir=folder)
         async with moving(robot):

@@ -20,11 +20,11 @@ from mesh.settings import Settings
 from mesh.watching import JobEvent, Reading, Readings, Tally
 from schemas import Empty, RejectKey, Result, String, encode, message_hash, verify_message
 from schemas.rejection import Rejection
-from tests.mesh.watching.test_market import CONTRACT, EVENT, JOB
+from tests.mesh.watching.test_market import EVENT, JOB
 from tests.support.commands import AIRA, aira, environment
 from tests.support.market import MODEL, obliging
 from tests.support.objectives import objective
-from tests.support.orders import MARKET, RECORDING, ROBOT, TOKEN, demand, offer, result
+from tests.support.orders import CONTRACT, MARKET, RECORDING, ROBOT, TOKEN, demand, offer, result
 from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:

@@ -182,9 +182,9 @@ def test_ctrl_c_ends_it_at_any_moment(moment: str) -> None:
 
 @pytest.mark.parametrize("seconds", [0.2, 0.4, 0.6])
 def test_ctrl_c_ends_it_before_it_says_anything(seconds: float) -> None:
-    """Python itself needs a moment until it can end quietly."""
+    """Python itself needs a moment until it can end quietly; before that the signal ends it."""
     interrupted = Interrupted("demo", "--json", after=seconds)
-    assert interrupted.code == 130
+    assert interrupted.code in (130, -signal.SIGINT)
     assert "Traceback" not in interrupted.errors
     assert interrupted.seconds < SOON
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 from msgspec.structs import replace as replace_fields
 
-from mesh.market import order_id, patience, sending, watching
+from mesh.market import order_id, watching
 from schemas import verify_message
 from tests.mesh.market.tokens import BURNS_ALL_GAS, deploy_token, refuses_with, says
 from tests.mesh.market.troubles import works_on
@@ -19,12 +19,7 @@ if TYPE_CHECKING:
     from tests.mesh.market.floor import Floor
 
 
-@pytest.fixture(autouse=True)
-def impatience(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is tried again is tried again soon."""
-    for module in (sending, watching):
-        monkeypatch.setattr(module, "RETRY", 0.05)
-    monkeypatch.setattr(patience, "PAUSE", 0.01)
+pytestmark = pytest.mark.usefixtures("impatience")
 
 
 async def test_two_providers_share_the_work_in_their_turns(floor: Floor) -> None:

@@ -13,7 +13,7 @@ from web3.providers.async_base import AsyncBaseProvider
 
 from mesh.chain import GWEI, JsonRpcServer
 from mesh.demo.market import found_market
-from mesh.market import patience, sending, watching
+from mesh.market import patience, sending
 from schemas import cid_of_bytes, parse_cid
 from tests.mesh.market.floor import QUICK, Floor
 from tests.mesh.market.troubles import works_on
@@ -29,12 +29,7 @@ if TYPE_CHECKING:
     from tests.support.routers import EmbeddedRouter
 
 
-@pytest.fixture(autouse=True)
-def impatience(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is tried again is tried again soon."""
-    for module in (sending, watching):
-        monkeypatch.setattr(module, "RETRY", 0.05)
-    monkeypatch.setattr(patience, "PAUSE", 0.01)
+pytestmark = pytest.mark.usefixtures("impatience")
 
 
 @asynccontextmanager

@@ -230,7 +230,7 @@ async def test_leaving_a_subscription_ends_its_iteration(here: zenoh.Session, th
         theirs.publish(demand())
         await until(lambda: taken)
 
-    async with asyncio.timeout(2):
+    async with asyncio.timeout(15):
         await consuming
     assert len(taken) == 1
 

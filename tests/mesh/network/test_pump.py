@@ -152,7 +152,7 @@ async def test_leaving_ends_the_iteration_of_whoever_waits(here: zenoh.Session) 
         consuming = asyncio.create_task(collect(numbers))
         await asyncio.sleep(0)
 
-    async with asyncio.timeout(2):
+    async with asyncio.timeout(15):
         assert await consuming == []
     with pytest.raises(StopAsyncIteration):
         await anext(numbers)

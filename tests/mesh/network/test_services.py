@@ -10,7 +10,7 @@ import pytest
 from mesh.errors import AiraError
 from mesh.network import ServiceFailed, Services, call
 from mesh.network.services import AT_ONCE
-from schemas import Liability, RpcKey
+from schemas import RpcKey
 from schemas.rpc import (
     AccountBalance,
     Balance,
@@ -22,7 +22,7 @@ from schemas.rpc import (
     StartLiability,
 )
 from tests.mesh.network.offers import ADDRESS, REQUEST, done, offering
-from tests.support.orders import LIGHTHOUSE, MODEL, OBJECTIVE, PERSON, ROBOT, TOKEN
+from tests.support.orders import LIGHTHOUSE, PERSON, liability
 from tests.support.waiting import at_most, until, until_answered
 
 if TYPE_CHECKING:
@@ -51,28 +51,13 @@ async def test_amounts_beyond_what_json_numbers_hold_survive(here: zenoh.Session
 
 
 async def test_a_whole_record_travels(here: zenoh.Session, there: zenoh.Session) -> None:
-    liability = Liability(
-        address=LIGHTHOUSE,
-        model=MODEL,
-        objective=OBJECTIVE,
-        result="",
-        promisee=PERSON.address,
-        promisor=ROBOT.address,
-        lighthouse=LIGHTHOUSE,
-        lighthouse_fee=1,
-        token=TOKEN,
-        cost=2,
-        validator=PERSON.address,
-        validator_fee=3,
-        is_success=False,
-        is_finalized=False,
-    )
+    job = liability(lighthouse_fee=1, cost=2, validator=PERSON.address, validator_fee=3)
 
     async def read(request: ReadLiability) -> LiabilityRead:
-        return LiabilityRead(True, liability)
+        return LiabilityRead(True, job)
 
     async with offering(there, here, read=read):
-        assert await call(here, ADDRESS, "read", ReadLiability(LIGHTHOUSE)) == LiabilityRead(True, liability)
+        assert await call(here, ADDRESS, "read", ReadLiability(LIGHTHOUSE)) == LiabilityRead(True, job)
 
 
 async def test_a_question_without_a_payload_is_an_empty_request(here: zenoh.Session, there: zenoh.Session) -> None:

@@ -3,29 +3,20 @@
 from __future__ import annotations
 
 import threading
-import time
 from typing import TYPE_CHECKING
 
 from mesh.recording import RecordingAbout
 from mesh.recording.partial import PartialFile
 from mesh.recording.recorders import Recorders
 from schemas.payloads import STRING
-from tests.support.waiting import SECONDS
+from tests.support.waiting import SECONDS, wait_until
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
     import pytest
 
 ABOUT = RecordingAbout()
-
-
-def wait(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + SECONDS
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
 
 
 def test_the_figures_of_recorders_that_are_closed_stay(tmp_path: Path) -> None:
@@ -36,7 +27,7 @@ def test_the_figures_of_recorders_that_are_closed_stay(tmp_path: Path) -> None:
                 recorder.record("/led", b"on", STRING)
     third = recorders.open(tmp_path / "three.mcap", ABOUT)
     third.record("/led", b"on", STRING)
-    wait(lambda: recorders.statistics().recorded == 8)
+    wait_until(lambda: recorders.statistics().recorded == 8)
     assert recorders.statistics().lost == 0
     assert recorders.statistics().lag == 0
     third.close()
@@ -55,8 +46,8 @@ def test_the_lag_grows_while_the_disk_does_not_take_anything(tmp_path: Path, mon
     recorders = Recorders()
     with recorders.open(tmp_path / "one.mcap", ABOUT) as recorder:
         recorder.record("/led", b"on", STRING)
-        wait(lambda: recorders.statistics().lag > 0.2)
+        wait_until(lambda: recorders.statistics().lag > 0.2)
         assert recorders.statistics().recorded == 0
         held.set()
-        wait(lambda: recorders.statistics().lag == 0)
+        wait_until(lambda: recorders.statistics().lag == 0)
     assert recorders.statistics().recorded == 1

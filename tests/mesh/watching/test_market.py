@@ -11,20 +11,20 @@ import pytest
 
 from mesh.network import Channel, Endpoints, Network, message_key
 from mesh.watching import JobEvent, MarketWatch
-from schemas import ZERO_ADDRESS, EventKey, Liability, RejectKey, Verified, encode, message_hash
+from schemas import EventKey, RejectKey, Verified, encode, message_hash
 from schemas.rejection import Rejection
 from tests.support.orders import (
+    CONTRACT,
     LIGHTHOUSE,
     MARKET,
     MODEL,
-    OBJECTIVE,
     OTHER_MODEL,
     PERSON,
     RECORDING,
     ROBOT,
     STRANGER,
-    TOKEN,
     demand,
+    liability,
     offer,
     result,
 )
@@ -35,23 +35,7 @@ if TYPE_CHECKING:
 
     from tests.support.routers import EmbeddedRouter
 
-CONTRACT = "0x5FbDB2315678afecb367f032d93F642f64180aa3"
-JOB = Liability(
-    address=CONTRACT,
-    model=MODEL,
-    objective=OBJECTIVE,
-    result="",
-    promisee=PERSON.address,
-    promisor=ROBOT.address,
-    lighthouse=LIGHTHOUSE,
-    lighthouse_fee=0,
-    token=TOKEN,
-    cost=42,
-    validator=ZERO_ADDRESS,
-    validator_fee=0,
-    is_success=False,
-    is_finalized=False,
-)
+JOB = liability()
 EVENT = str(EventKey(ROBOT.address, CONTRACT, "incoming"))
 
 

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.support.objectives import objective
-from tests.support.waiting import until_found
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.agent import Agent, Contract, Phase
+    from mesh.agent import Agent, Contract
     from mesh.work.run import Run
     from schemas import String
     from tests.support.market import Place
@@ -38,14 +37,6 @@ def speaking(robot: Agent, said: list[str], *, stuck_at: str = "") -> Agent:
         job.publish("/said", message.data)
 
     return robot
-
-
-async def in_phase(robot: Agent, contract: Contract, phase: Phase) -> None:
-    async def reached() -> bool:
-        job = await robot.parts.ledger.job(contract.address)
-        return job is not None and job.phase is phase
-
-    await until_found(reached, what=phase)
 
 
 class Paying:

@@ -12,7 +12,7 @@ import pytest
 
 from mesh.agent import JobFailed, Phase
 from mesh.running import _cause
-from mesh.work.ledger import LedgerUnusable
+from mesh.work.database import LedgerUnusable
 from mesh.work.run import NOTE_TOPIC
 from schemas import Empty, String, cid_of_bytes
 from tests.mesh.work.executions import COST, doing_nothing, heard, recorded
@@ -163,7 +163,7 @@ async def test_a_ledger_that_can_not_be_written_ends_the_agent_and_fails_no_job(
         @made.on("/go")
         async def go(job: Run, message: Any) -> None:
             if not writable[0]:
-                await made.parts.ledger._run("PRAGMA query_only = ON")
+                await made.parts.ledger._database.run("PRAGMA query_only = ON")
             done.append(message.data)
 
         return made

@@ -13,7 +13,7 @@ import pytest
 
 from mesh.errors import ClosedError, ConfigurationError
 from mesh.work import Ledger, Phase
-from mesh.work.ledger import VERSION, LedgerUnusable
+from mesh.work.database import VERSION, LedgerUnusable
 from tests.mesh.work.ledgers import RESULT, ledger, mark_as_version, path
 from tests.mesh.work.samples import liability, message
 from tests.support.disks import room_for

@@ -12,8 +12,8 @@ from mesh.recording import open_objective
 from mesh.work import Ledger
 from mesh.work import outbox as outbox_module
 from schemas import String, cid_of_file
-from tests.mesh.work.restarts import COST, WORDS, Paying, in_phase, made_by_a_provider_that_goes, paid, speaking, words
-from tests.support.market import careless, obliging
+from tests.mesh.work.restarts import COST, WORDS, Paying, made_by_a_provider_that_goes, paid, speaking, words
+from tests.support.market import careless, in_phase, obliging
 from tests.support.orders import result
 from tests.support.waiting import until, until_found
 

@@ -12,9 +12,9 @@ from mesh.recording import open_objective
 from mesh.work import outbox as outbox_module
 from mesh.work.outbox import outgoing
 from schemas import String, cid_of_file
-from tests.mesh.work.restarts import COST, WORDS, Paying, in_phase, made_by_a_provider_that_goes, paid, speaking, words
+from tests.mesh.work.restarts import COST, WORDS, Paying, made_by_a_provider_that_goes, paid, speaking, words
 from tests.mesh.work.samples import liability
-from tests.support.market import obliging
+from tests.support.market import in_phase, obliging
 from tests.support.orders import result
 from tests.support.waiting import until
 
@@ -39,12 +39,12 @@ async def test_a_job_that_awaits_its_finish_keeps_its_recording_over_a_restart(p
             await in_phase(robot, contract, Phase.READY)
             executor = robot._working().executor
             await executor.start(contract.address)
-            executor._runs[contract.address].publish("/said", "before")
-            await until(lambda: executor._runs[contract.address].position == len(WORDS))
+            executor._playbacks[contract.address].publish("/said", "before")
+            await until(lambda: executor._playbacks[contract.address].position == len(WORDS))
         async with place.agent("robot") as robot:
             executor = robot._working().executor
             await executor.resume(contract.address)
-            executor._runs[contract.address].publish("/said", "after")
+            executor._playbacks[contract.address].publish("/said", "after")
             await robot.finish(contract.address, success=True)
             assert (await contract.outcome()).success
             recording = open_objective(await contract.recording())
