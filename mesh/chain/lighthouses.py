@@ -62,6 +62,8 @@ class Lighthouses(Following, Tokens):
         """
         me = self._signing().account.address
         address = await self.lighthouse_address(lighthouse)
+        # In this order: a stake on its way may be mined between the two, and takes its allowance with it.
+        allowance = await self.allowance(me, address)
         state = await self._suite.state(address)
         missing = stake - state.stakes.get(me, 0)
         if missing <= 0:
@@ -71,7 +73,7 @@ class Lighthouses(Following, Tokens):
         balance = await self.balance_of(me)
         if balance < missing:
             raise InsufficientTokens(me, self.xrt, balance=balance, needed=missing)
-        if await self.allowance(me, address) < missing:
+        if allowance < missing:
             await self.approve(address, missing)
         await self.refill(address, missing)
         return await self._suite.state(address)

@@ -77,9 +77,9 @@ async def test_a_daemon_that_comes_late_goes_and_comes_back_costs_nothing_that_w
 
         await bob.publish(topic, legacy_json(answer := offer()))
         await until(lambda: encode(answer) in mesh.payloads, seconds=SECONDS)
-    # What was on its way when the daemon died may have gone out, and what a busy one did not answer in time; nobody
-    # can know. All else goes out once.
-    assert len(bob.heard) - 1 - len(set(bob.heard[:-1])) <= 3
+    # What was on its way when the daemon died may have gone out, and what was said before it was known again who
+    # listens; nobody can know, and all who listen drop what they know. All else goes out once.
+    assert len(bob.heard) - 1 - len(set(bob.heard[:-1])) <= 10
 
 
 async def test_a_daemon_that_is_frozen_is_lost_and_taken_up_again_when_it_goes_on(

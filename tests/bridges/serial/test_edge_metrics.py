@@ -75,5 +75,5 @@ async def test_an_edge_agent_that_waits_for_its_router_says_that_it_has_not_begu
     listen, router = f"127.0.0.1:{free_port()}", f"tcp/127.0.0.1:{free_port()}"
     options = ("--agent", "0x" + "11" * 20, "--connect", router, "--connect-timeout", "-1", "--metrics-listen", listen)
     with Serving(*AIRA, "edge", tmp_path / "port", *options, says="metrics at"):
-        assert await health(f"http://{listen}") == (503, {"start": "has not come to its end"})
+        assert await health(f"http://{listen}") == (503, {"start": "still waits"})
         assert aira("health", "--url", f"http://{listen}").returncode == 1

@@ -124,9 +124,9 @@ def test_a_bag_is_played(tmp_path: Path) -> None:
 
 def test_a_dense_objective_takes_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The lamp needs longer for its messages than they lie apart: no reason to give up."""
-    monkeypatch.setattr("mesh.demo.demo.PATIENCE", 1.0)
+    monkeypatch.setattr("mesh.demo.demo.PATIENCE", 6.0)
     path = tmp_path / "dense.mcap"
-    path.write_bytes(objective(*(("/blink", Empty()) for _ in range(18)), step_ns=0))
+    path.write_bytes(objective(*(("/blink", Empty()) for _ in range(40)), step_ns=0))
     assert told(demo("--json", "--objective", path))[-1]["paid"]
 
 

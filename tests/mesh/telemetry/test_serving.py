@@ -39,7 +39,7 @@ async def test_without_a_place_nothing_is_served() -> None:
 
 async def test_what_has_not_begun_is_not_well_and_says_what_it_waits_for() -> None:
     async with Telemetry(HERE) as telemetry:
-        assert await health(telemetry.url) == (503, {"start": "has not come to its end"})
+        assert await health(telemetry.url) == (503, {"start": "still waits"})
         telemetry.starting("no router answers")
         assert await health(telemetry.url) == (503, {"start": "waits: no router answers"})
         figures = await scraped(telemetry.url)
