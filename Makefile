@@ -13,7 +13,7 @@ LOCK := requirements/lock.txt
 TYPED := schemas mesh bridges peers tests bench examples
 BENCHES := $(shell grep -l __main__ bench/*.py)
 # Processes that run the tests. They wait more than they compute, so more than there are cores; 0 runs all in one.
-JOBS ?= 4
+JOBS ?= 3
 
 .PHONY: help setup demo test compose-test lint peers bench contracts contracts-check slither firmware lock clean
 

@@ -132,7 +132,7 @@ class Wire:
         if self._locator.startswith(SECURE):
             return broken(f"the router lets anybody write anything: a write in {where} came through", do=ROSTER)
         if is_loopback(self._locator):
-            return sound("the router is open: everybody on this machine may write everything, which is fine on one")
+            return sound("the router is open: everybody may write everything, which is fine on this machine alone")
         return broken(
             f"the router is open to everybody who reaches it: a write in {where} came through",
             do="begin a site with a roster and certificates, as docs/sites.md shows: `aira identity site FOLDER`",

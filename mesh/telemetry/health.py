@@ -13,7 +13,7 @@ from schemas.status import ALIVE, OFF
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-STARTING: Final = "has not come to its end"
+STARTING: Final = "still waits"
 """The state of the start of a role, until it is over."""
 
 
