@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NoReturn
 
 from mesh.background import Background
-from mesh.demo.anvil_state import STATE_SECONDS, keep_state, prepare_state
+from mesh.demo.anvil_state import STATE_SECONDS, keep_state, prepare_state, settle_state
 from mesh.errors import ConfigurationError, RemoteError
 
 if TYPE_CHECKING:
@@ -140,6 +140,7 @@ async def serve_anvil(
         if state is not None:
             await asyncio.to_thread(prepare_state, state)
             command += ["--state", str(state), "--state-interval", str(STATE_SECONDS)]
+            stack.push_async_callback(asyncio.to_thread, settle_state, state)
         node = Anvil(program, await _start(program, command), host=host, port=port)
         stack.push_async_callback(node.stop)
         await node.until_ready(facts)

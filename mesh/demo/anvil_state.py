@@ -69,6 +69,12 @@ def founding(state: Path | None) -> Iterator[None]:
     _mark(state, f"{MADE}, and not saved yet\n")
 
 
+def settle_state(state: Path) -> None:
+    """After anvil's end, which wrote the state once more: contracts that are in it are not made again."""
+    if state.exists():
+        _be_founded(being_founded(state), saved=state.stat().st_mtime_ns)
+
+
 def kept(state: Path) -> Path:
     """Where the last whole state is."""
     return state.with_name(f"{state.name}.kept")
