@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any, Final
 from crowd import PATIENCE, SPAWN, router
 from mesh import Agent
 from mesh.background import Background
-from mesh.chain import EmbeddedChain
-from mesh.demo.anvil import find_anvil, serve_anvil
-from mesh.demo.market import found_market
 from mesh.demo.objective import write_objective
+from mesh.devchain import EmbeddedChain
+from mesh.devchain.anvil import find_anvil, serve_anvil
+from mesh.devchain.market import found_market
 from mesh.market.provider import Provider
 from mesh.network import Channel, Endpoints, Network
 from mesh.settings import Settings
@@ -27,7 +27,7 @@ from schemas import cid_of_bytes
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from mesh.demo.market import Market
+    from mesh.devchain.market import Market
     from schemas import Demand, Verified
 
 MODEL: Final = cid_of_bytes(b"what the robot of the benchmark can do")

@@ -8,13 +8,19 @@ from schemas.errors import AiraError, InputError, InvalidAddress, InvalidCid, In
 class ConfigurationError(AiraError):
     """The settings can't work as they are: an unknown option, a missing keyfile, a value out of range."""
 
+    code = "configuration-error"
+
 
 class RemoteError(AiraError):
     """The other side failed or is not there; trying again later may help."""
 
+    code = "remote-error"
+
 
 class NetworkUnavailable(RemoteError):
     """No Zenoh router answers at the configured endpoints."""
+
+    code = "network-unavailable"
 
     def __init__(self, endpoints: tuple[str, ...], why: str) -> None:
         super().__init__(
@@ -27,13 +33,19 @@ class NetworkUnavailable(RemoteError):
 class ContentError(RemoteError):
     """A file behind a CID can't be had."""
 
+    code = "content-error"
+
 
 class ChainError(RemoteError):
     """The chain, or what runs on it, refused or did not answer."""
 
+    code = "chain-error"
+
 
 class ClosedError(AiraError):
     """An object was used after it was closed (by you; a broken world raises `RemoteError`)."""
+
+    code = "closed-error"
 
 
 __all__ = [

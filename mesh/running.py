@@ -57,14 +57,14 @@ def tell(error: AiraError) -> None:
 
     Where a server logs in JSON, that is an event of its log.
     """
-    from mesh.telemetry.context import facts  # here, as few commands come to this
+    from mesh.telemetry.context import log_event  # here, as few commands come to this
     from mesh.telemetry.events import without_secrets
     from mesh.telemetry.logs import writes_json
 
     if writes_json():
-        log.error("%s", error, extra=facts(hint=error.hint))
+        log.error("%s", error, extra=log_event("failed", code=error.code, hint=error.hint))
         return
-    print(f"aira: {without_secrets(str(error))}", file=sys.stderr)
+    print(f"aira: {without_secrets(str(error))} [{error.code}]", file=sys.stderr)
     if error.hint:
         print(f"      {without_secrets(error.hint)}", file=sys.stderr)
 

@@ -8,7 +8,7 @@ import os
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from mesh.errors import ConfigurationError, RemoteError
-from mesh.trouble import Trouble
+from mesh.outage_log import OutageLog
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -33,12 +33,16 @@ def waits_for_ever(settings: Settings) -> bool:
 class FilesMissing(ConfigurationError):
     """Files that the settings name are not there."""
 
+    code = "files-missing"
+
     def __init__(self, files: Sequence[str]) -> None:
         super().__init__(f"files that are not there yet: {', '.join(files)}")
 
 
 class FilesNotReadable(ConfigurationError):
     """Files that the settings name are there, and not for this user to read."""
+
+    code = "files-not-readable"
 
     def __init__(self, files: Sequence[str]) -> None:
         user = os.geteuid()
@@ -52,11 +56,11 @@ def lacking(settings: Settings) -> Iterator[None]:
 
     Ends at once where nothing is to be waited for: what reads the file says then that it is not there.
     """
-    trouble = Trouble(log)
+    trouble = OutageLog(log, "files")
     while waits_for_ever(settings) and (error := _lack(settings)) is not None:
-        trouble.met(error, "waiting")
+        trouble.failed(error, "waiting")
         yield
-    trouble.over("the files are there")
+    trouble.recovered("the files are there")
 
 
 async def files(settings: Settings) -> None:
@@ -83,18 +87,18 @@ async def entered(
     """
     import asyncio
 
-    trouble = Trouble(log)
+    trouble = OutageLog(log, "startup")
     while True:
         try:
             opened = await stack.enter_async_context(make())
         except RemoteError as error:
             if not waits_for_ever(settings):
                 raise
-            trouble.met(error, f"the {role} waits")
+            trouble.failed(error, f"the {role} waits")
             waits(str(error))
             await asyncio.sleep(AGAIN)
         else:
-            trouble.over(f"the {role} waits no longer")
+            trouble.recovered(f"the {role} waits no longer")
             return opened
 
 

@@ -25,6 +25,8 @@ class LogEvent(Record, frozen=True, kw_only=True, omit_defaults=True, forbid_unk
     """One of `LEVELS`."""
     logger: str
     """The module that says it."""
+    event: str = ""
+    """The stable name of what happened (`contract-created`), for programs; empty for other programs' lines."""
     message: str
     role: str = ""
     """What speaks: agent, provider, router, bridge, edge."""

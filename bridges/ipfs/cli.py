@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import logging
 from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import click
-import msgspec
 
 from mesh.cli.announcing import announce
 from mesh.cli.options import with_settings
 from mesh.errors import ConfigurationError, NetworkUnavailable
 from mesh.running import run_until_stopped
-from mesh.settings import CHAIN_SETTINGS, NETWORK_SETTINGS, SERVER_SETTINGS
+from mesh.settings import ChainSettings, NetworkSettings, TelemetrySettings, options_of
 from mesh.telemetry.context import Speaker
 from mesh.telemetry.log_service import LogService
 from mesh.telemetry.logs import introduce
@@ -39,7 +39,7 @@ AGAIN: Final = 1.0
 @click.option("--api", help="the daemon's RPC, a multiaddr or a URL; the same as --ipfs-http-provider")
 @click.option("--lighthouse", "lighthouses", multiple=True, metavar="NAME", help="several channels: name each")
 @with_settings(
-    *NETWORK_SETTINGS,
+    *options_of(NetworkSettings),
     "ipfs_http_provider",
     "ipfs_authorization_file",
     "ipfs_gateway",
@@ -50,8 +50,8 @@ AGAIN: Final = 1.0
     "content_limit",
     "fetch_timeout",
     "keyfile",
-    *CHAIN_SETTINGS,
-    *SERVER_SETTINGS,
+    *options_of(ChainSettings),
+    *options_of(TelemetrySettings),
 )
 def command(settings: Settings, api: str | None, lighthouses: tuple[str, ...]) -> None:
     """Carry messages and content between the mesh and the legacy network on IPFS. Ctrl-C ends it.
@@ -61,7 +61,7 @@ def command(settings: Settings, api: str | None, lighthouses: tuple[str, ...]) -
     or without one (--web3-http-provider ""), no ENS name in a message is looked up, and deadlines are not checked.
     """
     if api:
-        settings = msgspec.structs.replace(settings, ipfs_http_provider=api)
+        settings = dataclasses.replace(settings, ipfs_http_provider=api)
     run_until_stopped(lambda: _serve(settings, lighthouses), settings=settings, role="bridge")
 
 
@@ -120,7 +120,7 @@ async def _introduce(bridge: IpfsBridge, network: Network, stack: AsyncExitStack
 
 async def _network(settings: Settings, stack: AsyncExitStack, *, waits: Callable[[str], None]) -> Network:
     """The session, as soon as there is a router; `waits` is told why there is none."""
-    from mesh.agent.parts import endpoints_of
+    from mesh.composition import endpoints_of
     from mesh.network import Network
 
     said = False
@@ -137,7 +137,7 @@ async def _network(settings: Settings, stack: AsyncExitStack, *, waits: Callable
 
 def _chain(settings: Settings) -> Callable[[], Chain] | None:
     """What makes a client of the chain, if the settings name one. Raises `ConfigurationError`."""
-    from mesh.agent.parts import chain_of
+    from mesh.composition import chain_of
 
     if not settings.web3_http_provider.strip() and not settings.web3_ws_provider.strip():
         return None

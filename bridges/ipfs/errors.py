@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 class IpfsError(RemoteError):
     """An IPFS daemon or gateway failed or is not there; `api` is its address."""
 
+    code = "ipfs-error"
+
     def __init__(self, api: str, why: str, *, hint: str = "") -> None:
         super().__init__(f"IPFS at {api}: {why}", hint=hint)
         self.api = api
@@ -22,12 +24,16 @@ class IpfsError(RemoteError):
 class DaemonUnreachable(IpfsError):
     """The daemon does not answer, or broke off in the middle; it may be there again later."""
 
+    code = "daemon-unreachable"
+
     def __init__(self, api: str, why: str) -> None:
         super().__init__(api, why, hint="is the daemon running, and is this the address of its RPC?")
 
 
 class DaemonRefused(IpfsError):
     """The daemon answered a call with an error: `status` is HTTP's, `why` the daemon's own words."""
+
+    code = "daemon-refused"
 
     def __init__(self, api: str, status: int, why: str, *, hint: str = "") -> None:
         super().__init__(api, why, hint=hint)
@@ -36,6 +42,8 @@ class DaemonRefused(IpfsError):
 
 class AccessDenied(DaemonRefused):
     """The daemon wants other credentials."""
+
+    code = "access-denied"
 
     def __init__(self, api: str, status: int, why: str) -> None:
         super().__init__(
@@ -50,6 +58,8 @@ class AccessDenied(DaemonRefused):
 class PubSubDisabled(DaemonRefused):
     """The daemon runs without PubSub."""
 
+    code = "pub-sub-disabled"
+
     def __init__(self, api: str, status: int, why: str) -> None:
         super().__init__(
             api, status, why, hint="ipfs config --json Pubsub.Enabled true; old ones: --enable-pubsub-experiment"
@@ -59,13 +69,19 @@ class PubSubDisabled(DaemonRefused):
 class NoPeers(DaemonRefused):
     """Nobody whom the daemon knows listens to the topic. Keep the message and publish it later."""
 
+    code = "no-peers"
+
 
 class Overtaken(DaemonRefused):
     """The daemon has checked a later message of its own first, and so takes this one for a replay: publish it again."""
 
+    code = "overtaken"
+
 
 class JournalFailed(AiraError):
     """A bridge can't read or write what it must remember."""
+
+    code = "journal-failed"
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(

@@ -23,6 +23,8 @@ AGAIN: Final = 5.0
 class ChainAwaited(ChainError):
     """The chain's node was not reached yet."""
 
+    code = "chain-awaited"
+
 
 class Markets:
     """The addresses of `lighthouses` (ENS names), other names, and the latest block: `await markets.run()`.
@@ -58,7 +60,7 @@ class Markets:
         """The address behind an ENS name. Raises `ChainError`."""
         if self._chain is None:
             raise ChainAwaited("the chain's node is not there yet")
-        return await self._chain.resolve(name)
+        return await self._chain.names.address(name)
 
     async def run(self) -> None:
         """Follow the chain until cancelled. Raises `ConfigurationError` for a chain that can't be the right one."""
@@ -80,7 +82,7 @@ class Markets:
         try:
             self.head = await chain.block_number()
             for name in [name for name, address in self._addresses.items() if address is None]:
-                self._addresses[name] = await chain.resolve(name)
+                self._addresses[name] = await chain.names.address(name)
             self.error = ""
         except ChainError as error:
             self._say(error, "the latest block, or a lighthouse's address, is not known")

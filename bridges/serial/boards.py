@@ -35,6 +35,8 @@ AVR: Final = 83
 class NoFirmware(InputError):
     """A file is not what a board runs."""
 
+    code = "no-firmware"
+
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(
             f"{path} is no firmware for an Uno: {why}",
@@ -45,6 +47,8 @@ class NoFirmware(InputError):
 
 class BoardFailed(RemoteError):
     """The simulated board ended, or did not do what was waited for; the text has what it said last."""
+
+    code = "board-failed"
 
 
 @dataclass(frozen=True)

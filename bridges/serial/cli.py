@@ -9,7 +9,7 @@ import click
 from mesh.cli.options import with_settings
 from mesh.errors import AiraError
 from mesh.running import fail
-from mesh.settings import NETWORK_SETTINGS, SERVER_SETTINGS
+from mesh.settings import NetworkSettings, TelemetrySettings, options_of
 from mesh.telemetry.logs import start_log_of
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def _number(text: str) -> int | float | str:
     callback=_renaming,
     help="what the board's topic, or all beneath it, is called in the mesh: /led=/left/led, /=/left",
 )
-@with_settings(*NETWORK_SETTINGS, *SERVER_SETTINGS)
+@with_settings(*options_of(NetworkSettings), *options_of(TelemetrySettings))
 def command(
     settings: Settings,
     port: str,

@@ -43,6 +43,8 @@ FUNCTION: Final = re.compile(r"^(?!static|inline)([A-Za-z_][\w:<>*& ]*\s[*&]?\w+
 class SketchBroken(InputError):
     """A sketch does not compile; the text has what the compiler says."""
 
+    code = "sketch-broken"
+
 
 def compile_sketch(sketch: Path, elf: Path, *, libraries: Sequence[Path] = (), defines: Sequence[str] = ()) -> Path:
     """Compile the sketch in the folder `sketch` into `elf`, for an Uno. `defines` are as for the compiler's `-D`,

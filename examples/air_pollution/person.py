@@ -30,9 +30,9 @@ async def question() -> Demand:
     return Demand(
         model=MODEL,
         objective=MODEL,
-        token=await chain.resolve(settings.erc20_token),
+        token=await chain.names.address(settings.erc20_token),
         cost=0,
-        lighthouse=await chain.resolve(settings.lighthouse_contract),
+        lighthouse=await chain.names.address(settings.lighthouse_contract),
         validator=ZERO_ADDRESS,
         validator_fee=0,
         deadline=await chain.block_number() + 1000,

@@ -9,9 +9,10 @@ from functools import partial
 from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 from mesh.agent.hooks import Handler, HandlerPerformer, Hooks, hear, repeat
-from mesh.agent.parts import load_account, watching, working
+from mesh.agent.parts import watching, working
 from mesh.agent.watcher import Watcher
 from mesh.background import Background
+from mesh.composition import load_account
 from mesh.errors import ClosedError, ConfigurationError
 from mesh.settings import load
 from mesh.starting import entered, files

@@ -51,37 +51,37 @@ class ChainServices:
 
     async def account_eth_balance(self, request: AccountBalance) -> Balance:
         """Anybody's wei."""
-        return Balance(await self._chain.eth_balance(request.account))
+        return Balance(await self._chain.tokens.eth_balance(request.account))
 
     async def eth_balance(self, _request: Nothing) -> Balance:
         """This agent's wei."""
-        return Balance(await self._chain.eth_balance(self._account))
+        return Balance(await self._chain.tokens.eth_balance(self._account))
 
     async def account_xrt_balance(self, request: AccountBalance) -> Balance:
         """Anybody's tokens."""
-        return Balance(await self._chain.balance_of(request.account, token=self._token))
+        return Balance(await self._chain.tokens.balance(request.account, token=self._token))
 
     async def xrt_balance(self, _request: Nothing) -> Balance:
         """This agent's tokens."""
-        return Balance(await self._chain.balance_of(self._account, token=self._token))
+        return Balance(await self._chain.tokens.balance(self._account, token=self._token))
 
     async def account_xrt_allowance(self, request: AccountToAddressAllowance) -> Allowance:
         """What one may take of another's tokens."""
-        return Allowance(await self._chain.allowance(request.account, request.to, token=self._token))
+        return Allowance(await self._chain.tokens.allowance(request.account, request.to, token=self._token))
 
     async def xrt_allowance(self, _request: Nothing) -> Allowance:
         """What the factory may take of this agent's tokens, for costs and fees."""
-        return Allowance(await self._chain.allowance(self._account, self._chain.factory, token=self._token))
+        return Allowance(await self._chain.tokens.allowance(self._account, self._chain.factory, token=self._token))
 
     async def transfer(self, request: Transfer) -> Transaction:
         """Send tokens of this agent; answered once they are there."""
-        return Transaction(await self._chain.transfer(request.to, int(request.value), token=self._token))
+        return Transaction(await self._chain.tokens.transfer(request.to, int(request.value), token=self._token))
 
     async def transfer_from(self, request: TransferFrom) -> Transaction:
         """Send tokens that their owner has approved for this agent; answered once they are there."""
-        tx = await self._chain.transfer_from(request.owner, request.to, int(request.value), token=self._token)
+        tx = await self._chain.tokens.transfer_from(request.owner, request.to, int(request.value), token=self._token)
         return Transaction(tx)
 
     async def approve(self, request: Approve) -> Transaction:
         """Let somebody take tokens of this agent; answered once the chain has it."""
-        return Transaction(await self._chain.approve(request.spender, int(request.value), token=self._token))
+        return Transaction(await self._chain.tokens.approve(request.spender, int(request.value), token=self._token))

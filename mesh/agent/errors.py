@@ -13,9 +13,13 @@ if TYPE_CHECKING:
 class JobFailed(AiraError):
     """Raised by a handler to end its job without success, which refunds the promisee; the text says why."""
 
+    code = "job-failed"
+
 
 class OrderRejected(AiraError):
     """A provider says that an order can't be used; `rejection` holds its machine-readable reason."""
+
+    code = "order-rejected"
 
     def __init__(self, rejection: Rejection) -> None:
         super().__init__(
@@ -28,6 +32,8 @@ class OrderRejected(AiraError):
 class ServiceClosed(AiraError):
     """A service that others may not use: it signs, spends or drives jobs, and the settings don't open it."""
 
+    code = "service-closed"
+
     def __init__(self, service: str) -> None:
         super().__init__(
             f"this agent does not offer {service} to others",
@@ -38,6 +44,8 @@ class ServiceClosed(AiraError):
 
 class OrderExpired(AiraError):
     """An order's deadline has passed and nobody took it."""
+
+    code = "order-expired"
 
     def __init__(self, order: str, deadline: int) -> None:
         super().__init__(
@@ -51,6 +59,8 @@ class OrderExpired(AiraError):
 class ContractTakenBack(AiraError):
     """The chain was reorganised, and a contract of before was not made again until its orders' deadline."""
 
+    code = "contract-taken-back"
+
     def __init__(self, liability: str, deadline: int) -> None:
         super().__init__(
             f"the chain took the contract {liability} back, and it was not made again until block {deadline}",
@@ -62,6 +72,8 @@ class ContractTakenBack(AiraError):
 
 class ShortOfFunds(AiraError):
     """The account can't pay what it wants to promise: units of the token that it has, and that it needs."""
+
+    code = "short-of-funds"
 
     def __init__(self, account: str, token: str, *, balance: int, needed: int) -> None:
         super().__init__(

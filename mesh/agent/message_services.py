@@ -47,7 +47,7 @@ class MessageServices:
 
     async def sign_order(self, request: SignDemand | SignOffer) -> Published:
         """Sign an order in the settings' generation and post it. Raises `InvalidMessage`, `InputError`."""
-        request = replace(request, model=await self._chain.resolve_model(request.model))
+        request = replace(request, model=await self._chain.names.model(request.model))
         order = await self._resolved(request.unsigned(**await self._origin()))
         self._check(order)
         return await self._post(self._parts.signer.sign(order))
@@ -57,8 +57,8 @@ class MessageServices:
         result = await self._resolved(request.unsigned())
         signed = self._parts.signer.sign(result)
         is_owed = (
-            await self._chain.is_liability(signed.liability)
-            and not (await self._chain.liability(signed.liability)).is_finalized
+            await self._chain.liabilities.exists(signed.liability)
+            and not (await self._chain.liabilities.get(signed.liability)).is_finalized
         )
         return await (self._post(signed) if is_owed else self._publish(signed))
 
@@ -74,10 +74,10 @@ class MessageServices:
         if self._parts.settings.generation == 3:
             return {"nonce": secrets.token_hex(32), "sender": None}
         address = self._parts.signer.address
-        return {"nonce": await self._chain.nonce_of(address), "sender": address}
+        return {"nonce": await self._chain.liabilities.next_nonce(address), "sender": address}
 
     async def _resolved(self, message: M) -> M:
-        return resolve_names(message, {name: await self._chain.resolve(name) for name in names_in(message)})
+        return resolve_names(message, {name: await self._chain.names.address(name) for name in names_in(message)})
 
     def _check(self, message: SignedMessage) -> None:
         if isinstance(message, Result):

@@ -8,9 +8,10 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from mesh.composition import chain_of, endpoints_of
 from mesh.content import Exchange, Store
 from mesh.errors import ConfigurationError
-from mesh.network import Channel, Endpoints, Network, Services
+from mesh.network import Channel, Network, Services
 from mesh.work.ledger import Ledger
 from mesh.work.outbox import Outbox
 from mesh.work.workshop import Workshop
@@ -75,44 +76,6 @@ class Parts:
         )
 
 
-def load_account(settings: Settings) -> Account:
-    """The account that the settings name. Blocks while the keyfile is decrypted. Raises `ConfigurationError`."""
-    from mesh.chain import Account
-
-    return Account.from_keyfile(*settings.keyfile_and_password())
-
-
-def chain_of(settings: Settings, account: Account | None) -> Chain:
-    """The chain that the settings name, not yet opened, for `account` or for reading only.
-
-    What is sent is written down in the settings' folder, so that a number that was used stays used after a restart,
-    and in other programs of the same account. Raises `ConfigurationError`.
-    """
-    from mesh.chain import GWEI, Chain, FeePolicy, Timing
-
-    return Chain(
-        settings.node,
-        account=account,
-        ens=settings.ens_contract,
-        factory=settings.factory_contract,
-        xrt=settings.xrt_contract,
-        generation=settings.generation,
-        contracts=settings.contracts,
-        timing=Timing(
-            poll_interval=settings.poll_interval,
-            confirmations=settings.confirmations,
-            reorg_depth=settings.reorg_depth,
-        ),
-        fees=FeePolicy(ceiling=round(settings.max_fee_gwei * GWEI)),
-        journal=settings.state_directory / "transactions",
-    )
-
-
-def endpoints_of(settings: Settings) -> Endpoints:
-    """Where the settings' client session connects to."""
-    return Endpoints.from_settings(settings)
-
-
 @asynccontextmanager
 async def watching(settings: Settings) -> AsyncIterator[tuple[Network, Channel]]:
     """The parts of an agent that only watches the market: it needs a router, no account and no chain."""
@@ -162,8 +125,8 @@ async def working(settings: Settings, account: Account, chain: Chain | None) -> 
 
 async def _channel_of(lighthouse: str, network: Network, *, chain: Chain, clock: Clock) -> Channel:
     """The channel of a lighthouse, not yet open, with names and blocks as the chain has them."""
-    address = await chain.resolve(lighthouse)
-    return Channel(network.session, lighthouse, address=address, resolver=chain.resolve, head=lambda: clock.head)
+    address = await chain.names.address(lighthouse)
+    return Channel(network.session, lighthouse, address=address, resolver=chain.names.address, head=lambda: clock.head)
 
 
 async def _name_of(chain: Chain) -> str:

@@ -42,14 +42,14 @@ class Purse:
         self._promised.pop(order, None)
 
     async def _allow(self, token: str, needed: int) -> None:
-        balance = await self._chain.balance_of(self._account, token=token)
+        balance = await self._chain.tokens.balance(self._account, token=token)
         if balance < needed:
             raise ShortOfFunds(self._account, token, balance=balance, needed=needed)
         factory = self._chain.factory
-        while await self._chain.allowance(self._account, factory, token=token) < needed:
+        while await self._chain.tokens.allowance(self._account, factory, token=token) < needed:
             log.info("allowing the factory %d of token %s", needed, token)
             try:
-                await self._chain.approve(factory, needed, token=token)
+                await self._chain.tokens.approve(factory, needed, token=token)
             except Reverted as error:
                 if error.reason != "OutOfGas":
                     raise

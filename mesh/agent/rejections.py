@@ -73,7 +73,7 @@ class Rejections:
                 rejection = await signed.get()
 
     async def _consider(self, rejection: Rejection, tell: Callable[[Rejection], Awaitable[None]]) -> None:
-        if rejection.provider in (await self._chain.lighthouse(self._lighthouse)).stakes:
+        if rejection.provider in (await self._chain.lighthouses.get(self._lighthouse)).stakes:
             await tell(rejection)
         else:
             log.warning("%s, who is no provider, says of an order: %s", rejection.provider, rejection.reason)

@@ -16,7 +16,7 @@ from mesh.agent.rejections import Rejections
 from mesh.chain import NodeUnreachable, RequestRefused
 from mesh.errors import AiraError, ClosedError
 from mesh.market.book import Refusal
-from mesh.telemetry.context import concerning, facts
+from mesh.telemetry.context import concerning, log_event
 from schemas import ZERO_ADDRESS, Demand, Offer, message_hash
 
 if TYPE_CHECKING:
@@ -77,12 +77,12 @@ class Trader:
         """The fields that a demand and an offer share, names looked up, with a deadline."""
         settings, chain = self._parts.settings, self._chain
         return {
-            "model": await chain.resolve_model(model),
+            "model": await chain.names.model(model),
             "objective": objective,
-            "token": await chain.resolve(token or settings.erc20_token),
+            "token": await chain.names.address(token or settings.erc20_token),
             "cost": cost,
-            "lighthouse": await chain.resolve(settings.lighthouse_contract),
-            "validator": await chain.resolve(validator) if validator else ZERO_ADDRESS,
+            "lighthouse": await chain.names.address(settings.lighthouse_contract),
+            "validator": await chain.names.address(validator) if validator else ZERO_ADDRESS,
             "deadline": await chain.block_number() + lifetime,
             "sender": None if settings.generation == 3 else self._address,
         }
@@ -107,7 +107,11 @@ class Trader:
                 return await self._contract_of(signed, costs)
             except _Overtaken:
                 order = message_hash(signed).hex()
-                log.info("demand %s is signed anew: its nonce was used meanwhile", order, extra=facts(order=order))
+                log.info(
+                    "demand %s is signed anew: its nonce was used meanwhile",
+                    order,
+                    extra=log_event("unnamed", order=order),
+                )
 
     async def offer(self, terms: Terms, *, lighthouse_fee: int) -> str:
         """Sign and post an offer; returns its hash (hex). It is sent again until it is taken or its deadline passes.
@@ -149,11 +153,11 @@ class Trader:
 
     async def contract(self, address: str) -> Contract:
         """The contract at `address`, to be waited for. Raises `NotALiability`."""
-        address = await self._chain.resolve(address)
+        address = await self._chain.names.address(address)
         known = address in self._endings
         self._ending(address)  # before it is read: it may end in between
         try:
-            return self._contract(await self._chain.liability(address))
+            return self._contract(await self._chain.liabilities.get(address))
         except BaseException:
             if not known:
                 self._endings.pop(address, None)
@@ -193,7 +197,7 @@ class Trader:
 
     async def _signed(self, kind: type[AnOrder], terms: Terms, **fee: Any) -> AnOrder:
         counted = terms["sender"] is not None
-        nonce = await self._chain.nonce_of(self._address) if counted else secrets.token_hex(32)
+        nonce = await self._chain.liabilities.next_nonce(self._address) if counted else secrets.token_hex(32)
         return self._parts.signer.sign(kind(**terms, nonce=nonce, **fee))
 
     async def _contract_of(self, signed: Demand, costs: Mapping[str, int]) -> Contract:
@@ -224,7 +228,7 @@ class Trader:
             self._endings[liability.address] = self._endings.pop(contract.address)
             contract.liability = liability
         elif matched is not None and not matched.done():
-            log.info("made of the demand %s", demand, extra=facts(order=demand))
+            log.info("made of the demand %s", demand, extra=log_event("unnamed", order=demand))
             self._contracts[demand] = self._contract(liability)
             matched.set_result(self._contracts[demand])
 
@@ -250,7 +254,7 @@ class Trader:
             self._counted[identity] = counted
             raise
         except AiraError as error:
-            log.warning("the offer %s is given up: %s", identity, error, extra=facts(order=identity))
+            log.warning("the offer %s is given up: %s", identity, error, extra=log_event("unnamed", order=identity))
         await self._parts.outbox.settle(identity)
 
     def _forget(self, identity: str) -> None:
@@ -264,11 +268,11 @@ class Trader:
         That is known when the chain has been read as far as it went when the nonce was asked for.
         """
         if rejection.reason == Refusal.FULL:
-            known = facts(order=identity, reason=rejection.reason)
+            known = log_event("unnamed", order=identity, reason=rejection.reason)
             log.warning("provider %s has no room for the order %s now", rejection.provider, identity, extra=known)
             return
         nonce = self._nonces.get(identity)
-        overtaken = nonce is not None and nonce < await self._chain.nonce_of(self._address)
+        overtaken = nonce is not None and nonce < await self._chain.liabilities.next_nonce(self._address)
         head = await self._chain.block_number()
         while self._parts.clock.head < head:
             await self._progress.wait()

@@ -1,4 +1,4 @@
-"""The chain: accounts, names, contracts, events, and a node of one's own for demonstrations and tests.
+"""The chain: accounts, names, contracts, events.
 
 Importing this package loads web3, which takes a second: what also runs without a chain imports it where it is needed.
 """
@@ -15,7 +15,6 @@ from mesh.chain.accounts import (
 )
 from mesh.chain.client import Chain
 from mesh.chain.deploy import XRT, Deployment, DeploymentPlan, deploy
-from mesh.chain.embedded import EmbeddedChain, ServedChain, serve_embedded
 from mesh.chain.errors import (
     ChainWentBack,
     FeeTooHigh,
@@ -55,7 +54,6 @@ from mesh.chain.node import Node
 from mesh.chain.reader import BlockEvents, Reorganised
 from mesh.chain.records import Created, LighthouseState, RefundState, Settled
 from mesh.chain.recursion import restrain_recursion
-from mesh.chain.rpc_server import JsonRpcServer
 from mesh.chain.timing import Timing
 from mesh.chain.tokens import Token
 from mesh.chain.transactions import Receipt, Sender
@@ -75,7 +73,6 @@ __all__ = [
     "Current",
     "Deployment",
     "DeploymentPlan",
-    "EmbeddedChain",
     "FeePolicy",
     "FeeTooHigh",
     "Finalized",
@@ -83,7 +80,6 @@ __all__ = [
     "InsufficientFunds",
     "InsufficientTokens",
     "InvalidName",
-    "JsonRpcServer",
     "KeyfileError",
     "LighthouseState",
     "NewLiability",
@@ -103,7 +99,6 @@ __all__ = [
     "RequestRefused",
     "Reverted",
     "Sender",
-    "ServedChain",
     "Settled",
     "SignedTransaction",
     "StakeTooSmall",
@@ -119,6 +114,5 @@ __all__ = [
     "keyfile_address",
     "namehash",
     "new_private_key",
-    "serve_embedded",
     "write_keyfile",
 ]

@@ -1,16 +1,42 @@
-"""The chain as the mesh uses it: names, tokens, liabilities, lighthouses, events; one account that signs."""
+"""The chain as the mesh uses it: liabilities, lighthouses, tokens, names, events; one account that signs."""
 
 from __future__ import annotations
 
+from contextlib import AsyncExitStack
+from typing import TYPE_CHECKING
+
+from mesh.chain.contracts import Contracts
+from mesh.chain.errors import NoContracts, UnknownName
+from mesh.chain.following import follow
 from mesh.chain.liabilities import Liabilities
 from mesh.chain.lighthouses import Lighthouses
+from mesh.chain.names import Names, find_registry
+from mesh.chain.node import Node
+from mesh.chain.tokens import Tokens
+from mesh.chain.transactions import Sender
+from mesh.chain.versions import contract_version
+from mesh.errors import ClosedError
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator, Iterable
+    from pathlib import Path
+    from types import TracebackType
+    from typing import Self
+
+    from mesh.chain.accounts import Account
+    from mesh.chain.fees import FeePolicy
+    from mesh.chain.history import History
+    from mesh.chain.provider import Endpoint
+    from mesh.chain.reader import BlockEvents
+    from mesh.chain.timing import Timing
+    from mesh.chain.versions import Kind
 
 
-class Chain(Liabilities, Lighthouses):
+class Chain:
     """The contracts of the network on the chain at `endpoint` (see `Node`), for one `account` or for reading only.
 
     `contracts` says whether they are this project's (`"mesh"`, which read both generations of orders) or the
-    originals (`"original"`) of a `generation`; the generation also names the root under which names are looked for.
+    originals (`"original"`) of a `generation`; the generation also names the root under which names are looked up.
     `ens` is the address of the ENS registry (empty: the public or a development chain's); `factory` and `xrt` are
     names or addresses, empty for those under that root. `timing`, `fees` and `journal` are the node's (see `Node`);
     a given node has its own.
@@ -19,10 +45,122 @@ class Chain(Liabilities, Lighthouses):
     lighthouse, token or account is asked for, an ENS name does as well.
 
     Used with `async with`, which raises `NodeUnreachable`, `NoContracts` and `UnknownName`. Every method raises
-    `NodeUnreachable` when the node is lost, but those that wait for something (`watch_…`). What sends a transaction
-    waits until it is mined and raises `NoAccount`, `Reverted` (also without sending, when the simulation fails),
-    `InsufficientFunds`, `TransactionTimeout`.
-
-    What it can do is told by topic: `Tokens`, `Liabilities`, `Lighthouses`, `Following` (events), and `OpenChain`
-    (names).
+    `NodeUnreachable` when the node is lost, except those that wait for something. What sends a transaction waits until
+    it is mined and raises `NoAccount`, `Reverted` (also without sending, when the simulation fails),
+    `InsufficientFunds`, `TransactionTimeout`. What it can do is in its parts: `liabilities`, `lighthouses`, `tokens`,
+    `names`, and `follow` for events.
     """
+
+    def __init__(
+        self,
+        endpoint: Endpoint | Node,
+        *,
+        account: Account | None = None,
+        ens: str = "",
+        factory: str = "",
+        xrt: str = "",
+        generation: int = 3,
+        contracts: Kind = "mesh",
+        timing: Timing | None = None,
+        fees: FeePolicy | None = None,
+        journal: Path | None = None,
+    ) -> None:
+        self.account = account
+        self.generation = generation
+        self._owns_node = not isinstance(endpoint, Node)
+        self.node = (
+            endpoint if isinstance(endpoint, Node) else Node(endpoint, timing=timing, fees=fees, journal=journal)
+        )
+        self._ens = ens
+        self._factory_name = factory or f"factory.{generation}.robonomics.eth"
+        self._xrt_name = xrt or f"xrt.{generation}.robonomics.eth"
+        self._kind = contracts
+        self._stack = AsyncExitStack()
+        self._contracts: Contracts | None = None
+
+    async def __aenter__(self) -> Self:
+        async with AsyncExitStack() as stack:
+            if self._owns_node:
+                await stack.enter_async_context(self.node)
+            self._contracts = await self._find_contracts()
+            self._stack = stack.pop_all()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._contracts = None
+        await self._stack.aclose()
+
+    @property
+    def chain_id(self) -> int:
+        """EIP-155 number of the chain."""
+        return self.node.chain_id
+
+    @property
+    def ens(self) -> str:
+        """Address of the ENS registry in use."""
+        return self._opened().names.registry
+
+    @property
+    def factory(self) -> str:
+        """Address of the factory, which is also what `approve` names as the spender for costs and fees."""
+        return self._opened().factory
+
+    @property
+    def xrt(self) -> str:
+        """Address of the token XRT."""
+        return self._opened().xrt
+
+    @property
+    def names(self) -> Names:
+        """ENS names."""
+        return self._opened().names
+
+    @property
+    def tokens(self) -> Tokens:
+        """Ether, XRT and other tokens."""
+        return Tokens(self._opened())
+
+    @property
+    def lighthouses(self) -> Lighthouses:
+        """Lighthouses, stakes and turns."""
+        return Lighthouses(self._opened())
+
+    @property
+    def liabilities(self) -> Liabilities:
+        """Liabilities, and the orders that they are created from."""
+        return Liabilities(self._opened())
+
+    async def block_number(self) -> int:
+        """Number of the latest block."""
+        return await self.node.block_number()
+
+    def follow(
+        self, from_block: int, *, lighthouses: Iterable[str] = (), token: str = "", history: History | None = None
+    ) -> AsyncGenerator[BlockEvents, None]:
+        """Blocks with their events from a block on, for ever, and reorganisations; see `mesh.chain.following`."""
+        return follow(self._opened(), from_block, lighthouses=lighthouses, token=token, history=history)
+
+    async def _find_contracts(self) -> Contracts:
+        names = Names(self.node, await find_registry(self.node, self._ens), self.generation)
+        try:
+            factory = await names.address(self._factory_name)
+            xrt = await names.address(self._xrt_name)
+        except UnknownName as error:
+            raise NoContracts(f"contract named {error.name}", self.node.chain_id) from None
+        if not await self.node.code(factory):
+            raise NoContracts(f"factory at {factory}", self.node.chain_id)
+        return Contracts(
+            node=self.node,
+            names=names,
+            version=contract_version(self._kind, self.node, factory, self.generation),
+            factory=factory,
+            xrt=xrt,
+            sender=None if self.account is None else Sender(self.node, self.account),
+        )
+
+    def _opened(self) -> Contracts:
+        if self._contracts is None:
+            raise ClosedError("the chain is not open: use it with `async with`")
+        return self._contracts

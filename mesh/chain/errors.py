@@ -9,6 +9,8 @@ from mesh.errors import ChainError, ConfigurationError, InputError
 class NodeUnreachable(ChainError):
     """No node answers at the endpoint, or what answers is no Ethereum node. Trying again later may help."""
 
+    code = "node-unreachable"
+
     def __init__(self, endpoint: str, why: str) -> None:
         super().__init__(
             f"no Ethereum node answers at {endpoint} ({why})",
@@ -21,6 +23,8 @@ class NodeUnreachable(ChainError):
 class WrongChain(ConfigurationError):
     """Of several nodes one is on another chain than the rest; `found` and `expected` are EIP-155 numbers."""
 
+    code = "wrong-chain"
+
     def __init__(self, endpoint: str, *, found: int, expected: int) -> None:
         super().__init__(
             f"the node {endpoint} is on the chain {found}, the others are on the chain {expected}",
@@ -32,17 +36,21 @@ class WrongChain(ConfigurationError):
 
 
 class RequestRefused(ChainError):
-    """The node answered with an error that has no better name here. `code` is JSON-RPC's."""
+    """The node answered with an error that has no better name here. `rpc_code` is JSON-RPC's."""
+
+    code = "request-refused"
 
     def __init__(self, method: str, code: int, message: str) -> None:
         super().__init__(f"the node refused {method}: {message} (code {code})")
         self.method = method
-        self.code = code
+        self.rpc_code = code
         self.detail = message
 
 
 class NoContracts(ChainError):
     """The chain does not hold the contracts: another network, or nothing deployed yet."""
+
+    code = "no-contracts"
 
     def __init__(self, what: str, chain_id: int) -> None:
         super().__init__(
@@ -56,6 +64,8 @@ class NoContracts(ChainError):
 class UnknownName(ChainError):
     """An ENS name that no resolver on this chain knows."""
 
+    code = "unknown-name"
+
     def __init__(self, name: str) -> None:
         super().__init__(f"the ENS name {name!r} is not known on this chain", hint="check its spelling and the network")
         self.name = name
@@ -64,6 +74,8 @@ class UnknownName(ChainError):
 class NotALiability(ChainError):
     """An address that the factory did not make: its terms can't be trusted."""
 
+    code = "not-a-liability"
+
     def __init__(self, address: str) -> None:
         super().__init__(f"{address} is not a liability of this factory")
         self.address = address
@@ -71,6 +83,8 @@ class NotALiability(ChainError):
 
 class NotOffered(ChainError):
     """The original contracts lack something that ours have."""
+
+    code = "not-offered"
 
     def __init__(self, what: str, generation: int) -> None:
         super().__init__(
@@ -84,6 +98,8 @@ class NotOffered(ChainError):
 class InsufficientFunds(ChainError):
     """The account can't pay for the transaction's gas (and value). Amounts are wei."""
 
+    code = "insufficient-funds"
+
     def __init__(self, address: str, *, balance: int, needed: int) -> None:
         super().__init__(
             f"{address} has {_ether(balance)}, and the transaction may need {_ether(needed)}",
@@ -96,6 +112,8 @@ class InsufficientFunds(ChainError):
 
 class InsufficientTokens(ChainError):
     """The account holds less of a token than it is to give. Amounts are the token's smallest unit (wn for XRT)."""
+
+    code = "insufficient-tokens"
 
     def __init__(self, account: str, token: str, *, balance: int, needed: int) -> None:
         super().__init__(
@@ -111,6 +129,8 @@ class InsufficientTokens(ChainError):
 class StakeTooSmall(InputError):
     """A lighthouse takes no provider with less than its minimal stake. Amounts are wn."""
 
+    code = "stake-too-small"
+
     def __init__(self, stake: int, minimal_stake: int) -> None:
         super().__init__(
             f"a stake of {stake} wn is below the lighthouse's minimum of {minimal_stake} wn",
@@ -122,6 +142,8 @@ class StakeTooSmall(InputError):
 
 class FeeTooHigh(ChainError):
     """Gas costs more than the account is ready to pay; nothing was sent. Prices are wei for a unit of gas."""
+
+    code = "fee-too-high"
 
     def __init__(self, price: int, ceiling: int) -> None:
         super().__init__(
@@ -140,6 +162,8 @@ class Reverted(ChainError):
     are what that has cost: nothing, unless the transaction was mined.
     """
 
+    code = "reverted"
+
     def __init__(
         self, reason: str, *, arguments: tuple[object, ...] = (), data: bytes = b"", gas_used: int = 0, wei: int = 0
     ) -> None:
@@ -156,6 +180,8 @@ class Reverted(ChainError):
 class TransactionTimeout(ChainError):
     """A sent transaction was not mined in time; it may still be. Sending the same again waits on for this one."""
 
+    code = "transaction-timeout"
+
     def __init__(self, tx: str, seconds: float) -> None:
         super().__init__(
             f"the transaction {tx} was not mined within {seconds:g} s",
@@ -167,6 +193,8 @@ class TransactionTimeout(ChainError):
 
 class ChainWentBack(ChainError):
     """The chain is shorter than what was already read of it: it was started afresh, or the node is still syncing."""
+
+    code = "chain-went-back"
 
     def __init__(self, cursor: int, head: int) -> None:
         super().__init__(
@@ -183,6 +211,8 @@ class ReorganisedTooDeep(ChainWentBack):
     `cursor` is the oldest block that is remembered.
     """
 
+    code = "reorganised-too-deep"
+
     def __init__(self, cursor: int, head: int) -> None:
         ChainError.__init__(
             self,
@@ -196,12 +226,16 @@ class ReorganisedTooDeep(ChainWentBack):
 class NoAccount(ConfigurationError):
     """Something was to be signed and no account was given."""
 
+    code = "no-account"
+
     def __init__(self) -> None:
         super().__init__("this needs an account", hint="set keyfile and keyfile_password_file")
 
 
 class KeyfileError(ConfigurationError):
     """A keyfile or its password file can't be read or written, or is no Web3 secret storage."""
+
+    code = "keyfile-error"
 
     def __init__(self, path: object, why: str, *, hint: str = "") -> None:
         super().__init__(f"{path}: {why}", hint=hint)
@@ -210,6 +244,8 @@ class KeyfileError(ConfigurationError):
 
 class WrongPassword(KeyfileError):
     """The password does not open the keyfile."""
+
+    code = "wrong-password"
 
     def __init__(self, keyfile: object, password_file: object) -> None:
         super().__init__(
@@ -221,6 +257,8 @@ class WrongPassword(KeyfileError):
 
 class InvalidName(InputError):
     """A text that can't be an ENS name."""
+
+    code = "invalid-name"
 
     def __init__(self, text: str, why: str) -> None:
         super().__init__(f"{text[:80]!r} is not an ENS name: {why}")

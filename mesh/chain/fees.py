@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.chain.errors import FeeTooHigh, RequestRefused
-from mesh.chain.jsonrpc import METHOD_NOT_FOUND
+from mesh.devchain.jsonrpc import METHOD_NOT_FOUND
 from mesh.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ async def _suggested_priority(node: Node, base: int) -> int:
     try:
         return int(await node.web3.eth.max_priority_fee)
     except RequestRefused as refused:
-        if refused.code != METHOD_NOT_FOUND:
+        if refused.rpc_code != METHOD_NOT_FOUND:
             raise
         return max(int(await node.web3.eth.gas_price) - base, 0)
 

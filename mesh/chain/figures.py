@@ -73,7 +73,9 @@ class ChainFigures:
     async def _ask_balances(self) -> Iterable[Family]:
         if self._chain.account is None:
             return ()
-        eth, xrt = await asyncio.gather(self._chain.eth_balance(), self._chain.balance_of(self._chain.account.address))
+        eth, xrt = await asyncio.gather(
+            self._chain.tokens.eth_balance(), self._chain.tokens.balance(self._chain.account.address)
+        )
         return (
             gauge("aira_account_eth_wei", "What the account has to pay gas with, wei", eth),
             gauge("aira_account_xrt_wn", "What the account has of XRT, wn", xrt),

@@ -1,4 +1,4 @@
-"""Contracts between promisees and promisors: the parts of `Chain` that make, read, end and watch liabilities."""
+"""Liabilities: creating, reading, finalizing and watching them. `chain.liabilities`."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING, Final
 
 from mesh.chain.errors import NoContracts, NodeUnreachable, NotALiability, RequestRefused
 from mesh.chain.events import NewLiability, liability_created, xrt_minted
-from mesh.chain.following import Following
+from mesh.chain.following import list_created
 from mesh.chain.records import Created, RefundState, Settled, read_liability
-from mesh.trouble import Trouble
+from mesh.outage_log import OutageLog
 from schemas.packing import cancellation_hash, order_abi
 from schemas.signing import recover
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
+    from mesh.chain.contracts import Contracts
     from mesh.chain.transactions import Receipt
     from schemas.liability import Liability
     from schemas.messages import Demand, Offer, Result
@@ -27,79 +28,90 @@ READ_AT_ONCE: Final = 8
 """Records that a listing asks a node for at the same time."""
 
 
-class Liabilities(Following):
-    """Liabilities and the orders that they are made of; a part of `Chain`."""
+class Liabilities:
+    """Liabilities, and the orders that they are created from."""
 
-    async def nonce_of(self, address: str | None = None) -> int:
+    def __init__(self, contracts: Contracts) -> None:
+        self._contracts = contracts
+
+    async def exists(self, address: str) -> bool:
+        """Whether the factory created the contract at an address."""
+        return await self._contracts.version.is_liability(address)
+
+    async def next_nonce(self, address: str | None = None) -> int:
         """The nonce that an account's next generation-5 order must have."""
-        return await self._suite.nonce_of(await self._whose(address))
+        return await self._contracts.version.nonce_of(await self._contracts.address_or_own(address))
 
     async def is_order_used(self, order_hash: bytes, signer: str) -> bool:
         """Whether a generation-3 order of `signer` (address) was used already (generation 5 is told by its nonce)."""
-        return await self._suite.is_order_used(order_hash, signer)
+        return await self._contracts.version.is_order_used(order_hash, signer)
 
-    async def liability(self, address: str) -> Liability:
+    async def get(self, address: str) -> Liability:
         """The record of a liability. Raises `NotALiability` unless the factory made it."""
-        return await read_liability(self.node, await self._recognised(address))
+        return await read_liability(self._contracts.node, await self._recognised(address))
 
-    async def liabilities(
+    async def list(
         self, *, from_block: int = 0, promisee: str = "", promisor: str = "", lighthouse: str = ""
-    ) -> list[Liability]:
+    ) -> Sequence[Liability]:
         """The records of the liabilities made since a block, in order; of one promisee, promisor, lighthouse only."""
         wanted = {"promisee": promisee, "promisor": promisor}
-        filters = {getter: await self.resolve(whose) for getter, whose in wanted.items() if whose}
+        filters = {getter: await self._contracts.names.address(whose) for getter, whose in wanted.items() if whose}
         if lighthouse:
-            filters["lighthouse"] = await self.lighthouse_address(lighthouse)
-        made = [event.liability async for event in self._made(from_block) if isinstance(event, NewLiability)]
-        found: list[Liability] = []
+            filters["lighthouse"] = await self._contracts.names.lighthouse(lighthouse)
+        made = [
+            event.liability
+            async for event in list_created(self._contracts, from_block)
+            if isinstance(event, NewLiability)
+        ]
+        found = []
         for start in range(0, len(made), READ_AT_ONCE):
             some = made[start : start + READ_AT_ONCE]
             records = await asyncio.gather(*(self._matching(address, filters) for address in some))
             found += [record for record in records if record is not None]
         return found
 
-    async def watch_liability(self, address: str) -> Liability:
+    async def watch(self, address: str) -> Liability:
         """The record of a liability once it has ended, as its contract has it; waits for that.
 
         The end counts when it has the node's confirmations (`Timing.confirmations`). A node that is lost meanwhile is
         waited for. Raises `NotALiability`, and `NodeUnreachable` when there is no node at the start.
         """
-        address, trouble = await self._recognised(address), Trouble(log)
+        address, trouble = await self._recognised(address), OutageLog(log, "chain")
         while True:
             try:
                 record = await self._ended(address)
-                trouble.over(f"{address} can be watched again")
+                trouble.recovered(f"{address} can be watched again")
             except (NodeUnreachable, RequestRefused) as error:
-                trouble.met(error, f"{address} can't be watched, trying again")
+                trouble.failed(error, f"{address} can't be watched, trying again")
                 record = None
             if record is not None:
                 return record
-            await asyncio.sleep(self.node.timing.poll_interval)
+            await asyncio.sleep(self._contracts.node.timing.poll_interval)
 
     async def order_hashes(self, liability: str) -> tuple[bytes, bytes]:
         """The hashes of the demand and of the offer that a liability was made of."""
-        functions = self.node.contract("Liability", liability).functions
-        demand_hash = await self.node.read(functions.demandHash())
-        return bytes(demand_hash), bytes(await self.node.read(functions.offerHash()))
+        functions = self._contracts.node.contract("Liability", liability).functions
+        demand_hash = await self._contracts.node.read(functions.demandHash())
+        return bytes(demand_hash), bytes(await self._contracts.node.read(functions.offerHash()))
 
-    async def create_liability(self, lighthouse: str, demand: Demand, offer: Offer) -> Created:
+    async def create(self, lighthouse: str, demand: Demand, offer: Offer) -> Created:
         """Make a liability of two signed orders, as a provider of the lighthouse.
 
         Raises `InvalidMessage` for an unsigned order or one with a name that is not resolved.
         """
         for order in (demand, offer):
-            self._suite.check_order(order)
-        functions = (await self._lighthouse(lighthouse)).functions
-        receipt = await self._send(functions.createLiability(order_abi(demand), order_abi(offer)))
-        made = liability_created(receipt.logs, factory=self.factory)
+            self._contracts.version.check_order(order)
+        functions = (await self._contracts.lighthouse_contract(lighthouse)).functions
+        receipt = await self._contracts.send(functions.createLiability(order_abi(demand), order_abi(offer)))
+        made = liability_created(receipt.logs, factory=self._contracts.factory)
         created = Created(made.liability, receipt.tx, receipt.gas_used, receipt.wei)
-        self._suite.recognise(created.liability)
+        self._contracts.version.recognise(created.liability)
         return created
 
     async def finalize(self, lighthouse: str, result: Result) -> Settled:
         """Finalize a liability by its signed result, as a provider of the lighthouse."""
-        functions = (await self._lighthouse(lighthouse)).functions
-        receipt = await self._send(self._suite.finalization(functions, result))
+        functions = (await self._contracts.lighthouse_contract(lighthouse)).functions
+        receipt = await self._contracts.send(self._contracts.version.finalization(functions, result))
         return self._settled(receipt)
 
     async def validate(self, result: Result, *, agree: bool) -> Settled:
@@ -107,7 +119,7 @@ class Liabilities(Following):
 
         Without `agree` the promisee is paid back, as for a result without success.
         """
-        receipt = await self._send(self._suite.validation(result, agree=agree))
+        receipt = await self._contracts.send(self._contracts.version.validation(result, agree=agree))
         return self._settled(receipt)
 
     async def cancel(
@@ -119,67 +131,67 @@ class Liabilities(Following):
         digits. The promisee has everything back. Raises `InvalidMessage` for what is no signature, `NotALiability`,
         `NotOffered`, `Reverted` (`WrongSigner`, `AlreadyFinalized`).
         """
-        address = await self.resolve(liability)
+        address = await self._contracts.names.address(liability)
         signatures = [_signature_bytes(address, given) for given in (promisee_signature, promisor_signature)]
-        call = self._suite.cancellation(await self._recognised(address), *signatures)
-        receipt = await self._send(call)
+        call = self._contracts.version.cancellation(await self._recognised(address), *signatures)
+        receipt = await self._contracts.send(call)
         return self._settled(receipt)
 
     async def refund_state(self, liability: str) -> RefundState:
         """Whether the promisee can be paid back, and from when on. Raises `NotALiability`, `NotOffered`."""
         address = await self._recognised(liability)
-        block = await self.node.block_number()
+        block = await self._contracts.node.block_number()
         return RefundState(
             liability=address,
             block_number=block,
-            refundable_from=await self._suite.refundable_from(address),
+            refundable_from=await self._contracts.version.refundable_from(address),
             is_finalized=await self._is_finalized(address, block),
         )
 
     async def refundable_from(self, liability: str) -> int:
         """The block from which anyone may have the promisee paid back, if the liability is not finalized by then."""
-        return await self._suite.refundable_from(liability)
+        return await self._contracts.version.refundable_from(liability)
 
     async def refund(self, liability: str) -> Settled:
         """Pay back the promisee of a liability that was never finalized."""
-        receipt = await self._send(self._suite.refund(liability))
+        receipt = await self._contracts.send(self._contracts.version.refund(liability))
         return self._settled(receipt)
 
     def _settled(self, receipt: Receipt) -> Settled:
-        minted = xrt_minted(receipt.logs, xrt=self.xrt, account=self._signing().account.address)
+        minted = xrt_minted(receipt.logs, xrt=self._contracts.xrt, account=self._contracts.own_address)
         return Settled(receipt.tx, receipt.gas_used, receipt.wei, minted)
 
     async def _recognised(self, address: str) -> str:
-        address = await self.resolve(address)
-        if not await self.is_liability(address):
+        address = await self._contracts.names.address(address)
+        if not await self.exists(address):
             raise NotALiability(address)
         return address
 
     async def _matching(self, address: str, filters: Mapping[str, str]) -> Liability | None:
         """The record of what the factory made, None for another's, or if a reorganisation has taken it back."""
-        self._suite.recognise(address)
-        functions = self.node.contract("Liability", address).functions
+        self._contracts.version.recognise(address)
+        functions = self._contracts.node.contract("Liability", address).functions
         try:
             for getter, whose in filters.items():
-                if await self.node.read(functions[getter]()) != whose:
+                if await self._contracts.node.read(functions[getter]()) != whose:
                     return None
-            return await read_liability(self.node, address)
+            return await read_liability(self._contracts.node, address)
         except NoContracts:
             return None
 
     async def _ended(self, address: str) -> Liability | None:
         """The record of a liability whose end is confirmed; None as long as it is not."""
-        block = await self.node.block_number() - self.node.timing.confirmations + 1
+        block = await self._contracts.node.block_number() - self._contracts.node.timing.confirmations + 1
         try:
             if block < 0 or not await self._is_finalized(address, block):
                 return None
-            return await read_liability(self.node, address, block=block)
+            return await read_liability(self._contracts.node, address, block=block)
         except NoContracts:  # not made yet in that block
             return None
 
     async def _is_finalized(self, address: str, block: int) -> bool:
-        functions = self.node.contract("Liability", address).functions
-        return bool(await self.node.read(functions.isFinalized(), block=block))
+        functions = self._contracts.node.contract("Liability", address).functions
+        return bool(await self._contracts.node.read(functions.isFinalized(), block=block))
 
 
 def _signature_bytes(liability: str, given: str | bytes) -> bytes:

@@ -1,4 +1,4 @@
-"""Markets and those who work for them: the parts of `Chain` that make lighthouses and stake on them."""
+"""Lighthouses: creating them, reading their state, staking. `chain.lighthouses`."""
 
 from __future__ import annotations
 
@@ -7,52 +7,62 @@ from typing import TYPE_CHECKING
 
 from mesh.chain.errors import InsufficientTokens, StakeTooSmall
 from mesh.chain.events import NewLighthouse, lighthouse_created
-from mesh.chain.following import Following
+from mesh.chain.following import follow_created, list_created
 from mesh.chain.tokens import Tokens
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator
+    from collections.abc import AsyncGenerator, Sequence
 
+    from mesh.chain.contracts import Contracts
     from mesh.chain.records import LighthouseState
 
 
-class Lighthouses(Following, Tokens):
-    """Lighthouses, stakes and turns; a part of `Chain`."""
+class Lighthouses:
+    """Lighthouses, stakes and turns. A lighthouse is given by its ENS name, its label or its address."""
 
-    async def is_lighthouse(self, address: str) -> bool:
+    def __init__(self, contracts: Contracts) -> None:
+        self._contracts = contracts
+        self._tokens = Tokens(contracts)
+
+    async def exists(self, address: str) -> bool:
         """Whether the factory made the lighthouse at an address."""
-        return bool(await self.node.read(self._factory_contract().functions.isLighthouse(await self.resolve(address))))
+        functions = self._contracts.factory_contract().functions
+        return bool(
+            await self._contracts.node.read(functions.isLighthouse(await self._contracts.names.address(address)))
+        )
 
-    async def lighthouse(self, lighthouse: str) -> LighthouseState:
+    async def get(self, lighthouse: str) -> LighthouseState:
         """The state of a lighthouse: stakes, turn, quota."""
-        return await self._suite.state(await self.lighthouse_address(lighthouse))
+        return await self._contracts.version.state(await self._contracts.names.lighthouse(lighthouse))
 
     async def is_turn(self, lighthouse: str, address: str | None = None) -> bool:
         """Whether a provider (one's own account by default) may send to a lighthouse in the next block."""
-        return await self._suite.is_turn(await self.lighthouse_address(lighthouse), await self._whose(address))
+        return await self._contracts.version.is_turn(
+            await self._contracts.names.lighthouse(lighthouse), await self._contracts.address_or_own(address)
+        )
 
-    async def lighthouses(self, *, from_block: int = 0) -> list[NewLighthouse]:
+    async def list(self, *, from_block: int = 0) -> Sequence[NewLighthouse]:
         """All lighthouses made since a block, in order."""
-        return [made async for made in self._made(from_block) if isinstance(made, NewLighthouse)]
+        return [made async for made in list_created(self._contracts, from_block) if isinstance(made, NewLighthouse)]
 
-    async def watch_lighthouses(self, from_block: int | None = None) -> AsyncGenerator[NewLighthouse, None]:
+    async def watch(self, from_block: int | None = None) -> AsyncGenerator[NewLighthouse, None]:
         """Each lighthouse made from a block on (by default from the next), for ever and each once.
 
         A lighthouse that a reorganisation takes back stays told. A node that is lost meanwhile is waited for; only
         when there is none at the start, `NodeUnreachable` is raised.
         """
-        cursor = await self.block_number() + 1 if from_block is None else from_block
+        cursor = await self._contracts.node.block_number() + 1 if from_block is None else from_block
         told: set[str] = set()
-        async with aclosing(self._follow_made(cursor)) as following:
+        async with aclosing(follow_created(self._contracts, cursor)) as following:
             async for made in following:
                 if isinstance(made, NewLighthouse) and made.lighthouse not in told:
                     told.add(made.lighthouse)
                     yield made
 
-    async def create_lighthouse(self, *, minimal_stake: int, timeout_blocks: int, name: str) -> NewLighthouse:
+    async def create(self, *, minimal_stake: int, timeout_blocks: int, name: str) -> NewLighthouse:
         """Make a market. `minimal_stake` in wn; `name` is one label of a to z, 0 to 9 and -."""
-        function = self._factory_contract().functions.createLighthouse
-        return lighthouse_created((await self._send(function(minimal_stake, timeout_blocks, name))).logs)
+        function = self._contracts.factory_contract().functions.createLighthouse
+        return lighthouse_created((await self._contracts.send(function(minimal_stake, timeout_blocks, name))).logs)
 
     async def become_provider(self, lighthouse: str, stake: int) -> LighthouseState:
         """Have at least `stake` wn staked on a lighthouse, all told; its state then.
@@ -60,28 +70,34 @@ class Lighthouses(Following, Tokens):
         Only what is missing is approved, and only what is missing is staked: called again after it was broken off
         anywhere, it goes on from there. Raises `StakeTooSmall` and `InsufficientTokens` before anything is sent.
         """
-        me = self._signing().account.address
-        address = await self.lighthouse_address(lighthouse)
+        me = self._contracts.own_address
+        address = await self._contracts.names.lighthouse(lighthouse)
         # In this order: a stake on its way may be mined between the two, and takes its allowance with it.
-        allowance = await self.allowance(me, address)
-        state = await self._suite.state(address)
+        allowance = await self._tokens.allowance(me, address)
+        state = await self._contracts.version.state(address)
         missing = stake - state.stakes.get(me, 0)
         if missing <= 0:
             return state
         if stake < state.minimal_stake:
             raise StakeTooSmall(stake, state.minimal_stake)
-        balance = await self.balance_of(me)
+        balance = await self._tokens.balance(me)
         if balance < missing:
-            raise InsufficientTokens(me, self.xrt, balance=balance, needed=missing)
+            raise InsufficientTokens(me, self._contracts.xrt, balance=balance, needed=missing)
         if allowance < missing:
-            await self.approve(address, missing)
+            await self._tokens.approve(address, missing)
         await self.refill(address, missing)
-        return await self._suite.state(address)
+        return await self._contracts.version.state(address)
 
     async def refill(self, lighthouse: str, value: int) -> str:
         """Stake `value` wn, for which the lighthouse must be approved, and become a provider; the tx hash."""
-        return (await self._send((await self._lighthouse(lighthouse)).functions.refill(value))).tx
+        return (
+            await self._contracts.send((await self._contracts.lighthouse_contract(lighthouse)).functions.refill(value))
+        ).tx
 
     async def withdraw(self, lighthouse: str, value: int) -> str:
         """Take `value` wn off the stake, or all of it where less than the minimum would remain; the tx hash."""
-        return (await self._send((await self._lighthouse(lighthouse)).functions.withdraw(value))).tx
+        return (
+            await self._contracts.send(
+                (await self._contracts.lighthouse_contract(lighthouse)).functions.withdraw(value)
+            )
+        ).tx

@@ -60,10 +60,14 @@ def root_of(name: str) -> str:
 
 
 class Names:
-    """What names mean on the chain behind a node. `registry` is the address of the ENS registry."""
+    """ENS names on the chain behind `node`, by the registry at the address `registry`.
 
-    def __init__(self, node: Node, registry: str) -> None:
+    The `generation` is the root of names that are given by their label only.
+    """
+
+    def __init__(self, node: Node, registry: str, generation: int) -> None:
         self.registry = registry
+        self._generation = generation
         self._node = node
         self._resolvers: dict[str, str] = {}
 
@@ -95,6 +99,12 @@ class Names:
             return format_cid(bytes(await self._node.read(resolver.functions.multihash(namehash(name)))))
         except (InvalidCid, Reverted):
             raise UnknownName(name) from None
+
+    async def lighthouse(self, name_or_address: str) -> str:
+        """The address of a lighthouse; a label alone (`airalab`) is a name under the generation's root."""
+        is_label = "." not in name_or_address and not name_or_address.startswith("0x")
+        root = f".lighthouse.{self._generation}.robonomics.eth" if is_label else ""
+        return await self.address(name_or_address + root)
 
     async def _resolver(self, name: str) -> str:
         root = root_of(name)

@@ -106,6 +106,18 @@ class Node:
         """Wei of an account."""
         return int(await self.web3.eth.get_balance(self.checksum(address)))
 
+    async def gas_price(self) -> int:
+        """The price of a unit of gas now, wei."""
+        return int(await self.web3.eth.gas_price)
+
+    async def block_hash(self, number: int) -> bytes:
+        """The 32-byte hash of a block."""
+        return bytes((await self.web3.eth.get_block(number))["hash"])
+
+    async def code(self, address: str) -> bytes:
+        """The code of the contract at an address; empty if there is none."""
+        return bytes(await self.web3.eth.get_code(self.checksum(address)))
+
     async def read(self, call: AsyncContractFunction, *, block: BlockIdentifier = "latest") -> Any:
         """What a contract's function returns. Raises `Reverted`, and `NoContracts` if there is no such contract."""
         try:

@@ -17,7 +17,7 @@ WORD: Final = 32
 async def is_ours(chain: Chain) -> bool:
     """Whether factory and token have the code that this project's sources compile to. Raises `NodeUnreachable`."""
     for name, address in (("Factory", chain.factory), ("XRT", chain.xrt)):
-        code = bytes(await chain.node.web3.eth.get_code(chain.node.checksum(address)))
+        code = await chain.node.code(address)
         if not is_code_of(name, code):
             return False
     return True

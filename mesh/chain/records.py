@@ -11,7 +11,7 @@ from schemas.liability import Liability
 
 if TYPE_CHECKING:
     from mesh.chain.node import Node
-    from mesh.chain.suites import Members
+    from mesh.chain.versions import Members
 
 LIABILITY_GETTERS = (
     "model",

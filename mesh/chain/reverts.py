@@ -14,7 +14,7 @@ from eth_abi.exceptions import DecodingError
 
 from mesh.chain.artifacts import NAMES, load_artifact, signature_of
 from mesh.chain.errors import Reverted
-from mesh.chain.jsonrpc import REVERTED
+from mesh.devchain.jsonrpc import REVERTED
 from schemas.address import parse_address
 from schemas.keccak import keccak256
 

@@ -1,4 +1,4 @@
-"""What accounts hold: ether, XRT and any other ERC-20; the parts of `Chain` that read and move it."""
+"""What accounts hold: ether, XRT and other ERC-20 tokens. `chain.tokens`."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from eth_abi.exceptions import DecodingError
 from web3.exceptions import BadFunctionCallOutput
 
 from mesh.chain.errors import NoContracts, Reverted
-from mesh.chain.opening import OpenChain
 
 if TYPE_CHECKING:
     from web3.contract import AsyncContract
     from web3.contract.async_contract import AsyncContractFunction
+
+    from mesh.chain.contracts import Contracts
 
 LONGEST_LABEL: Final = 64
 """Characters of a token's name or symbol that are shown: anybody may deploy a token and call it anything."""
@@ -37,22 +38,25 @@ class Token:
     total_supply: int
 
 
-class Tokens(OpenChain):
-    """Balances, allowances and transfers; a part of `Chain`."""
+class Tokens:
+    """Balances, allowances and transfers. Where a token is None, it is XRT; where an account is None, it is the own."""
+
+    def __init__(self, contracts: Contracts) -> None:
+        self._contracts = contracts
 
     async def eth_balance(self, address: str | None = None) -> int:
         """Wei of an account; of one's own by default."""
-        return await self.node.eth_balance(await self._whose(address))
+        return await self._contracts.node.eth_balance(await self._contracts.address_or_own(address))
 
     async def send_eth(self, to: str, value: int) -> str:
         """Send `value` wei; the transaction's hash."""
-        return (await self._signing().send(to=await self.resolve(to), data=b"", value=value)).tx
+        return (await self._contracts.signing().send(to=await self._address(to), data=b"", value=value)).tx
 
-    async def token(self, token: str | None = None) -> Token:
+    async def info(self, token: str | None = None) -> Token:
         """What a token (XRT by default) says of itself. Raises `NoContracts` for what is no ERC-20."""
         contract = await self._token(token)
         functions = contract.functions
-        total_supply = int(await self.node.read(functions.totalSupply()))
+        total_supply = int(await self._contracts.node.read(functions.totalSupply()))
         return Token(
             address=str(contract.address),
             symbol=_label(await self._said(contract, functions.symbol())),
@@ -61,36 +65,53 @@ class Tokens(OpenChain):
             total_supply=total_supply,
         )
 
-    async def balance_of(self, address: str | None = None, *, token: str | None = None) -> int:
+    async def balance(self, address: str | None = None, *, token: str | None = None) -> int:
         """Units of a token (XRT by default) that an account holds."""
         contract = await self._token(token)
-        return int(await self.node.read(contract.functions.balanceOf(await self._whose(address))))
+        return int(
+            await self._contracts.node.read(contract.functions.balanceOf(await self._contracts.address_or_own(address)))
+        )
 
     async def allowance(self, owner: str, spender: str, *, token: str | None = None) -> int:
         """Units of a token (XRT by default) that `spender` may take from `owner`."""
         functions = (await self._token(token)).functions
-        return int(await self.node.read(functions.allowance(await self.resolve(owner), await self.resolve(spender))))
+        return int(
+            await self._contracts.node.read(
+                functions.allowance(await self._address(owner), await self._address(spender))
+            )
+        )
 
     async def approve(self, spender: str, value: int, *, token: str | None = None) -> str:
         """Let `spender` take up to `value` units of a token (XRT by default); the transaction's hash."""
         functions = (await self._token(token)).functions
-        return (await self._send(functions.approve(await self.resolve(spender), value))).tx
+        return (await self._contracts.send(functions.approve(await self._address(spender), value))).tx
 
     async def transfer(self, to: str, value: int, *, token: str | None = None) -> str:
         """Send units of a token (XRT by default); the transaction's hash."""
         functions = (await self._token(token)).functions
-        return (await self._send(functions.transfer(await self.resolve(to), value))).tx
+        return (await self._contracts.send(functions.transfer(await self._address(to), value))).tx
 
     async def transfer_from(self, owner: str, to: str, value: int, *, token: str | None = None) -> str:
         """Send what `owner` approved for this account; the transaction's hash."""
         functions = (await self._token(token)).functions
-        return (await self._send(functions.transferFrom(await self.resolve(owner), await self.resolve(to), value))).tx
+        return (
+            await self._contracts.send(
+                functions.transferFrom(await self._address(owner), await self._address(to), value)
+            )
+        ).tx
+
+    async def _address(self, name_or_address: str) -> str:
+        return await self._contracts.names.address(name_or_address)
+
+    async def _token(self, token: str | None) -> AsyncContract:
+        address = self._contracts.xrt if token is None else await self._address(token)
+        return self._contracts.node.contract("XRT", address)
 
     async def _said(self, contract: AsyncContract, function: AsyncContractFunction) -> bytes:
         """The bytes that an optional function of a token answers; none where it lacks the function."""
         call: Any = {"to": contract.address, "data": function._encode_transaction_data()}
         try:
-            return bytes(await self.node.web3.eth.call(call))
+            return bytes(await self._contracts.node.web3.eth.call(call))
         except (Reverted, BadFunctionCallOutput, NoContracts):
             return b""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
-from mesh.telemetry.context import facts
+from mesh.telemetry.context import log_event
 from mesh.telemetry.logs import own_log
 
 if TYPE_CHECKING:
@@ -25,6 +25,8 @@ def announce(log: Logger, words: str, **known: object) -> None:
     if own is not None:
         texts = {name: value for name, value in known.items() if isinstance(value, str)}
         line = "; ".join(" ".join(part.split()) for part in words.splitlines())
-        record = log.makeRecord(log.name, logging.INFO, __file__, 0, "%s", (line,), None, extra=facts(**texts))
+        record = log.makeRecord(
+            log.name, logging.INFO, __file__, 0, "%s", (line,), None, extra=log_event("unnamed", **texts)
+        )
         record.is_said = True
         log.handle(record)

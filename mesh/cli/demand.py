@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from msgspec.structs import replace
 
 from mesh.cli.amounts import AMOUNT, XRT
 from mesh.cli.options import with_settings
 from mesh.cli.printing import print_json, say, with_json
 from mesh.errors import AiraError, ConfigurationError, InputError, RemoteError
 from mesh.running import run_to_end
-from mesh.settings import CHAIN_SETTINGS, NETWORK_SETTINGS
+from mesh.settings import ChainSettings, NetworkSettings, options_of
 from schemas import InvalidCid, parse_cid
 
 if TYPE_CHECKING:
@@ -61,12 +61,12 @@ class Amount(click.ParamType[str]):
 @click.option("--out", type=click.Path(path_type=Path), help="file to write the recording to")
 @with_json
 @with_settings(
-    *NETWORK_SETTINGS,
+    *options_of(NetworkSettings),
     "lighthouse_contract",
     "erc20_token",
     "keyfile",
     "keyfile_password_file",
-    *CHAIN_SETTINGS,
+    *options_of(ChainSettings),
 )
 def command(settings: Settings, **order: Any) -> None:
     """Publish a Demand, wait for the contract, the work and the payment. Ctrl-C stops waiting; the contract goes on.

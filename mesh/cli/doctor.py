@@ -14,7 +14,7 @@ from mesh.doctor.case import Case, Line, Role, examined_as
 from mesh.doctor.findings import Verdict
 from mesh.errors import AiraError, InputError
 from mesh.running import fail, run_to_end
-from mesh.settings import CHAIN_SETTINGS, NETWORK_SETTINGS
+from mesh.settings import ChainSettings, NetworkSettings, options_of
 
 if TYPE_CHECKING:
     from mesh.doctor.checks import Checked
@@ -42,7 +42,7 @@ MARK: Final = 6
 @click.option("--device", default="", help="of an edge agent: name of that device")
 @with_json
 @with_settings(
-    *NETWORK_SETTINGS,
+    *options_of(NetworkSettings),
     "listen",
     "link",
     "roster",
@@ -50,7 +50,7 @@ MARK: Final = 6
     "erc20_token",
     "keyfile",
     "keyfile_password_file",
-    *CHAIN_SETTINGS,
+    *options_of(ChainSettings),
     "content_limit",
     "ipfs_http_provider",
     "ipfs_authorization_file",

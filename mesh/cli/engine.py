@@ -30,7 +30,7 @@ def with_engine(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def chosen(*, engine: str, anvil: Path | None, state: Path | None) -> Path | None:
     """The program anvil, or None for the embedded chain. Raises `ConfigurationError`."""
-    from mesh.demo.anvil import find_anvil
+    from mesh.devchain.anvil import find_anvil
 
     program = None if engine == "embedded" else find_anvil(anvil)
     if engine == "anvil" and program is None:

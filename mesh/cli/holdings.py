@@ -11,7 +11,7 @@ from mesh.cli.opening import own_address
 from mesh.cli.progress import progress
 from mesh.content import Exchange, Store
 from mesh.errors import InputError
-from mesh.settings import NETWORK_SETTINGS
+from mesh.settings import NetworkSettings, options_of
 from schemas import InvalidCid, parse_cid
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 STORE: Final = ("data_dir", "keyfile")
 """The settings that say which store."""
-MESH: Final = (*NETWORK_SETTINGS, "fetch_timeout", *STORE)
+MESH: Final = (*options_of(NetworkSettings), "fetch_timeout", *STORE)
 """Those that say also where a file comes from that is not there."""
 LARGEST: Final = 8 << 30
 """Bytes of the largest file that commands take."""
@@ -52,7 +52,7 @@ async def fetch(settings: Settings, store: Store, cid: str) -> Path:
 
     Raises `InvalidCid`, `NetworkUnavailable`, `ContentUnavailable` and other branches of `ContentError`.
     """
-    from mesh.agent.parts import endpoints_of
+    from mesh.composition import endpoints_of
     from mesh.network import Network
 
     parse_cid(cid)

@@ -13,7 +13,7 @@ from mesh.cli.printing import print_facts, print_json, visible, with_json
 from mesh.errors import AiraError, ConfigurationError, InputError
 from mesh.identity.roles import ROLES
 from mesh.running import fail, run_to_end, tell
-from mesh.settings import NETWORK_SETTINGS
+from mesh.settings import NetworkSettings, options_of
 
 if TYPE_CHECKING:
     from mesh.identity.certificates import Facts
@@ -133,7 +133,7 @@ def renew(
 @command.command("check", short_help="ask the router whether it heeds an identity")
 @click.option("--agent", default="", help="of an edge agent: address of the agent whose device it serves")
 @click.option("--device", default="", help="of an edge agent: name of that device")
-@with_settings(*NETWORK_SETTINGS)
+@with_settings(*options_of(NetworkSettings))
 def check(settings: Settings, agent: str, device: str) -> None:
     """Connect as the settings say, and see whether what this identity does has an effect.
 

@@ -12,7 +12,7 @@ from mesh.cli.pipes import until_unread
 from mesh.cli.printing import plural, say, visible, with_json
 from mesh.errors import RemoteError
 from mesh.running import run_to_end
-from mesh.settings import NETWORK_SETTINGS
+from mesh.settings import NetworkSettings, options_of
 from schemas import parse_address
 from schemas.keys import DeviceTopicKey, RpcKey
 from schemas.logs import LEVELS
@@ -43,7 +43,7 @@ DEVICE_LOG: Final = "/log"
     "--timeout", type=click.FloatRange(min=0, min_open=True), default=3.0, show_default=True, help="seconds to wait"
 )
 @with_json
-@with_settings(*NETWORK_SETTINGS)
+@with_settings(*options_of(NetworkSettings))
 def command(
     settings: Settings,
     address: str,
@@ -80,8 +80,8 @@ async def _show(
     timeout: float,
     follow: bool,
 ) -> None:
-    from mesh.agent.parts import endpoints_of
     from mesh.background import Background
+    from mesh.composition import endpoints_of
     from mesh.network import Network
     from mesh.watching.logs import LogReader
 

@@ -47,7 +47,7 @@ def for_signing(*more: str) -> Callable[[Callable[..., Any]], Callable[..., Any]
 @asynccontextmanager
 async def reading(settings: Settings) -> AsyncIterator[Chain]:
     """The chain, open, for reading only. Raises `NodeUnreachable`, `NoContracts`."""
-    from mesh.agent.parts import chain_of
+    from mesh.composition import chain_of
 
     async with chain_of(settings, None) as chain:
         yield chain
@@ -56,7 +56,7 @@ async def reading(settings: Settings) -> AsyncIterator[Chain]:
 @asynccontextmanager
 async def signing(settings: Settings) -> AsyncIterator[Chain]:
     """The chain, open, with the account of the settings. Raises also `ConfigurationError` for the account."""
-    from mesh.agent.parts import chain_of, load_account
+    from mesh.composition import chain_of, load_account
 
     account = await asyncio.to_thread(load_account, settings)
     async with chain_of(settings, account) as chain:

@@ -9,7 +9,7 @@ import click
 from mesh.cli.options import with_settings
 from mesh.cli.printing import plural, print_json, print_table, say, visible, with_json
 from mesh.running import run_to_end
-from mesh.settings import NETWORK_SETTINGS
+from mesh.settings import NetworkSettings, options_of
 
 if TYPE_CHECKING:
     from mesh.settings import Settings
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @click.command("peers")
 @with_json
-@with_settings(*NETWORK_SETTINGS, "lighthouse_contract")
+@with_settings(*options_of(NetworkSettings), "lighthouse_contract")
 def command(settings: Settings, as_json: bool) -> None:
     """Show who is on the lighthouse's channel, by role and address, and how many nodes listen on the IPFS side.
 

@@ -14,7 +14,7 @@ from mesh.background import Background
 from mesh.cli.announcing import announce
 from mesh.cli.options import with_settings
 from mesh.running import run_until_stopped
-from mesh.settings import CHAIN_SETTINGS, NETWORK_SETTINGS, SERVER_SETTINGS
+from mesh.settings import ChainSettings, NetworkSettings, TelemetrySettings, options_of
 from mesh.telemetry.context import Speaker
 from mesh.telemetry.logs import introduce
 from mesh.telemetry.serving import Telemetry
@@ -35,13 +35,13 @@ REPORT: Final = 600.0
 
 @click.command("provider")
 @with_settings(
-    *NETWORK_SETTINGS,
+    *options_of(NetworkSettings),
     "lighthouse_contract",
     "keyfile",
     "keyfile_password_file",
-    *CHAIN_SETTINGS,
+    *options_of(ChainSettings),
     "open_orders_limit",
-    *SERVER_SETTINGS,
+    *options_of(TelemetrySettings),
 )
 def command(settings: Settings) -> None:
     """Match the demands and offers of a lighthouse, make their contracts, finalize them. Ctrl-C ends it.
@@ -53,7 +53,7 @@ def command(settings: Settings) -> None:
 
 
 async def _serve(settings: Settings) -> None:
-    from mesh.agent.parts import load_account
+    from mesh.composition import load_account
     from mesh.starting import entered, files
 
     lighthouse = settings.lighthouse_contract
@@ -76,7 +76,7 @@ async def _opened(
     settings: Settings, account: Account, telemetry: Telemetry
 ) -> AsyncIterator[tuple[Network, Provider]]:
     """The provider with all that it needs: a node, contracts, a stake, a router; and with its figures to be seen."""
-    from mesh.agent.parts import chain_of, endpoints_of
+    from mesh.composition import chain_of, endpoints_of
     from mesh.market.process import ProviderProcess
     from mesh.market.provider import Provider
     from mesh.market.standing import check_standing

@@ -20,7 +20,7 @@ from mesh.cli.progress import progress
 from mesh.errors import InputError
 from mesh.recording import GENEROUS, AtOnce, RecordedTimes, open_objective, play
 from mesh.running import run_to_end
-from mesh.settings import CHAIN_SETTINGS
+from mesh.settings import ChainSettings, options_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -45,7 +45,7 @@ ROLES: Final = ("objective", "device", "agent")
 @click.option("--at-once", is_flag=True, help="without the pauses")
 @click.option("--from", "start", type=click.FloatRange(min=0), default=0.0, help="leave out so many seconds")
 @with_json
-@with_settings(*dict.fromkeys((*MESH, *CHAIN_SETTINGS)))
+@with_settings(*dict.fromkeys((*MESH, *options_of(ChainSettings))))
 def command(settings: Settings, **options: Any) -> None:
     """Play SOURCE again onto keys of the mesh: a file, a CID, or the recording of a liability, by its address.
 
@@ -82,7 +82,7 @@ class Replay(Struct, frozen=True, kw_only=True):
 
 
 async def _replay(settings: Settings, asked: Replay) -> None:
-    from mesh.agent.parts import endpoints_of
+    from mesh.composition import endpoints_of
     from mesh.network import Network
 
     given = None if asked.to is None else await asyncio.to_thread(destination_of, settings, asked.to)
@@ -110,7 +110,7 @@ async def _source(settings: Settings, store: Store, asked: Replay) -> tuple[Path
         named = file_or_cid(asked.source)
         return (await fetch(settings, store, named) if isinstance(named, str) else readable(named)), None
     async with reading(settings) as chain:
-        liability = await chain.liability(asked.source)
+        liability = await chain.liabilities.get(asked.source)
     cid = liability.objective if asked.of_objective else liability.result
     if not cid:
         raise InputError(

@@ -13,10 +13,10 @@ from mesh.cli.announcing import announce
 from mesh.cli.options import with_settings
 from mesh.cli.printing import print_json, print_table, visible, with_json
 from mesh.errors import AiraError, ConfigurationError
+from mesh.outage_log import OutageLog
 from mesh.running import fail, run_until_stopped
-from mesh.settings import SERVER_SETTINGS
+from mesh.settings import TelemetrySettings, options_of
 from mesh.telemetry.serving import Telemetry
-from mesh.trouble import Trouble
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -35,7 +35,7 @@ LOOK: Final = 1.0
 
 
 @click.group("router", invoke_without_command=True)
-@with_settings(*SITE, *SERVER_SETTINGS)
+@with_settings(*SITE, *options_of(TelemetrySettings))
 @click.pass_context
 def command(context: click.Context, settings: Settings) -> None:
     """Run a Zenoh router, the place where agents, providers and people meet. Ctrl-C ends it.
@@ -133,16 +133,16 @@ async def _changed(settings: Settings, endpoints: Endpoints, certificate: bytes)
     """Where and how to listen, once it is something else; what can't work is reported and left alone."""
     from mesh.identity.routers import router_endpoints
 
-    trouble = Trouble(log)
+    trouble = OutageLog(log, "roster")
     while True:
         await asyncio.sleep(LOOK)
         try:
             found = await asyncio.to_thread(router_endpoints, settings)
             await asyncio.to_thread(found.config)
         except AiraError as error:
-            trouble.met(error, "the router goes on as it is")
+            trouble.failed(error, "the router goes on as it is")
             continue
-        trouble.over("the roster can be used again")
+        trouble.recovered("the roster can be used again")
         if found != endpoints or _contents(found) != certificate:
             return found
 

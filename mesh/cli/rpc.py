@@ -14,7 +14,7 @@ from mesh.cli.options import with_settings
 from mesh.cli.printing import print_facts, print_json, print_table, say, visible, with_json
 from mesh.errors import InputError
 from mesh.running import run_to_end
-from mesh.settings import NETWORK_SETTINGS
+from mesh.settings import NetworkSettings, options_of
 from schemas import Record, parse_address
 from schemas.rpc import GUARDED, SERVICES, Balance, Done, LiabilityRead, LogsRead, Status
 
@@ -35,7 +35,7 @@ ETH_BALANCES: Final = frozenset({"eth/eth_balance", "eth/account_eth_balance"})
     help="seconds to wait for the answer [10, or 240 for what sends a transaction]",
 )
 @with_json
-@with_settings(*NETWORK_SETTINGS)
+@with_settings(*options_of(NetworkSettings))
 def command(
     settings: Settings,
     address: str | None,
@@ -85,7 +85,7 @@ def _names(kind: type[Record], most: int) -> str:
 async def _call(
     settings: Settings, called: tuple[str, str, tuple[str, ...]], *, timeout: float | None, as_json: bool
 ) -> None:
-    from mesh.agent.parts import endpoints_of
+    from mesh.composition import endpoints_of
     from mesh.network import Network, ServiceFailed, call
     from mesh.telemetry.events import human_line
 

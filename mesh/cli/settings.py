@@ -8,7 +8,7 @@ import click
 import msgspec
 
 from mesh.cli.options import with_settings
-from mesh.settings import MEANING, Settings
+from mesh.settings import MEANING, OPTIONS, Settings
 
 if TYPE_CHECKING:
     from typing import Any
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @click.command("settings")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
-@with_settings(*Settings.__struct_fields__)
+@with_settings(*OPTIONS)
 def command(settings: Settings, as_json: bool) -> None:
     """Show the settings in force, as a TOML file that can be edited and given to --config."""
     values: dict[str, Any] = msgspec.to_builtins(settings)

@@ -11,7 +11,7 @@ from mesh.cli.options import with_settings
 from mesh.cli.printing import print_facts, print_json, print_table, say, with_json
 from mesh.errors import RemoteError
 from mesh.running import run_to_end
-from mesh.settings import NETWORK_SETTINGS
+from mesh.settings import NetworkSettings, options_of
 from schemas import parse_address
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     "--timeout", type=click.FloatRange(min=0, min_open=True), default=3.0, show_default=True, help="seconds to wait"
 )
 @with_json
-@with_settings(*NETWORK_SETTINGS, "lighthouse_contract")
+@with_settings(*options_of(NetworkSettings), "lighthouse_contract")
 def command(settings: Settings, address: str | None, timeout: float, as_json: bool) -> None:
     """Show how whoever has ADDRESS is: an agent, a provider, a bridge. Whether its parts are alive, how far it has
     read the chain, its jobs or its market.

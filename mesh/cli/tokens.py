@@ -21,7 +21,7 @@ async def unit_of(chain: Chain, token: str | None) -> Unit:
     from mesh.chain import NoContracts, Reverted
 
     try:
-        said = await chain.token(token)
+        said = await chain.tokens.info(token)
     except (NoContracts, Reverted):
         if token is None:
             raise
@@ -35,20 +35,20 @@ async def account_of(chain: Chain, settings: Settings, named: str | None) -> str
     """The address of a named account (ENS name or address), of the settings' where none is named."""
     if named is None:
         return await asyncio.to_thread(needed_address, settings)
-    return await chain.resolve(named)
+    return await chain.names.address(named)
 
 
 async def spender_of(chain: Chain, named: str) -> str:
     """The address of who may take tokens: `factory`, a lighthouse's label, an ENS name or an address."""
     if named == FACTORY:
         return chain.factory
-    return await chain.lighthouse_address(named)
+    return await chain.names.lighthouse(named)
 
 
 async def check_enough(chain: Chain, unit: Unit, needed: int, *, token: str | None = None) -> None:
     """Raise `ChainError` when the chain's account holds less of a token than it is to give."""
     assert chain.account is not None
-    balance = await chain.balance_of(token=token)
+    balance = await chain.tokens.balance(token=token)
     if balance < needed:
         raise ChainError(
             f"{chain.account.address} has {unit.show(balance)}, and {unit.show(needed)} are needed",

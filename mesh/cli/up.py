@@ -13,7 +13,7 @@ from mesh.cli.announcing import announce
 from mesh.cli.engine import chosen, with_engine
 from mesh.cli.options import BLOCK_TIME, PORT, with_settings
 from mesh.running import run_until_stopped
-from mesh.settings import SERVER_SETTINGS, Settings
+from mesh.settings import Settings, TelemetrySettings, options_of
 from mesh.telemetry.serving import Telemetry
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
     "--block-time", type=BLOCK_TIME, default=1.0, show_default=True, help="mine an empty block every so many seconds"
 )
 @with_engine
-@with_settings("listen", "data_dir", *SERVER_SETTINGS)
+@with_settings("listen", "data_dir", *options_of(TelemetrySettings))
 def command(settings: Settings, port: int, block_time: float, **engine: Any) -> None:
     """Run a market to develop on: a Zenoh router, a chain with the contracts, and a provider. Ctrl-C ends it.
 
@@ -49,7 +49,7 @@ async def _serve(
     anvil: Path | None = None,
     state: Path | None = None,
 ) -> None:
-    from mesh.demo.development import serve_chain
+    from mesh.devchain.development import serve_chain
     from mesh.identity.routers import check_loopback
     from mesh.market.process import ProviderProcess
     from mesh.market.provider import Provider

@@ -17,7 +17,7 @@ from mesh.cli.progress import progress
 from mesh.errors import AiraError, InputError
 from mesh.evidence import Claim, Verdict, check_end, verify
 from mesh.running import run_to_end
-from mesh.settings import CHAIN_SETTINGS
+from mesh.settings import ChainSettings, options_of
 from schemas import parse_address
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ MARKS: Final = {True: "holds", False: "FAILS", None: "open"}
 @click.option("--message", type=FILE, help="the Result message as it travelled (JSON)")
 @click.option("--offline", is_flag=True, help="ask no chain; what only a contract can tell stays open")
 @with_json
-@with_settings(*dict.fromkeys((*MESH, *CHAIN_SETTINGS)))
+@with_settings(*dict.fromkeys((*MESH, *options_of(ChainSettings))))
 def command(
     settings: Settings,
     liability: str | None,
@@ -94,7 +94,7 @@ async def _claim(settings: Settings, liability: str | None, *, offline: bool) ->
     if offline:
         return Claim(liability=parse_address(liability))
     async with reading(settings) as chain:
-        return Claim.of_contract(await chain.liability(liability))
+        return Claim.of_contract(await chain.liabilities.get(liability))
 
 
 async def _verdict(settings: Settings, claim: Claim, files: Files, message: bytes | None) -> Verdict:

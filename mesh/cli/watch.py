@@ -16,7 +16,7 @@ from mesh.cli.options import with_settings
 from mesh.cli.pipes import until_unread
 from mesh.cli.printing import plural, print_json, say, with_json
 from mesh.running import run_until_stopped
-from mesh.settings import NETWORK_SETTINGS
+from mesh.settings import NetworkSettings, options_of
 from mesh.telemetry.logs import start_log
 from schemas import InvalidAddress, parse_address, parse_cid
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 @click.option("--open", "with_open", is_flag=True, help="begin with the orders that are open now")
 @click.option("--readings", is_flag=True, help="show what Results without a contract hold, such as a sensor's readings")
 @with_json
-@with_settings(*NETWORK_SETTINGS, "lighthouse_contract", "xrt_contract")
+@with_settings(*options_of(NetworkSettings), "lighthouse_contract", "xrt_contract")
 def command(settings: Settings, model: str | None, with_open: bool, readings: bool, as_json: bool) -> None:
     """Tell what happens on a lighthouse, a line each: orders, rejections, contracts and their work, Results. Ctrl-C
     ends it.

@@ -42,7 +42,7 @@ async def _balance(settings: Settings, *, account: str | None, token: str | None
     async with reading(settings) as chain:
         owner = await account_of(chain, settings, account)
         unit = await unit_of(chain, token)
-        amount = await chain.balance_of(owner, token=token)
+        amount = await chain.tokens.balance(owner, token=token)
         if as_json:
             print_json({"account": owner, **await _about(chain, token, unit), "balance": str(amount)})
         else:
@@ -64,7 +64,7 @@ async def _allowance(settings: Settings, *, spender: str, owner: str | None, tok
     async with reading(settings) as chain:
         whose, by = await account_of(chain, settings, owner), await spender_of(chain, spender)
         unit = await unit_of(chain, token)
-        amount = await chain.allowance(whose, by, token=token)
+        amount = await chain.tokens.allowance(whose, by, token=token)
         if as_json:
             about = await _about(chain, token, unit)
             print_json({"owner": whose, "spender": by, **about, "allowance": str(amount)})
@@ -91,7 +91,7 @@ async def _approve(settings: Settings, *, spender: str, amount: str, token: str 
         unit = await unit_of(chain, token)
         value, by = unit.parse(amount), await spender_of(chain, spender)
         with patience():
-            tx = await chain.approve(by, value, token=token)
+            tx = await chain.tokens.approve(by, value, token=token)
         if as_json:
             print_json({"spender": by, **await _about(chain, token, unit), "allowance": str(value), "tx": tx})
         else:
@@ -112,11 +112,11 @@ def transfer(settings: Settings, **what: Any) -> None:
 async def _transfer(settings: Settings, *, to: str, amount: str, token: str | None, as_json: bool) -> None:
     async with signing(settings) as chain:
         unit = await unit_of(chain, token)
-        value, recipient = unit.parse(amount), await chain.resolve(to)
+        value, recipient = unit.parse(amount), await chain.names.address(to)
         await check_enough(chain, unit, value, token=token)
         with patience():
-            tx = await chain.transfer(recipient, value, token=token)
-        left = await chain.balance_of(token=token)
+            tx = await chain.tokens.transfer(recipient, value, token=token)
+        left = await chain.tokens.balance(token=token)
         if as_json:
             about = await _about(chain, token, unit)
             print_json({"to": recipient, **about, "amount": str(value), "balance": str(left), "tx": tx})
@@ -126,5 +126,5 @@ async def _transfer(settings: Settings, *, to: str, amount: str, token: str | No
 
 async def _about(chain: Chain, token: str | None, unit: Unit) -> dict[str, Any]:
     """The token, for programs."""
-    address = chain.xrt if token is None else await chain.resolve(token)
+    address = chain.xrt if token is None else await chain.names.address(token)
     return {"token": address, "symbol": unit.symbol, "decimals": unit.decimals}

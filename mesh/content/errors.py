@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 class ContentUnavailable(ContentError):
     """Nobody who was asked has the file, or a block of it."""
 
+    code = "content-unavailable"
+
     def __init__(self, cid: str, why: str) -> None:
         super().__init__(
             f"{cid} is not to be had: {why}", hint="check the name, and that whoever has the file is on the network"
@@ -24,6 +26,8 @@ class ContentUnavailable(ContentError):
 
 class ContentTooLarge(ContentError):
     """A file is larger than what the caller, or the store, takes. Sizes are in bytes."""
+
+    code = "content-too-large"
 
     def __init__(self, cid: str, *, size: int, limit: int) -> None:
         super().__init__(
@@ -41,6 +45,8 @@ class ContentCorrupt(ContentError):
     `holders` are the Zenoh ids of those who offered them (empty when the bytes were our own, or came from elsewhere).
     """
 
+    code = "content-corrupt"
+
     def __init__(self, cid: str, why: str, *, holders: Iterable[str] = ()) -> None:
         self.holders = tuple(holders)
         offered = f" (offered by {', '.join(self.holders)})" if self.holders else ""
@@ -52,6 +58,8 @@ class ContentCorrupt(ContentError):
 class ContentPinned(AiraError):
     """A file was to be removed that is pinned; `labels` say what for."""
 
+    code = "content-pinned"
+
     def __init__(self, cid: str, labels: Iterable[str]) -> None:
         self.labels = tuple(sorted(labels))
         super().__init__(f"{cid} is pinned ({', '.join(self.labels)})", hint="unpin it first")
@@ -60,6 +68,8 @@ class ContentPinned(AiraError):
 
 class StoreFull(AiraError):
     """The store has no room for a file: the disk under it is full, or its own quota is reached."""
+
+    code = "store-full"
 
     def __init__(self, path: Path, *, why: str = "", hint: str = "") -> None:
         super().__init__(
@@ -74,6 +84,8 @@ class QuotaReached(StoreFull):
     `kept` bytes may not be: they are pinned, or being written.
     """
 
+    code = "quota-reached"
+
     def __init__(self, path: Path, *, missing: int, quota: int, kept: int) -> None:
         super().__init__(
             path,
@@ -87,6 +99,8 @@ class QuotaReached(StoreFull):
 
 class StoreDamaged(AiraError):
     """The store's own books can't be read or written. The files themselves may be whole."""
+
+    code = "store-damaged"
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Final
 
 from mesh.agent import Agent, Phase
 from mesh.background import Background
-from mesh.chain import XRT, EmbeddedChain
+from mesh.chain import XRT
 from mesh.demo.device import BLINK, Lamp
-from mesh.demo.market import ROLES, Market, found_market
 from mesh.demo.objective import write_objective
+from mesh.devchain import EmbeddedChain
+from mesh.devchain.market import ROLES, Market, found_market
 from mesh.errors import ConfigurationError, InputError, RemoteError
 from mesh.market.provider import Provider
 from mesh.network import Endpoints, Network, free_endpoint
@@ -270,7 +271,7 @@ class _Stage:
 
     async def _balances(self) -> dict[str, int]:
         chain = self._person.parts.chain
-        return {role: await chain.balance_of(account.address) for role, account in self._market.accounts.items()}
+        return {role: await chain.tokens.balance(account.address) for role, account in self._market.accounts.items()}
 
     def _keep(self, recording: Path, result: str, objective: Path, cid: str) -> str:
         """Copy recording and objective, by their CIDs, to where they outlive the demo; says where the recording is."""

@@ -86,7 +86,7 @@ class Purse:
     async def check_allowance(self) -> Finding:
         """That the factory may take what a job costs, or that it can be allowed to."""
         chain, coin = self._ledgers.chain, await self._coin()
-        allowed = await chain.allowance(self.address, chain.factory, token=self._case.settings.erc20_token)
+        allowed = await chain.tokens.allowance(self.address, chain.factory, token=self._case.settings.erc20_token)
         if allowed:
             return sound(f"the factory may take {_amount(allowed, coin)}")
         node = chain.node
@@ -106,7 +106,7 @@ class Purse:
         from mesh.market.turns import NoStake
 
         chain, name = self._ledgers.chain, self._case.settings.lighthouse_contract
-        state = await chain.lighthouse(name)
+        state = await chain.lighthouses.get(name)
         if self.address not in state.stakes:
             raise NoStake(self.address, name, minimal_stake=state.minimal_stake)
         stake = state.stakes[self.address]
@@ -116,22 +116,22 @@ class Purse:
     async def check_turn(self) -> Finding:
         """Whose turn it is; others may be next."""
         chain = self._ledgers.chain
-        state = await chain.lighthouse(self._case.settings.lighthouse_contract)
+        state = await chain.lighthouses.get(self._case.settings.lighthouse_contract)
         block, providers = await chain.block_number(), list(state.stakes)
         if state.current == self.address:
             return sound(f"its own, {state.quota:,} transactions left of it")
         place = f"{providers.index(state.current) + 1} of {len(providers)}" if state.current in providers else "gone"
         alive = f"who was heard of {block - state.keep_alive_block:,} blocks ago"
         alive = alive if state.keep_alive_block else "who was not heard of yet"
-        may = "may send now" if await chain.is_turn(state.address, self.address) else "waits for its turn"
+        may = "may send now" if await chain.lighthouses.is_turn(state.address, self.address) else "waits for its turn"
         return sound(f"{state.current}'s ({place}), {alive}; this account {may}")
 
     async def _coin(self) -> Coin:
-        token = await self._ledgers.chain.token(self._case.settings.erc20_token)
+        token = await self._ledgers.chain.tokens.info(self._case.settings.erc20_token)
         return Coin(token.symbol or "tokens", token.decimals)
 
     async def _balance(self) -> int:
-        return await self._ledgers.chain.balance_of(self.address, token=self._case.settings.erc20_token)
+        return await self._ledgers.chain.tokens.balance(self.address, token=self._case.settings.erc20_token)
 
 
 def _amount(count: int, coin: Coin) -> str:

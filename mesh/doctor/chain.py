@@ -104,13 +104,13 @@ class Ledgers:
     async def check_lighthouse(self) -> Finding:
         """That the market is there, and is one of the factory's. Raises `UnknownName`."""
         name = self._settings.lighthouse_contract
-        address = await self.chain.lighthouse_address(name)
-        if not await self.chain.is_lighthouse(address):
+        address = await self.chain.names.lighthouse(name)
+        if not await self.chain.lighthouses.exists(address):
             return broken(
                 f"{name} is {address}, which is no lighthouse of this factory",
                 do="`aira lighthouse list` shows those that there are; name one with --lighthouse-contract",
             )
-        state = await self.chain.lighthouse(address)
+        state = await self.chain.lighthouses.get(address)
         providers = len(state.stakes)
         if not providers:
             return doubtful(
@@ -121,7 +121,7 @@ class Ledgers:
 
     async def check_token(self) -> Finding:
         """That the token that pays is one. Raises `UnknownName`, `NoContracts`."""
-        token = await self.chain.token(self._settings.erc20_token)
+        token = await self.chain.tokens.info(self._settings.erc20_token)
         if not token.total_supply:
             raise NoContracts(f"token with any supply at {token.address}", self.node.chain_id)
         return sound(f"{token.symbol or 'without a symbol'}, {token.decimals} decimals, at {token.address}")

@@ -26,6 +26,8 @@ ELSEWHERE: Final = {"ipfs": "bridges.ipfs.check", "serial": "bridges.serial.chec
 class NoRouter(ConfigurationError):
     """The settings name no router, or of a router nowhere to listen."""
 
+    code = "no-router"
+
     def __init__(self, role: str) -> None:
         option = "--listen" if role == "router" else "--connect"
         super().__init__("the settings name no router", hint=f"give {option} tcp/127.0.0.1:7447, or another address")

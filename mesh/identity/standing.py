@@ -23,6 +23,8 @@ SECONDS: Final = 5.0
 class NotHeeded(RemoteError):
     """The identity with this `address` was let in, and nothing that it does has an effect."""
 
+    code = "not-heeded"
+
     def __init__(self, address: str) -> None:
         super().__init__(
             f"the router lets {address} in, and heeds nothing that it does: it is not in the roster, or revoked",

@@ -10,7 +10,7 @@ from mesh.chain import NodeUnreachable, RequestRefused, Reverted
 from mesh.errors import AiraError, InputError
 from mesh.market.blame import at_fault, word_for
 from mesh.market.patience import Patience, may_pass
-from mesh.telemetry.context import concerning, facts
+from mesh.telemetry.context import concerning, log_event
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -61,7 +61,7 @@ class Contracting:
 
     async def _make(self, match: Match, patience: Patience) -> None:
         demand, offer = match
-        create = partial(self._chain.create_liability, self._lighthouse, demand.message, offer.message)
+        create = partial(self._chain.liabilities.create, self._lighthouse, demand.message, offer.message)
         try:
             created = await self._sending.send(partial(patience.attempt, create))
         except Reverted as error:
@@ -76,7 +76,7 @@ class Contracting:
         else:
             self._books.made(created, fee=offer.message.lighthouse_fee)
             self._used.add(created.liability, demand, offer)
-            known = facts(demand=demand.hash.hex(), offer=offer.hash.hex(), gas=created.gas_used)
+            known = log_event("unnamed", demand=demand.hash.hex(), offer=offer.hash.hex(), gas=created.gas_used)
             with concerning(created.liability):
                 log.info("created, gas %d", created.gas_used, extra=known)
 
@@ -101,8 +101,8 @@ class Contracting:
     async def _is_used(self, order: Verified[Order]) -> bool:
         try:
             if order.message.generation == 3:
-                return await self._chain.is_order_used(order.hash, order.signer)
-            return await self._chain.nonce_of(order.signer) > int(order.message.nonce)
+                return await self._chain.liabilities.is_order_used(order.hash, order.signer)
+            return await self._chain.liabilities.next_nonce(order.signer) > int(order.message.nonce)
         except RequestRefused:
             return False  # the contracts will say so when it is matched
 
@@ -112,7 +112,7 @@ class Contracting:
 
     async def _finalize(self, result: Verified[Result], patience: Patience) -> None:
         message = result.message
-        finalize = partial(self._chain.finalize, self._lighthouse, message)
+        finalize = partial(self._chain.liabilities.finalize, self._lighthouse, message)
         try:
             settled = await self._sending.send(partial(patience.attempt, finalize))
         except Reverted as error:
@@ -128,7 +128,7 @@ class Contracting:
         else:
             self._books.ended(message.liability, settled)
             self._used.add(message.liability, result)
-            known = facts(gas=settled.gas_used)
+            known = log_event("unnamed", gas=settled.gas_used)
             log.info("finalized, success %s, gas %d", message.success, settled.gas_used, extra=known)
 
 

@@ -88,7 +88,7 @@ class MarketFigures:
     async def _ask_stake(self) -> Iterable[Family]:
         assert self._chain.account is not None
         assert self._channel.address is not None
-        state = await self._chain.lighthouse(self._channel.address)
+        state = await self._chain.lighthouses.get(self._channel.address)
         own = self._chain.account.address
         return (
             gauge("aira_stake_wn", "What this provider has staked at the lighthouse, wn", state.stakes.get(own, 0)),

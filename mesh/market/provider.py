@@ -25,7 +25,7 @@ from mesh.market.watching import Watching
 from mesh.network.channel import Channel
 from mesh.network.services import Services
 from mesh.role import Role
-from mesh.telemetry.context import Speaker, concerning, facts, speaking
+from mesh.telemetry.context import Speaker, concerning, log_event, speaking
 from mesh.telemetry.log_service import LogService
 from schemas import ZERO_ADDRESS, Demand, Offer, RejectKey, Result, Verified
 from schemas.rejection import Rejection
@@ -79,7 +79,7 @@ class Provider(Role):
         self._speaker = Speaker("provider", self.address, self._lighthouse)
 
     async def _open(self, stack: AsyncExitStack) -> None:
-        market, head = await self._chain.resolve(self._lighthouse), await self._chain.block_number()
+        market, head = await self._chain.names.address(self._lighthouse), await self._chain.block_number()
         self.book = OrderBook(market, limit=self._limit)
         self.book.expire(head)
         self._prepare(market, head)
@@ -88,7 +88,7 @@ class Provider(Role):
                 self._session,
                 self._lighthouse,
                 address=market,
-                resolver=self._chain.resolve,
+                resolver=self._chain.names.address,
                 head=lambda: self._watching.head,
             )
         )
@@ -168,7 +168,7 @@ class Provider(Role):
         """Tell the sender why. That an order was used already is no news to whom it made a contract."""
         self._books.rejected(reason)
         order = message.hash.hex()
-        known = facts(order=order, signer=message.signer, reason=reason)
+        known = log_event("unnamed", order=order, signer=message.signer, reason=reason)
         log.warning("rejected %s of %s: %s", order, message.signer, detail, extra=known)
         if reason != USED:
             rejection = Rejection(order=order, reason=reason, detail=detail, provider=self.address)
@@ -191,7 +191,9 @@ class Provider(Role):
         outcome = self.book.add(order)
         if isinstance(outcome, Match):
             demand, offer = outcome.demand.hash.hex(), outcome.offer.hash.hex()
-            log.info("matched demand %s and offer %s", demand, offer, extra=facts(demand=demand, offer=offer))
+            log.info(
+                "matched demand %s and offer %s", demand, offer, extra=log_event("unnamed", demand=demand, offer=offer)
+            )
             self._books.matched()
             self._matched(outcome)
             self._contracting.make(outcome)

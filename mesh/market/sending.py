@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 from mesh.chain import FeeTooHigh, InsufficientFunds, NodeUnreachable, RequestRefused, Reverted, TransactionTimeout
 from mesh.market.patience import may_pass
 from mesh.market.turns import NoStake, Turns
-from mesh.trouble import Trouble
+from mesh.outage_log import OutageLog
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -48,8 +48,8 @@ class Sending:
         self._later = 0
         self._room = asyncio.Event()
         self._room.set()
-        self._trouble = Trouble(log)
-        self._silence = Trouble(log)
+        self._trouble = OutageLog(log, "transactions")
+        self._silence = OutageLog(log, "chain")
 
     def put(self, work: Work) -> None:
         """Do `work`, a coroutine function that uses `send`, after what waits already."""
@@ -58,7 +58,7 @@ class Sending:
     @property
     def waits_for(self) -> str:
         """In a few words what transactions wait for that is not a turn or a block; empty when they go through."""
-        return "wait for the node" if self._silence.stands else "wait" if self._trouble.stands else ""
+        return "wait for the node" if self._silence.is_down else "wait" if self._trouble.is_down else ""
 
     @property
     def waiting(self) -> int:
@@ -72,7 +72,7 @@ class Sending:
         """
         if self._later >= LATER:
             return False
-        self._trouble.met(because, "a transaction waits")
+        self._trouble.failed(because, "a transaction waits")
         self._later += 1
         asyncio.get_running_loop().call_later(after, self._put_again, work, self._since)
         return True
@@ -91,7 +91,7 @@ class Sending:
                 await work()
             except InsufficientFunds as error:
                 # Perhaps for this transaction only: a token may ask for any amount of gas.
-                self._trouble.met(error, "a transaction waits")
+                self._trouble.failed(error, "a transaction waits")
                 asyncio.get_running_loop().call_later(RETRY, self._put, work, self._since)
 
     async def send(self, transaction: Callable[[], Awaitable[T]]) -> T:
@@ -107,17 +107,17 @@ class Sending:
             try:
                 done = await transaction()
             except (FeeTooHigh, TransactionTimeout) as error:
-                self._trouble.met(error, "a transaction waits")
+                self._trouble.failed(error, "a transaction waits")
             except (NodeUnreachable, RequestRefused, Reverted) as error:
                 if not may_pass(error):
                     raise
                 if await self._is_our_turn():
                     self._turns.forget()
                     raise
-                self._trouble.met(error, "a transaction waits")
+                self._trouble.failed(error, "a transaction waits")
             else:
                 self._turns.took_one()
-                self._trouble.over("transactions go through again")
+                self._trouble.recovered("transactions go through again")
                 return done
             # Time has passed, and with it perhaps the turn.
             self._turns.forget()
@@ -129,9 +129,9 @@ class Sending:
             try:
                 answer = await question()
             except NodeUnreachable as error:
-                self._silence.met(error, "a question waits")
+                self._silence.failed(error, "a question waits")
             else:
-                self._silence.over("the node answers again")
+                self._silence.recovered("the node answers again")
                 return answer
             await asyncio.sleep(RETRY)
 
@@ -151,11 +151,11 @@ class Sending:
                 if await self._turns.has_come(since=self._since):
                     return
             except (NodeUnreachable, RequestRefused, NoStake) as error:
-                self._trouble.met(error, "a transaction waits")
+                self._trouble.failed(error, "a transaction waits")
             await asyncio.sleep(min(RETRY, self._chain.node.timing.poll_interval))
 
     async def _is_our_turn(self) -> bool:
         try:
-            return await self._chain.is_turn(self._lighthouse)
+            return await self._chain.lighthouses.is_turn(self._lighthouse)
         except (NodeUnreachable, RequestRefused):
             return False

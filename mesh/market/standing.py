@@ -21,9 +21,9 @@ async def check_standing(chain: Chain, lighthouse: str) -> None:
     """
     assert chain.account is not None
     address = chain.account.address
-    state = await chain.lighthouse(lighthouse)
+    state = await chain.lighthouses.get(lighthouse)
     if address not in state.stakes:
         raise NoStake(address, lighthouse, minimal_stake=state.minimal_stake)
-    balance, price = await chain.eth_balance(), int(await chain.node.web3.eth.gas_price)
+    balance, price = await chain.tokens.eth_balance(), int(await chain.node.web3.eth.gas_price)
     if balance < GAS_OF_ONE * price:
         raise InsufficientFunds(address, balance=balance, needed=GAS_OF_ONE * price)

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 class NoStake(ChainError):
     """A provider has staked nothing at its lighthouse, which takes no transaction of it."""
 
+    code = "no-stake"
+
     def __init__(self, provider: str, lighthouse: str, *, minimal_stake: int) -> None:
         super().__init__(
             f"{provider} has no stake at the lighthouse {lighthouse}",
@@ -45,13 +47,13 @@ class Turns:
         """
         if self._left > 0:
             return True
-        state = await self._chain.lighthouse(self._lighthouse)
+        state = await self._chain.lighthouses.get(self._lighthouse)
         if self._provider not in state.stakes:
             raise NoStake(self._provider, self._lighthouse, minimal_stake=state.minimal_stake)
         if state.current == self._provider:
             self._left = state.quota
             return True
-        return await self._chain.is_turn(self._lighthouse) and await self._is_left_to_us(state, since)
+        return await self._chain.lighthouses.is_turn(self._lighthouse) and await self._is_left_to_us(state, since)
 
     def took_one(self) -> None:
         """A transaction of ours was mined."""

@@ -19,8 +19,8 @@ from mesh.chain import (
     RequestRefused,
 )
 from mesh.market.sending import RETRY
-from mesh.telemetry.context import concerning, facts
-from mesh.trouble import Trouble
+from mesh.outage_log import OutageLog
+from mesh.telemetry.context import concerning, log_event
 from schemas import Demand, Offer, Result, address_bytes
 
 if TYPE_CHECKING:
@@ -65,33 +65,33 @@ class Watching:
         self._used = used
         self._history = History(chain.node.timing.reorg_depth)
         self._open: dict[str, Liability] = {}
-        self._trouble = Trouble(log)
+        self._trouble = OutageLog(log, "chain")
 
     async def run(self) -> None:
         """Read until cancelled: orders that others made into contracts, and those whose time has passed, leave the
         book; what the chain takes back is done again."""
         while True:
             try:
-                async with aclosing(self._chain.events(self.head + 1, history=self._history)) as blocks:
+                async with aclosing(self._chain.follow(self.head + 1, history=self._history)) as blocks:
                     async for block in blocks:
-                        self._trouble.over(f"the chain can be read again, from block {block.block_number}")
+                        self._trouble.recovered(f"the chain can be read again, from block {block.block_number}")
                         if isinstance(block, Reorganised):
                             self._take_back(block)
                         else:
                             await self._take_block(block)
             except (NodeUnreachable, RequestRefused, NotALiability, NoContracts) as error:
                 # The latter two of a contract in a block that the chain has replaced meanwhile: that is told next.
-                self._trouble.met(error, f"the chain can't be read on from block {self.head + 1}")
+                self._trouble.failed(error, f"the chain can't be read on from block {self.head + 1}")
                 await asyncio.sleep(RETRY)
 
     @property
     def waits(self) -> bool:
         """Whether the chain can't be read just now."""
-        return self._trouble.stands
+        return self._trouble.is_down
 
     async def liability(self, address: str) -> Liability:
         """The record of a liability. Raises `NotALiability`, `NodeUnreachable`, `RequestRefused`."""
-        return self._open.get(address) or await self._chain.liability(address)
+        return self._open.get(address) or await self._chain.liabilities.get(address)
 
     async def _take_block(self, block: BlockEvents) -> None:
         for event in block.events:
@@ -101,14 +101,14 @@ class Watching:
                 self._open.pop(event.liability, None)
         self.head, self.read_at = block.block_number, time.monotonic()
         for order in self._book.expire(self.head):
-            known = facts(order=order.hash.hex(), signer=order.signer)
+            known = log_event("unnamed", order=order.hash.hex(), signer=order.signer)
             log.info("expired order %s of %s", order.hash.hex(), order.signer, extra=known)
 
     async def _forget_orders(self, address: str) -> None:
-        liability = await self._chain.liability(address)
+        liability = await self._chain.liabilities.get(address)
         if liability.lighthouse != self._lighthouse:
             return
-        demand_hash, offer_hash = await self._chain.order_hashes(address)
+        demand_hash, offer_hash = await self._chain.liabilities.order_hashes(address)
         demand = self._book.remove(demand_hash + address_bytes(liability.promisee))
         offer = self._book.remove(offer_hash + address_bytes(liability.promisor))
         self._used.add(address, demand, offer)

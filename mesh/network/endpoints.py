@@ -17,7 +17,7 @@ from mesh.network.tls import Tls
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from mesh.settings import Settings
+    from mesh.settings import NetworkSettings
 
 RETRY: Final = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
 """Pauses between attempts to reach a router again: short, so that an agent is back within a second."""
@@ -53,7 +53,7 @@ class Endpoints:
     access: Mapping[str, Any] | None = None
 
     @classmethod
-    def from_settings(cls, settings: Settings) -> Endpoints:
+    def from_settings(cls, settings: NetworkSettings) -> Endpoints:
         """Where the settings' client connects to, and as whom."""
         return cls(connect=settings.connect, timeout=settings.connect_timeout, tls=tls_of(settings))
 
@@ -117,7 +117,7 @@ def check_locators(*locators: str) -> None:
             )
 
 
-def tls_of(settings: Settings) -> Tls | None:
+def tls_of(settings: NetworkSettings) -> Tls | None:
     """The identity that the settings name, if they name any."""
     if not settings.tls_ca and (settings.tls_certificate or settings.tls_key):
         raise ConfigurationError("tls_certificate is set, and tls_ca is not", hint="give --tls-ca")

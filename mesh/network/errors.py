@@ -8,6 +8,8 @@ from mesh.errors import RemoteError
 class NotAdmitted(RemoteError):
     """A router is there, and it and this identity do not take each other."""
 
+    code = "not-admitted"
+
     def __init__(self, *refusals: str) -> None:
         super().__init__(
             f"not let in by the Zenoh router at {'; '.join(refusals)}",

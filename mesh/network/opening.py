@@ -13,7 +13,7 @@ import zenoh
 from mesh.errors import ClosedError, ConfigurationError, NetworkUnavailable
 from mesh.network.endpoints import ATTEMPT
 from mesh.network.errors import NotAdmitted
-from mesh.trouble import Trouble
+from mesh.outage_log import OutageLog
 
 if TYPE_CHECKING:
     from mesh.network.endpoints import Endpoints
@@ -34,7 +34,7 @@ class Opening:
         self._lock = threading.Lock()
         self._session: zenoh.Session | None = None
         self._abandoned = threading.Event()
-        self._trouble = Trouble(log)
+        self._trouble = OutageLog(log, "router")
 
     def run(self) -> zenoh.Session:
         """The open session.
@@ -54,7 +54,7 @@ class Opening:
                 self._abandoned.wait(PAUSE)
                 session = None
             if (opened := self._wanted(session)) is not None:
-                self._trouble.over("a router answers")
+                self._trouble.recovered("a router answers")
                 return opened
 
     def abandon(self) -> None:
@@ -79,7 +79,7 @@ class Opening:
         self._check_admitted()
         timeout, routers = self._endpoints.timeout, self._endpoints.connect
         if timeout < 0:
-            self._trouble.met(NetworkUnavailable(routers, "no answer yet"), "waiting for a router")
+            self._trouble.failed(NetworkUnavailable(routers, "no answer yet"), "waiting for a router")
         elif time.monotonic() + PAUSE >= ends:
             raise NetworkUnavailable(routers, f"no answer within {timeout:g} s") from None
 

@@ -49,6 +49,8 @@ BUSY: Final = Failure("the agent is answering too many questions", "ask again la
 class ServiceFailed(RemoteError):
     """The agent that was asked answered with an error, or did not answer; `service` is what was asked."""
 
+    code = "service-failed"
+
     def __init__(self, service: str, why: str, *, hint: str = "") -> None:
         super().__init__(f"{service}: {why}", hint=hint)
         self.service = service

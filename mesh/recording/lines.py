@@ -40,6 +40,8 @@ _LONGEST: Final = 16 << 20
 class InvalidLine(InputError):
     """A line is no message of an objective. `number` counts from 1."""
 
+    code = "invalid-line"
+
     def __init__(self, number: int, why: str) -> None:
         super().__init__(
             f"line {number}: {why}", hint='a line is like {"topic": "/blink", "time": 0.5, "data": "blue"}'

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 class ArchiveUnusable(InputError):
     """A file is no backup, is damaged, or holds what no backup has. Nothing of it was used."""
 
+    code = "archive-unusable"
+
     def __init__(self, path: Path, why: str, *, hint: str = "take another backup; nothing was changed") -> None:
         super().__init__(f"{path} can't be used: {why}", hint=hint)
         self.path = path
@@ -22,6 +24,8 @@ class ArchiveUnusable(InputError):
 class StateInUse(ConfigurationError):
     """An agent is using the state that was to be replaced."""
 
+    code = "state-in-use"
+
     def __init__(self, path: Path) -> None:
         super().__init__(f"{path} is in use", hint="stop the agent first")
         self.path = path
@@ -29,6 +33,8 @@ class StateInUse(ConfigurationError):
 
 class StateExists(ConfigurationError):
     """There is a state where one was to be restored."""
+
+    code = "state-exists"
 
     def __init__(self, folder: Path, parts: Sequence[str]) -> None:
         super().__init__(
@@ -42,6 +48,8 @@ class StateExists(ConfigurationError):
 class NoState(ConfigurationError):
     """There is nothing to back up."""
 
+    code = "no-state"
+
     def __init__(self, folder: Path) -> None:
         super().__init__(f"there is no agent's state in {folder}", hint="name its folder with --data-dir")
         self.folder = folder
@@ -49,6 +57,8 @@ class NoState(ConfigurationError):
 
 class StateRestless(ConfigurationError):
     """Jobs began and ended faster than they could be copied."""
+
+    code = "state-restless"
 
     def __init__(self, path: Path) -> None:
         super().__init__(f"the jobs of {path} change too quickly to be copied", hint="try again, or stop the agent")

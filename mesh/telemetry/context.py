@@ -88,6 +88,9 @@ def _canonical(address: str) -> str:
         return address
 
 
-def facts(**known: object) -> dict[str, dict[str, str]]:
-    """For `extra` of a log call: what programs should find in the event under names of its own."""
-    return {"facts": {name: str(value) for name, value in known.items()}}
+def log_event(name: str, /, **fields: object) -> dict[str, Any]:
+    """The `extra` of a log call: the event's stable name, and fields for programs to read.
+
+    `log.info("contract created, gas %d", gas, extra=log_event("contract-created", gas=gas))`
+    """
+    return {"event": name, "facts": {field: str(value) for field, value in fields.items()}}

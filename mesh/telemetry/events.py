@@ -46,6 +46,7 @@ def event_of(record: logging.LogRecord, *, default: Speaker = context.NOBODY) ->
         time=moment(record.created),
         level=level_of(record.levelno),
         logger=record.name,
+        event=getattr(record, "event", ""),
         message=_cut(_encodable(record.getMessage()), LONGEST_MESSAGE),
         role=who.role,
         address=who.address,

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 class NoLog(AiraError):
     """A program that embeds the role writes its log in its own way."""
 
+    code = "no-log"
+
 
 class LogService:
     """`logs` of the role `role` with the account `address`. Of a process with several, each tells its own events."""

@@ -49,6 +49,8 @@ CREATE TABLE IF NOT EXISTS cursors (name TEXT PRIMARY KEY, block INTEGER NOT NUL
 class LedgerUnusable(ConfigurationError):
     """The ledger can't be read or written: a full disk, a folder of somebody else's, a file that is no ledger."""
 
+    code = "ledger-unusable"
+
     def __init__(self, path: Path, why: object) -> None:
         hint = "make room on that disk, let this user write there, or give another folder with --data-dir"
         super().__init__(f"can't use the ledger {path}: {why}", hint=hint)

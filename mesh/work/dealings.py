@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from mesh.telemetry.context import facts
+from mesh.telemetry.context import log_event
 from mesh.work.lifecycle import Phase, advance
 from mesh.work.outbox import result_identity
 
@@ -43,7 +43,7 @@ class Dealings:
             await self._shop.owe_result(address, success=bool(job.success), result=job.result, note=job.note)
             await self._shop.outbox.send()
             return
-        known = facts(model=liability.model, objective=liability.objective, cost=liability.cost)
+        known = log_event("unnamed", model=liability.model, objective=liability.objective, cost=liability.cost)
         log.info("incoming, model %s, objective %s", liability.model, liability.objective, extra=known)
         await self._witness(Phase.INCOMING, liability)
         self._executor.prepare(liability)

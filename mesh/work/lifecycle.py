@@ -41,6 +41,8 @@ UNFINISHED: Final = (Phase.INCOMING, Phase.READY, Phase.RUNNING, Phase.COMPLETE)
 class WrongPhase(AiraError):
     """Something was asked of a job that its phase does not allow; `phase` is where it stands, None if unknown."""
 
+    code = "wrong-phase"
+
     def __init__(self, liability: str, *, asked: str, phase: Phase | None) -> None:
         where = f"is {phase.value}" if phase else "is not a job of this agent"
         super().__init__(f"can't {asked} {liability}: it {where}")

@@ -19,8 +19,8 @@ from mesh.chain import (
     RequestRefused,
     Transfer,
 )
+from mesh.outage_log import OutageLog
 from mesh.telemetry.context import concerning
-from mesh.trouble import Trouble
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -75,7 +75,7 @@ class Listener:
         self._account = account
         self._party = party
         self._token = token
-        self._trouble = Trouble(log)
+        self._trouble = OutageLog(log, "chain")
 
     async def run(self) -> None:
         """Read until cancelled. A node that can't be reached is waited for. Raises `ChainWentBack`, `UnknownName`."""
@@ -84,21 +84,21 @@ class Listener:
                 await self._read()
             except (NodeUnreachable, RequestRefused, NoContracts) as error:
                 # The last of a contract whose block was replaced, or of a node that is behind the one that told of it.
-                self._trouble.met(error, "the chain can't be read, trying again")
+                self._trouble.failed(error, "the chain can't be read, trying again")
                 await asyncio.sleep(RETRY)
 
     @property
     def waits(self) -> bool:
         """Whether the chain can't be read just now."""
-        return self._trouble.stands
+        return self._trouble.is_down
 
     async def _read(self) -> None:
         """Read from the ledger's cursor on."""
-        token = await self._chain.resolve(self._token) if self._token else ""
+        token = await self._chain.names.address(self._token) if self._token else ""
         cursor, history = await self._memory()
-        async with aclosing(self._chain.events(cursor + 1, token=token, history=history)) as blocks:
+        async with aclosing(self._chain.follow(cursor + 1, token=token, history=history)) as blocks:
             async for block in blocks:
-                self._trouble.over(f"the chain can be read again, from block {block.block_number}")
+                self._trouble.recovered(f"the chain can be read again, from block {block.block_number}")
                 if isinstance(block, Reorganised):
                     await self._take_back(block)
                 await self._handle(block.events)
@@ -129,13 +129,13 @@ class Listener:
 
     async def _new_liability(self, event: NewLiability) -> None:
         try:
-            liability = await self._chain.liability(event.liability)
+            liability = await self._chain.liabilities.get(event.liability)
         except NotALiability as error:
             with concerning(event.liability):
                 log.warning("a reorganisation was quicker: %s", error)
             return
         if self._account in (liability.promisor, liability.promisee):
-            demand_hash, offer_hash = await self._chain.order_hashes(event.liability)
+            demand_hash, offer_hash = await self._chain.liabilities.order_hashes(event.liability)
             await self._party.new_liability(liability, demand_hash=demand_hash, offer_hash=offer_hash)
 
     async def _take_back(self, block: Reorganised) -> None:

@@ -11,7 +11,7 @@ import logging
 from typing import TYPE_CHECKING, Final
 
 from mesh.chain import NoContracts, NodeUnreachable, NotALiability, RequestRefused
-from mesh.trouble import Trouble
+from mesh.outage_log import OutageLog
 from mesh.work.lifecycle import Phase
 
 if TYPE_CHECKING:
@@ -29,19 +29,19 @@ TO_BE_DONE: Final = (Phase.INCOMING, Phase.READY, Phase.RUNNING)
 async def settle_ended(chain: Chain, ledger: Ledger, party: Party) -> None:
     """Tell the party of each job still to be done that has ended on the chain. A node that can't be reached is waited
     for; of a contract that the chain does not have any more, the listener tells."""
-    trouble = Trouble(log)
+    trouble = OutageLog(log, "chain")
     for job in await ledger.jobs(TO_BE_DONE):
         address = job.liability.address
         while True:
             try:
-                now = await chain.liability(address)
+                now = await chain.liabilities.get(address)
             except NotALiability:
                 break
             except (NodeUnreachable, RequestRefused, NoContracts) as error:
-                trouble.met(error, "no job is gone on with before the chain can be asked, trying again")
+                trouble.failed(error, "no job is gone on with before the chain can be asked, trying again")
                 await asyncio.sleep(RETRY)
                 continue
-            trouble.over("the chain can be asked again")
+            trouble.recovered("the chain can be asked again")
             if now.is_finalized:
                 await party.finalized(address, success=now.is_success, result=now.result)
             break

@@ -38,6 +38,8 @@ FLUSH: Final = "aira/flush"
 class HandlerCancelled(AiraError):
     """A handler ended with the cancellation of something that it waited for, and so without having done its work."""
 
+    code = "handler-cancelled"
+
 
 class Performer(Protocol):
     """What does the work: the code that talks to the device."""

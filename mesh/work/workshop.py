@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 class UnfitObjective(InputError):
     """An objective can't be played here; `reason` is preflight's machine-readable word."""
 
+    code = "unfit-objective"
+
     def __init__(self, cid: str, reason: str, detail: str) -> None:
         super().__init__(f"objective {cid} can't be played ({reason}): {detail}")
         self.cid = cid

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from mesh.errors import ConfigurationError
-from mesh.settings import CHAIN_SETTINGS, MEANING, NOT_OPTIONS, Settings, load
+from mesh.settings import MEANING, NOT_OPTIONS, OPTIONS, ChainSettings, Settings, load, options_of
 
 NOTHING: dict[str, str] = {}
 
@@ -226,11 +226,11 @@ def test_without_a_data_folder_the_users_own_is_taken(monkeypatch: pytest.Monkey
 
 
 def test_every_option_has_its_meaning_in_words() -> None:
-    assert set(MEANING) == set(Settings.__struct_fields__)
+    assert set(MEANING) == set(OPTIONS)
 
 
 def test_what_decides_of_the_chain_are_options() -> None:
-    assert set(Settings.__struct_fields__) >= set(CHAIN_SETTINGS)
+    assert set(OPTIONS) >= set(options_of(ChainSettings))
 
 
 def test_the_file_that_aira_config_names_is_read(tmp_path: Path) -> None:

@@ -6,17 +6,18 @@ Accounts and the chain are shared by all tests of a run, so tests compare balanc
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
-import msgspec
 import pytest
 
 from mesh.agent import Agent
 from mesh.background import Background
-from mesh.chain import Chain, EmbeddedChain, Timing
-from mesh.demo.market import Market, found_market
+from mesh.chain import Chain, Timing
+from mesh.devchain import EmbeddedChain
+from mesh.devchain.market import Market, found_market
 from mesh.market.provider import Provider
 from mesh.network import Endpoints, Network
 from mesh.settings import Settings
@@ -86,7 +87,7 @@ class Place:
 
     async def balance(self, role: str) -> int:
         """What a role has, wn."""
-        return await self.chains[role].balance_of(self.address(role))
+        return await self.chains[role].tokens.balance(self.address(role))
 
     def settings(self, role: str, **options: Any) -> Settings:
         """Settings of an agent of that role, `options` changed. Objectives are played at once."""
@@ -99,7 +100,7 @@ class Place:
             playback="at-once",
             fetch_timeout=5.0,
         )
-        return msgspec.structs.replace(settings, **options)
+        return dataclasses.replace(settings, **options)
 
     def agent(self, role: str, model: str = MODEL, **options: Any) -> Agent:
         """An agent of that role, not yet running; handlers can be added. Always with the same memory."""

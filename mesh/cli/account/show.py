@@ -39,9 +39,9 @@ async def _show_balance(settings: Settings, address: str, as_json: bool) -> None
     from mesh.chain import NotOffered
 
     async with reading(settings) as chain:
-        wei, wn = await chain.eth_balance(address), await chain.balance_of(address)
+        wei, wn = await chain.tokens.eth_balance(address), await chain.tokens.balance(address)
         try:
-            nonce = await chain.nonce_of(address)
+            nonce = await chain.liabilities.next_nonce(address)
         except NotOffered:
             nonce = None
     if as_json:

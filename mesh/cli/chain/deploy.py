@@ -55,8 +55,8 @@ async def _deploy(
     again: bool,
     as_json: bool,
 ) -> None:
-    from mesh.agent.parts import chain_of, load_account
     from mesh.chain import DeploymentPlan, deploy
+    from mesh.composition import chain_of, load_account
 
     plan = DeploymentPlan(
         lighthouse=lighthouse,
@@ -79,8 +79,8 @@ async def _deploy(
 
 
 async def _check_not_deployed(settings: Settings, node: Node) -> None:
-    from mesh.agent.parts import chain_of
     from mesh.chain import NoContracts
+    from mesh.composition import chain_of
 
     try:
         async with chain_of(settings, None) as chain:

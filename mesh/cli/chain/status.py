@@ -35,7 +35,7 @@ def command(settings: Settings, as_json: bool) -> None:
 
 
 async def _status(settings: Settings, as_json: bool) -> None:
-    from mesh.agent.parts import chain_of
+    from mesh.composition import chain_of
 
     account = await asyncio.to_thread(own_address, settings)
     trouble: ChainError | None = None
@@ -74,7 +74,7 @@ async def _contract_facts(chain: Chain, lighthouse: str, account: str | None) ->
     from mesh.chain.recognition import is_ours
 
     try:
-        address: str | None = await chain.lighthouse_address(lighthouse)
+        address: str | None = await chain.names.lighthouse(lighthouse)
     except UnknownName:
         address = None
     return {
@@ -84,7 +84,7 @@ async def _contract_facts(chain: Chain, lighthouse: str, account: str | None) ->
         "isOurCode": await is_ours(chain),
         "lighthouse": address,
         "lighthouseName": lighthouse,
-        "wn": None if account is None else str(await chain.balance_of(account)),
+        "wn": None if account is None else str(await chain.tokens.balance(account)),
     }
 
 

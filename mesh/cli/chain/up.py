@@ -13,7 +13,7 @@ from mesh.cli.engine import chosen, with_engine
 from mesh.cli.options import BLOCK_TIME, PORT, with_settings
 from mesh.cli.printing import print_json, with_json
 from mesh.running import run_until_stopped
-from mesh.settings import SERVER_SETTINGS
+from mesh.settings import TelemetrySettings, options_of
 from mesh.telemetry.serving import Telemetry
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 @click.option("--block-time", type=BLOCK_TIME, help="also mine an empty block every so many seconds")
 @with_engine
 @with_json
-@with_settings("data_dir", *SERVER_SETTINGS)
+@with_settings("data_dir", *options_of(TelemetrySettings))
 def command(settings: Settings, host: str, port: int, block_time: float | None, as_json: bool, **engine: Any) -> None:
     """Serve a chain with the contracts on it, as JSON-RPC over HTTP and WebSocket.
 
@@ -39,7 +39,7 @@ def command(settings: Settings, host: str, port: int, block_time: float | None, 
     """
 
     async def serve() -> None:
-        from mesh.demo.development import serve_chain
+        from mesh.devchain.development import serve_chain
 
         program = chosen(**engine)
         async with (

@@ -50,14 +50,14 @@ def command(settings: Settings, address: str, signatures: tuple[str, ...], refun
 async def _refund(settings: Settings, address: str, as_json: bool) -> None:
     async with signing(settings) as chain:
         liability = await _open_liability(chain, address)
-        state = await chain.refund_state(liability.address)
+        state = await chain.liabilities.refund_state(liability.address)
         if not state.is_refundable:
             raise ChainError(
                 f"the money of {liability.address} can't be had back yet: {refund_words(state)}",
                 hint="before that, both parties can call the work off: `aira liability cancel` without --refund",
             )
         with patience():
-            settled = await chain.refund(liability.address)
+            settled = await chain.liabilities.refund(liability.address)
         await _print_end(chain, liability.address, settled, as_json)
 
 
@@ -68,7 +68,7 @@ async def _cancel(settings: Settings, address: str, signatures: Sequence[str], a
         missing = [party for party in ("promisee", "promisor") if party not in signed]
         if not missing:
             with patience():
-                settled = await chain.cancel(
+                settled = await chain.liabilities.cancel(
                     liability.address, promisee_signature=signed["promisee"], promisor_signature=signed["promisor"]
                 )
             await _print_end(chain, liability.address, settled, as_json)
@@ -85,7 +85,7 @@ async def _cancel(settings: Settings, address: str, signatures: Sequence[str], a
 
 async def _open_liability(chain: Chain, address: str) -> Liability:
     """The liability, which has not ended. Raises `ChainError`."""
-    liability = await chain.liability(address)
+    liability = await chain.liabilities.get(address)
     if liability.is_finalized:
         raise ChainError(f"{liability.address} has ended already: {OUTCOMES[state_of(liability)]}")
     return liability
@@ -132,7 +132,7 @@ def _print_signature(chain: Chain, liability: Liability, signed: dict[str, str],
 
 
 async def _print_end(chain: Chain, address: str, settled: Settled, as_json: bool) -> None:
-    liability = await chain.liability(address)
+    liability = await chain.liabilities.get(address)
     if as_json:
         print_json(facts_of(liability) | {"tx": settled.tx, "gasUsed": settled.gas_used})
         return

@@ -14,6 +14,8 @@ from mesh.cli.tokens import account_of
 from mesh.running import run_to_end
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from mesh.chain import Chain
     from mesh.settings import Settings
     from schemas.liability import Liability
@@ -74,10 +76,10 @@ async def _list(
     print_table(HEAD, rows, numbers=("COST",))
 
 
-async def _found(chain: Chain, whose: str | None, from_block: int) -> list[Liability]:
+async def _found(chain: Chain, whose: str | None, from_block: int) -> Sequence[Liability]:
     """All liabilities, or those of an account in either part; one with itself once."""
     if whose is None:
-        return await chain.liabilities(from_block=from_block)
-    paid = await chain.liabilities(from_block=from_block, promisee=whose)
-    worked = await chain.liabilities(from_block=from_block, promisor=whose)
+        return await chain.liabilities.list(from_block=from_block)
+    paid = await chain.liabilities.list(from_block=from_block, promisee=whose)
+    worked = await chain.liabilities.list(from_block=from_block, promisor=whose)
     return list({liability.address: liability for liability in (*paid, *worked)}.values())

@@ -31,7 +31,7 @@ def command(settings: Settings, address: str, as_json: bool) -> None:
 async def _show(settings: Settings, address: str, as_json: bool) -> None:
     own = await asyncio.to_thread(own_address, settings)
     async with reading(settings) as chain:
-        await print_liability(chain, await chain.liability(address), own=own, as_json=as_json)
+        await print_liability(chain, await chain.liabilities.get(address), own=own, as_json=as_json)
 
 
 async def print_liability(chain: Chain, liability: Liability, *, own: str | None, as_json: bool) -> None:
@@ -50,7 +50,7 @@ async def refund_state(chain: Chain, liability: Liability) -> RefundState | None
     from mesh.chain import NotOffered
 
     try:
-        return None if liability.is_finalized else await chain.refund_state(liability.address)
+        return None if liability.is_finalized else await chain.liabilities.refund_state(liability.address)
     except NotOffered:
         return None
 

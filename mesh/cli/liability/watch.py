@@ -44,10 +44,10 @@ def command(settings: Settings, address: str | None, from_block: int | None, as_
 async def _watch(settings: Settings, address: str, as_json: bool) -> None:
     own = await asyncio.to_thread(own_address, settings)
     async with reading(settings) as chain:
-        liability = await chain.liability(address)
+        liability = await chain.liabilities.get(address)
         if not liability.is_finalized and not as_json:
             say(f"{liability.address} is {OUTCOMES['open']}; waiting for its end (Ctrl-C leaves it as it is)")
-        await print_liability(chain, await chain.watch_liability(address), own=own, as_json=as_json)
+        await print_liability(chain, await chain.liabilities.watch(address), own=own, as_json=as_json)
 
 
 async def _watch_all(settings: Settings, from_block: int | None, as_json: bool) -> None:
@@ -110,7 +110,7 @@ async def _followed(chain: Chain, cursor: int) -> AsyncIterator[Happening | Take
     history, is_lost = History(chain.node.timing.reorg_depth), False
     while True:
         try:
-            async with aclosing(chain.events(cursor, history=history)) as blocks:
+            async with aclosing(chain.follow(cursor, history=history)) as blocks:
                 async for block in blocks:
                     happenings = await _happenings(chain, block)
                     cursor, is_lost = block.block_number + 1, False
@@ -136,7 +136,7 @@ async def _happenings(chain: Chain, block: BlockEvents) -> list[Happening | Take
         if not isinstance(event, NewLiability | Finalized):
             continue
         try:
-            liability = await chain.liability(event.liability)
+            liability = await chain.liabilities.get(event.liability)
         except NoContracts:  # the chain was reorganised meanwhile, which is told next
             continue
         unit = (await units_of(chain, [liability]))[liability.token]

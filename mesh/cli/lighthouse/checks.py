@@ -53,7 +53,7 @@ async def find_lighthouse(chain: Chain, name: str) -> str:
 
     Raises `ChainError` for what is no lighthouse of the factory, `UnknownName`, `InvalidName`, `InvalidAddress`.
     """
-    address = await chain.lighthouse_address(name)
-    if not await chain.is_lighthouse(address):
+    address = await chain.names.lighthouse(name)
+    if not await chain.lighthouses.exists(address):
         raise ChainError(f"{address} is not a lighthouse of this factory", hint="`aira lighthouse list` shows those")
     return address

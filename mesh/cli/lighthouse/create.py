@@ -36,7 +36,7 @@ async def _create(settings: Settings, *, name: str, minimal_stake: str, timeout_
         full_name = f"{name}.lighthouse.{chain.generation}.robonomics.eth"
         await _check_free(chain, full_name)
         with patience():
-            made = await chain.create_lighthouse(minimal_stake=stake, timeout_blocks=timeout_blocks, name=name)
+            made = await chain.lighthouses.create(minimal_stake=stake, timeout_blocks=timeout_blocks, name=name)
     if as_json:
         facts = {"lighthouse": made.lighthouse, "name": full_name, "minimalStake": str(stake)}
         print_json(facts | {"timeoutBlocks": timeout_blocks, "tx": made.tx})
@@ -56,7 +56,7 @@ async def _check_free(chain: Chain, name: str) -> None:
     from mesh.chain import UnknownName
 
     try:
-        taken = await chain.resolve(name)
+        taken = await chain.names.address(name)
     except UnknownName:
         return
     raise ChainError(f"the name {name} is taken, by {taken}", hint="choose another name")

@@ -29,9 +29,9 @@ def command(settings: Settings, name: str | None, as_json: bool) -> None:
 
 async def _info(settings: Settings, name: str, as_json: bool) -> None:
     async with reading(settings) as chain:
-        state = await chain.lighthouse(await find_lighthouse(chain, name))
+        state = await chain.lighthouses.get(await find_lighthouse(chain, name))
         block = await chain.block_number()
-        may_send = {provider: await chain.is_turn(state.address, provider) for provider in state.stakes}
+        may_send = {provider: await chain.lighthouses.is_turn(state.address, provider) for provider in state.stakes}
     if as_json:
         facts = facts_of(name, state) | {"blockNumber": block}
         for provider in facts["providers"]:

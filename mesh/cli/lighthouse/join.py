@@ -40,12 +40,12 @@ async def _join(settings: Settings, words: Sequence[str], as_json: bool) -> None
         raise InputError("a VALUE is missing, what is to be staked", hint=f"say so: `aira lighthouse join {name} 20`")
     async with signing(settings) as chain:
         assert chain.account is not None
-        state = await chain.lighthouse(await find_lighthouse(chain, name))
+        state = await chain.lighthouses.get(await find_lighthouse(chain, name))
         staked = state.stakes.get(chain.account.address, 0)
         _check_stake(state, staked=staked, added=value)
         await check_enough(chain, XRT, value)
         with patience():
-            state = await chain.become_provider(state.address, staked + value)
+            state = await chain.lighthouses.become_provider(state.address, staked + value)
     print_stake(name, chain.account.address, state, as_json=as_json)
 
 

@@ -38,7 +38,7 @@ async def _leave(settings: Settings, words: Sequence[str], as_json: bool) -> Non
     async with signing(settings) as chain:
         assert chain.account is not None
         me = chain.account.address
-        state = await chain.lighthouse(await find_lighthouse(chain, name))
+        state = await chain.lighthouses.get(await find_lighthouse(chain, name))
         staked = state.stakes.get(me)
         if staked is None:
             raise ChainError(f"{me} has no stake at {name}", hint=f"see `aira lighthouse info {name}`")
@@ -47,6 +47,6 @@ async def _leave(settings: Settings, words: Sequence[str], as_json: bool) -> Non
                 f"{XRT.show(value)} can't be taken off a stake of {XRT.show(staked)}", hint="without VALUE all is taken"
             )
         with patience():
-            await chain.withdraw(state.address, staked if value is None else value)
-        state = await chain.lighthouse(state.address)
+            await chain.lighthouses.withdraw(state.address, staked if value is None else value)
+        state = await chain.lighthouses.get(state.address)
     print_stake(name, me, state, as_json=as_json)

@@ -30,8 +30,8 @@ def command(settings: Settings, from_block: int, as_json: bool) -> None:
 async def _list(settings: Settings, from_block: int, as_json: bool) -> None:
     async with reading(settings) as chain:
         found = [
-            (made.name, await chain.lighthouse(made.lighthouse))
-            for made in await chain.lighthouses(from_block=from_block)
+            (made.name, await chain.lighthouses.get(made.lighthouse))
+            for made in await chain.lighthouses.list(from_block=from_block)
         ]
     if as_json:
         print_json([facts_of(name, state) for name, state in found])

@@ -29,6 +29,8 @@ BEAT = 0.1
 class NothingHeard(RemoteError):
     """Nobody said anything on the keys."""
 
+    code = "nothing-heard"
+
     def __init__(self, keys: Sequence[str]) -> None:
         super().__init__(
             f"nobody said anything on {', '.join(keys)}", hint="`aira/agent/ADDRESS/device/**` are an agent's devices"

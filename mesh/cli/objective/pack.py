@@ -18,7 +18,7 @@ from mesh.cli.progress import progress
 from mesh.errors import InputError
 from mesh.recording import GENEROUS, bag_to_mcap, messages_in, open_objective, pack
 from mesh.running import run_until_stopped
-from mesh.settings import NETWORK_SETTINGS
+from mesh.settings import NetworkSettings, options_of
 from schemas import cid_of_file
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ _BAG = b"#ROSBAG V"
 @click.option("--hear", "keys", multiple=True, metavar="KEY", help="record what is said on KEY (may be repeated)")
 @click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="how long to hear [until Ctrl-C]")
 @with_json
-@with_settings(*NETWORK_SETTINGS)
+@with_settings(*options_of(NetworkSettings))
 def command(
     settings: Settings, source: Path | None, out: Path, keys: tuple[str, ...], seconds: float | None, as_json: bool
 ) -> None:
@@ -108,8 +108,8 @@ def _told(stream: BinaryIO, tell: Callable[[int, int | None], None], total: int 
 
 
 async def _hear(settings: Settings, keys: Sequence[str], out: Path, *, seconds: float | None, as_json: bool) -> None:
-    from mesh.agent.parts import endpoints_of
     from mesh.cli.objective.hearing import hear, key_expression
+    from mesh.composition import endpoints_of
     from mesh.network import Network
 
     expressions = [key_expression(key) for key in keys]

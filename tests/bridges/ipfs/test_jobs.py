@@ -5,14 +5,14 @@ from __future__ import annotations
 import asyncio
 import json
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from msgspec.structs import replace
 
 from bridges.ipfs.service import IpfsBridge
 from mesh.background import Background
-from mesh.demo.market import ROLES
+from mesh.devchain.market import ROLES
 from mesh.network import Endpoints, Network
 from schemas import Demand, Offer, Result, decode
 from tests.bridges.ipfs.veterans import Veteran
@@ -21,7 +21,7 @@ from tests.support.objectives import objective
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Sequence
 
     from mesh.agent import Agent
     from mesh.work.run import Run
@@ -63,15 +63,15 @@ async def liability_of(place: Place, since: int, **parties: str) -> Liability:
     """The contract that comes about, as anybody finds it on the chain."""
     chain = place.chains["provider"]
 
-    async def made() -> list[Liability]:
-        return await chain.liabilities(from_block=since, **parties)
+    async def made() -> Sequence[Liability]:
+        return await chain.liabilities.list(from_block=since, **parties)
 
     await until_found(made, what="a contract", seconds=SECONDS)
     return (await made())[0]
 
 
 async def is_paid(place: Place, address: str) -> bool:
-    liability = await place.chains["provider"].liability(address)
+    liability = await place.chains["provider"].liabilities.get(address)
     return liability.is_finalized and liability.is_success
 
 
@@ -98,7 +98,7 @@ async def test_a_provider_on_zenoh_serves_promisee_and_robot_on_ipfs(place: Plac
         veteran(place, "robot", swarm.b.api) as robot,
     ):
         await all_meet(door, person, robot)
-        await place.chains["person"].approve(place.chains["person"].factory, COST)
+        await place.chains["person"].tokens.approve(place.chains["person"].factory, COST)
         before = await place.balance("robot")
         await person.say(person.demand(**await terms(place, await person.add(b"what is to be done"))))
         await robot.say(robot.offer(await robot.hear("validatorFee")))
@@ -120,9 +120,9 @@ async def test_a_provider_on_ipfs_serves_promisee_and_robot_on_zenoh(place: Plac
         asked = asyncio.create_task(person.demand(place.save(objective(("/go", "there"))), cost=COST))
         demand = read(await provider.hear("validatorFee"), Demand)
         offer = read(await provider.hear("lighthouseFee", objective=demand.objective), Offer)
-        created = await chain.create_liability(market, demand, offer)
+        created = await chain.liabilities.create(market, demand, offer)
         result = read(await provider.hear("liability", liability=created.liability), Result)
-        await chain.finalize(market, result)
+        await chain.liabilities.finalize(market, result)
         outcome = await (await asked).outcome()
         assert (outcome.success, outcome.result) == (True, result.result)
         # What the mesh made is on IPFS by now, for whoever of the old network wants to see it.
@@ -162,7 +162,7 @@ async def test_a_robot_on_zenoh_works_for_a_promisee_on_ipfs(place: Place, swarm
         working(place.agent("robot")) as robot,
     ):
         await all_meet(door, person)
-        await place.chains["person"].approve(place.chains["person"].factory, COST)
+        await place.chains["person"].tokens.approve(place.chains["person"].factory, COST)
         task = await person.add(objective(("/go", "there")))
         await person.say(person.demand(**await terms(place, task)))
         liability = await liability_of(place, since, promisee=person.address, promisor=robot.address)

@@ -9,7 +9,8 @@ import pytest
 
 from bridges.ipfs.market import Markets
 from mesh.background import Background
-from mesh.chain import Chain, JsonRpcServer, Timing
+from mesh.chain import Chain, Timing
+from mesh.devchain import JsonRpcServer
 from mesh.errors import ChainError
 from tests.support.market import founded, place
 from tests.support.ports import free_port

@@ -60,26 +60,26 @@ async def test_all_may_read_what_accounts_have(place: Place, closed: Asker) -> N
     robot, person, chain = place.address("robot"), place.address("person"), place.chains["person"]
     assert await closed.ask("eth/accounts") == Accounts((robot,))
     assert await closed.ask("eth/current_block") == BlockNumber(await chain.block_number())
-    assert await closed.ask("eth/eth_balance") == Balance(await chain.eth_balance(robot))
-    assert await closed.ask("eth/xrt_balance") == Balance(await chain.balance_of(robot))
+    assert await closed.ask("eth/eth_balance") == Balance(await chain.tokens.eth_balance(robot))
+    assert await closed.ask("eth/xrt_balance") == Balance(await chain.tokens.balance(robot))
     for account in (person, person.lower()):
         assert await closed.ask("eth/account_eth_balance", AccountBalance(account)) == Balance(
-            await chain.eth_balance(person)
+            await chain.tokens.eth_balance(person)
         )
         assert await closed.ask("eth/account_xrt_balance", AccountBalance(account)) == Balance(
-            await chain.balance_of(person)
+            await chain.tokens.balance(person)
         )
     factory = AccountBalance("factory.3.robonomics.eth")
-    assert (await closed.ask("eth/account_xrt_balance", factory)).balance == await chain.balance_of(chain.factory)
+    assert (await closed.ask("eth/account_xrt_balance", factory)).balance == await chain.tokens.balance(chain.factory)
 
 
 async def test_all_may_read_who_may_take_how_much(place: Place, closed: Asker) -> None:
     chain = place.chains["person"]
-    await chain.approve(place.address("robot"), 123)
+    await chain.tokens.approve(place.address("robot"), 123)
     asked = AccountToAddressAllowance(place.address("person"), place.address("robot"))
     assert await closed.ask("eth/account_xrt_allowance", asked) == Allowance(123)
     assert await closed.ask("eth/xrt_allowance") == Allowance(
-        await chain.allowance(place.address("robot"), chain.factory)
+        await chain.tokens.allowance(place.address("robot"), chain.factory)
     )
 
 
@@ -134,7 +134,7 @@ async def test_who_asks_for_many_transfers_at_once_gets_each_of_them(place: Plac
 
 async def test_tokens_that_were_approved_for_the_agent_are_sent(place: Place, opened: Asker) -> None:
     before = await place.balance("person"), await place.balance("provider")
-    await place.chains["person"].approve(place.address("robot"), 40)
+    await place.chains["person"].tokens.approve(place.address("robot"), 40)
     request = TransferFrom(place.address("person"), place.address("provider"), 40)
     assert len((await opened.ask("eth/transfer_from", request)).txhash) == 66
     assert (await place.balance("person"), await place.balance("provider")) == (before[0] - 40, before[1] + 40)
@@ -143,7 +143,7 @@ async def test_tokens_that_were_approved_for_the_agent_are_sent(place: Place, op
 async def test_an_allowance_is_given(place: Place, opened: Asker) -> None:
     await opened.ask("eth/approve", Approve(place.address("person"), 77))
     chain = place.chains["person"]
-    assert await chain.allowance(place.address("robot"), place.address("person")) == 77
+    assert await chain.tokens.allowance(place.address("robot"), place.address("person")) == 77
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh import Agent, Settings
-from mesh.chain import JsonRpcServer, WrongPassword, write_keyfile
+from mesh.chain import WrongPassword, write_keyfile
+from mesh.devchain import JsonRpcServer
 from mesh.errors import ConfigurationError
 from schemas import Demand, Offer, Result, Verified, cid_of_bytes
 from tests.mesh.agent.agents import SOON, channel, heard_on, settings
@@ -218,7 +219,7 @@ async def test_account_and_chain_come_from_the_settings(place: Place, tmp_path: 
         )
         async with Agent(MODEL, settings=settings) as robot:
             assert robot.address == address == place.address("robot")
-            assert await robot.parts.chain.balance_of() == await place.balance("robot")
+            assert await robot.parts.chain.tokens.balance() == await place.balance("robot")
         await asyncio.to_thread(password.write_text, "open barley\n")
         with pytest.raises(WrongPassword):
             await Agent(MODEL, settings=settings).__aenter__()

@@ -99,12 +99,12 @@ async def test_orders_that_two_agents_signed_become_a_contract(place: Place, gen
         offered: Published = await ask_robot.ask("sign/offer", SignOffer(**agreed, lighthouse_fee=0))
 
         async def is_made() -> bool:
-            return len(await chain.liabilities(from_block=before)) == 1
+            return len(await chain.liabilities.list(from_block=before)) == 1
 
         await until_found(is_made, what="a contract", seconds=30)
-        [liability] = await chain.liabilities(from_block=before)
+        [liability] = await chain.liabilities.list(from_block=before)
         assert (liability.cost, liability.promisee, liability.promisor) == (9, person.address, robot.address)
-        hashes = await chain.order_hashes(liability.address)
+        hashes = await chain.liabilities.order_hashes(liability.address)
         assert tuple(digest.hex() for digest in hashes) == (demanded.hash, offered.hash)
         await until_settled(person)
         await until_settled(robot)

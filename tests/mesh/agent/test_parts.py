@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.agent.parts import chain_of
-from mesh.chain import GWEI, Account, FeeTooHigh, UnknownName, deploy, new_private_key, serve_embedded
+from mesh.chain import GWEI, Account, FeeTooHigh, UnknownName, deploy, new_private_key
+from mesh.composition import chain_of
+from mesh.devchain import serve_embedded
 from mesh.errors import ConfigurationError
 from mesh.settings import Settings
 
@@ -17,17 +18,17 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from mesh.chain import ServedChain
+    from mesh.devchain import ServedChain
 
 PAYING = """
 import asyncio, sys
-from mesh.agent.parts import chain_of
+from mesh.composition import chain_of
 from mesh.chain import Account
 from mesh.settings import load
 
 async def main(key, friend, count):
     async with chain_of(load(), Account.from_key(bytes.fromhex(key))) as chain:
-        await asyncio.gather(*(chain.transfer(friend, 1) for _ in range(int(count))))
+        await asyncio.gather(*(chain.tokens.transfer(friend, 1) for _ in range(int(count))))
 
 asyncio.run(main(*sys.argv[1:]))
 """
@@ -79,15 +80,15 @@ def test_what_is_no_address_of_a_node_is_said(tmp_path: Path) -> None:
 @pytest.mark.parametrize("generation", [3, 5])
 async def test_names_are_those_of_the_generation(served: ServedChain, tmp_path: Path, generation: int) -> None:
     async with chain_of(settings(served, tmp_path, generation=generation), None) as chain:
-        assert chain.factory == await chain.resolve(f"factory.{generation}.robonomics.eth")
-        assert chain.xrt == await chain.resolve(f"xrt.{generation}.robonomics.eth")
+        assert chain.factory == await chain.names.address(f"factory.{generation}.robonomics.eth")
+        assert chain.xrt == await chain.names.address(f"xrt.{generation}.robonomics.eth")
         lighthouse = f"airalab.lighthouse.{generation}.robonomics.eth"
-        assert await chain.lighthouse_address("airalab") == await chain.resolve(lighthouse)
+        assert await chain.names.lighthouse("airalab") == await chain.names.address(lighthouse)
 
 
 async def test_the_contracts_may_be_the_original_ones(served: ServedChain, tmp_path: Path) -> None:
     async with chain_of(settings(served, tmp_path, contracts="original", generation=5), None) as chain:
-        assert type(chain._suite).__name__ == "OriginalSuite"
+        assert type(chain._opened().version).__name__ == "OriginalContracts"
 
 
 async def test_another_token_may_be_xrt(served: ServedChain, tmp_path: Path) -> None:
@@ -96,30 +97,30 @@ async def test_another_token_may_be_xrt(served: ServedChain, tmp_path: Path) -> 
     async with chain_of(settings(served, tmp_path, xrt_contract=factory), None) as chain:
         assert chain.xrt == factory
         with pytest.raises(UnknownName):
-            await chain.resolve("no.xrt.3.robonomics.eth")
+            await chain.names.address("no.xrt.3.robonomics.eth")
 
 
 async def test_gas_that_is_too_dear_is_not_bought(served: ServedChain, tmp_path: Path) -> None:
     dear = settings(served, tmp_path, max_fee_gwei=1e-9)
     async with chain_of(dear, account(served)) as chain:
         with pytest.raises(FeeTooHigh, match="the ceiling is 1e-09 gwei"):
-            await chain.approve(chain.factory, 1)
+            await chain.tokens.approve(chain.factory, 1)
 
 
 async def test_what_was_left_behind_is_taken_up_by_the_next_run(served: ServedChain, tmp_path: Path) -> None:
     """One that was cancelled while it waited; a second one, started anew, does not send the same again."""
     mine, friend = account(served), Account.from_key(new_private_key()).address
     async with chain_of(settings(served, tmp_path, confirmations=1000), mine) as chain:
-        sending = asyncio.create_task(chain.transfer(friend, 7))
-        while await chain.balance_of(friend) == 0:
+        sending = asyncio.create_task(chain.tokens.transfer(friend, 7))
+        while await chain.tokens.balance(friend) == 0:
             await asyncio.sleep(0.01)
         sending.cancel()
         await asyncio.wait([sending])
     async with chain_of(settings(served, tmp_path), mine) as chain:
-        await chain.transfer(friend, 7)
-        assert await chain.balance_of(friend) == 7
-        await chain.transfer(friend, 7)
-        assert await chain.balance_of(friend) == 14
+        await chain.tokens.transfer(friend, 7)
+        assert await chain.tokens.balance(friend) == 7
+        await chain.tokens.transfer(friend, 7)
+        assert await chain.tokens.balance(friend) == 14
 
 
 async def test_programs_of_one_account_get_not_in_each_others_way(served: ServedChain, tmp_path: Path) -> None:
@@ -138,7 +139,7 @@ async def test_programs_of_one_account_get_not_in_each_others_way(served: Served
     said = [(await program.communicate())[0].decode() for program in programs]
     assert said == [""] * 3
     async with chain_of(settings(served, tmp_path), None) as chain:
-        assert await chain.balance_of(friend) == 18
+        assert await chain.tokens.balance(friend) == 18
     assert left_in_the_journal(tmp_path) == [], "all of them are settled"
 
 

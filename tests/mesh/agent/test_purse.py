@@ -49,7 +49,7 @@ async def chain(place: Place, road: Overtaken) -> AsyncIterator[Chain]:
     async with Chain(
         road, account=place.market.accounts["person"], ens=place.market.deployment.ens, timing=QUICK
     ) as opened:
-        await opened.approve(opened.factory, 0)
+        await opened.tokens.approve(opened.factory, 0)
         yield opened
 
 
@@ -60,7 +60,7 @@ def purse(place: Place, chain: Chain) -> Purse:
 
 async def allowance(chain: Chain) -> int:
     assert chain.account is not None
-    return await chain.allowance(chain.account.address, chain.factory)
+    return await chain.tokens.allowance(chain.account.address, chain.factory)
 
 
 async def spend(place: Place, cost: int) -> None:
@@ -69,7 +69,7 @@ async def spend(place: Place, cost: int) -> None:
     fields = terms(token=deployment.xrt, cost=cost, lighthouse=deployment.lighthouse, nonce=secrets.token_hex(32))
     demand = place.market.accounts["person"].signer.sign(Demand(**fields, validator_fee=0))
     offer = place.market.accounts["robot"].signer.sign(Offer(**fields, lighthouse_fee=0))
-    await place.chains["provider"].create_liability(deployment.lighthouse_name, demand, offer)
+    await place.chains["provider"].liabilities.create(deployment.lighthouse_name, demand, offer)
 
 
 async def test_promises_add_up_and_are_allowed_together(chain: Chain, purse: Purse) -> None:
@@ -79,7 +79,7 @@ async def test_promises_add_up_and_are_allowed_together(chain: Chain, purse: Pur
 
 
 async def test_what_is_allowed_already_costs_no_transaction(chain: Chain, purse: Purse) -> None:
-    await chain.approve(chain.factory, 100)
+    await chain.tokens.approve(chain.factory, 100)
     before = await chain.block_number()
     await purse.promise("one", {chain.xrt: 100})
     assert await chain.block_number() == before
@@ -92,7 +92,7 @@ async def test_a_promise_of_nothing_asks_nothing(chain: Chain, purse: Purse) -> 
 
 
 async def test_a_forgotten_promise_makes_room(chain: Chain, purse: Purse) -> None:
-    balance = await chain.balance_of()
+    balance = await chain.tokens.balance()
     await purse.promise("one", {chain.xrt: balance})
     with pytest.raises(ShortOfFunds) as caught:
         await purse.promise("other", {chain.xrt: 1})
@@ -106,7 +106,7 @@ async def test_an_allowance_that_is_used_up_on_the_way_is_given_once_more(
     place: Place, road: Overtaken, chain: Chain, purse: Purse
 ) -> None:
     """Gas is estimated for changing an allowance; to set one anew costs more."""
-    await chain.approve(chain.factory, 100)
+    await chain.tokens.approve(chain.factory, 100)
     spent: list[int] = []
 
     async def spend_all() -> None:

@@ -53,11 +53,11 @@ async def until_handled(place: Place, agent: Agent) -> None:
 async def test_what_comes_goes_and_is_allowed_is_told_as_the_legacy_stack_did(place: Place) -> None:
     robot, person, provider = (place.address(role) for role in ("robot", "person", "provider"))
     async with place.agent("robot") as agent, heard(place, agent) as events:
-        await place.chains["person"].transfer(robot, 11)
-        await place.chains["robot"].transfer(provider, 12)
-        await place.chains["robot"].approve(person, 13)
-        await place.chains["person"].approve(robot, 14)
-        await place.chains["robot"].transfer(robot, 15)
+        await place.chains["person"].tokens.transfer(robot, 11)
+        await place.chains["robot"].tokens.transfer(provider, 12)
+        await place.chains["robot"].tokens.approve(person, 13)
+        await place.chains["person"].tokens.approve(robot, 14)
+        await place.chains["robot"].tokens.transfer(robot, 15)
         await until(lambda: len(events) == 5, seconds=30)
     transfers = [event for event in events if isinstance(event, TransferEvent)]
     assert transfers == [
@@ -71,9 +71,9 @@ async def test_what_comes_goes_and_is_allowed_is_told_as_the_legacy_stack_did(pl
 
 async def test_what_others_do_among_themselves_is_not_told(place: Place) -> None:
     async with place.agent("robot") as agent, heard(place, agent) as events:
-        await place.chains["person"].transfer(place.address("provider"), 1)
-        await place.chains["person"].approve(place.address("provider"), 1)
-        await place.chains["person"].transfer(agent.address, 2)
+        await place.chains["person"].tokens.transfer(place.address("provider"), 1)
+        await place.chains["person"].tokens.approve(place.address("provider"), 1)
+        await place.chains["person"].tokens.transfer(agent.address, 2)
         await until(lambda: bool(events), seconds=30)
         await until_handled(place, agent)
     assert events == [TransferEvent(place.address("person"), place.address("robot"), 2)]
@@ -82,8 +82,8 @@ async def test_what_others_do_among_themselves_is_not_told(place: Place) -> None
 async def test_events_are_of_the_token_of_the_settings(place: Place) -> None:
     token, person = await other_token(place, "robot", supply=100), place.address("person")
     async with place.agent("robot", erc20_token=token) as agent, heard(place, agent) as events:
-        await place.chains["robot"].transfer(person, 1)
-        await place.chains["robot"].transfer(person, 2, token=token)
+        await place.chains["robot"].tokens.transfer(person, 1)
+        await place.chains["robot"].tokens.transfer(person, 2, token=token)
         await until(lambda: bool(events), seconds=30)
         await until_handled(place, agent)
     assert events == [TransferEvent(place.address("robot"), person, 2)]
@@ -92,10 +92,10 @@ async def test_events_are_of_the_token_of_the_settings(place: Place) -> None:
 async def test_what_happened_while_the_agent_was_down_is_told_when_it_is_back_and_nothing_again(place: Place) -> None:
     person, robot = place.address("person"), place.address("robot")
     async with place.agent("robot") as agent, heard(place, agent) as events:
-        await place.chains["person"].transfer(robot, 1)
+        await place.chains["person"].tokens.transfer(robot, 1)
         await until(lambda: bool(events), seconds=30)
         await until_handled(place, agent)
-    await place.chains["person"].transfer(robot, 2)
+    await place.chains["person"].tokens.transfer(robot, 2)
     agent = place.agent("robot")
     told: list[Any] = []
     async with Network(Endpoints(connect=(place.endpoint,))) as network:
@@ -104,7 +104,7 @@ async def test_what_happened_while_the_agent_was_down_is_told_when_it_is_back_an
             key, lambda sample: told.append(TransferEvent.decode(sample.payload.to_bytes()))
         )
         async with agent:
-            await place.chains["person"].transfer(robot, 3)
+            await place.chains["person"].tokens.transfer(robot, 3)
             await until(lambda: TransferEvent(person, robot, 3) in told, seconds=30)
             await until_handled(place, agent)
         subscriber.undeclare()
@@ -116,15 +116,15 @@ async def test_a_transfer_that_lands_in_another_block_after_a_reorganisation_is_
     chain, person = place.chains["person"], place.address("person")
     friend = Account.from_key(new_private_key()).address
     async with place.agent("robot") as agent, heard(place, agent) as events:
-        await chain.transfer(friend, 1)  # what goes before, so that there is a block to go back to
-        tx = await chain.transfer(agent.address, 7)
+        await chain.tokens.transfer(friend, 1)  # what goes before, so that there is a block to go back to
+        tx = await chain.tokens.transfer(agent.address, 7)
         await until(lambda: len(events) == 1, seconds=30)
         await until_handled(place, agent)
         raw = await raw_of(place, tx)
         await place.forget_blocks(1)
         await place.node.request("eth_sendRawTransaction", [raw])
         assert (await chain.node.web3.eth.get_transaction_receipt(tx))["status"] == 1  # type: ignore[arg-type]
-        await chain.transfer(agent.address, 8)
+        await chain.tokens.transfer(agent.address, 8)
         await until(lambda: events[-1].args_value == 8, seconds=30)
         await until_handled(place, agent)
     assert events == [TransferEvent(person, place.address("robot"), value) for value in (7, 8)]

@@ -31,7 +31,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 async def allowance(place: Place, role: str) -> int:
     chain = place.chains[role]
-    return await chain.allowance(place.address(role), chain.factory)
+    return await chain.tokens.allowance(place.address(role), chain.factory)
 
 
 @GENERATIONS
@@ -180,7 +180,7 @@ async def test_an_offer_without_demand_waits_for_one(place: Place) -> None:
         assert await waiting(robot) == ["offer"]
         contract = await person.demand(job(place), cost=55)
         assert (await contract.outcome()).success
-        _, offer_hash = await place.chains["person"].order_hashes(contract.address)
+        _, offer_hash = await place.chains["person"].liabilities.order_hashes(contract.address)
         assert offer_hash.hex() == offer
         assert [kind for kind in await waiting(robot) if kind == "offer"] == []
     assert working_on == ["there"]

@@ -105,7 +105,7 @@ async def test_a_rejection_of_what_is_a_contract_already_means_nothing(place: Pl
         working(place.agent("robot")),
         Network(Endpoints(connect=(place.endpoint,))) as network,
     ):
-        before = await chain.nonce_of(me.address)
+        before = await chain.liabilities.next_nonce(me.address)
         demand = asyncio.create_task(person.demand(OBJECTIVE))
         await posted(person)
         (identity,) = person._working().trader._matches
@@ -114,9 +114,9 @@ async def test_a_rejection_of_what_is_a_contract_already_means_nothing(place: Pl
             key = str(RejectKey(person.channel.lighthouse, identity, place.address("provider")))
             network.session.put(key, rejection(place, "provider", identity, reason="WrongSigner").encode())
             contract = await demand
-        demand_hash, _ = await chain.order_hashes(contract.address)
+        demand_hash, _ = await chain.liabilities.order_hashes(contract.address)
         assert demand_hash.hex() == identity
-        assert await chain.nonce_of(me.address) == before + 1
+        assert await chain.liabilities.next_nonce(me.address) == before + 1
 
 
 async def test_a_provider_without_room_is_asked_again(place: Place, caplog: pytest.LogCaptureFixture) -> None:
@@ -204,8 +204,8 @@ async def test_a_contract_on_our_terms_that_a_stranger_has_signed_leaves_our_dem
         fresh: dict[str, Any] = {"deadline": ours.deadline, "nonce": "ab" * 32, "lighthouse_fee": 0}
         offer = person.parts.signer.sign(Offer(**terms, **fresh))
         chain = place.chains["provider"]
-        made = await chain.create_liability(place.market.deployment.lighthouse, stolen, offer)
-        assert (await chain.order_hashes(made.liability))[0] == message_hash(ours)
+        made = await chain.liabilities.create(place.market.deployment.lighthouse, stolen, offer)
+        assert (await chain.liabilities.order_hashes(made.liability))[0] == message_hash(ours)
 
         head = await chain.block_number()
         await until(lambda: person.parts.clock.head >= head)
@@ -223,7 +223,7 @@ async def test_an_offer_that_can_not_be_signed_anew_stops_nothing(
     async with place.agent("robot", generation=5) as robot, place.agent("person", generation=5) as person:
         await robot.offer(objective=OBJECTIVE)
         await robot.offer(objective=cid_of_bytes(b"something dear"), lighthouse_fee=everything)
-        await place.chains["robot"].transfer(place.address("person"), 5)
+        await place.chains["robot"].tokens.transfer(place.address("person"), 5)
         async with place.provider():
             await person.demand(OBJECTIVE)
             await until(lambda: "is given up" in caplog.text)
@@ -231,4 +231,4 @@ async def test_an_offer_that_can_not_be_signed_anew_stops_nothing(
             again = cid_of_bytes(b"something else")
             await robot.offer(objective=again)
             assert (await person.demand(again)).liability.promisor == place.address("robot")
-    await place.chains["person"].transfer(place.address("robot"), 5)
+    await place.chains["person"].tokens.transfer(place.address("robot"), 5)

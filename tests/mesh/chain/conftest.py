@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest_asyncio
 
-from mesh.chain import XRT, Account, Chain, Deployment, DeploymentPlan, EmbeddedChain, Node, Timing, deploy
-from mesh.chain.embedded import EmbeddedProvider
+from mesh.chain import XRT, Account, Chain, Deployment, DeploymentPlan, Node, Timing, deploy
+from mesh.devchain import EmbeddedChain
+from mesh.devchain.embedded import EmbeddedProvider
 from schemas.address import ZERO_ADDRESS
 from schemas.cid import cid_of_digest
 from schemas.keccak import keccak256
@@ -101,19 +102,19 @@ async def prepare(endpoint: str | AsyncBaseProvider, keys: tuple[bytes, ...]) ->
         )
         async with Chain(node, account=deployer) as chain:
             for account in (provider, promisee, promisor):
-                await chain.transfer(account.address, 1000 * XRT)
+                await chain.tokens.transfer(account.address, 1000 * XRT)
         for account, spender in ((promisee, "factory"), (promisor, "factory"), (provider, "lighthouse")):
             async with Chain(node, account=account) as chain:
-                await chain.approve(getattr(market.deployment, spender), 1000 * XRT)
+                await chain.tokens.approve(getattr(market.deployment, spender), 1000 * XRT)
         async with Chain(node, account=provider) as chain:
-            await chain.refill(market.deployment.lighthouse, 500 * XRT)
+            await chain.lighthouses.refill(market.deployment.lighthouse, 500 * XRT)
     return market
 
 
 async def read_to(chain: Chain, first: int, last: int, *, lighthouses: Iterable[str] = ()) -> list[BlockEvents]:
     """What is told of the blocks from `first` to `last`."""
     blocks: list[BlockEvents] = []
-    async with asyncio.timeout(10), aclosing(chain.events(first, lighthouses=lighthouses)) as events:
+    async with asyncio.timeout(10), aclosing(chain.follow(first, lighthouses=lighthouses)) as events:
         async for block in events:
             blocks.append(block)
             if block.block_number >= last:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import aiohttp
 import pytest
 
-from mesh.chain import EmbeddedChain, JsonRpcServer
+from mesh.devchain import EmbeddedChain, JsonRpcServer
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

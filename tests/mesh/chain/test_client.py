@@ -34,24 +34,24 @@ async def test_names_of_both_generations_lead_to_the_same_contracts(market: Mark
         assert chain.factory == market.deployment.factory
         assert chain.xrt == market.deployment.xrt
         for generation in (3, 5):
-            assert await chain.resolve(f"factory.{generation}.robonomics.eth") == chain.factory
-            assert await chain.resolve(f"XRT.{generation}.Robonomics.eth") == chain.xrt
+            assert await chain.names.address(f"factory.{generation}.robonomics.eth") == chain.factory
+            assert await chain.names.address(f"XRT.{generation}.Robonomics.eth") == chain.xrt
             name = f"airalab.lighthouse.{generation}.robonomics.eth"
-            assert await chain.resolve(name) == market.deployment.lighthouse
-        assert await chain.lighthouse_address("airalab") == market.deployment.lighthouse
-        assert await chain.resolve(chain.xrt.lower()) == chain.xrt
+            assert await chain.names.address(name) == market.deployment.lighthouse
+        assert await chain.names.lighthouse("airalab") == market.deployment.lighthouse
+        assert await chain.names.address(chain.xrt.lower()) == chain.xrt
 
 
 async def test_what_is_no_name_and_what_nobody_knows_are_different_errors(market: Market) -> None:
     async with market.chain() as chain:
         with pytest.raises(UnknownName, match=r"none\.lighthouse"):
-            await chain.resolve("none.lighthouse.3.robonomics.eth")
+            await chain.names.address("none.lighthouse.3.robonomics.eth")
         with pytest.raises(UnknownName):
-            await chain.resolve("somebody.eth")
+            await chain.names.address("somebody.eth")
         with pytest.raises(InvalidName):
-            await chain.resolve("café.eth")
+            await chain.names.address("café.eth")
         with pytest.raises(InvalidAddress):
-            await chain.resolve("0x12")
+            await chain.names.address("0x12")
 
 
 async def test_a_chain_without_the_contracts_says_so(market: Market) -> None:
@@ -70,56 +70,56 @@ async def test_a_chain_without_the_contracts_says_so(market: Market) -> None:
 async def test_tokens_are_moved_and_approved(market: Market) -> None:
     owner, friend = market.promisee.address, Account.from_key(new_private_key()).address
     async with market.chain(market.promisee) as chain:
-        before = await chain.balance_of()
-        tx = await chain.transfer(friend, 5)
+        before = await chain.tokens.balance()
+        tx = await chain.tokens.transfer(friend, 5)
         assert len(tx) == 66
-        assert (await chain.balance_of(friend), await chain.balance_of(owner)) == (5, before - 5)
-        await chain.approve(market.stranger.address, 7)
-        assert await chain.allowance(owner, market.stranger.address) == 7
+        assert (await chain.tokens.balance(friend), await chain.tokens.balance(owner)) == (5, before - 5)
+        await chain.tokens.approve(market.stranger.address, 7)
+        assert await chain.tokens.allowance(owner, market.stranger.address) == 7
     async with market.chain(market.stranger) as chain:
-        await chain.transfer_from(owner, friend, 7)
-        assert await chain.balance_of(friend, token=market.deployment.xrt) == 12
-        assert await chain.balance_of(friend, token="xrt.5.robonomics.eth") == 12
+        await chain.tokens.transfer_from(owner, friend, 7)
+        assert await chain.tokens.balance(friend, token=market.deployment.xrt) == 12
+        assert await chain.tokens.balance(friend, token="xrt.5.robonomics.eth") == 12
 
 
 async def test_ether_is_counted_and_sent(market: Market) -> None:
     friend = Account.from_key(new_private_key()).address
     async with market.chain(market.promisee) as chain:
-        await chain.send_eth(friend, 10**15)
-        assert await chain.eth_balance(friend) == 10**15
-        assert await chain.eth_balance() > 10**15
+        await chain.tokens.send_eth(friend, 10**15)
+        assert await chain.tokens.eth_balance(friend) == 10**15
+        assert await chain.tokens.eth_balance() > 10**15
 
 
 async def test_without_funds_there_is_one_clear_error(market: Market) -> None:
     poor = Account.from_key(new_private_key())
     async with market.chain(poor) as chain:
         with pytest.raises(InsufficientFunds) as caught:
-            await chain.approve(market.stranger.address, 1)
+            await chain.tokens.approve(market.stranger.address, 1)
         assert caught.value.balance == 0
         assert caught.value.needed > 21_000
         assert caught.value.hint
         with pytest.raises(InsufficientFunds) as caught:
-            await chain.send_eth(market.stranger.address, 10**18)
+            await chain.tokens.send_eth(market.stranger.address, 10**18)
         assert caught.value.needed >= 10**18
 
 
 async def test_a_reader_needs_no_account_and_a_writer_does(market: Market) -> None:
     async with market.chain() as chain:
-        assert await chain.balance_of(market.promisee.address) > 0
+        assert await chain.tokens.balance(market.promisee.address) > 0
         with pytest.raises(NoAccount):
-            await chain.transfer(market.promisee.address, 1)
+            await chain.tokens.transfer(market.promisee.address, 1)
         with pytest.raises(NoAccount):
-            await chain.balance_of()
+            await chain.tokens.balance()
 
 
 async def test_a_refusal_of_the_token_is_decoded(market: Market) -> None:
     async with market.chain(market.stranger) as chain:
-        before = await chain.eth_balance()
+        before = await chain.tokens.eth_balance()
         with pytest.raises(Reverted, match="ERC20InsufficientBalance") as caught:
-            await chain.transfer(market.promisee.address, 1)
+            await chain.tokens.transfer(market.promisee.address, 1)
         assert caught.value.reason == "ERC20InsufficientBalance"
         assert caught.value.arguments == (market.stranger.address, 0, 1)
-        assert await chain.eth_balance() == before, "what the simulation refuses is not sent"
+        assert await chain.tokens.eth_balance() == before, "what the simulation refuses is not sent"
 
 
 @pytest.mark.parametrize("generation", [3, 5])
@@ -130,21 +130,26 @@ async def test_a_job_goes_from_orders_to_payment(market: Market, generation: int
     async with market.chain(market.provider) as chain:
         if generation == 5:
             for fields, who in ((demand_fields, market.promisee), (offer_fields, market.promisor)):
-                fields |= {"sender": who.address, "nonce": await chain.nonce_of(who.address)}
+                fields |= {"sender": who.address, "nonce": await chain.liabilities.next_nonce(who.address)}
         people = (market.promisee.address, market.promisor.address)
-        before = [await chain.balance_of(address) for address in people]
+        before = [await chain.tokens.balance(address) for address in people]
         demand, offer = market.demand(**demand_fields), market.offer(**offer_fields)
-        created = await chain.create_liability(market.deployment.lighthouse, demand, offer)
-        assert await chain.is_liability(created.liability)
+        created = await chain.liabilities.create(market.deployment.lighthouse, demand, offer)
+        assert await chain.liabilities.exists(created.liability)
         assert created.gas_used < 260_000
 
         hashes = message_hash(demand), message_hash(offer)
-        assert await chain.order_hashes(created.liability) == hashes
-        used = [await chain.is_order_used(order_hash, who) for order_hash, who in zip(hashes, people, strict=True)]
+        assert await chain.liabilities.order_hashes(created.liability) == hashes
+        used = [
+            await chain.liabilities.is_order_used(order_hash, who)
+            for order_hash, who in zip(hashes, people, strict=True)
+        ]
         assert used == [generation == 3] * 2
-        assert not await chain.is_order_used(hashes[0], market.stranger.address), "who has signed no such order"
+        assert not await chain.liabilities.is_order_used(hashes[0], market.stranger.address), (
+            "who has signed no such order"
+        )
 
-        made = await chain.liability(created.liability)
+        made = await chain.liabilities.get(created.liability)
         assert (made.model, made.objective, made.result) == (demand.model, demand.objective, "")
         assert (made.promisee, made.promisor, made.lighthouse) == (*people, market.deployment.lighthouse)
         assert (made.token, made.cost, made.lighthouse_fee) == (market.deployment.xrt, cost, fee)
@@ -152,23 +157,23 @@ async def test_a_job_goes_from_orders_to_payment(market: Market, generation: int
         assert (made.is_success, made.is_finalized) == (False, False)
 
         result = market.result(created.liability)
-        settled = await chain.finalize("airalab", result)
+        settled = await chain.liabilities.finalize("airalab", result)
         assert settled.gas_used < 150_000
-        done = await chain.liability(created.liability)
+        done = await chain.liabilities.get(created.liability)
         assert (done.result, done.is_success, done.is_finalized) == (result.result, True, True)
-        after = [await chain.balance_of(address) for address in people]
+        after = [await chain.tokens.balance(address) for address in people]
         assert [now - then for now, then in zip(after, before, strict=True)] == [-cost, cost - fee]
 
 
 async def test_a_failed_job_pays_the_promisee_back(market: Market) -> None:
     async with market.chain(market.provider) as chain:
-        before = await chain.balance_of(market.promisee.address)
+        before = await chain.tokens.balance(market.promisee.address)
         orders = market.demand(cost=XRT), market.offer(cost=XRT)
-        created = await chain.create_liability("airalab", *orders)
-        assert await chain.balance_of(market.promisee.address) == before - XRT
-        await chain.finalize("airalab", market.result(created.liability, success=False))
-        assert await chain.balance_of(market.promisee.address) == before
-        assert not (await chain.liability(created.liability)).is_success
+        created = await chain.liabilities.create("airalab", *orders)
+        assert await chain.tokens.balance(market.promisee.address) == before - XRT
+        await chain.liabilities.finalize("airalab", market.result(created.liability, success=False))
+        assert await chain.tokens.balance(market.promisee.address) == before
+        assert not (await chain.liabilities.get(created.liability)).is_success
 
 
 @pytest.mark.parametrize(
@@ -180,110 +185,110 @@ async def test_orders_that_do_not_match_are_refused_by_name(
 ) -> None:
     async with market.chain(market.provider) as chain:
         with pytest.raises(Reverted) as caught:
-            await chain.create_liability("airalab", market.demand(), market.offer(**{field: value}))
+            await chain.liabilities.create("airalab", market.demand(), market.offer(**{field: value}))
     assert caught.value.reason == reason
 
 
 async def test_an_order_makes_one_liability_only(market: Market) -> None:
     demand, offer = market.demand(), market.offer()
     async with market.chain(market.provider) as chain:
-        await chain.create_liability("airalab", demand, offer)
+        await chain.liabilities.create("airalab", demand, offer)
         with pytest.raises(Reverted, match="OrderUsed"):
-            await chain.create_liability("airalab", demand, market.offer())
+            await chain.liabilities.create("airalab", demand, market.offer())
 
 
 async def test_only_a_provider_sends_to_the_lighthouse(market: Market) -> None:
     async with market.chain(market.stranger) as chain:
-        assert not await chain.is_turn("airalab")
+        assert not await chain.lighthouses.is_turn("airalab")
         with pytest.raises(Reverted) as caught:
-            await chain.create_liability("airalab", market.demand(), market.offer())
+            await chain.liabilities.create("airalab", market.demand(), market.offer())
     assert (caught.value.reason, caught.value.arguments) == ("NotAProvider", (market.stranger.address,))
 
 
 async def test_a_result_of_another_is_refused(market: Market) -> None:
     async with market.chain(market.provider) as chain:
-        created = await chain.create_liability("airalab", market.demand(), market.offer())
+        created = await chain.liabilities.create("airalab", market.demand(), market.offer())
         forged = market.result(created.liability, account=market.stranger)
         with pytest.raises(Reverted, match="WrongSigner") as caught:
-            await chain.finalize("airalab", forged)
+            await chain.liabilities.finalize("airalab", forged)
         assert caught.value.arguments == (market.promisor.address, market.stranger.address)
 
 
 async def test_a_liability_is_only_what_the_factory_made(market: Market) -> None:
     async with market.chain() as chain:
         for address in (market.stranger.address, market.deployment.xrt):
-            assert not await chain.is_liability(address)
+            assert not await chain.liabilities.exists(address)
             with pytest.raises(NotALiability, match=address):
-                await chain.liability(address)
+                await chain.liabilities.get(address)
 
 
 async def test_the_named_validator_finalizes_a_generation_3_liability(market: Market) -> None:
     validator = market.stranger.address
     async with market.chain(market.provider) as chain:
         orders = market.demand(validator=validator), market.offer(validator=validator)
-        created = await chain.create_liability("airalab", *orders)
+        created = await chain.liabilities.create("airalab", *orders)
     result = market.result(created.liability)
     async with market.chain(market.stranger) as chain:
-        await chain.validate(result, agree=False)
-        record = await chain.liability(created.liability)
+        await chain.liabilities.validate(result, agree=False)
+        record = await chain.liabilities.get(created.liability)
     assert (record.is_finalized, record.is_success, record.validator) == (True, False, validator)
 
 
 async def test_a_promisee_is_paid_back_when_the_promisor_vanished(market: Market) -> None:
     async with market.chain(market.provider) as chain:
-        before = await chain.balance_of(market.promisee.address)
-        created = await chain.create_liability("airalab", market.demand(cost=9), market.offer(cost=9))
+        before = await chain.tokens.balance(market.promisee.address)
+        created = await chain.liabilities.create("airalab", market.demand(cost=9), market.offer(cost=9))
         with pytest.raises(Reverted, match="RefundTooEarly"):
-            await chain.refund(created.liability)
-        while await chain.block_number() + 1 < await chain.refundable_from(created.liability):
-            await chain.approve(market.stranger.address, 0)
-        await chain.refund(created.liability)
-        assert await chain.balance_of(market.promisee.address) == before
-        record = await chain.liability(created.liability)
+            await chain.liabilities.refund(created.liability)
+        while await chain.block_number() + 1 < await chain.liabilities.refundable_from(created.liability):
+            await chain.tokens.approve(market.stranger.address, 0)
+        await chain.liabilities.refund(created.liability)
+        assert await chain.tokens.balance(market.promisee.address) == before
+        record = await chain.liabilities.get(created.liability)
     assert (record.is_finalized, record.is_success, record.result) == (True, False, "")
 
 
 async def test_a_lighthouse_is_made_staked_and_left(market: Market) -> None:
     owner = market.promisor
     async with market.chain(owner) as chain:
-        made = await chain.create_lighthouse(minimal_stake=10, timeout_blocks=3, name="beacon")
-        assert await chain.lighthouse_address("beacon") == made.lighthouse
-        assert await chain.resolve("beacon.lighthouse.5.robonomics.eth") == made.lighthouse
-        assert [(one.lighthouse, one.name) for one in await chain.lighthouses()] == [
+        made = await chain.lighthouses.create(minimal_stake=10, timeout_blocks=3, name="beacon")
+        assert await chain.names.lighthouse("beacon") == made.lighthouse
+        assert await chain.names.address("beacon.lighthouse.5.robonomics.eth") == made.lighthouse
+        assert [(one.lighthouse, one.name) for one in await chain.lighthouses.list()] == [
             (market.deployment.lighthouse, "airalab"),
             (made.lighthouse, "beacon"),
         ]
-        await chain.approve(made.lighthouse, 25)
-        await chain.refill("beacon", 25)
-        state = await chain.lighthouse("beacon")
+        await chain.tokens.approve(made.lighthouse, 25)
+        await chain.lighthouses.refill("beacon", 25)
+        state = await chain.lighthouses.get("beacon")
         assert (state.minimal_stake, state.timeout_blocks, state.quota) == (10, 3, 2)
         assert (state.current, state.stakes) == (owner.address, {owner.address: 25})
-        assert await chain.is_turn("beacon")
-        await chain.withdraw("beacon", 20)
-        assert (await chain.lighthouse("beacon")).stakes == {}
+        assert await chain.lighthouses.is_turn("beacon")
+        await chain.lighthouses.withdraw("beacon", 20)
+        assert (await chain.lighthouses.get("beacon")).stakes == {}
         with pytest.raises(Reverted, match="NameTaken"):
-            await chain.create_lighthouse(minimal_stake=10, timeout_blocks=3, name="beacon")
+            await chain.lighthouses.create(minimal_stake=10, timeout_blocks=3, name="beacon")
 
 
 async def test_many_transactions_of_one_account_at_once_all_go_through(market: Market) -> None:
     friend = Account.from_key(new_private_key()).address
     async with market.chain(market.promisee) as chain:
-        txs = await asyncio.gather(*(chain.transfer(friend, 1) for _ in range(20)))
+        txs = await asyncio.gather(*(chain.tokens.transfer(friend, 1) for _ in range(20)))
         assert len(set(txs)) == 20
-        assert await chain.balance_of(friend) == 20
+        assert await chain.tokens.balance(friend) == 20
 
 
 async def test_two_clients_of_one_account_do_not_lose_a_transaction(market: Market) -> None:
     friend = Account.from_key(new_private_key()).address
     async with market.chain(market.promisee) as one, market.chain(market.promisee) as other:
-        await asyncio.gather(*(chain.transfer(friend, 1) for chain in (one, other) * 5))
-        assert await one.balance_of(friend) == 10
+        await asyncio.gather(*(chain.tokens.transfer(friend, 1) for chain in (one, other) * 5))
+        assert await one.tokens.balance(friend) == 10
 
 
 async def test_what_is_no_lighthouse_is_one_clear_error(market: Market) -> None:
     async with market.chain() as chain:
         with pytest.raises(NoContracts, match="providersLength"):
-            await chain.lighthouse(market.promisee.address)
+            await chain.lighthouses.get(market.promisee.address)
         functions = chain.node.contract("Liability", market.promisee.address).functions
         with pytest.raises(NoContracts):
             await chain.node.read_all((functions.model(), functions.cost()), block="latest")
@@ -292,8 +297,8 @@ async def test_what_is_no_lighthouse_is_one_clear_error(market: Market) -> None:
 async def test_a_closed_client_says_so(market: Market) -> None:
     chain = market.chain(market.promisee)
     with pytest.raises(ClosedError):
-        await chain.resolve("xrt.3.robonomics.eth")
+        await chain.names.address("xrt.3.robonomics.eth")
     async with chain:
-        await chain.balance_of()
+        await chain.tokens.balance()
     with pytest.raises(ClosedError):
         _ = chain.factory

@@ -6,18 +6,9 @@ import time
 
 import pytest
 
-from mesh.chain import (
-    XRT,
-    Account,
-    Chain,
-    DeploymentPlan,
-    EmbeddedChain,
-    InsufficientFunds,
-    NoContracts,
-    deploy,
-    new_private_key,
-)
+from mesh.chain import XRT, Account, Chain, DeploymentPlan, InsufficientFunds, NoContracts, deploy, new_private_key
 from mesh.chain.names import DEVELOPMENT_REGISTRY
+from mesh.devchain import EmbeddedChain
 from tests.mesh.chain.conftest import QUICK
 
 
@@ -34,10 +25,10 @@ async def test_the_plan_is_what_is_deployed() -> None:
         account = Account.from_key(node.funded_keys[3])
         deployment = await deploy(node.provider, account, plan=plan)
         async with Chain(node.provider, ens=deployment.ens, timing=QUICK) as chain:
-            assert await chain.balance_of(account.address) == 7 * XRT
-            assert await chain.resolve("home.lighthouse.5.robonomics.eth") == deployment.lighthouse
+            assert await chain.tokens.balance(account.address) == 7 * XRT
+            assert await chain.names.address("home.lighthouse.5.robonomics.eth") == deployment.lighthouse
             assert deployment.lighthouse_name == "home.lighthouse.3.robonomics.eth"
-            state = await chain.lighthouse("home")
+            state = await chain.lighthouses.get("home")
             assert (state.minimal_stake, state.timeout_blocks) == (5, 9)
             assert await chain.block_number() == deployment.block_number
             refund_delay = chain.node.contract("Factory", chain.factory).functions.refundDelay()

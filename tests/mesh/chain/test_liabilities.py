@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.chain import XRT, Account, Chain, EmbeddedChain, NotALiability, NotOffered, Reverted, new_private_key
+from mesh.chain import XRT, Account, Chain, NotALiability, NotOffered, Reverted, new_private_key
+from mesh.devchain import EmbeddedChain
 from mesh.errors import InvalidMessage
 from schemas import cancellation_hash
 from tests.mesh.chain.conftest import QUICK, Flaky, cid, prepare
@@ -21,7 +22,7 @@ pytestmark = pytest.mark.asyncio(loop_scope="module")
 
 async def _made(market: Market, **fields: Any) -> str:
     async with market.chain(market.provider) as chain:
-        return (await chain.create_liability("airalab", market.demand(**fields), market.offer(**fields))).liability
+        return (await chain.liabilities.create("airalab", market.demand(**fields), market.offer(**fields))).liability
 
 
 def _signed(account: Account, liability: str) -> bytes:
@@ -30,15 +31,15 @@ def _signed(account: Account, liability: str) -> bytes:
 
 async def test_what_both_parties_call_off_is_paid_back(market: Market) -> None:
     async with market.chain(market.stranger) as chain:
-        before = await chain.balance_of(market.promisee.address)
+        before = await chain.tokens.balance(market.promisee.address)
         liability = await _made(market, cost=XRT)
         promisee, promisor = (_signed(account, liability) for account in (market.promisee, market.promisor))
-        await chain.cancel(liability, promisee_signature=promisee, promisor_signature="0x" + promisor.hex())
-        assert await chain.balance_of(market.promisee.address) == before
-        record = await chain.liability(liability)
+        await chain.liabilities.cancel(liability, promisee_signature=promisee, promisor_signature="0x" + promisor.hex())
+        assert await chain.tokens.balance(market.promisee.address) == before
+        record = await chain.liabilities.get(liability)
         assert (record.is_finalized, record.is_success, record.result) == (True, False, "")
         with pytest.raises(Reverted, match="AlreadyFinalized"):
-            await chain.cancel(liability, promisee_signature=promisee, promisor_signature=promisor)
+            await chain.liabilities.cancel(liability, promisee_signature=promisee, promisor_signature=promisor)
 
 
 async def test_one_party_alone_calls_nothing_off(market: Market) -> None:
@@ -46,9 +47,9 @@ async def test_one_party_alone_calls_nothing_off(market: Market) -> None:
     promisee, stranger = (_signed(account, liability) for account in (market.promisee, market.stranger))
     async with market.chain(market.stranger) as chain:
         with pytest.raises(Reverted, match="WrongSigner") as caught:
-            await chain.cancel(liability, promisee_signature=promisee, promisor_signature=stranger)
+            await chain.liabilities.cancel(liability, promisee_signature=promisee, promisor_signature=stranger)
         assert caught.value.arguments == (market.promisor.address, market.stranger.address)
-        assert not (await chain.liability(liability)).is_finalized
+        assert not (await chain.liabilities.get(liability)).is_finalized
 
 
 async def test_what_is_no_signature_is_told_without_asking_the_contract(market: Market) -> None:
@@ -56,7 +57,7 @@ async def test_what_is_no_signature_is_told_without_asking_the_contract(market: 
     async with market.chain() as chain:
         for nonsense in ("", "0x12", "nonsense", bytes(65)):
             with pytest.raises(InvalidMessage, match="signature"):
-                await chain.cancel(liability, promisee_signature=nonsense, promisor_signature=bytes(65))
+                await chain.liabilities.cancel(liability, promisee_signature=nonsense, promisor_signature=bytes(65))
 
 
 async def test_a_signature_of_another_liability_does_not_count(market: Market) -> None:
@@ -64,7 +65,7 @@ async def test_a_signature_of_another_liability_does_not_count(market: Market) -
     signatures = [_signed(account, other) for account in (market.promisee, market.promisor)]
     async with market.chain(market.stranger) as chain:
         with pytest.raises(Reverted, match="WrongSigner"):
-            await chain.cancel(one, promisee_signature=signatures[0], promisor_signature=signatures[1])
+            await chain.liabilities.cancel(one, promisee_signature=signatures[0], promisor_signature=signatures[1])
 
 
 async def test_what_is_no_liability_can_be_neither_called_off_nor_watched(market: Market) -> None:
@@ -72,11 +73,11 @@ async def test_what_is_no_liability_can_be_neither_called_off_nor_watched(market
     signature = _signed(market.promisee, nobody)
     async with market.chain(market.stranger) as chain:
         with pytest.raises(NotALiability, match=nobody):
-            await chain.cancel(nobody, promisee_signature=signature, promisor_signature=signature)
+            await chain.liabilities.cancel(nobody, promisee_signature=signature, promisor_signature=signature)
         with pytest.raises(NotALiability, match=nobody):
-            await chain.watch_liability(nobody)
+            await chain.liabilities.watch(nobody)
         with pytest.raises(NotALiability, match=nobody):
-            await chain.refund_state(nobody)
+            await chain.liabilities.refund_state(nobody)
 
 
 @pytest.mark.parametrize("generation", [3, 5])
@@ -85,26 +86,26 @@ async def test_the_originals_can_not_be_called_off(market: Market, generation: i
     signature = _signed(market.promisee, liability)
     options: dict[str, Any] = {"contracts": "original", "generation": generation}
     async with market.chain(market.provider, **options) as chain:
-        chain._suite.recognise(liability)
+        chain._opened().version.recognise(liability)
         with pytest.raises(NotOffered, match="no cancellation") as caught:
-            await chain.cancel(liability, promisee_signature=signature, promisor_signature=signature)
+            await chain.liabilities.cancel(liability, promisee_signature=signature, promisor_signature=signature)
         assert caught.value.hint
         with pytest.raises(NotOffered, match="refund"):
-            await chain.refund_state(liability)
+            await chain.liabilities.refund_state(liability)
 
 
 async def test_a_refund_is_due_after_the_delay_and_not_after_the_end(market: Market) -> None:
     liability = await _made(market, cost=1)
     async with market.chain(market.provider) as chain:
-        state = await chain.refund_state(liability)
+        state = await chain.liabilities.refund_state(liability)
         assert (state.liability, state.is_finalized, state.is_refundable) == (liability, False, False)
-        assert state.refundable_from == await chain.refundable_from(liability)
-        while not (await chain.refund_state(liability)).is_refundable:
+        assert state.refundable_from == await chain.liabilities.refundable_from(liability)
+        while not (await chain.liabilities.refund_state(liability)).is_refundable:
             with pytest.raises(Reverted, match="RefundTooEarly"):
-                await chain.refund(liability)
-            await chain.approve(market.stranger.address, 0)
-        await chain.refund(liability)
-        state = await chain.refund_state(liability)
+                await chain.liabilities.refund(liability)
+            await chain.tokens.approve(market.stranger.address, 0)
+        await chain.liabilities.refund(liability)
+        state = await chain.liabilities.refund_state(liability)
     assert (state.is_finalized, state.is_refundable) == (True, False)
 
 
@@ -113,51 +114,55 @@ async def test_liabilities_are_listed_in_order_and_by_who_has_part_in_them(marke
         start = await chain.block_number() + 1
         # Each is the other's promisee: the accounts of the market change places.
         swapped = market.demand(market.promisor), market.offer(market.promisee)
-        made = [await _made(market), (await chain.create_liability("airalab", *swapped)).liability, await _made(market)]
-        every = await chain.liabilities(from_block=start)
+        made = [
+            await _made(market),
+            (await chain.liabilities.create("airalab", *swapped)).liability,
+            await _made(market),
+        ]
+        every = await chain.liabilities.list(from_block=start)
         assert [record.address for record in every] == made
-        assert every[0] == await chain.liability(made[0])
+        assert every[0] == await chain.liabilities.get(made[0])
 
         async def listed(**filters: Any) -> list[str]:
-            return [record.address for record in await chain.liabilities(from_block=start, **filters)]
+            return [record.address for record in await chain.liabilities.list(from_block=start, **filters)]
 
         assert await listed(promisee=market.promisee.address.lower()) == [made[0], made[2]]
         assert await listed(promisor=market.promisee.address) == [made[1]]
         assert await listed(promisee=market.promisee.address, promisor=market.promisee.address) == []
         assert await listed(lighthouse="airalab") == made
         assert await listed(lighthouse=market.stranger.address) == []
-        assert len(await chain.liabilities()) >= len(made)
+        assert len(await chain.liabilities.list()) >= len(made)
 
 
 async def test_liabilities_of_the_originals_are_listed_by_the_factorys_word(market: Market) -> None:
     liability = await _made(market)
     async with market.chain(contracts="original", generation=3) as chain:
-        assert liability in [record.address for record in await chain.liabilities()]
+        assert liability in [record.address for record in await chain.liabilities.list()]
 
 
 async def test_the_end_of_a_liability_is_waited_for_and_read_from_its_contract(market: Market) -> None:
     liability = await _made(market, cost=1)
     async with market.chain() as reader, market.chain(market.provider) as chain, asyncio.timeout(30):
-        watching = asyncio.create_task(reader.watch_liability(liability.lower()))
-        await chain.approve(market.stranger.address, 0)
+        watching = asyncio.create_task(reader.liabilities.watch(liability.lower()))
+        await chain.tokens.approve(market.stranger.address, 0)
         assert not watching.done()
-        await chain.finalize("airalab", market.result(liability))
+        await chain.liabilities.finalize("airalab", market.result(liability))
         ended = await watching
         assert (ended.address, ended.is_success, ended.result) == (liability, True, cid(3))
-        assert ended == await chain.liability(liability)
-        assert await reader.watch_liability(liability) == ended, "what has ended already is told at once"
+        assert ended == await chain.liabilities.get(liability)
+        assert await reader.liabilities.watch(liability) == ended, "what has ended already is told at once"
 
 
 async def test_an_end_counts_when_it_has_its_confirmations(market: Market) -> None:
     liability = await _made(market)
     timing = replace(QUICK, confirmations=3)
     async with market.chain(timing=timing) as reader, market.chain(market.provider) as chain, asyncio.timeout(30):
-        watching = asyncio.create_task(reader.watch_liability(liability))
-        await chain.finalize("airalab", market.result(liability))
+        watching = asyncio.create_task(reader.liabilities.watch(liability))
+        await chain.liabilities.finalize("airalab", market.result(liability))
         for _ in range(2):
             await asyncio.sleep(10 * QUICK.poll_interval)
             assert not watching.done()
-            await chain.approve(market.stranger.address, 0)
+            await chain.tokens.approve(market.stranger.address, 0)
         assert (await watching).is_finalized
 
 
@@ -167,10 +172,10 @@ async def test_watching_outlives_a_lost_node() -> None:
         liability = await _made(market)
         flaky = Flaky(node)
         async with market.chain(market.provider) as chain, Chain(flaky, timing=QUICK) as reader:
-            watching = asyncio.create_task(reader.watch_liability(liability))
+            watching = asyncio.create_task(reader.liabilities.watch(liability))
             await asyncio.sleep(5 * QUICK.poll_interval)
             flaky.is_lost = True
-            await chain.finalize("airalab", market.result(liability))
+            await chain.liabilities.finalize("airalab", market.result(liability))
             await asyncio.sleep(5 * QUICK.poll_interval)
             assert not watching.done()
             flaky.is_lost = False

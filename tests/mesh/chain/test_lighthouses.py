@@ -14,7 +14,6 @@ from mesh.chain import (
     Account,
     Approval,
     Chain,
-    EmbeddedChain,
     InsufficientTokens,
     NewLighthouse,
     NodeUnreachable,
@@ -25,6 +24,7 @@ from mesh.chain import (
     deploy,
     new_private_key,
 )
+from mesh.devchain import EmbeddedChain
 from mesh.errors import InputError
 from schemas.address import ZERO_ADDRESS
 from tests.mesh.chain.conftest import QUICK, Flaky, events_of, prepare, read_to
@@ -45,23 +45,23 @@ async def _newcomer(market: Market, *, holding: int) -> Account:
     """An account with ether and XRT."""
     account = Account.from_key(new_private_key())
     async with market.chain(market.deployer) as chain:
-        await chain.send_eth(account.address, 10**18)
-        await chain.transfer(account.address, holding)
+        await chain.tokens.send_eth(account.address, 10**18)
+        await chain.tokens.transfer(account.address, holding)
     return account
 
 
 async def _beacon(market: Market, name: str) -> str:
     async with market.chain(market.deployer) as chain:
-        return (await chain.create_lighthouse(minimal_stake=10, timeout_blocks=3, name=name)).lighthouse
+        return (await chain.lighthouses.create(minimal_stake=10, timeout_blocks=3, name=name)).lighthouse
 
 
 async def test_who_becomes_a_provider_approves_and_stakes_just_that(market: Market) -> None:
     beacon, account = await _beacon(market, "first"), await _newcomer(market, holding=XRT)
     async with market.chain(account) as chain:
         start = await chain.block_number()
-        state = await chain.become_provider("first", STAKE)
+        state = await chain.lighthouses.become_provider("first", STAKE)
         assert (state.stakes, state.current) == ({account.address: STAKE}, account.address)
-        assert await chain.allowance(account.address, beacon) == 0
+        assert await chain.tokens.allowance(account.address, beacon) == 0
         told = events_of(await read_to(chain, start + 1, await chain.block_number(), lighthouses=[beacon]))
     assert [event.value for event in told if isinstance(event, Approval)] == [STAKE]
     assert [event.value for event in told if isinstance(event, Transfer)] == [STAKE]
@@ -72,21 +72,21 @@ async def test_a_provider_that_stakes_enough_already_sends_nothing(market: Marke
     await _beacon(market, "second")
     account = await _newcomer(market, holding=XRT)
     async with market.chain(account) as chain:
-        await chain.become_provider("second", STAKE)
+        await chain.lighthouses.become_provider("second", STAKE)
         sent = await chain.node.web3.eth.get_transaction_count(chain.node.checksum(account.address))
-        state = await chain.become_provider("second", STAKE - 5)
+        state = await chain.lighthouses.become_provider("second", STAKE - 5)
         assert state.stakes == {account.address: STAKE}
         assert await chain.node.web3.eth.get_transaction_count(chain.node.checksum(account.address)) == sent
-        assert (await chain.become_provider("second", STAKE + 1)).stakes == {account.address: STAKE + 1}
+        assert (await chain.lighthouses.become_provider("second", STAKE + 1)).stakes == {account.address: STAKE + 1}
 
 
 async def test_what_was_broken_off_after_the_approval_goes_on_from_there(market: Market) -> None:
     beacon, account = await _beacon(market, "third"), await _newcomer(market, holding=XRT)
     async with market.chain(account) as chain:
-        await chain.approve(beacon, STAKE)  # and then the process was killed
+        await chain.tokens.approve(beacon, STAKE)  # and then the process was killed
     async with market.chain(account) as chain:
         start = await chain.block_number()
-        assert (await chain.become_provider("third", STAKE)).stakes == {account.address: STAKE}
+        assert (await chain.lighthouses.become_provider("third", STAKE)).stakes == {account.address: STAKE}
         told = events_of(await read_to(chain, start + 1, await chain.block_number()))
     assert not [event for event in told if isinstance(event, Approval)]
 
@@ -96,14 +96,14 @@ async def test_a_stake_that_was_sent_before_a_crash_is_waited_for_and_not_sent_a
         market = await prepare(anvil.url, anvil.private_keys)
         beacon, account = await _beacon(market, "beacon"), await _newcomer(market, holding=XRT)
         async with market.chain(account) as chain:
-            await chain.approve(beacon, STAKE)
+            await chain.tokens.approve(beacon, STAKE)
             await chain.node.web3.provider.make_request("evm_setAutomine", [False])
         hasty = replace(QUICK, receipt_timeout=0.3)
         async with market.chain(account, journal=tmp_path, timing=hasty) as chain:
             with pytest.raises(TransactionTimeout) as sent:
-                await chain.become_provider("beacon", STAKE)
+                await chain.lighthouses.become_provider("beacon", STAKE)
         async with market.chain(account, journal=tmp_path) as chain, asyncio.timeout(30):
-            becoming = asyncio.create_task(chain.become_provider("beacon", STAKE))
+            becoming = asyncio.create_task(chain.lighthouses.become_provider("beacon", STAKE))
             await asyncio.sleep(5 * QUICK.poll_interval)
             await chain.node.web3.provider.make_request("evm_mine", [])
             assert (await becoming).stakes == {account.address: STAKE}
@@ -116,7 +116,7 @@ async def test_the_originals_take_providers_in_the_same_way(market: Market, gene
     await _beacon(market, f"original-{generation}")
     account = await _newcomer(market, holding=XRT)
     async with market.chain(account, contracts="original", generation=generation) as chain:
-        state = await chain.become_provider(f"original-{generation}", STAKE)
+        state = await chain.lighthouses.become_provider(f"original-{generation}", STAKE)
     assert state.stakes == {account.address: STAKE}
 
 
@@ -125,9 +125,9 @@ async def test_too_small_a_stake_and_too_few_tokens_are_told_before_anything_is_
     account = await _newcomer(market, holding=STAKE)
     async with market.chain(account) as chain:
         with pytest.raises(StakeTooSmall, match="9 wn is below") as small:
-            await chain.become_provider("fourth", 9)
+            await chain.lighthouses.become_provider("fourth", 9)
         with pytest.raises(InsufficientTokens, match=f"has {STAKE} of the token") as poor:
-            await chain.become_provider("fourth", STAKE + 1)
+            await chain.lighthouses.become_provider("fourth", STAKE + 1)
         assert await chain.node.web3.eth.get_transaction_count(chain.node.checksum(account.address)) == 0
     assert isinstance(small.value, InputError)
     assert (small.value.hint, poor.value.hint) != ("", "")
@@ -136,9 +136,9 @@ async def test_too_small_a_stake_and_too_few_tokens_are_told_before_anything_is_
 
 async def test_a_lighthouse_is_only_what_the_factory_made(market: Market) -> None:
     async with market.chain() as chain:
-        assert await chain.is_lighthouse("airalab.lighthouse.3.robonomics.eth")
-        assert not await chain.is_lighthouse(market.deployment.xrt)
-        assert not await chain.is_lighthouse(ZERO_ADDRESS)
+        assert await chain.lighthouses.exists("airalab.lighthouse.3.robonomics.eth")
+        assert not await chain.lighthouses.exists(market.deployment.xrt)
+        assert not await chain.lighthouses.exists(ZERO_ADDRESS)
 
 
 async def _first(watching: AsyncGenerator[NewLighthouse, None], count: int) -> list[str]:
@@ -153,7 +153,7 @@ async def _first(watching: AsyncGenerator[NewLighthouse, None], count: int) -> l
 
 async def test_new_lighthouses_are_heard_of_as_they_are_made(market: Market) -> None:
     async with market.chain() as chain:
-        watching = asyncio.create_task(_first(chain.watch_lighthouses(await chain.block_number() + 1), 2))
+        watching = asyncio.create_task(_first(chain.lighthouses.watch(await chain.block_number() + 1), 2))
         await _beacon(market, "fifth")
         await _beacon(market, "sixth")
         assert await watching == ["fifth", "sixth"]
@@ -161,9 +161,9 @@ async def test_new_lighthouses_are_heard_of_as_they_are_made(market: Market) -> 
 
 async def test_those_made_before_are_told_when_asked_for_and_the_list_has_them_too(market: Market) -> None:
     async with market.chain() as chain:
-        listed = [made.name for made in await chain.lighthouses()]
+        listed = [made.name for made in await chain.lighthouses.list()]
         assert listed[0] == "airalab"
-        assert await _first(chain.watch_lighthouses(0), len(listed)) == listed
+        assert await _first(chain.lighthouses.watch(0), len(listed)) == listed
 
 
 async def test_watching_outlives_a_lost_node_and_a_reorganisation() -> None:
@@ -175,10 +175,10 @@ async def test_watching_outlives_a_lost_node_and_a_reorganisation() -> None:
             Chain(flaky, timing=QUICK) as reader,
             Chain(node.provider, account=deployer, timing=QUICK) as chain,
             asyncio.timeout(30),
-            aclosing(reader.watch_lighthouses(await chain.block_number() + 1)) as watching,
+            aclosing(reader.lighthouses.watch(await chain.block_number() + 1)) as watching,
         ):
             heard = asyncio.ensure_future(anext(watching))
-            await chain.create_lighthouse(minimal_stake=1, timeout_blocks=1, name="one")
+            await chain.lighthouses.create(minimal_stake=1, timeout_blocks=1, name="one")
             assert (await heard).name == "one"
             heard = asyncio.ensure_future(anext(watching))
             flaky.is_lost = True
@@ -186,15 +186,15 @@ async def test_watching_outlives_a_lost_node_and_a_reorganisation() -> None:
                 await reader.block_number()
             # The block with the first is replaced by another with the first and the second.
             await node.request("evm_revert", [hex(await chain.block_number() - 1)])
-            await chain.create_lighthouse(minimal_stake=1, timeout_blocks=1, name="one")
-            await chain.create_lighthouse(minimal_stake=1, timeout_blocks=1, name="two")
+            await chain.lighthouses.create(minimal_stake=1, timeout_blocks=1, name="one")
+            await chain.lighthouses.create(minimal_stake=1, timeout_blocks=1, name="two")
             flaky.is_lost = False
             assert (await heard).name == "two"
 
 
 async def test_the_new_lighthouse_is_told_with_its_transaction(market: Market) -> None:
     async with market.chain(market.provider) as chain:
-        made = await chain.create_lighthouse(minimal_stake=1, timeout_blocks=1, name="far")
+        made = await chain.lighthouses.create(minimal_stake=1, timeout_blocks=1, name="far")
     assert isinstance(made, NewLighthouse)
     assert made.name == "far"
     assert made.tx.startswith("0x")

@@ -6,8 +6,9 @@ from typing import Any
 
 import pytest
 
-from mesh.chain import Account, Chain, EmbeddedChain, InvalidName, Sender, UnknownName, deploy, namehash
+from mesh.chain import Account, Chain, InvalidName, Sender, UnknownName, deploy, namehash
 from mesh.chain.names import parse_name, root_of
+from mesh.devchain import EmbeddedChain
 from schemas.cid import parse_cid
 from schemas.errors import InvalidCid
 from tests.mesh.chain.conftest import QUICK, cid
@@ -66,13 +67,13 @@ async def test_a_model_is_a_cid_or_a_name_of_one() -> None:
         deployment = await deploy(node.provider, account)
         places: dict[str, Any] = {"factory": deployment.factory, "xrt": deployment.xrt}
         async with Chain(node.provider, account=account, timing=QUICK, **places) as chain:
-            assert await chain.resolve_model(cid(1)) == cid(1)
+            assert await chain.names.model(cid(1)) == cid(1)
             with pytest.raises(InvalidCid):
-                await chain.resolve_model("Qm")
+                await chain.names.model("Qm")
             with pytest.raises(UnknownName):
-                await chain.resolve_model("sensor.model.5.robonomics.eth")
+                await chain.names.model("sensor.model.5.robonomics.eth")
             sender = Sender(chain.node, account)
             resolver = (await sender.send(to=None, data=_content_resolver(parse_cid(cid(1))))).contract
             registry = chain.node.contract("ENSRegistry", chain.ens)
             await sender.call(registry.functions.setResolver(namehash("3.robonomics.eth"), resolver))
-            assert await chain.resolve_model("Sensor.model.3.robonomics.eth") == cid(1)
+            assert await chain.names.model("Sensor.model.3.robonomics.eth") == cid(1)

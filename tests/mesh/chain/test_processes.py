@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import sys
 
-from mesh.chain import XRT, Account, Chain, deploy, new_private_key, serve_embedded
+from mesh.chain import XRT, Account, Chain, deploy, new_private_key
+from mesh.devchain import serve_embedded
 from tests.mesh.chain.conftest import QUICK
 
 CHILD = """
@@ -15,7 +16,7 @@ from mesh.chain import Account, Chain, Timing
 async def main(url, key, friend, count):
     timing = Timing(poll_interval=0.05, receipt_interval=0.01)
     async with Chain(url, account=Account.from_key(bytes.fromhex(key)), timing=timing) as chain:
-        await asyncio.gather(*(chain.transfer(friend, 1) for _ in range(int(count))))
+        await asyncio.gather(*(chain.tokens.transfer(friend, 1) for _ in range(int(count))))
         print(await chain.block_number())
 
 asyncio.run(main(*sys.argv[1:]))
@@ -62,11 +63,11 @@ async def test_processes_with_accounts_of_their_own_and_with_the_same_one_lose_n
         await deploy(served.node.provider, deployer)
         async with Chain(served.url, account=deployer, timing=QUICK) as chain:
             other = served.node.funded_keys[1]
-            await chain.transfer(Account.from_key(other).address, XRT)
+            await chain.tokens.transfer(Account.from_key(other).address, XRT)
             keys = (served.node.funded_keys[0], other, other)
             ended = await asyncio.gather(*(_child(CHILD, served.url, key.hex(), friend, "8") for key in keys))
             assert [code for code, _ in ended] == [0, 0, 0], ended
-            assert await chain.balance_of(friend) == 24
+            assert await chain.tokens.balance(friend) == 24
 
 
 async def test_deeply_nested_json_is_refused_where_the_chain_is_imported_and_where_it_runs() -> None:

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from aiohttp import web
 
-from mesh.chain import Chain, EmbeddedChain, JsonRpcServer, Node, NodeUnreachable, RequestRefused, WrongChain
+from mesh.chain import Chain, Node, NodeUnreachable, RequestRefused, WrongChain
+from mesh.devchain import EmbeddedChain, JsonRpcServer
 from mesh.errors import ClosedError, ConfigurationError, RemoteError
 from tests.mesh.chain.conftest import QUICK
 from tests.support.nodes import Anvil
@@ -122,7 +123,7 @@ async def test_an_error_that_comes_with_a_http_status_is_still_the_nodes_word() 
         with pytest.raises(RequestRefused, match="limit exceeded") as caught:
             async with Node(url, timing=QUICK):
                 pass
-    assert caught.value.code == -32005
+    assert caught.value.rpc_code == -32005
 
 
 @pytest.mark.parametrize("endpoint", ["", "127.0.0.1:8545", "ftp://127.0.0.1"])

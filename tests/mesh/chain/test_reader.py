@@ -15,7 +15,6 @@ from mesh.chain import (
     Chain,
     ChainWentBack,
     Current,
-    EmbeddedChain,
     Finalized,
     NewLiability,
     NewLighthouse,
@@ -24,9 +23,10 @@ from mesh.chain import (
     Transfer,
     deploy,
 )
-from mesh.chain.embedded import EmbeddedProvider
 from mesh.chain.errors import RequestRefused
-from mesh.chain.jsonrpc import RpcError
+from mesh.devchain import EmbeddedChain
+from mesh.devchain.embedded import EmbeddedProvider
+from mesh.devchain.jsonrpc import RpcError
 from schemas.address import ZERO_ADDRESS
 from tests.mesh.chain.conftest import QUICK, Flaky, events_of, read_to
 
@@ -42,9 +42,9 @@ async def test_a_job_is_told_from_the_liability_to_the_payment(market: Market) -
     cost = 5 * XRT
     async with market.chain(market.provider) as chain:
         start = await chain.block_number()
-        created = await chain.create_liability("airalab", market.demand(cost=cost), market.offer(cost=cost))
+        created = await chain.liabilities.create("airalab", market.demand(cost=cost), market.offer(cost=cost))
         result = market.result(created.liability)
-        settled = await chain.finalize("airalab", result)
+        settled = await chain.liabilities.finalize("airalab", result)
         head = await chain.block_number()
         events = events_of(await read_to(chain, start + 1, head))
     factory = market.deployment.factory
@@ -71,7 +71,7 @@ async def test_lighthouses_are_told_and_those_asked_for_tell_their_turns(market:
 
 async def test_an_approval_is_told(market: Market) -> None:
     async with market.chain(market.promisee) as chain:
-        tx = await chain.approve(market.stranger.address, 17)
+        tx = await chain.tokens.approve(market.stranger.address, 17)
         head = await chain.block_number()
         assert events_of(await read_to(chain, head, head)) == [
             Approval(market.promisee.address, market.stranger.address, 17, tx)
@@ -80,10 +80,10 @@ async def test_an_approval_is_told(market: Market) -> None:
 
 async def test_a_refund_is_told_without_a_result(market: Market) -> None:
     async with market.chain(market.provider) as chain:
-        created = await chain.create_liability("airalab", market.demand(cost=1), market.offer(cost=1))
-        while await chain.block_number() + 1 < await chain.refundable_from(created.liability):
-            await chain.approve(market.stranger.address, 0)
-        settled = await chain.refund(created.liability)
+        created = await chain.liabilities.create("airalab", market.demand(cost=1), market.offer(cost=1))
+        while await chain.block_number() + 1 < await chain.liabilities.refundable_from(created.liability):
+            await chain.tokens.approve(market.stranger.address, 0)
+        settled = await chain.liabilities.refund(created.liability)
         head = await chain.block_number()
         events = events_of(await read_to(chain, head, head))
     assert Finalized(created.liability, False, "", settled.tx) in events
@@ -91,7 +91,7 @@ async def test_a_refund_is_told_without_a_result(market: Market) -> None:
 
 async def test_block_numbers_grow_and_the_head_is_told_withoutevents_of(market: Market) -> None:
     async with market.chain(market.promisee) as chain:
-        await chain.send_eth(market.stranger.address, 1)
+        await chain.tokens.send_eth(market.stranger.address, 1)
         head = await chain.block_number()
         blocks = await read_to(chain, 0, head)
     numbers = [block.block_number for block in blocks]
@@ -103,8 +103,8 @@ async def test_reading_goes_on_with_new_blocks_and_a_cursor_takes_it_up(market: 
     async with market.chain(market.promisee) as chain:
         cursor = await chain.block_number() + 1
         reading = asyncio.create_task(read_to(chain, cursor, cursor + 1))
-        await chain.approve(market.stranger.address, 1)
-        await chain.approve(market.stranger.address, 2)
+        await chain.tokens.approve(market.stranger.address, 1)
+        await chain.tokens.approve(market.stranger.address, 2)
         live = await reading
         again = await read_to(chain, cursor, cursor + 1)
         rest = await read_to(chain, cursor + 1, cursor + 1)
@@ -127,13 +127,15 @@ async def test_a_finalized_event_of_somebody_elses_contract_is_not_told(market: 
     elsewhere: dict[str, Any] = {"lighthouse": other.lighthouse, "token": other.xrt}
     options = {"ens": other.ens}
     async with market.chain(market.deployer, **options) as theirs:
-        await theirs.transfer(market.provider.address, XRT)
+        await theirs.tokens.transfer(market.provider.address, XRT)
     async with market.chain(market.provider, **options) as theirs, market.chain() as ours:
         start = await theirs.block_number()
-        await theirs.approve(other.lighthouse, XRT)
-        await theirs.refill(other.lighthouse, XRT)
-        created = await theirs.create_liability(other.lighthouse, market.demand(**elsewhere), market.offer(**elsewhere))
-        await theirs.finalize(other.lighthouse, market.result(created.liability))
+        await theirs.tokens.approve(other.lighthouse, XRT)
+        await theirs.lighthouses.refill(other.lighthouse, XRT)
+        created = await theirs.liabilities.create(
+            other.lighthouse, market.demand(**elsewhere), market.offer(**elsewhere)
+        )
+        await theirs.liabilities.finalize(other.lighthouse, market.result(created.liability))
         head = await theirs.block_number()
         assert [type(event) for event in events_of(await read_to(theirs, start + 1, head))][-1] is Finalized
         assert events_of(await read_to(ours, start + 1, head)) == []
@@ -162,7 +164,7 @@ async def test_a_node_that_refuses_long_ranges_is_asked_for_shorter_ones() -> No
         deployer = await _prepare_lonely(node)
         async with Chain(node.provider, account=deployer, timing=QUICK) as chain:
             for value in range(25):
-                await chain.approve(deployer.address, value)
+                await chain.tokens.approve(deployer.address, value)
             everything = events_of(await read_to(chain, 0, await chain.block_number()))
         choosy = _Choosy(node, limit=10)
         async with Chain(choosy, timing=QUICK) as chain:
@@ -191,7 +193,7 @@ async def test_a_lost_node_ends_the_reading_and_the_cursor_takes_it_up() -> None
         flaky = Flaky(node)
         async with Chain(flaky, timing=QUICK) as chain:
             head = await chain.block_number()
-            events = chain.events(head + 1)
+            events = chain.follow(head + 1)
             waiting = asyncio.create_task(anext(events))
             flaky.is_lost = True
             with pytest.raises(NodeUnreachable, match="wire is cut"):

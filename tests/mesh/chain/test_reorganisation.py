@@ -15,7 +15,6 @@ from mesh.chain import (
     BlockEvents,
     Chain,
     ChainWentBack,
-    EmbeddedChain,
     History,
     Node,
     NodeUnreachable,
@@ -24,6 +23,7 @@ from mesh.chain import (
     deploy,
 )
 from mesh.chain.history import Remembered
+from mesh.devchain import EmbeddedChain
 from mesh.errors import ConfigurationError, InputError
 from tests.mesh.chain.conftest import QUICK
 from tests.support.nodes import Anvil
@@ -44,7 +44,7 @@ class Fork:
 
     async def approve(self, value: int) -> int:
         """Make one event, in a block of its own; the block's number."""
-        await self.chain.approve(self.friend, value)
+        await self.chain.tokens.approve(self.friend, value)
         return await self.chain.block_number()
 
     async def replace_last(self, blocks: int) -> None:
@@ -109,7 +109,7 @@ def _values(events: tuple[ChainEvent, ...]) -> list[int]:
 async def test_events_of_replaced_blocks_are_taken_back_newest_first_before_the_new_ones(fork: Fork) -> None:
     chain = fork.chain
     start = await fork.approve(1)
-    async with aclosing(chain.events(start)) as events:
+    async with aclosing(chain.follow(start)) as events:
         first = await _until(events, _reaches(start))
         for value in (2, 3):
             head = await fork.approve(value)
@@ -129,13 +129,13 @@ async def test_events_of_replaced_blocks_are_taken_back_newest_first_before_the_
 async def test_a_reorganisation_while_nobody_read_is_told_first_with_the_history_that_was_kept(fork: Fork) -> None:
     chain, history = fork.chain, History()
     start = await fork.approve(1)
-    async with aclosing(chain.events(start, history=history)) as events:
+    async with aclosing(chain.follow(start, history=history)) as events:
         await _until(events, _reaches(start))
         head = await fork.approve(2)
         await _until(events, _reaches(head))
     await fork.replace_last(1)
     kept = History.decode(history.encode())
-    async with aclosing(chain.events(head + 1, history=kept)) as events:
+    async with aclosing(chain.follow(head + 1, history=kept)) as events:
         back = await anext(events)
         assert isinstance(back, Reorganised)
         assert (back.back_to, _values(back.events_taken_back)) == (start, [2])
@@ -145,13 +145,13 @@ async def test_a_reorganisation_while_nobody_read_is_told_first_with_the_history
 async def test_without_a_history_a_new_iterator_only_looks_forward(fork: Fork) -> None:
     head = await fork.approve(1)
     await fork.replace_last(1)
-    async with aclosing(fork.chain.events(head + 1)) as events:
+    async with aclosing(fork.chain.follow(head + 1)) as events:
         assert await anext(events) == BlockEvents(head + 1, ())
 
 
 async def test_a_reorganisation_of_eventless_blocks_takes_nothing_back(fork: Fork) -> None:
     start = await fork.approve(1)
-    async with aclosing(fork.chain.events(start)) as events:
+    async with aclosing(fork.chain.follow(start)) as events:
         await _until(events, _reaches(start))
         await fork.request("evm_mine")
         await _until(events, _reaches(start + 1))
@@ -163,7 +163,7 @@ async def test_a_reorganisation_of_eventless_blocks_takes_nothing_back(fork: For
 async def test_a_reorganisation_of_the_whole_depth_is_unwound_and_a_deeper_one_is_an_error(fork: Fork) -> None:
     chain, history = fork.chain, History(depth=3)
     start = await fork.approve(1)
-    async with aclosing(chain.events(start, history=history)) as events:
+    async with aclosing(chain.follow(start, history=history)) as events:
         await _until(events, _reaches(start))
         for value in (2, 3, 4):
             head = await fork.approve(value)
@@ -187,10 +187,10 @@ async def test_a_block_that_was_handled_in_part_is_told_again_or_taken_back(fork
     chain, history = fork.chain, History()
     start = await fork.approve(1)
     for wanted in ([1], [1]):
-        async with aclosing(chain.events(start, history=history)) as events:
+        async with aclosing(chain.follow(start, history=history)) as events:
             assert _values((await anext(events)).events) == wanted
     await fork.replace_last(1)
-    async with aclosing(chain.events(start, history=history)) as events:
+    async with aclosing(chain.follow(start, history=history)) as events:
         back = await anext(events)
     assert isinstance(back, Reorganised)
     assert (back.back_to, _values(back.events_taken_back)) == (start - 1, [1])
@@ -201,12 +201,12 @@ async def test_a_node_that_is_behind_is_waited_for_by_who_read_further(fork: For
     chain, history = fork.chain, History()
     for value in (1, 2, 3):
         head = await fork.approve(value)
-    async with aclosing(chain.events(head - 2, history=history)) as events:
+    async with aclosing(chain.follow(head - 2, history=history)) as events:
         await _until(events, _reaches(head))
     history.remember(Remembered(head + 2, bytes(32), ()))
     with pytest.raises(ChainWentBack):
-        await anext(chain.events(head + 3))
-    async with aclosing(chain.events(head + 3, history=history)) as events:
+        await anext(chain.follow(head + 3))
+    async with aclosing(chain.follow(head + 3, history=history)) as events:
         waiting = asyncio.create_task(anext(events))
         await asyncio.sleep(10 * QUICK.poll_interval)
         assert not waiting.done()
@@ -234,7 +234,7 @@ async def test_a_node_that_is_killed_and_started_from_its_state_takes_back_what_
         async with Chain(anvil.url, account=account, timing=replace(QUICK, attempts=1)) as chain:
             fork = Fork(chain, friend.address)
             kept = await fork.approve(1)
-            async with aclosing(chain.events(kept, history=history)) as events:
+            async with aclosing(chain.follow(kept, history=history)) as events:
                 await _until(events, _reaches(kept))
                 # The file is written once a second: two writings later it holds the block.
                 for _ in range(2):
@@ -249,7 +249,7 @@ async def test_a_node_that_is_killed_and_started_from_its_state_takes_back_what_
             await asyncio.to_thread(anvil.start)
             assert await chain.block_number() == kept
             await fork.approve(3)
-            async with aclosing(chain.events(lost + 1, history=history)) as events:
+            async with aclosing(chain.follow(lost + 1, history=history)) as events:
                 back, new = await anext(events), await anext(events)
     assert isinstance(back, Reorganised)
     assert (back.back_to, _values(back.events_taken_back)) == (kept, [2])
@@ -261,7 +261,7 @@ async def test_a_chain_started_afresh_is_not_taken_for_the_one_that_was_read() -
     async with Anvil() as anvil, Node(anvil.url, timing=QUICK) as node:
         account = Account.from_key(anvil.private_keys[0])
         await deploy(node, account)
-        async with Chain(node) as chain, aclosing(chain.events(5, history=history)) as events:
+        async with Chain(node) as chain, aclosing(chain.follow(5, history=history)) as events:
             await _until(events, _reaches(await chain.block_number()))
             head = await chain.block_number()
         await asyncio.to_thread(anvil.stop)
@@ -271,7 +271,7 @@ async def test_a_chain_started_afresh_is_not_taken_for_the_one_that_was_read() -
         await deploy(node, account)
         async with Chain(node) as chain:
             with pytest.raises(ReorganisedTooDeep, match="no block 4") as caught:
-                await anext(chain.events(head + 1, history=history))
+                await anext(chain.follow(head + 1, history=history))
     assert "fresh data_dir" in caught.value.hint
 
 

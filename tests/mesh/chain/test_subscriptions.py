@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 from web3 import AsyncWeb3, WebSocketProvider
 
-from mesh.chain import XRT, Account, Chain, Deployment, EmbeddedChain, JsonRpcServer, Node, Sender, deploy
+from mesh.chain import XRT, Account, Chain, Deployment, Node, Sender, deploy
 from schemas.keccak import keccak256
 from tests.mesh.chain.conftest import QUICK
 from tests.mesh.chain.pushing import connected, node, server
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
+
+    from mesh.devchain import EmbeddedChain, JsonRpcServer
 
 
 __all__ = ["node", "server"]
@@ -37,8 +39,8 @@ async def test_web3_hears_of_new_heads_and_of_the_logs_that_it_asked_for(
         heads = await web3.eth.subscribe("newHeads")
         logs = await web3.eth.subscribe("logs", {"address": deployment.xrt, "topics": [TRANSFER]})
         before = await web3.eth.block_number
-        await chain.approve(deployment.factory, 7)
-        tx = await chain.transfer(deployment.factory, 5)
+        await chain.tokens.approve(deployment.factory, 7)
+        tx = await chain.tokens.transfer(deployment.factory, 5)
         heard: dict[str, list[Any]] = {heads: [], logs: []}
         async with asyncio.timeout(30):
             async for message in web3.socket.process_subscriptions():
@@ -94,11 +96,11 @@ async def test_logs_of_replaced_blocks_are_removed_before_those_of_the_new_ones_
     async with token(node) as (chain, deployment), connected(server) as client:
         subscription = await client.subscribe("logs", {"address": deployment.xrt})
         for value in (1, 2):
-            await chain.approve(deployment.factory, value)
+            await chain.tokens.approve(deployment.factory, value)
         told = [await client.notified(subscription) for _ in range(2)]
         await node.request("evm_revert", [hex(await chain.block_number() - 2)])
         await node.mine(2)
-        await chain.approve(deployment.factory, 3)
+        await chain.tokens.approve(deployment.factory, 3)
         told += [await client.notified(subscription) for _ in range(3)]
     assert [(int(log["data"], 16), log["removed"]) for log in told] == [
         (1, False),

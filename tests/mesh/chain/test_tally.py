@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.chain import XRT, Account, Chain, EmbeddedChain, Node, NodeUnreachable, Reverted, Sender, deploy
-from mesh.chain.embedded import EmbeddedProvider
+from mesh.chain import XRT, Account, Chain, Node, NodeUnreachable, Reverted, Sender, deploy
 from mesh.chain.tally import Fate
+from mesh.devchain import EmbeddedChain
+from mesh.devchain.embedded import EmbeddedProvider
 from tests.mesh.chain.conftest import QUICK
 from tests.mesh.chain.lives import anvil, ask, life, stranger, until_waiting
 
@@ -60,7 +61,7 @@ async def test_what_the_contracts_would_refuse_is_never_sent_and_costs_nothing(n
     await deploy(node.provider, deployer)
     async with Chain(node.provider, account=friend, timing=QUICK) as chain:
         with pytest.raises(Reverted, match="ERC20InsufficientBalance"):
-            await chain.transfer(deployer.address, XRT)
+            await chain.tokens.transfer(deployer.address, XRT)
         counted = chain.node.tally.statistics()
         assert counted.transactions == NONE | {"refused": 1}
         assert (counted.gas_used, counted.wei) == (0, 0)

@@ -16,8 +16,10 @@ pytestmark = pytest.mark.asyncio(loop_scope="module")
 
 async def test_the_networks_token_is_described_by_itself(market: Market) -> None:
     async with market.chain() as chain:
-        token = await chain.token()
-        assert token == await chain.token("xrt.5.robonomics.eth") == await chain.token(market.deployment.xrt)
+        token = await chain.tokens.info()
+        assert (
+            token == await chain.tokens.info("xrt.5.robonomics.eth") == await chain.tokens.info(market.deployment.xrt)
+        )
     assert (token.address, token.symbol, token.name) == (market.deployment.xrt, "XRT", "Robonomics")
     assert 10**token.decimals == XRT
     assert token.total_supply >= 1_000_000 * XRT
@@ -26,7 +28,7 @@ async def test_the_networks_token_is_described_by_itself(market: Market) -> None
 async def test_what_is_no_token_is_one_clear_error(market: Market) -> None:
     async with market.chain() as chain:
         with pytest.raises(NoContracts, match="totalSupply"):
-            await chain.token(market.stranger.address)
+            await chain.tokens.info(market.stranger.address)
 
 
 async def _deployed(market: Market, runtime: bytes) -> str:
@@ -46,7 +48,7 @@ def _answering(word: bytes) -> bytes:
 async def test_a_token_of_the_first_years_answers_its_symbol_as_32_bytes(market: Market) -> None:
     address = await _deployed(market, _answering(b"MKR"))
     async with market.chain() as chain:
-        token = await chain.token(address)
+        token = await chain.tokens.info(address)
     assert (token.symbol, token.name) == ("MKR", "MKR")
     assert token.decimals == 0, "what is no number of decimals is none"
 
@@ -56,10 +58,12 @@ async def test_a_token_that_says_nothing_has_no_symbol_and_whole_units(market: M
     supply = bytes.fromhex("60003560e01c6318160ddd14601357600080fd5b600760005260206000f3")
     address = await _deployed(market, supply)
     async with market.chain() as chain:
-        assert await chain.token(address) == Token(address=address, symbol="", name="", decimals=0, total_supply=7)
+        assert await chain.tokens.info(address) == Token(
+            address=address, symbol="", name="", decimals=0, total_supply=7
+        )
 
 
 async def test_what_a_token_calls_itself_can_not_write_to_a_terminal(market: Market) -> None:
     address = await _deployed(market, _answering(b"\x1b[31mXRT\n\xe2\x80\xae"))
     async with market.chain() as chain:
-        assert (await chain.token(address)).symbol == "[31mXRT"
+        assert (await chain.tokens.info(address)).symbol == "[31mXRT"

@@ -12,7 +12,6 @@ from mesh.chain import (
     XRT,
     Account,
     Chain,
-    EmbeddedChain,
     Node,
     NodeUnreachable,
     Reverted,
@@ -21,8 +20,9 @@ from mesh.chain import (
     deploy,
     new_private_key,
 )
-from mesh.chain.embedded import EmbeddedProvider
 from mesh.chain.transports import HttpTransport
+from mesh.devchain import EmbeddedChain
+from mesh.devchain.embedded import EmbeddedProvider
 from tests.mesh.chain.conftest import QUICK
 from tests.support.nodes import Anvil
 
@@ -104,11 +104,11 @@ async def test_what_fails_only_when_mined_is_explained(node: EmbeddedChain) -> N
         Chain(wire, account=friend, timing=QUICK) as chain,
         Chain(node.provider, account=deployer, timing=QUICK) as rival,
     ):
-        await rival.transfer(friend.address, XRT)
-        await chain.approve(deployer.address, XRT)
-        wire.before = lambda: rival.transfer_from(friend.address, deployer.address, XRT)
+        await rival.tokens.transfer(friend.address, XRT)
+        await chain.tokens.approve(deployer.address, XRT)
+        wire.before = lambda: rival.tokens.transfer_from(friend.address, deployer.address, XRT)
         with pytest.raises(Reverted, match="ERC20InsufficientBalance") as caught:
-            await chain.transfer(deployment.factory, XRT)
+            await chain.tokens.transfer(deployment.factory, XRT)
         assert caught.value.arguments == (friend.address, 0, XRT)
 
 

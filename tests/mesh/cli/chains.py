@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 from click.testing import CliRunner
 from eth_keyfile.keyfile import create_keyfile_json
 
-from mesh.chain import XRT, Account, Chain, DeploymentPlan, Timing, deploy, serve_embedded
+from mesh.chain import XRT, Account, Chain, DeploymentPlan, Timing, deploy
 from mesh.cli import main
+from mesh.devchain import serve_embedded
 from schemas import Demand, Offer, Result, cid_of_bytes
 from schemas.address import ZERO_ADDRESS
 
@@ -160,14 +161,14 @@ class Town:
         offer = Offer(**terms, nonce=secrets.token_hex(32), lighthouse_fee=fees.get("lighthouse_fee", 0))
         signed = self.people["person"].account.signer.sign(demand), self.people["robot"].account.signer.sign(offer)
         lighthouse = self.deployment.lighthouse
-        return self.ask("provider", lambda chain: chain.create_liability(lighthouse, *signed)).liability
+        return self.ask("provider", lambda chain: chain.liabilities.create(lighthouse, *signed)).liability
 
     def finish(self, liability: str, *, success: bool = True) -> str:
         """Bring the robot's result; its CID."""
         cid = cid_of_bytes(b"a recording")
         result = Result(liability=liability, result=cid, success=success)
         signed = self.people["robot"].account.signer.sign(result)
-        self.ask("provider", lambda chain: chain.finalize(self.deployment.lighthouse, signed))
+        self.ask("provider", lambda chain: chain.liabilities.finalize(self.deployment.lighthouse, signed))
         return cid
 
     async def _found(self) -> None:
@@ -186,12 +187,12 @@ class Town:
         lighthouse = self.deployment.lighthouse
         async with self.chain("provider") as chain:
             for role in ("robot", "person"):
-                await chain.transfer(self.people[role].address, MONEY)
-            await chain.approve(lighthouse, 100 * XRT)
-            await chain.refill(lighthouse, 100 * XRT)
+                await chain.tokens.transfer(self.people[role].address, MONEY)
+            await chain.tokens.approve(lighthouse, 100 * XRT)
+            await chain.lighthouses.refill(lighthouse, 100 * XRT)
         for role in ("robot", "person"):
             async with self.chain(role) as chain:
-                await chain.approve(chain.factory, MONEY)
+                await chain.tokens.approve(chain.factory, MONEY)
 
 
 def refused(done: Done, code: int, words: str) -> str:

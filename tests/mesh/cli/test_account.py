@@ -174,7 +174,7 @@ def test_show_asks_the_chain_for_what_the_account_holds(town: Town) -> None:
     told = town.told("account", "show", person.keyfile, "--balance", AIRA_KEYFILE="")
     assert told == {
         "address": person.address,
-        "wei": str(town.ask("person", lambda chain: chain.eth_balance())),
+        "wei": str(town.ask("person", lambda chain: chain.tokens.eth_balance())),
         "wn": str(1_000 * XRT),
         "nonce": 0,
     }

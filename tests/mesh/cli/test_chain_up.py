@@ -17,7 +17,7 @@ from web3.types import RPCEndpoint
 
 from mesh.chain import XRT, Chain
 from mesh.cli import main
-from mesh.demo.development import serve_chain
+from mesh.devchain.development import serve_chain
 from mesh.settings import Settings
 from tests.mesh.cli.chains import columns, refused
 from tests.support.commands import AIRA, SOON, Serving, aira
@@ -181,8 +181,8 @@ async def test_a_transaction_that_is_not_mined_can_be_left_and_is_not_sent_twice
                 code, seconds = await asyncio.to_thread(waiting.end, signal.SIGINT)
                 assert (code, seconds < SOON) == (130, True), waiting.log()
                 assert "Traceback" not in waiting.log()
-            assert await chain.balance_of(NOBODY) == 0
+            assert await chain.tokens.balance(NOBODY) == 0
             await chain.node.web3.provider.make_request(RPCEndpoint("evm_setAutomine"), [True])
             done = await asyncio.to_thread(aira, *command, **person)
             assert done.returncode == 0, done.stderr
-            assert await chain.balance_of(NOBODY) == 2 * XRT
+            assert await chain.tokens.balance(NOBODY) == 2 * XRT

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.chain import XRT
+from mesh.chain import XRT, Sender
 from mesh.chain.artifacts import load_artifact
 from schemas import Liability
 from tests.mesh.cli.chains import REFUND_DELAY, Town, columns, refused
@@ -21,7 +21,7 @@ COST = 1_500_000_000
 
 
 def held(town: Town, role: str) -> int:
-    return town.ask(role, lambda chain: chain.balance_of())
+    return town.ask(role, lambda chain: chain.tokens.balance())
 
 
 def signature_of(town: Town, role: str, liability: str) -> str:
@@ -48,7 +48,7 @@ def test_json_is_the_record_of_the_wire_and_a_state(town: Town) -> None:
     told = town.told("liability", "show", address)
     assert (told.pop("state"), told.pop("refundableFrom") > 0) == ("open", True)
     record = Liability.decode(json.dumps(told).encode())
-    assert record == town.ask("robot", lambda chain: chain.liability(address))
+    assert record == town.ask("robot", lambda chain: chain.liabilities.get(address))
     cid = town.finish(address)
     told = town.told("liability", "show", address)
     assert (told["state"], told["result"], told["refundableFrom"]) == ("paid", cid, None)
@@ -184,9 +184,10 @@ def test_a_token_of_another_name_is_not_taken_for_xrt(town: Town) -> None:
             artifact = load_artifact("XRT")
             contract = chain.node.web3.eth.contract(abi=artifact.abi, bytecode=artifact.bytecode)
             data = bytes.fromhex(contract.constructor(1_000 * XRT).data_in_transaction[2:])
-            receipt = await chain._signing().send(to=None, data=data)
+            assert chain.account is not None
+            receipt = await Sender(chain.node, chain.account).send(to=None, data=data)
             assert receipt.contract is not None
-            await chain.approve(chain.factory, XRT, token=receipt.contract)
+            await chain.tokens.approve(chain.factory, XRT, token=receipt.contract)
             return receipt.contract
 
     token = town.run(forge())

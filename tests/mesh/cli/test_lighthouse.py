@@ -16,7 +16,7 @@ _numbers = count(1)
 def market(town: Town) -> str:
     """A lighthouse of this test's own: two XRT at least, ten blocks."""
     name = f"market-{next(_numbers)}"
-    town.ask("provider", lambda chain: chain.create_lighthouse(minimal_stake=2 * XRT, timeout_blocks=10, name=name))
+    town.ask("provider", lambda chain: chain.lighthouses.create(minimal_stake=2 * XRT, timeout_blocks=10, name=name))
     return name
 
 
@@ -58,10 +58,10 @@ def test_the_list_has_a_line_for_each_since_a_block(town: Town, market: str) -> 
 
 def test_joining_approves_what_is_missing_and_leaving_gives_it_back(town: Town, market: str) -> None:
     person = town.people["person"].address
-    before = town.ask("person", lambda chain: chain.balance_of())
+    before = town.ask("person", lambda chain: chain.tokens.balance())
     said = columns(town.aira("lighthouse", "join", market, "5").stdout)
     assert (said["stake"], said["a turn"]) == ("5 XRT", "2 transactions")
-    assert town.ask("person", lambda chain: chain.balance_of()) == before - 5 * XRT
+    assert town.ask("person", lambda chain: chain.tokens.balance()) == before - 5 * XRT
     more = town.told("lighthouse", "join", market, "1000000000wn")
     assert (more["stake"], more["quota"], more["isProvider"]) == (str(6 * XRT), 3, True)
     less = town.told("lighthouse", "leave", market, "2")
@@ -69,7 +69,7 @@ def test_joining_approves_what_is_missing_and_leaving_gives_it_back(town: Town, 
     said = columns(town.aira("lighthouse", "leave", market).stdout)
     assert said["stake"] == "0 XRT"
     assert said["provider"] == f"{person}  (no more)"
-    assert town.ask("person", lambda chain: chain.balance_of()) == before
+    assert town.ask("person", lambda chain: chain.tokens.balance()) == before
 
 
 def test_taking_off_so_much_that_too_little_remains_takes_all(town: Town, market: str) -> None:

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.agent import Agent
-from mesh.agent.parts import load_account
 from mesh.cli.demand import _demand
 from mesh.cli.provider import _serve as serve_provider
 from mesh.cli.router import _serve as serve_router
 from mesh.cli.up import _serve as serve_up
+from mesh.composition import load_account
 from mesh.errors import AiraError, ConfigurationError, NetworkUnavailable
 from mesh.settings import Settings
 from schemas import cid_of_bytes, cid_of_file

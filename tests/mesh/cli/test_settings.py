@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from mesh.cli import main
-from mesh.settings import Settings, load
+from mesh.settings import OPTIONS, Settings, load
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -39,7 +39,7 @@ def test_the_plain_form_is_a_settings_file(tmp_path: Path) -> None:
     assert loaded.connect == ("tcp/robots.example:7447",)
     assert loaded.poll_interval == 0.5
     assert loaded.enable_executor is False
-    assert set(tomllib.loads(done.stdout)) == set(Settings.__struct_fields__)
+    assert set(tomllib.loads(done.stdout)) == set(OPTIONS)
     assert "# seconds between two looks for new blocks\n" in done.stdout
 
 
@@ -87,6 +87,6 @@ def test_an_unknown_option_in_the_file_names_the_nearest(tmp_path: Path) -> None
 
 def test_every_option_is_a_flag_with_its_meaning_and_default() -> None:
     text = " ".join(settings("--help").stdout.split())
-    for name in Settings.__struct_fields__:
+    for name in OPTIONS:
         assert f"--{name.replace('_', '-')} " in text
     assert "[recorded]" in text

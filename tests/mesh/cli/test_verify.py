@@ -12,12 +12,12 @@ import zenoh
 from click.testing import CliRunner
 
 from mesh.agent import Agent
-from mesh.agent.parts import load_account
 from mesh.cli import main
 from mesh.cli.demand import _demand
 from mesh.cli.replay import Replay, _replay
 from mesh.cli.up import _serve as serve_up
 from mesh.cli.verify import Files, _verify
+from mesh.composition import load_account
 from mesh.errors import AiraError
 from mesh.settings import Settings
 from schemas import cid_of_bytes

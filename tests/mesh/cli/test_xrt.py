@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.chain import XRT, Account, new_private_key
+from mesh.chain import XRT, Account, Sender, new_private_key
 from mesh.chain.artifacts import load_artifact
 from tests.mesh.cli.chains import MONEY, Town, columns, refused, write_quick_keyfile
 from tests.support.ports import free_port
@@ -18,7 +18,7 @@ NOBODY = "0x00000000000000000000000000000000000000AA"
 
 
 def held(town: Town, who: str) -> int:
-    return town.ask("provider", lambda chain: chain.balance_of(who))
+    return town.ask("provider", lambda chain: chain.tokens.balance(who))
 
 
 @pytest.fixture
@@ -75,7 +75,8 @@ async def _deploy_token(town: Town) -> str:
         artifact = load_artifact("XRT")
         contract = chain.node.web3.eth.contract(abi=artifact.abi, bytecode=artifact.bytecode)
         data = bytes.fromhex(contract.constructor(123_450_000_000).data_in_transaction[2:])
-        receipt = await chain._signing().send(to=None, data=data)
+        assert chain.account is not None
+        receipt = await Sender(chain.node, chain.account).send(to=None, data=data)
         assert receipt.contract is not None
         return receipt.contract
 
@@ -141,6 +142,6 @@ def test_what_was_received_can_be_sent_on(town: Town, tmp_path: Path) -> None:
     key = new_private_key()
     address = Account.from_key(key).address
     keyfile = write_quick_keyfile(tmp_path / "new.json", key)
-    town.ask("provider", lambda chain: chain.send_eth(address, 10**18))
+    town.ask("provider", lambda chain: chain.tokens.send_eth(address, 10**18))
     assert town.aira("xrt", "transfer", address, "3").exit_code == 0
     assert town.told("xrt", "transfer", NOBODY, "1", AIRA_KEYFILE=str(keyfile))["balance"] == str(2 * XRT)

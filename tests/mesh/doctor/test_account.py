@@ -79,11 +79,11 @@ async def test_a_provider_without_a_stake_is_told_how_to_get_one(ward: Ward) -> 
 
 async def test_a_missing_allowance_is_named_with_the_command_that_gives_it(ward: Ward) -> None:
     person = await ward.examined("person", "person")
-    ward.town.ask("person", lambda chain: chain.approve(chain.factory, 0))
+    ward.town.ask("person", lambda chain: chain.tokens.approve(chain.factory, 0))
     try:
         without = await ward.examined("person", "person")
     finally:
-        ward.town.ask("person", lambda chain: chain.approve(chain.factory, 1_000 * XRT))
+        ward.town.ask("person", lambda chain: chain.tokens.approve(chain.factory, 1_000 * XRT))
 
     assert person.one("allowance").found == "the factory may take 1,000 XRT"
     finding = without.one("allowance")
@@ -99,8 +99,8 @@ async def test_the_turn_of_another_is_told(router: EmbeddedRouter, anvil: Anvil,
     for account in (first, second):
         async with Chain(anvil.url, account=account, timing=TIMING) as chain:
             if account is first:
-                await chain.transfer(second.address, 100 * XRT)
-            await chain.become_provider(deployed.lighthouse, 10 * XRT)
+                await chain.tokens.transfer(second.address, 100 * XRT)
+            await chain.lighthouses.become_provider(deployed.lighthouse, 10 * XRT)
     write_keyfile(tmp_path / "second.json", anvil.private_keys[1], PASSWORD)
     (tmp_path / "password").write_text(PASSWORD)
     (tmp_path / "password").chmod(0o600)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
 import zenoh
-from msgspec.structs import replace
 
 from mesh.doctor import Case
 from mesh.identity import Member

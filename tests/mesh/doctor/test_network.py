@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import http.server
 import socket
 import threading
 from typing import TYPE_CHECKING
 
-import msgspec
 import pytest
 import zenoh
 
@@ -134,7 +134,7 @@ def leaky(site: Site) -> Iterator[str]:
 
 async def test_each_router_of_a_site_is_tried_and_the_one_that_forbids_nothing_is_named(site: Site, leaky: str) -> None:
     arm = site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
-    settings = msgspec.structs.replace(settings_of(site.client(arm)), connect=(site.endpoint, leaky))
+    settings = dataclasses.replace(settings_of(site.client(arm)), connect=(site.endpoint, leaky))
     with site.open_router("wheel"):
         found = await examined(Case(settings=settings, asked_role="operator"))
 

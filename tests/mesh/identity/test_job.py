@@ -70,7 +70,7 @@ async def test_a_running_job_is_done_and_paid_while_one_is_revoked_and_another_r
         await may_work.wait()
 
     async with asyncio.timeout(3 * PATIENCE), router(site) as door, provider, robot, person:
-        before = await person.parts.chain.balance_of(market.address("robot"))
+        before = await person.parts.chain.tokens.balance(market.address("robot"))
         order = await person.demand(market.job("word"), cost=COST)
         await until(lambda: done, what="the job under way", seconds=PATIENCE)
 
@@ -82,4 +82,4 @@ async def test_a_running_job_is_done_and_paid_while_one_is_revoked_and_another_r
 
         assert (await order.outcome()).success
         assert done == ["word"]
-        assert await person.parts.chain.balance_of(market.address("robot")) == before + COST - FEE
+        assert await person.parts.chain.tokens.balance(market.address("robot")) == before + COST - FEE

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import msgspec
 import pytest
 
 from mesh.errors import ConfigurationError
@@ -42,7 +42,7 @@ def site(tmp_path: Path) -> Site:
 
 def linked(site: Site, own: MemberFolder, port: int) -> Settings:
     """The settings of a second router, which keeps a link to the site's first."""
-    return msgspec.structs.replace(
+    return dataclasses.replace(
         site.settings(),
         listen=(f"tls/127.0.0.1:{port}",),
         link=(site.endpoint,),
@@ -102,9 +102,9 @@ async def test_who_is_no_router_in_the_roster_links_nothing(site: Site) -> None:
 
 
 def test_a_link_that_shows_no_certificate_is_refused(site: Site) -> None:
-    settings = msgspec.structs.replace(site.settings(), link=("tcp/192.0.2.1:7447",))
+    settings = dataclasses.replace(site.settings(), link=("tcp/192.0.2.1:7447",))
 
     with pytest.raises(ConfigurationError, match="does not tell who connects"):
         router_endpoints(settings)
     with pytest.raises(ConfigurationError, match="without a roster a router listens on loopback only"):
-        router_endpoints(msgspec.structs.replace(settings, roster="", listen=("tcp/127.0.0.1:1",)))
+        router_endpoints(dataclasses.replace(settings, roster="", listen=("tcp/127.0.0.1:1",)))

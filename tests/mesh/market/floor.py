@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import zenoh
     from web3.providers.async_base import AsyncBaseProvider
 
-    from mesh.demo.market import Market
+    from mesh.devchain.market import Market
     from schemas import Liability, SignedMessage
 
 QUICK = Timing(poll_interval=0.02, receipt_interval=0.01, attempts=1, retry_delay=0.01)
@@ -77,13 +77,13 @@ class Floor:
     async def found_lighthouse(self, *, timeout_blocks: int, **stakes: int) -> None:
         """Make a lighthouse where the named accounts stake so many transactions a turn, and trade there."""
         async with self.chain_of("provider") as chain:
-            made = await chain.create_lighthouse(
+            made = await chain.lighthouses.create(
                 minimal_stake=STAKE,
                 timeout_blocks=timeout_blocks,
                 name=f"test-{next(_names)}",
             )
             for role, turns in stakes.items():
-                await chain.transfer(self.address(role), turns * STAKE)
+                await chain.tokens.transfer(self.address(role), turns * STAKE)
         for role, turns in stakes.items():
             await self.stake(role, made.lighthouse, turns)
         await self.trade_at(made.lighthouse, f"{made.name}.lighthouse.3.robonomics.eth")
@@ -91,8 +91,8 @@ class Floor:
     async def stake(self, role: str, lighthouse: str, turns: int) -> None:
         """Stake so many transactions a turn, which the account must have."""
         async with self.chain_of(role) as chain:
-            await chain.approve(lighthouse, turns * STAKE)
-            await chain.refill(lighthouse, turns * STAKE)
+            await chain.tokens.approve(lighthouse, turns * STAKE)
+            await chain.lighthouses.refill(lighthouse, turns * STAKE)
 
     def address(self, role: str) -> str:
         """An account's address."""
@@ -169,10 +169,12 @@ class Floor:
         """The liabilities that an order has become on this floor: at most one, if all is well."""
         digest = message_hash(order)
         made = []
-        async for block in self.chain.events(self.started):
+        async for block in self.chain.follow(self.started):
             for event in block.events:
-                if isinstance(event, NewLiability) and digest in await self.chain.order_hashes(event.liability):
-                    made.append(await self.chain.liability(event.liability))
+                if isinstance(event, NewLiability) and digest in await self.chain.liabilities.order_hashes(
+                    event.liability
+                ):
+                    made.append(await self.chain.liabilities.get(event.liability))
             if block.block_number >= await self.chain.block_number():
                 return made
         raise AssertionError

@@ -40,8 +40,8 @@ async def test_a_demand_and_an_offer_become_a_contract(floor: Floor) -> None:
 
 
 async def test_a_result_ends_the_contract_and_pays(floor: Floor) -> None:
-    await floor.chain.approve(floor.chain.factory, 2 * XRT)
-    before = await floor.chain.balance_of(floor.address("robot"))
+    await floor.chain.tokens.approve(floor.chain.factory, 2 * XRT)
+    before = await floor.chain.tokens.balance(floor.address("robot"))
     async with floor.provider() as provider:
         demand = floor.demand(cost=2 * XRT)
         floor.publish(demand, floor.offer(cost=2 * XRT))
@@ -50,29 +50,29 @@ async def test_a_result_ends_the_contract_and_pays(floor: Floor) -> None:
 
         await until(lambda: provider.earnings().finalized == 1)
 
-        ended = await floor.chain.liability(liability.address)
+        ended = await floor.chain.liabilities.get(liability.address)
         assert (ended.is_finalized, ended.is_success) == (True, True)
-        assert await floor.chain.balance_of(floor.address("robot")) == before + 2 * XRT
+        assert await floor.chain.tokens.balance(floor.address("robot")) == before + 2 * XRT
 
 
 async def test_the_provider_wins_the_lighthouse_fee(floor: Floor) -> None:
     async with floor.chain_of("robot") as robots:
-        await robots.approve(robots.factory, 5)
-    before = await floor.chain.balance_of(floor.address("provider"))
+        await robots.tokens.approve(robots.factory, 5)
+    before = await floor.chain.tokens.balance(floor.address("provider"))
     async with floor.provider() as provider:
         demand = floor.demand()
         floor.publish(demand, floor.offer(lighthouse_fee=5))
         await until(lambda: provider.earnings().created == 1)
 
         assert provider.earnings().fees == 5
-        assert await floor.chain.balance_of(floor.address("provider")) == before + 5
+        assert await floor.chain.tokens.balance(floor.address("provider")) == before + 5
 
 
 async def test_orders_of_generation_5_become_a_contract(floor: Floor) -> None:
     person, robot = floor.address("person"), floor.address("robot")
     async with floor.provider():
-        demand = floor.demand(sender=person, nonce=await floor.chain.nonce_of(person))
-        floor.publish(demand, floor.offer(sender=robot, nonce=await floor.chain.nonce_of(robot)))
+        demand = floor.demand(sender=person, nonce=await floor.chain.liabilities.next_nonce(person))
+        floor.publish(demand, floor.offer(sender=robot, nonce=await floor.chain.liabilities.next_nonce(robot)))
 
         assert (await floor.liability_of(demand)).promisee == person
 
@@ -80,7 +80,7 @@ async def test_orders_of_generation_5_become_a_contract(floor: Floor) -> None:
 async def test_orders_of_different_generations_do_not_match(floor: Floor) -> None:
     robot = floor.address("robot")
     async with floor.provider() as provider:
-        fifth = floor.offer(sender=robot, nonce=await floor.chain.nonce_of(robot))
+        fifth = floor.offer(sender=robot, nonce=await floor.chain.liabilities.next_nonce(robot))
         demand, third = floor.demand(), floor.offer()
         floor.publish(fifth, demand)
         await until(lambda: len(provider.book) == 2)
@@ -105,8 +105,8 @@ async def test_names_in_orders_are_looked_up_on_the_chain(floor: Floor) -> None:
 
 async def test_a_demand_without_money_is_rejected_and_the_offer_stays_for_the_next(floor: Floor) -> None:
     async with floor.chain_of("poor") as chain:
-        await chain.approve(chain.factory, 7)
-    await floor.chain.approve(floor.chain.factory, 7)
+        await chain.tokens.approve(chain.factory, 7)
+    await floor.chain.tokens.approve(floor.chain.factory, 7)
     async with floor.provider() as provider:
         guilty, innocent, offer = floor.demand("poor", cost=7), floor.demand(cost=7), floor.offer(cost=7)
         floor.publish(guilty, offer)
@@ -135,8 +135,8 @@ async def test_an_offer_that_does_not_allow_its_fee_is_rejected_and_the_demand_s
 async def test_a_wrong_nonce_of_generation_5_is_its_senders_fault(floor: Floor) -> None:
     person, robot = floor.address("person"), floor.address("robot")
     async with floor.provider() as provider:
-        guilty = floor.demand(sender=person, nonce=await floor.chain.nonce_of(person) + 5)
-        offer = floor.offer(sender=robot, nonce=await floor.chain.nonce_of(robot))
+        guilty = floor.demand(sender=person, nonce=await floor.chain.liabilities.next_nonce(person) + 5)
+        offer = floor.offer(sender=robot, nonce=await floor.chain.liabilities.next_nonce(robot))
         floor.publish(guilty, offer)
 
         assert (await floor.rejection_of(guilty)).reason == "WrongSigner"
@@ -146,7 +146,7 @@ async def test_a_wrong_nonce_of_generation_5_is_its_senders_fault(floor: Floor) 
 async def test_a_used_order_leaves_without_a_word_and_the_other_one_stays(floor: Floor) -> None:
     used, partner = floor.demand(), floor.offer()
     async with floor.chain_of("provider") as chain:
-        await chain.create_liability(floor.lighthouse, used, partner)
+        await chain.liabilities.create(floor.lighthouse, used, partner)
     async with floor.provider() as provider:
         offer = floor.offer()
         floor.publish(used, offer)
@@ -159,7 +159,7 @@ async def test_a_used_order_leaves_without_a_word_and_the_other_one_stays(floor:
 async def test_of_a_pair_that_was_used_elsewhere_neither_stays(floor: Floor) -> None:
     demand, offer = floor.demand(), floor.offer()
     async with floor.chain_of("provider") as chain:
-        await chain.create_liability(floor.lighthouse, demand, offer)
+        await chain.liabilities.create(floor.lighthouse, demand, offer)
     async with floor.provider() as provider:
         floor.publish(demand, offer)
 
@@ -171,10 +171,10 @@ async def test_of_a_pair_that_was_used_elsewhere_neither_stays(floor: Floor) -> 
 
 async def test_of_a_used_pair_of_generation_5_neither_stays(floor: Floor) -> None:
     person, robot = floor.address("person"), floor.address("robot")
-    demand = floor.demand(sender=person, nonce=await floor.chain.nonce_of(person))
-    offer = floor.offer(sender=robot, nonce=await floor.chain.nonce_of(robot))
+    demand = floor.demand(sender=person, nonce=await floor.chain.liabilities.next_nonce(person))
+    offer = floor.offer(sender=robot, nonce=await floor.chain.liabilities.next_nonce(robot))
     async with floor.chain_of("provider") as chain:
-        await chain.create_liability(floor.lighthouse, demand, offer)
+        await chain.liabilities.create(floor.lighthouse, demand, offer)
     async with floor.provider() as provider:
         floor.publish(demand, offer)
 
@@ -193,7 +193,7 @@ async def test_a_result_of_somebody_else_is_rejected_and_the_promisors_own_count
         floor.publish(forged)
 
         assert (await floor.rejection_of(forged)).reason == "WrongSigner"
-        assert not (await floor.chain.liability(liability.address)).is_finalized
+        assert not (await floor.chain.liabilities.get(liability.address)).is_finalized
         floor.publish(floor.result(liability.address))
         await until(lambda: provider.earnings().finalized == 1)
 

@@ -72,7 +72,7 @@ async def test_orders_that_were_used_while_it_was_not_our_turn_leave(floor: Floo
         floor.publish(demand, offer)
         await until(lambda: len(rival.book) == 0)
         async with floor.chain_of("provider") as chain:
-            await chain.create_liability(floor.lighthouse, demand, offer)
+            await chain.liabilities.create(floor.lighthouse, demand, offer)
 
         await until(lambda: rival.earnings().rejected == {"OrderUsed": 1})
         last = floor.demand()
@@ -133,11 +133,11 @@ async def test_what_the_chain_takes_back_is_done_again(floor: Floor) -> None:
         await until(lambda: not provider._watching._open.keys() & {liability.address})
 
         await floor.request("evm_revert", snapshot)
-        assert not (await floor.chain.liability(liability.address)).is_finalized
+        assert not (await floor.chain.liabilities.get(liability.address)).is_finalized
         await floor.mine(5)
 
         async def finalized() -> bool:
-            return (await floor.chain.liability(liability.address)).is_finalized
+            return (await floor.chain.liabilities.get(liability.address)).is_finalized
 
         await until_found(finalized)
         await until(lambda: (provider.earnings().created, provider.earnings().finalized) == (2, 1))
@@ -177,13 +177,13 @@ async def test_a_result_that_was_too_early_counts_when_it_is_sent_again(floor: F
     demand, offer = floor.demand(), floor.offer()
     async with floor.chain_of("provider") as chain:
         snapshot = await floor.request("evm_snapshot")
-        created = await chain.create_liability(floor.lighthouse, demand, offer)
+        created = await chain.liabilities.create(floor.lighthouse, demand, offer)
         await floor.request("evm_revert", snapshot)
         async with floor.provider() as provider:
             result = floor.result(created.liability)
             floor.publish(result, floor.result(floor.address("person")))
             await until(lambda: provider._results.statistics().received == 2)
-            again = await chain.create_liability(floor.lighthouse, demand, offer)
+            again = await chain.liabilities.create(floor.lighthouse, demand, offer)
             assert again.liability == created.liability
 
             async def finalized() -> bool:

@@ -67,7 +67,7 @@ async def test_orders_that_somebody_else_made_into_a_contract_leave_the_book(flo
         floor.publish(demand, other)
         await until(lambda: len(provider.book) == 2)
         async with floor.chain_of("provider") as chain:
-            await chain.create_liability(floor.lighthouse, demand, offer)
+            await chain.liabilities.create(floor.lighthouse, demand, offer)
 
         await until(lambda: list(provider.book.orders()) == [verify_message(other)])
 
@@ -80,7 +80,7 @@ async def test_another_persons_order_with_the_same_terms_stays(floor: Floor) -> 
         floor.publish(demand, copy)
         await until(lambda: len(provider.book) == 2)
         async with floor.chain_of("provider") as chain:
-            await chain.create_liability(floor.lighthouse, demand, floor.offer())
+            await chain.liabilities.create(floor.lighthouse, demand, floor.offer())
 
         await until(lambda: list(provider.book.orders()) == [verify_message(copy)])
 
@@ -101,12 +101,12 @@ async def test_a_provider_that_was_restarted_takes_up_orders_that_are_sent_again
 async def test_a_contract_of_before_the_start_is_ended_too(floor: Floor) -> None:
     demand = floor.demand()
     async with floor.chain_of("provider") as chain:
-        created = await chain.create_liability(floor.lighthouse, demand, floor.offer())
+        created = await chain.liabilities.create(floor.lighthouse, demand, floor.offer())
     async with floor.provider() as provider:
         floor.publish(floor.result(created.liability, success=False))
 
         await until(lambda: provider.earnings().finalized == 1)
-        assert not (await floor.chain.liability(created.liability)).is_success
+        assert not (await floor.chain.liabilities.get(created.liability)).is_success
 
 
 async def test_a_full_book_says_so_and_takes_the_order_when_there_is_room(floor: Floor) -> None:

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from web3.providers.async_base import AsyncBaseProvider
 
-from mesh.chain import GWEI, JsonRpcServer
-from mesh.demo.market import found_market
+from mesh.chain import GWEI
+from mesh.devchain import JsonRpcServer
+from mesh.devchain.market import found_market
 from mesh.market import patience, sending
 from schemas import cid_of_bytes, parse_cid
 from tests.mesh.market.floor import QUICK, Floor
@@ -136,14 +137,14 @@ async def test_a_provider_without_eth_says_so_and_goes_on_when_it_has_some(
 ) -> None:
     await floor.found_lighthouse(timeout_blocks=1000, rival=5)
     async with floor.chain_of("rival") as rival:
-        balance, price = await rival.eth_balance(), await rival.node.web3.eth.gas_price
-        await rival.send_eth(floor.address("person"), balance - 100_000 * price)
+        balance, price = await rival.tokens.eth_balance(), await rival.node.web3.eth.gas_price
+        await rival.tokens.send_eth(floor.address("person"), balance - 100_000 * price)
         async with floor.provider("rival"):
             demand = floor.demand()
             floor.publish(demand, floor.offer())
             await until(lambda: "send ETH to the account" in caplog.text)
 
-            await floor.chain.send_eth(floor.address("rival"), balance - 10**18)
+            await floor.chain.tokens.send_eth(floor.address("rival"), balance - 10**18)
 
             await floor.liability_of(demand)
             assert floor.rejections == []

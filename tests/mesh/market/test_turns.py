@@ -29,7 +29,7 @@ async def head(floor: Floor) -> int:
 async def send_one(floor: Floor, role: str) -> None:
     """A transaction of a provider's to the lighthouse."""
     async with floor.chain_of(role) as chain:
-        await chain.create_liability(floor.lighthouse, floor.demand(), floor.offer())
+        await chain.liabilities.create(floor.lighthouse, floor.demand(), floor.offer())
 
 
 async def test_a_turn_lasts_as_many_transactions_as_are_staked_for(floor: Floor) -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.agent import Agent
-from mesh.agent.parts import chain_of
 from mesh.chain import XRT, Account, Chain
-from mesh.demo.market import ALLOWANCE, ROLES, found_market
+from mesh.composition import chain_of
+from mesh.devchain.market import ALLOWANCE, ROLES, found_market
 from mesh.settings import Settings
 from schemas import cid_of_bytes
 from tests.mesh.cli.chains import write_quick_keyfile
@@ -47,7 +47,7 @@ class Site:
         site = cls(url, keys, endpoint, folder)
         for role in ("robot", "person"):
             async with site.chain(role) as chain:
-                await chain.approve(chain.factory, ALLOWANCE)
+                await chain.tokens.approve(chain.factory, ALLOWANCE)
         return site
 
     def address(self, role: str) -> str:
@@ -97,12 +97,12 @@ class Site:
     async def found_lighthouse(self, name: str, *, timeout_blocks: int, **quotas: int) -> NewLighthouse:
         """Make a lighthouse where these roles have so many transactions a turn, and trade there from now on."""
         async with self.chain("provider") as chain:
-            made = await chain.create_lighthouse(minimal_stake=XRT, timeout_blocks=timeout_blocks, name=name)
+            made = await chain.lighthouses.create(minimal_stake=XRT, timeout_blocks=timeout_blocks, name=name)
             for role, quota in quotas.items():
-                await chain.transfer(self.address(role), quota * XRT)
+                await chain.tokens.transfer(self.address(role), quota * XRT)
         for role, quota in quotas.items():
             async with self.chain(role) as chain:
-                await chain.become_provider(made.lighthouse, quota * XRT)
+                await chain.lighthouses.become_provider(made.lighthouse, quota * XRT)
         self.lighthouse = f"{name}.lighthouse.3.robonomics.eth"
         return made
 

@@ -36,7 +36,7 @@ async def test_what_it_says_is_what_the_account_gained_and_lost(
         keyfile_password_file=variables["AIRA_KEYFILE_PASSWORD_FILE"],
     )
     async with site.chain("provider") as chain, site.robot([]), site.agent("person") as person:
-        start, xrt, wei = await chain.block_number(), await chain.balance_of(), await chain.eth_balance()
+        start, xrt, wei = await chain.block_number(), await chain.tokens.balance(), await chain.tokens.eth_balance()
         serving = asyncio.create_task(command._serve(settings))
         async with asyncio.timeout(60):
             for word in ("one", "two"):
@@ -45,7 +45,7 @@ async def test_what_it_says_is_what_the_account_gained_and_lost(
         await until(lambda: caplog.text.count("finalized, success True") == 2, seconds=30)
         serving.cancel()
         await asyncio.wait([serving])
-        gained, spent = await chain.balance_of() - xrt, wei - await chain.eth_balance()
+        gained, spent = await chain.tokens.balance() - xrt, wei - await chain.tokens.eth_balance()
         gas = await gas_used(chain, start)
     earned = Earnings(
         created=2, finalized=2, rejected={}, gas_used=gas, spent=spent, fees=2 * FEE, minted=gained - 2 * FEE

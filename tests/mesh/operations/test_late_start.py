@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.chain import Account, write_keyfile
-from mesh.demo.market import found_market
+from mesh.devchain.market import found_market
 from mesh.identity import Member
 from tests.support.commands import AIRA, Serving
 from tests.support.nodes import Anvil
@@ -91,10 +91,10 @@ async def test_a_provider_waits_for_its_stake(tmp_path: Path) -> None:
         variables = variables_of(tmp_path, node=node.port, router=router.port)
         with started(*PROVIDER, says=f"the provider waits: {late.address} has no stake", variables=variables) as server:
             async with market.chain(node.url, "provider") as chain:
-                await chain.transfer(late.address, 10**9)
+                await chain.tokens.transfer(late.address, 10**9)
             market.accounts["late"] = late
             async with market.chain(node.url, "late") as chain:
-                await chain.become_provider(market.deployment.lighthouse, 10**9)
+                await chain.lighthouses.become_provider(market.deployment.lighthouse, 10**9)
             await says(server, " serves airalab.lighthouse")
 
 

@@ -73,7 +73,7 @@ async def test_jobs_of_before_and_after_are_done_when_the_node_was_away(
             await may_work.wait()
 
         async with site.provider() as provider, robot, site.agent("person") as person:
-            before = await person.parts.chain.balance_of(site.address("robot"))
+            before = await person.parts.chain.tokens.balance(site.address("robot"))
             early = await person.demand(site.job("early"), cost=COST)
             await until(lambda: done, what="the early job under way", seconds=PATIENCE)
             await written(state, await person.parts.chain.block_number())
@@ -89,7 +89,7 @@ async def test_jobs_of_before_and_after_are_done_when_the_node_was_away(
             late = await person.demand(site.job("late"), cost=COST)
             assert (await late.outcome()).success
             assert done == ["early", "late"]
-            assert await person.parts.chain.balance_of(site.address("robot")) == before + 2 * (COST - FEE)
+            assert await person.parts.chain.tokens.balance(site.address("robot")) == before + 2 * (COST - FEE)
             log = provider.log()
             assert "the chain can be read again" in log
             assert "Traceback" not in log

@@ -67,7 +67,7 @@ async def test_a_contract_that_the_chain_drops_is_made_again_and_its_job_paid_on
 
     async with site.provider() as provider, robot, site.agent("person") as person, asyncio.timeout(3 * PATIENCE):
         chain = person.parts.chain
-        before = await chain.balance_of(site.address("robot"))
+        before = await chain.tokens.balance(site.address("robot"))
         contract = await person.demand(site.job("once"), cost=COST)
         first = contract.address
         await until(lambda: incoming == [first], what="the job", seconds=PATIENCE)
@@ -83,7 +83,7 @@ async def test_a_contract_that_the_chain_drops_is_made_again_and_its_job_paid_on
         assert (await contract.outcome()).success
         assert contract.address == incoming[-1]
         assert done == ["once"]
-        (made,) = await chain.liabilities(promisee=site.address("person"))
+        (made,) = await chain.liabilities.list(promisee=site.address("person"))
         assert (made.address, made.is_finalized, made.is_success) == (contract.address, True, True)
-        assert await chain.balance_of(site.address("robot")) == before + COST - FEE
+        assert await chain.tokens.balance(site.address("robot")) == before + COST - FEE
         assert "Traceback" not in provider.log()

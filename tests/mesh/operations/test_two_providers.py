@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import pytest
 
 from mesh.background import Background
-from mesh.chain import Chain, ServedChain, serve_embedded
+from mesh.devchain import ServedChain, serve_embedded
 from tests.mesh.operations.site import FEE, Site
 from tests.support.waiting import until
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.agent import Agent, Outcome
+    from mesh.chain import Chain
     from tests.support.routers import EmbeddedRouter
 
 JOBS = 30
@@ -63,9 +64,9 @@ async def test_jobs_are_shared_in_turns_and_taken_over_and_done_once_each(served
             tasks.start(let_time_pass(served), "blocks without transactions")
             outcomes = await asyncio.gather(*jobs)
             log = await asyncio.to_thread(stopped, provider)
-        made = await chain.liabilities(from_block=start)
-        hashes = [await chain.order_hashes(liability.address) for liability in made]
-        after, supply = await wealth(site, chain), (await chain.token()).total_supply
+        made = await chain.liabilities.list(from_block=start)
+        hashes = [await chain.liabilities.order_hashes(liability.address) for liability in made]
+        after, supply = await wealth(site, chain), (await chain.tokens.info()).total_supply
         transactions = await sent(site, chain, start)
 
     assert all(outcome.success for outcome in outcomes)
@@ -109,7 +110,7 @@ def stopped(provider: Any) -> str:
 
 async def sent(site: Site, chain: Chain, start: int) -> list[Sent]:
     """The transactions to the lighthouse since a block, in order."""
-    lighthouse = await chain.lighthouse_address(site.lighthouse)
+    lighthouse = await chain.names.lighthouse(site.lighthouse)
     roles = {site.address(role): role for role in QUOTAS}
     found = []
     eth = chain.node.web3.eth
@@ -135,5 +136,7 @@ async def wealth(site: Site, chain: Chain) -> dict[str, int]:
     """Who has how much XRT."""
     holders = {role: account.address for role, account in site.accounts.items()}
     for name in ("airalab", site.lighthouse):
-        holders[name] = await chain.lighthouse_address(name)
-    return {name: await chain.balance_of(address) for name, address in (holders | {"factory": chain.factory}).items()}
+        holders[name] = await chain.names.lighthouse(name)
+    return {
+        name: await chain.tokens.balance(address) for name, address in (holders | {"factory": chain.factory}).items()
+    }

@@ -50,9 +50,9 @@ async def have_eth(site: Site, role: str, wei: int) -> None:
 
 async def stake_and_spend_all_eth(site: Site, role: str) -> None:
     async with site.chain("provider") as chain:
-        await chain.transfer(site.address(role), 10**9)
+        await chain.tokens.transfer(site.address(role), 10**9)
     async with site.chain(role) as chain:
-        await chain.become_provider(site.lighthouse, 10**9)
+        await chain.lighthouses.become_provider(site.lighthouse, 10**9)
     await have_eth(site, role, 0)
 
 
@@ -128,5 +128,5 @@ def test_a_demand_without_eth_for_the_allowance(site: Site) -> None:
 
 async def have_xrt_only(site: Site, role: str) -> None:
     async with site.chain("provider") as chain:
-        await chain.transfer(site.address(role), 7)
+        await chain.tokens.transfer(site.address(role), 7)
     await have_eth(site, role, 0)

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from mesh.telemetry.context import Speaker, concerning, facts, of_its_liability, speaking
+from mesh.telemetry.context import Speaker, concerning, log_event, of_its_liability, speaking
 from mesh.telemetry.events import LARGEST, LONGEST_MESSAGE, event_of, human_line, json_line, without_secrets
 from schemas.logs import LogEvent
 from tests.support.orders import ROBOT, STRANGER
@@ -71,7 +71,7 @@ def test_who_speaks_in_threads_of_libraries_is_the_process() -> None:
 
 def test_facts_are_members_of_the_json_object_and_never_replace_a_field() -> None:
     event = record("rejected")
-    vars(event).update(facts(order="ab" * 32, gas=7, level="none", message="forged"))
+    vars(event).update(log_event("unnamed", order="ab" * 32, gas=7, level="none", message="forged"))
     told = json.loads(json_line(event_of(event)))
     assert (told["order"], told["gas"]) == ("ab" * 32, "7")
     assert (told["level"], told["message"]) == ("info", "rejected")

@@ -93,13 +93,13 @@ async def test_a_job_moves_exactly_the_figures_of_its_provider_that_it_has_to(
     monkeypatch.setattr(chain_figures, "FRESH", 0.0)
     lighthouse = place.market.deployment.lighthouse_name
     async with provider_at(place) as url, blinking(place), place.agent("person") as person:
-        before, eth = await scraped(url), await place.chains["provider"].eth_balance()
+        before, eth = await scraped(url), await place.chains["provider"].tokens.eth_balance()
         contract = await person.demand(place.save(objective(("/go", Empty()))), model=MODEL, cost=COST)
         assert (await contract.outcome()).success
         after = await settled(url, aira_contracts_finalized_total=before("aira_contracts_finalized_total") + 1)
         changes = after.changes(before)
 
-        assert changes.pop("aira_gas_spent_wei_total") == eth - await place.chains["provider"].eth_balance()
+        assert changes.pop("aira_gas_spent_wei_total") == eth - await place.chains["provider"].tokens.eth_balance()
         assert changes.pop("aira_gas_used_total") > 100_000
         assert changes.pop("aira_minted_wn_total", 0) >= 0
         assert {name: value for name, value in changes.items() if "duplicate" not in name} == {
@@ -113,7 +113,7 @@ async def test_a_job_moves_exactly_the_figures_of_its_provider_that_it_has_to(
             "aira_transactions_total{mined}": 2,
         }
         assert after.of_label("aira_matches_total", "lighthouse") == {lighthouse}
-        assert after("aira_account_eth_wei") == float(await place.chains["provider"].eth_balance())
+        assert after("aira_account_eth_wei") == float(await place.chains["provider"].tokens.eth_balance())
         assert after("aira_account_xrt_wn") == await place.balance("provider")
         assert after("aira_stake_wn") > 0
         assert after("aira_turn") == 1

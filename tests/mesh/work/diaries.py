@@ -90,10 +90,10 @@ async def contract(place: Place, *, promisor: str = "robot") -> tuple[str, Deman
     fields = terms(token=deployment.xrt, cost=0, lighthouse=deployment.lighthouse, nonce=secrets.token_hex(32))
     demand = place.market.accounts["person"].signer.sign(Demand(**fields, validator_fee=0))
     offer = place.market.accounts[promisor].signer.sign(Offer(**fields, lighthouse_fee=0))
-    created = await place.chains["provider"].create_liability(deployment.lighthouse_name, demand, offer)
+    created = await place.chains["provider"].liabilities.create(deployment.lighthouse_name, demand, offer)
     return created.liability, demand, offer
 
 
 async def finalize(place: Place, address: str) -> None:
     result = place.market.accounts["robot"].signer.sign(Result(liability=address, result=RECORDING, success=True))
-    await place.chains["provider"].finalize(place.market.deployment.lighthouse_name, result)
+    await place.chains["provider"].liabilities.finalize(place.market.deployment.lighthouse_name, result)

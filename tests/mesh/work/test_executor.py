@@ -182,7 +182,7 @@ async def test_an_agent_told_not_to_work_leaves_liabilities_alone(place: Place) 
         head = await place.chains["robot"].block_number()
         await until(lambda: robot.parts.clock.head >= head)
         assert await robot.parts.ledger.jobs() == []
-        assert not (await place.chains["person"].liability(contract.address)).is_finalized
+        assert not (await place.chains["person"].liabilities.get(contract.address)).is_finalized
 
 
 async def test_played_messages_are_on_the_mesh(place: Place) -> None:

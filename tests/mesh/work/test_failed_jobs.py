@@ -178,7 +178,7 @@ async def test_a_ledger_that_can_not_be_written_ends_the_agent_and_fails_no_job(
             await asyncio.wait_for(asked(robot()), 30)
         assert isinstance(_cause(caught.value), LedgerUnusable), "one line, and no traceback"
         writable[0] = True
-        (made,) = await place.chains["person"].liabilities(promisee=place.address("person"), from_block=before)
+        (made,) = await place.chains["person"].liabilities.list(promisee=place.address("person"), from_block=before)
         async with robot():
             assert (await asyncio.wait_for((await person.contract(made.address)).outcome(), 30)).success
     assert set(done) == {"there"}

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.chain import Chain, JsonRpcServer, Timing
+from mesh.chain import Chain, Timing
+from mesh.devchain import JsonRpcServer
 from mesh.work import Ledger
 from mesh.work import listener as listener_module
 from mesh.work.listener import Listener

@@ -68,7 +68,7 @@ async def test_a_contract_that_the_chain_took_back_is_told_and_told_again_when_i
         await place.forget_blocks(1)
         await until(lambda: diary.taken_back_contracts)
         lighthouse = place.market.deployment.lighthouse_name
-        again = await place.chains["provider"].create_liability(lighthouse, demand, offer)
+        again = await place.chains["provider"].liabilities.create(lighthouse, demand, offer)
         await until(lambda: len(diary.liabilities) == 2)
     assert diary.taken_back_contracts == [first]
     assert [liability.address for liability, *_ in diary.liabilities] == [first, again.liability]
@@ -79,8 +79,8 @@ async def test_token_events_are_told_and_taken_back(place: Place, ledger: Ledger
     person = place.chains["person"]
     async with listening(place, ledger) as diary:
         await started(ledger)
-        await person.approve(place.address("robot"), 11)
-        await person.transfer(place.address("robot"), 12)
+        await person.tokens.approve(place.address("robot"), 11)
+        await person.tokens.transfer(place.address("robot"), 12)
         await until(lambda: len(diary.token_events) == 2)
         await place.forget_blocks(1)
         await until(lambda: diary.taken_back_token_events)

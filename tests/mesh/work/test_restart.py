@@ -85,7 +85,7 @@ async def test_a_job_that_the_chain_ended_meanwhile_is_not_done(place: Place) ->
             contract = await person.demand(words(place))
             await in_phase(robot, contract, Phase.READY)
             failed = result(signer=robot.parts.signer, liability=contract.address, success=False)
-        await place.chains["provider"].finalize(place.market.deployment.lighthouse_name, failed)
+        await place.chains["provider"].liabilities.finalize(place.market.deployment.lighthouse_name, failed)
         robot = place.agent("robot")
         robot.on_liability(take_note(seen))
         async with robot:
@@ -120,7 +120,7 @@ async def test_a_liability_that_has_ended_before_the_agent_heard_of_it_is_no_job
             head, robot_memory = robot.parts.clock.head, robot.parts.directory
             contract = await person.demand(words(place))
         failed = result(signer=place.market.accounts["robot"].signer, liability=contract.address, success=False)
-        await place.chains["provider"].finalize(place.market.deployment.lighthouse_name, failed)
+        await place.chains["provider"].liabilities.finalize(place.market.deployment.lighthouse_name, failed)
         # As if it had been down since before the contract was made.
         async with Ledger(robot_memory / "ledger.sqlite") as ledger:
             await ledger.set_cursor("listener", head)
@@ -132,7 +132,7 @@ async def test_a_liability_that_has_ended_before_the_agent_heard_of_it_is_no_job
 
 async def told_again(robot: Agent, contract: Contract) -> None:
     """Have the chain take a contract back and tell it again, as when another block holds the same transaction."""
-    hashes = await robot.parts.chain.order_hashes(contract.address)
+    hashes = await robot.parts.chain.liabilities.order_hashes(contract.address)
     await robot._working().unmade(contract.address)
     assert await robot.parts.ledger.job(contract.address) is None
     assert "result" not in [waiting.kind for waiting in await robot.parts.ledger.outbox(head=0)]
@@ -197,8 +197,9 @@ async def test_a_finished_job_that_rested_sends_its_result_again(place: Place, p
 
 async def test_a_chain_started_anew_is_another_memory(place: Place) -> None:
     """A development chain gives the same addresses to other contracts: an old job there must not hide a new one."""
-    from mesh.chain import Chain, EmbeddedChain
-    from mesh.demo.market import found_market
+    from mesh.chain import Chain
+    from mesh.devchain import EmbeddedChain
+    from mesh.devchain.market import found_market
 
     async with place.agent("robot") as robot:
         here = robot.parts.directory

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.chain import XRT, Account, Chain, EmbeddedChain, Node, Sender
-from mesh.demo.anvil import STOP_SECONDS, NodeEnded, find_anvil, serve_anvil
-from mesh.demo.development import serve_chain
-from mesh.demo.market import ALLOWANCE
+from mesh.chain import XRT, Account, Chain, Node, Sender
+from mesh.devchain import EmbeddedChain
+from mesh.devchain.anvil import STOP_SECONDS, NodeEnded, find_anvil, serve_anvil
+from mesh.devchain.development import serve_chain
+from mesh.devchain.market import ALLOWANCE
 from mesh.errors import ConfigurationError
 from mesh.settings import Settings
 from tests.support.peers import require
@@ -72,7 +73,7 @@ async def test_an_end_of_its_own_ends_the_body_with_what_it_said(program: Path) 
 
     with pytest.raises(NodeEnded, match=r"^anvil ended by itself, by signal 9$") as ended:
         await asyncio.wait_for(serve(), 30)
-    assert ended.value.code == -9
+    assert ended.value.exit_code == -9
 
 
 async def test_a_start_that_fails_says_why(tmp_path: Path) -> None:
@@ -137,16 +138,16 @@ async def test_a_market_is_kept_with_all_that_happened_on_it(program: Path, tmp_
         settings, host="127.0.0.1", port=port, block_time=None, anvil=program, state=state
     ) as served:
         async with served.market.chain(served.url, "person") as chain:
-            await chain.transfer(NOBODY, 7 * XRT)
+            await chain.tokens.transfer(NOBODY, 7 * XRT)
             head = await chain.node.web3.eth.get_block("latest")
         first = served
     async with serve_chain(settings, host="127.0.0.1", port=port, block_time=None, anvil=program, state=state) as again:
         assert again.facts() == first.facts()
         async with Chain(again.url) as chain:
-            assert await chain.balance_of(NOBODY) == 7 * XRT
-            assert await chain.balance_of(again.market.accounts["person"].address) == ALLOWANCE - 7 * XRT
+            assert await chain.tokens.balance(NOBODY) == 7 * XRT
+            assert await chain.tokens.balance(again.market.accounts["person"].address) == ALLOWANCE - 7 * XRT
             assert (await chain.node.web3.eth.get_block(head["number"]))["hash"] == head["hash"]
-            assert list((await chain.lighthouse("airalab")).stakes) == [again.market.accounts["provider"].address]
+            assert list((await chain.lighthouses.get("airalab")).stakes) == [again.market.accounts["provider"].address]
 
 
 async def test_a_kept_chain_without_a_market_is_not_built_upon(program: Path, tmp_path: Path) -> None:

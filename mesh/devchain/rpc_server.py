@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Final
 
 from aiohttp import web
 
-from mesh.chain.dialogue import Dialogue
-from mesh.chain.dispatch import Dispatcher
-from mesh.chain.feed import Feed
+from mesh.devchain.dialogue import Dialogue
+from mesh.devchain.dispatch import Dispatcher
+from mesh.devchain.feed import Feed
 from mesh.errors import ConfigurationError
 
 if TYPE_CHECKING:

@@ -12,7 +12,8 @@ from hexbytes import HexBytes
 from web3 import AsyncWeb3
 from web3.exceptions import Web3RPCError
 
-from mesh.chain import Account, EmbeddedChain
+from mesh.chain import Account
+from mesh.devchain import EmbeddedChain
 from mesh.errors import ClosedError
 
 if TYPE_CHECKING:

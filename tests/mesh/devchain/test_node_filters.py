@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from web3 import AsyncWeb3
 
-from mesh.chain import Account, Chain, EmbeddedChain, deploy
-from mesh.chain.jsonrpc import RpcError
-from mesh.chain.node_filters import MAX_FILTERS
+from mesh.chain import Account, Chain, deploy
+from mesh.devchain import EmbeddedChain
+from mesh.devchain.jsonrpc import RpcError
+from mesh.devchain.node_filters import MAX_FILTERS
 from tests.mesh.chain.conftest import QUICK
 
 if TYPE_CHECKING:
@@ -44,10 +45,10 @@ async def test_web3_polls_for_what_is_new(node: EmbeddedChain, chain: Chain) -> 
     logs = await web3.eth.filter({"address": chain.xrt})
     blocks = await web3.eth.filter("latest")
     for value in (1, 2):
-        await chain.approve(FRIEND, value)
+        await chain.tokens.approve(FRIEND, value)
     assert values(await logs.get_new_entries()) == [1, 2]
     assert await logs.get_new_entries() == []
-    await chain.approve(FRIEND, 3)
+    await chain.tokens.approve(FRIEND, 3)
     assert values(await logs.get_new_entries()) == [3]
     hashes = await blocks.get_new_entries()
     assert [(await web3.eth.get_block(found))["number"] for found in hashes] == [
@@ -62,10 +63,10 @@ async def test_all_that_ever_was_is_had_by_a_filter_from_the_first_block(node: E
     """As the JavaScript of generation 3 lists the lighthouses."""
     name = await node.request("eth_newFilter", [{"address": chain.factory, "fromBlock": "0x0", "toBlock": "latest"}])
     found = await node.request("eth_getFilterLogs", [name])
-    [lighthouse] = await chain.lighthouses()
+    [lighthouse] = await chain.lighthouses.list()
     assert found[0]["transactionHash"] == lighthouse.tx
     assert await node.request("eth_getFilterChanges", [name]) == [], "that was before it was made"
-    await chain.create_lighthouse(minimal_stake=1, timeout_blocks=1, name="other")
+    await chain.lighthouses.create(minimal_stake=1, timeout_blocks=1, name="other")
     assert len(await node.request("eth_getFilterChanges", [name])) == 1
 
 
@@ -73,17 +74,17 @@ async def test_a_filter_of_later_blocks_waits_for_them(node: EmbeddedChain, chai
     later = await chain.block_number() + 2
     name = await node.request("eth_newFilter", [{"address": chain.xrt, "fromBlock": hex(later)}])
     for value in (1, 2):
-        await chain.approve(FRIEND, value)
+        await chain.tokens.approve(FRIEND, value)
     assert values(await node.request("eth_getFilterChanges", [name])) == [2]
 
 
 async def test_what_a_chain_that_was_taken_back_has_instead_is_new(node: EmbeddedChain, chain: Chain) -> None:
     name = await node.request("eth_newFilter", [{"address": chain.xrt}])
-    await chain.approve(FRIEND, 1)
+    await chain.tokens.approve(FRIEND, 1)
     assert values(await node.request("eth_getFilterChanges", [name])) == [1]
     await node.request("evm_revert", [hex(await chain.block_number() - 1)])
     assert await node.request("eth_getFilterChanges", [name]) == []
-    await chain.approve(FRIEND, 2)
+    await chain.tokens.approve(FRIEND, 2)
     assert values(await node.request("eth_getFilterChanges", [name])) == [2]
 
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from web3.providers.async_base import AsyncBaseProvider
 
-from mesh.chain.jsonrpc import RpcError
 from mesh.chain.recursion import restrain_recursion
-from mesh.chain.rpc_server import JsonRpcServer
+from mesh.devchain.jsonrpc import RpcError
+from mesh.devchain.rpc_server import JsonRpcServer
 from mesh.errors import ClosedError, ConfigurationError
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from web3.types import RPCEndpoint, RPCResponse
 
-    from mesh.chain.methods import Methods
+    from mesh.devchain.methods import Methods
 
 T = TypeVar("T")
 
@@ -78,8 +78,8 @@ class EmbeddedChain:
     def _start(self) -> None:
         # Imported here as py-evm takes most of a second to load, which the event loop need not wait for.
         try:
-            from mesh.chain.evm import Evm
-            from mesh.chain.methods import Methods
+            from mesh.devchain.evm import Evm
+            from mesh.devchain.methods import Methods
         except ModuleNotFoundError as error:
             raise ConfigurationError(
                 f"the embedded chain needs {error.name}, which is not installed", hint="pip install 'aira-mesh[demo]'"

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import aiohttp
 import pytest
 
-from mesh.chain import EmbeddedChain, JsonRpcServer
-from mesh.chain.embedded import EmbeddedProvider
+from mesh.devchain import EmbeddedChain, JsonRpcServer
+from mesh.devchain.embedded import EmbeddedProvider
 from tests.mesh.chain.pushing import Client, connected, node, server
 from tests.support.waiting import until
 

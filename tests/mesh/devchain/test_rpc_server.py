@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import aiohttp
 import pytest
 
-from mesh.chain import EmbeddedChain, JsonRpcServer, serve_embedded
+from mesh.devchain import EmbeddedChain, JsonRpcServer, serve_embedded
 from mesh.errors import ConfigurationError
 
 if TYPE_CHECKING:

@@ -1,8 +1,8 @@
 """Which contracts are on the chain: ours, which serve both generations at once, or the originals of one generation.
 
 They share most functions. Where they differ (how a result is brought, what lighthouses call their members, how a
-liability is recognised), each suite has its own way; the differences are those of the design page "Chain". The
-originals themselves were not at hand: their suites are tested against our contracts, which have both sets of names.
+liability is recognised), each version has its own way; the differences are those of the design page "Chain". The
+originals themselves were not at hand: their versions are tested against our contracts, which have both sets of names.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ NAMES: Final = {
 GAS_OF: Final = {3: "gasUtilizing", 5: "gasConsumedOf"}
 
 
-class Suite:
+class ContractVersion:
     """Our own contracts. `factory` is the address of the factory; `generation` names the root of its names."""
 
     def __init__(self, node: Node, factory: str, generation: int) -> None:
@@ -114,7 +114,7 @@ class Suite:
         return self._node.contract("Liability", address).functions
 
 
-class OriginalSuite(Suite):
+class OriginalContracts(ContractVersion):
     """The original contracts of one generation, which understand the orders of that generation only.
 
     They give no reasons when they refuse, pay nobody back, and don't say whose liability a contract is: recognised
@@ -171,14 +171,14 @@ class OriginalSuite(Suite):
         return int(await self._node.read(gas_of(address))) > 0
 
 
-def open_suite(kind: Kind, node: Node, factory: str, generation: int) -> Suite:
-    """The suite of a kind. Raises `ConfigurationError`."""
+def contract_version(kind: Kind, node: Node, factory: str, generation: int) -> ContractVersion:
+    """The version of a kind. Raises `ConfigurationError`."""
     if generation not in NAMES or kind not in ("mesh", "original"):
         raise ConfigurationError(
             f"there are no {kind} contracts of generation {generation}",
             hint='contracts are "mesh" or "original", generations 3 or 5',
         )
-    return (OriginalSuite if kind == "original" else Suite)(node, factory, generation)
+    return (OriginalContracts if kind == "original" else ContractVersion)(node, factory, generation)
 
 
 def result_arguments(result: Result) -> tuple[bytes, bool, bytes]:

@@ -8,10 +8,11 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from mesh.chain import NoContracts, serve_embedded, write_keyfile
-from mesh.demo.anvil import serve_anvil
-from mesh.demo.anvil_state import founding
-from mesh.demo.market import ROLES, Market, find_market, found_market
+from mesh.chain import NoContracts, write_keyfile
+from mesh.devchain import serve_embedded
+from mesh.devchain.anvil import serve_anvil
+from mesh.devchain.anvil_state import founding
+from mesh.devchain.market import ROLES, Market, find_market, found_market
 from mesh.errors import ConfigurationError
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.chain import Account, Chain
-from mesh.demo.development import DevelopmentChain, serve_chain
-from mesh.demo.market import ALLOWANCE, ROLES
+from mesh.devchain.development import DevelopmentChain, serve_chain
+from mesh.devchain.market import ALLOWANCE, ROLES
 from mesh.errors import ConfigurationError
 from mesh.settings import Settings
 from tests.support.ports import answers
@@ -25,7 +25,7 @@ async def test_its_keyfiles_are_those_of_people_with_money_and_outlive_it(tmp_pa
         assert [account.address for account in accounts] == [served.market.accounts[role].address for role in ROLES]
         assert {stat.S_IMODE(path.stat().st_mode) for path in served.keys.iterdir()} == {0o600}
         async with Chain(served.url, ens=served.market.deployment.ens) as chain:
-            assert [await chain.balance_of(account.address) for account in accounts[1:]] == [ALLOWANCE] * 2
+            assert [await chain.tokens.balance(account.address) for account in accounts[1:]] == [ALLOWANCE] * 2
         assert_described(served)
         before = {path.name: path.read_bytes() for path in served.keys.iterdir()}
         port = int(served.url.rpartition(":")[2])

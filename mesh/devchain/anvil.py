@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NoReturn
 
 from mesh.background import Background
-from mesh.demo.anvil_state import STATE_SECONDS, keep_state, prepare_state, settle_state
+from mesh.devchain.anvil_state import STATE_SECONDS, keep_state, prepare_state, settle_state
 from mesh.errors import ConfigurationError, RemoteError
 
 if TYPE_CHECKING:
@@ -37,12 +37,14 @@ PR_SET_PDEATHSIG: Final = 1
 class NodeEnded(RemoteError):
     """The node's process ended without being asked to. `code` is its exit code, negative for a signal."""
 
+    code = "node-ended"
+
     def __init__(self, program: Path, code: int, said: str) -> None:
         super().__init__(
             f"{program.name} ended by itself, {f'with exit code {code}' if code >= 0 else f'by signal {-code}'}",
             hint=said or "it said nothing",
         )
-        self.code = code
+        self.exit_code = code
 
 
 def find_anvil(program: Path | None) -> Path | None:

@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import TYPE_CHECKING, Any, Final
 
-from mesh.chain.jsonrpc import INVALID_PARAMS, SERVER_ERROR, RpcError, parse_quantity
-from mesh.chain.log_filter import LogFilter
+from mesh.devchain.jsonrpc import INVALID_PARAMS, SERVER_ERROR, RpcError, parse_quantity
+from mesh.devchain.log_filter import LogFilter
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from mesh.chain.evm import Evm
+    from mesh.devchain.evm import Evm
 
 MAX_FILTERS: Final = 1_000
 """Filters that are kept; a further one takes the place of that which was asked least recently."""

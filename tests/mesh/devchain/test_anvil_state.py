@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.chain import Account, Node, Sender
-from mesh.demo.anvil import serve_anvil
-from mesh.demo.anvil_state import being_founded, founding, kept, prepare_state
-from mesh.demo.development import serve_chain
+from mesh.devchain.anvil import serve_anvil
+from mesh.devchain.anvil_state import being_founded, founding, kept, prepare_state
+from mesh.devchain.development import serve_chain
 from mesh.errors import ConfigurationError
 from mesh.settings import Settings
 from tests.support.peers import require

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from mesh.chain.jsonrpc import INVALID_PARAMS, RpcError, parse_data
+from mesh.devchain.jsonrpc import INVALID_PARAMS, RpcError, parse_data
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 from aiohttp import WSMsgType
 
-from mesh.chain.jsonrpc import INVALID_PARAMS, RpcError
+from mesh.devchain.jsonrpc import INVALID_PARAMS, RpcError
 
 if TYPE_CHECKING:
     from aiohttp import web
 
-    from mesh.chain.dispatch import Dispatcher
-    from mesh.chain.feed import Feed
+    from mesh.devchain.dispatch import Dispatcher
+    from mesh.devchain.feed import Feed
 
 log = logging.getLogger(__name__)
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from mesh.chain.evm import PRIORITY_FEE_WEI, Call, Evm
-from mesh.chain.jsonrpc import (
+from mesh.devchain.evm import PRIORITY_FEE_WEI, Call, Evm
+from mesh.devchain.jsonrpc import (
     INTERNAL_ERROR,
     INVALID_PARAMS,
     METHOD_NOT_FOUND,
@@ -19,8 +19,8 @@ from mesh.chain.jsonrpc import (
     parse_quantity,
     to_json,
 )
-from mesh.chain.log_filter import LogFilter
-from mesh.chain.node_filters import NodeFilters
+from mesh.devchain.log_filter import LogFilter
+from mesh.devchain.node_filters import NodeFilters
 from schemas.keccak import keccak256
 
 if TYPE_CHECKING:

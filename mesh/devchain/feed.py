@@ -12,8 +12,8 @@ import secrets
 from collections import deque
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
-from mesh.chain.jsonrpc import INVALID_PARAMS, METHOD_NOT_FOUND, RpcError
-from mesh.chain.log_filter import LogFilter
+from mesh.devchain.jsonrpc import INVALID_PARAMS, METHOD_NOT_FOUND, RpcError
+from mesh.devchain.log_filter import LogFilter
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Sequence

@@ -45,8 +45,11 @@ async def find_market(endpoint: str, keys: Sequence[bytes]) -> Market | None:
         async with Chain(node, account=accounts["provider"]) as chain:
             root = namehash("3.robonomics.eth")
             resolver = await node.read(node.contract("ENSRegistry", chain.ens).functions.resolver(root))
-            made = next(iter(await chain.lighthouses()), None)
-            if made is None or accounts["provider"].address not in (await chain.lighthouse(made.lighthouse)).stakes:
+            made = next(iter(await chain.lighthouses.list()), None)
+            if (
+                made is None
+                or accounts["provider"].address not in (await chain.lighthouses.get(made.lighthouse)).stakes
+            ):
                 raise NoContracts("lighthouse with a provider", chain.chain_id)
             return Market(
                 deployment=Deployment(
@@ -70,7 +73,7 @@ async def found_market(endpoint: str | AsyncBaseProvider, keys: Sequence[bytes])
     market = Market(deployment=deployment, accounts=accounts)
     async with market.chain(endpoint, "provider") as chain:
         for role in ("robot", "person"):
-            await chain.transfer(accounts[role].address, ALLOWANCE)
-        await chain.approve(deployment.lighthouse, STAKE)
-        await chain.refill(deployment.lighthouse, STAKE)
+            await chain.tokens.transfer(accounts[role].address, ALLOWANCE)
+        await chain.tokens.approve(deployment.lighthouse, STAKE)
+        await chain.lighthouses.refill(deployment.lighthouse, STAKE)
     return market

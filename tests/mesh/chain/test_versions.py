@@ -27,7 +27,7 @@ async def _orders(market: Market, generation: int, **fields: Any) -> tuple[Any, 
     if generation == 3:
         return market.demand(**fields), market.offer(**fields)
     async with market.chain() as chain:
-        nonces = [await chain.nonce_of(who.address) for who in (market.promisee, market.promisor)]
+        nonces = [await chain.liabilities.next_nonce(who.address) for who in (market.promisee, market.promisor)]
     demand = market.demand(**fields, sender=market.promisee.address, nonce=nonces[0])
     return demand, market.offer(**fields, sender=market.promisor.address, nonce=nonces[1])
 
@@ -37,10 +37,10 @@ async def test_a_job_is_done_by_the_calls_of_the_generation(market: Market, gene
     options: dict[str, Any] = {"contracts": "original", "generation": generation}
     async with market.chain(market.provider, **options) as chain:
         start = await chain.block_number()
-        created = await chain.create_liability("airalab", *await _orders(market, generation, cost=XRT))
-        settled = await chain.finalize("airalab", market.result(created.liability))
+        created = await chain.liabilities.create("airalab", *await _orders(market, generation, cost=XRT))
+        settled = await chain.liabilities.finalize("airalab", market.result(created.liability))
         sent = await chain.node.web3.eth.get_transaction(settled.tx)  # type: ignore[arg-type]
-        record = await chain.liability(created.liability)
+        record = await chain.liabilities.get(created.liability)
         events = events_of(await read_to(chain, start + 1, await chain.block_number()))
     assert bytes(sent["input"])[:4].hex() == FINALIZE_BY[generation]
     assert (record.is_finalized, record.is_success, record.result) == (True, True, cid(3))
@@ -49,10 +49,10 @@ async def test_a_job_is_done_by_the_calls_of_the_generation(market: Market, gene
 
 async def test_generation_3s_result_of_a_failed_job_pays_the_promisee_back(market: Market) -> None:
     async with market.chain(market.provider, contracts="original", generation=3) as chain:
-        before = await chain.balance_of(market.promisee.address)
-        created = await chain.create_liability("airalab", *await _orders(market, 3, cost=XRT))
-        await chain.finalize("airalab", market.result(created.liability, success=False))
-        assert await chain.balance_of(market.promisee.address) == before
+        before = await chain.tokens.balance(market.promisee.address)
+        created = await chain.liabilities.create("airalab", *await _orders(market, 3, cost=XRT))
+        await chain.liabilities.finalize("airalab", market.result(created.liability, success=False))
+        assert await chain.tokens.balance(market.promisee.address) == before
 
 
 @pytest.mark.parametrize("generation", [3, 5])
@@ -60,51 +60,53 @@ async def test_a_liability_is_known_by_the_factorys_event_or_by_its_gas(market: 
     options: dict[str, Any] = {"contracts": "original", "generation": generation}
     async with market.chain(market.provider) as chain:
         start = await chain.block_number()
-        created = await chain.create_liability("airalab", market.demand(cost=1), market.offer(cost=1))
+        created = await chain.liabilities.create("airalab", market.demand(cost=1), market.offer(cost=1))
         head = await chain.block_number()
         async with market.chain(**options) as reader:
             with pytest.raises(NotALiability):
-                await reader.liability(created.liability)
+                await reader.liabilities.get(created.liability)
             await read_to(reader, start + 1, head)
-            assert (await reader.liability(created.liability)).cost == 1
-        await chain.finalize("airalab", market.result(created.liability))
+            assert (await reader.liabilities.get(created.liability)).cost == 1
+        await chain.liabilities.finalize("airalab", market.result(created.liability))
         async with market.chain(**options) as reader:
-            assert await reader.is_liability(created.liability)
-            assert not await reader.is_liability(market.deployment.xrt)
+            assert await reader.liabilities.exists(created.liability)
+            assert not await reader.liabilities.exists(market.deployment.xrt)
 
 
 @pytest.mark.parametrize("generation", [3, 5])
 async def test_a_lighthouse_is_read_by_the_names_of_the_generation(market: Market, generation: int) -> None:
     options: dict[str, Any] = {"contracts": "original", "generation": generation}
     async with market.chain(market.provider) as ours, market.chain(market.provider, **options) as chain:
-        assert await chain.lighthouse("airalab") == await ours.lighthouse("airalab")
-        assert await chain.is_turn("airalab")
-        assert not await chain.is_turn("airalab", market.stranger.address)
+        assert await chain.lighthouses.get("airalab") == await ours.lighthouses.get("airalab")
+        assert await chain.lighthouses.is_turn("airalab")
+        assert not await chain.lighthouses.is_turn("airalab", market.stranger.address)
 
 
 async def test_names_are_those_of_the_generations_root(market: Market) -> None:
     async with market.chain(generation=5) as chain:
         assert (chain.factory, chain.xrt) == (market.deployment.factory, market.deployment.xrt)
-        assert await chain.lighthouse_address("airalab") == await chain.resolve("airalab.lighthouse.5.robonomics.eth")
+        assert await chain.names.lighthouse("airalab") == await chain.names.address(
+            "airalab.lighthouse.5.robonomics.eth"
+        )
 
 
 async def test_what_the_originals_lack_is_told(market: Market) -> None:
     result = market.result(market.stranger.address)
     async with market.chain(market.provider, contracts="original", generation=3) as chain:
         with pytest.raises(NotOffered, match="generation 3 offer no nonceOf") as caught:
-            await chain.nonce_of()
+            await chain.liabilities.next_nonce()
         assert caught.value.hint
         with pytest.raises(NotOffered, match="refund"):
-            await chain.refund(market.stranger.address)
+            await chain.liabilities.refund(market.stranger.address)
         with pytest.raises(InvalidMessage, match="generation 3, the order of 5"):
-            await chain.create_liability("airalab", *await _orders(market, 5))
+            await chain.liabilities.create("airalab", *await _orders(market, 5))
     async with market.chain(market.provider, contracts="original", generation=5) as chain:
         with pytest.raises(NotOffered, match="validator"):
-            await chain.validate(result, agree=True)
+            await chain.liabilities.validate(result, agree=True)
         with pytest.raises(NotOffered, match="refund"):
-            await chain.refundable_from(market.stranger.address)
+            await chain.liabilities.refundable_from(market.stranger.address)
         with pytest.raises(InvalidMessage, match="generation 5, the order of 3"):
-            await chain.create_liability("airalab", *await _orders(market, 3))
+            await chain.liabilities.create("airalab", *await _orders(market, 3))
 
 
 async def test_contracts_that_never_were_are_refused(market: Market) -> None:

@@ -1,0 +1,53 @@
+"""From settings to open parts: the account, the chain and the network that the settings name.
+
+The command line, agents, bridges and tests compose their parts here, and nowhere else. The chain is imported on first
+use: what runs without one never loads web3.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from mesh.network import Endpoints
+
+if TYPE_CHECKING:
+    from mesh.chain import Account, Chain
+    from mesh.settings import AccountSettings, ChainSettings, NetworkSettings
+
+
+def load_account(settings: AccountSettings) -> Account:
+    """The account that the settings name. Blocks while the keyfile is decrypted. Raises `ConfigurationError`."""
+    from mesh.chain import Account
+
+    return Account.from_keyfile(*settings.keyfile_and_password())
+
+
+def chain_of(settings: ChainSettings, account: Account | None) -> Chain:
+    """The chain that the settings name, not yet opened, for `account` or for reading only.
+
+    What is sent is written down in the settings' folder, so that a number that was used stays used after a restart,
+    and in other programs of the same account. Raises `ConfigurationError`.
+    """
+    from mesh.chain import GWEI, Chain, FeePolicy, Timing
+
+    return Chain(
+        settings.node,
+        account=account,
+        ens=settings.ens_contract,
+        factory=settings.factory_contract,
+        xrt=settings.xrt_contract,
+        generation=settings.generation,
+        contracts=settings.contracts,
+        timing=Timing(
+            poll_interval=settings.poll_interval,
+            confirmations=settings.confirmations,
+            reorg_depth=settings.reorg_depth,
+        ),
+        fees=FeePolicy(ceiling=round(settings.max_fee_gwei * GWEI)),
+        journal=settings.state_directory / "transactions",
+    )
+
+
+def endpoints_of(settings: NetworkSettings) -> Endpoints:
+    """Where the settings' client session connects to."""
+    return Endpoints.from_settings(settings)

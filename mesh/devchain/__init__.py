@@ -1,0 +1,9 @@
+"""A chain to develop on: an EVM inside the process or anvil, with the contracts deployed, served over JSON-RPC.
+
+A server, not a client: the client is `mesh.chain`.
+"""
+
+from mesh.devchain.embedded import EmbeddedChain, ServedChain, serve_embedded
+from mesh.devchain.rpc_server import JsonRpcServer
+
+__all__ = ["EmbeddedChain", "JsonRpcServer", "ServedChain", "serve_embedded"]

@@ -1,0 +1,241 @@
+"""The options in groups: each part of the mesh takes the group it needs; `Settings` is all of them.
+
+Options keep the names and the defaults of the legacy stack where it had them.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeVar
+
+from msgspec import Meta
+
+from mesh.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+LONGEST: Final = 1e9
+"""The most seconds that an option can hold, about thirty years: not every file format can express infinity."""
+
+PositiveInt = Annotated[int, Meta(ge=1)]
+Seconds = Annotated[float, Meta(ge=0, le=LONGEST)]
+Interval = Annotated[float, Meta(gt=0, le=LONGEST)]
+SecondsOrEver = Annotated[float, Meta(ge=-1, le=LONGEST)]
+Gwei = Annotated[float, Meta(ge=1e-9, le=1e9)]
+
+T = TypeVar("T")
+
+
+def option(default: T, meaning: str) -> T:
+    """A field of a group: its default, and one line that explains it."""
+    return field(default=default, metadata={"meaning": meaning})
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkSettings:
+    """How a client joins the Zenoh network."""
+
+    connect: tuple[str, ...] = option(
+        ("tcp/127.0.0.1:7447",), "Zenoh routers to connect to, tried in order; with several, the client fails over"
+    )
+    connect_timeout: SecondsOrEver = option(
+        10.0, "seconds to wait for a router at startup; -1 waits forever, also for the node, the contracts and files"
+    )
+    tls_ca: str = option(
+        "", "the site's CA certificate (PEM); routers and clients on tls/ endpoints are checked with it"
+    )
+    tls_certificate: str = option("", "this client's certificate for tls/ endpoints (PEM), made by `aira identity new`")
+    tls_key: str = option("", "the key of tls_certificate (PEM)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RouterSettings(NetworkSettings):
+    """What `aira router` needs besides its certificate."""
+
+    listen: tuple[str, ...] = option(("tcp/127.0.0.1:7447",), "endpoints that `aira router` listens on")
+    roster: str = option(
+        "", "the site's members and their rights (TOML); without a roster the router listens on loopback only"
+    )
+    link: tuple[str, ...] = option(
+        (), "other routers of the site to stay connected to (each has the role router in the roster)"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class StorageSettings:
+    """Where state is kept."""
+
+    data_dir: str = option(
+        "", "folder for the ledger, content, recordings and sent transactions (default: the user's data folder)"
+    )
+
+    @property
+    def state_directory(self) -> Path:
+        """`data_dir`, or the user's data folder."""
+        if self.data_dir:
+            return Path(self.data_dir).expanduser()
+        base = os.environ.get("XDG_DATA_HOME") or "~/.local/share"
+        return Path(base).expanduser() / "aira"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChainSettings(StorageSettings):
+    """Which chain is used, and how."""
+
+    web3_http_provider: str = option(
+        "http://127.0.0.1:8545", "JSON-RPC of the EVM node; several nodes of one chain (http or ws) are split by commas"
+    )
+    web3_ws_provider: str = option(
+        "ws://127.0.0.1:8546", "JSON-RPC of the EVM node over WebSocket; used when web3_http_provider is empty"
+    )
+    ens_contract: str = option(
+        "", "address of the ENS registry (empty: the public registry, or the one of a development chain)"
+    )
+    factory_contract: str = option("", "ENS name or address of the factory")
+    xrt_contract: str = option("", "ENS name or address of XRT, the token of stakes and fees")
+    generation: Literal[3, 5] = option(
+        3, "message format and contract names to use by default, 3 or 5 (both formats are always read)"
+    )
+    contracts: Literal["mesh", "original"] = option(
+        "mesh", "which contracts are deployed: this project's (mesh), or the originals of the generation (original)"
+    )
+    max_fee_gwei: Gwei = option(500.0, "highest gas price to pay, gwei; nothing is sent while gas costs more")
+    confirmations: PositiveInt = option(1, "blocks until a transaction counts as mined, its own block included")
+    reorg_depth: PositiveInt = option(12, "how many blocks behind the head a reorganisation is still detected")
+    poll_interval: Interval = option(1.0, "seconds between polls for new blocks")
+
+    @property
+    def node(self) -> str:
+        """The node's URL, or several split by commas. Raises `ConfigurationError` when there is none."""
+        found = self.web3_http_provider.strip() or self.web3_ws_provider.strip()
+        if not found:
+            raise ConfigurationError(
+                "no EVM node is configured: web3_http_provider and web3_ws_provider are both empty",
+                hint="pass --web3-http-provider http://HOST:8545",
+            )
+        return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class AccountSettings:
+    """The account that signs."""
+
+    keyfile: str = option("", "the account's keyfile (Web3 Secret Storage)")
+    keyfile_password_file: str = option("", "file with the keyfile's password")
+
+    def keyfile_and_password(self) -> tuple[Path, Path]:
+        """The keyfile and its password file. Raises `ConfigurationError` when either is not set."""
+        if not self.keyfile or not self.keyfile_password_file:
+            raise ConfigurationError(
+                "this needs an account, and keyfile or keyfile_password_file is not set",
+                hint="create one with `aira account new`, then pass --keyfile and --keyfile-password-file",
+            )
+        return Path(self.keyfile).expanduser(), Path(self.keyfile_password_file).expanduser()
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarketSettings:
+    """The market to trade on."""
+
+    lighthouse_contract: str = option("", "ENS name of the lighthouse, the market to trade on")
+    erc20_token: str = option("", "ENS name or address of the token that pays for work")
+    open_orders_limit: PositiveInt = option(1_000_000, "most open orders that a provider keeps")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContentSettings:
+    """Limits for files behind CIDs."""
+
+    content_limit: PositiveInt = option(
+        10 * 1024**3, "most bytes of content to keep; beyond that the least recently used go, never those of open jobs"
+    )
+    objective_size_limit: PositiveInt = option(256 * 1024 * 1024, "largest objective to fetch, bytes")
+    objective_expanded_limit: PositiveInt = option(1024 * 1024 * 1024, "largest objective once decompressed, bytes")
+    fetch_timeout: Seconds = option(60.0, "seconds to look for an objective before the job fails")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExecutionSettings(ContentSettings):
+    """How jobs are done."""
+
+    enable_executor: bool = option(True, "do the jobs; false only listens")
+    recording_topics: str = option("", "topics to record, split by commas (empty: all topics of the liability)")
+    playback: Literal["recorded", "at-once"] = option(
+        "recorded", "play an objective's messages at their recorded times, or all at once"
+    )
+    open_services: bool = option(
+        False,
+        "let anyone on the router make this agent sign, send messages and spend"
+        " (rpc/sign, rpc/send, rpc/eth/transfer, transfer_from, approve)",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class IpfsSettings:
+    """How to reach IPFS."""
+
+    ipfs_http_provider: str = option("http://127.0.0.1:5001", "RPC of the IPFS daemon (a multiaddr or a URL)")
+    ipfs_authorization_file: str = option("", "file with the Authorization header for the daemon's RPC (empty: none)")
+    ipfs_gateway: str = option("", "IPFS gateway to read content from besides the daemon (a URL; empty: none)")
+    ipfs_public_providers: tuple[str, ...] = option(
+        (), "RPCs of further IPFS nodes that should pin objectives and results"
+    )
+    ipfs_swarm_connect: tuple[str, ...] = option((), "swarm addresses (/…/p2p/ID) to keep the IPFS daemon connected to")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TelemetrySettings:
+    """How an operator sees what a server does."""
+
+    log_level: Literal["debug", "info", "warning", "error"] = option(
+        "info", "lowest level to log: debug, info, warning, error"
+    )
+    log_format: Literal["human", "json"] = option(
+        "human", "log lines for people (human) or one JSON object each (json)"
+    )
+    metrics_listen: str = option(
+        "", "HOST:PORT for a server's metrics (/metrics) and health (/health); empty: not served"
+    )
+
+
+CONTRACT_NAMES: Final = {
+    "factory_contract": "factory.{}.robonomics.eth",
+    "lighthouse_contract": "airalab.lighthouse.{}.robonomics.eth",
+    "xrt_contract": "xrt.{}.robonomics.eth",
+    "erc20_token": "xrt.{}.robonomics.eth",
+}
+"""What the contracts are called in each generation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings(
+    TelemetrySettings,
+    IpfsSettings,
+    ExecutionSettings,
+    MarketSettings,
+    AccountSettings,
+    ChainSettings,
+    RouterSettings,
+):
+    """Every option of the mesh, with its default."""
+
+    def __post_init__(self) -> None:
+        """Contract names that are not given are those of the generation."""
+        for name, template in CONTRACT_NAMES.items():
+            if not getattr(self, name):
+                object.__setattr__(self, name, template.format(self.generation))
+
+
+def options_of(group: type) -> tuple[str, ...]:
+    """The names of a group's options, in order."""
+    return tuple(each.name for each in fields(group))
+
+
+OPTIONS: Final = options_of(Settings)
+MEANING: Final[Mapping[str, str]] = {each.name: each.metadata["meaning"] for each in fields(Settings)}
+"""What each option means, in one line."""
+DEFAULTS: Final = Settings()
+"""Every option with its default."""
