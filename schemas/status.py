@@ -106,7 +106,7 @@ class Way(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
     """Of the messages that this bridge has carried."""
 
 
-class ContentFigures(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
+class ContentMetrics(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
     """What a bridge has done with content since it started, on all its lighthouses together."""
 
     fetched: int
@@ -155,7 +155,7 @@ class BridgeStatus(Record, frozen=True, kw_only=True, rename="camel", forbid_unk
     last_error: str
     to_ipfs: Way
     to_mesh: Way
-    content: ContentFigures | None = None
+    content: ContentMetrics | None = None
     uptime: float = 0.0
     """Seconds since it began."""
 
@@ -169,7 +169,7 @@ __all__ = [
     "ALIVE",
     "OFF",
     "BridgeStatus",
-    "ContentFigures",
+    "ContentMetrics",
     "Market",
     "Status",
     "StoreUse",

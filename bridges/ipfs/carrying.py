@@ -141,7 +141,7 @@ class ToMesh:
         )
 
     async def _follow_network(self) -> None:
-        """Hold back while there is no router, and put again what vanished: readers drop what they know."""
+        """LockedEntry back while there is no router, and put again what vanished: readers drop what they know."""
         if self._network.connected:
             self._online.set()
         lost = 0.0

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from bridges.ipfs.gate import Gate, Passenger
     from bridges.ipfs.journal import Journal
     from mesh.network import Network
-    from schemas.status import ContentFigures
+    from schemas.status import ContentMetrics
 
 log = logging.getLogger(__name__)
 
@@ -86,7 +86,7 @@ class ChannelBridge(Role):
         address: str | None = None,
         limit: int = LIMIT,
         carried: Callable[[Side, Passenger], None] = lambda side, passenger: None,
-        content: Callable[[], ContentFigures | None] = lambda: None,
+        content: Callable[[], ContentMetrics | None] = lambda: None,
         report: float = REPORT,
     ) -> None:
         self.lighthouse: Final = lighthouse.lower()

@@ -16,7 +16,7 @@ from mesh.cli.options import with_settings
 from mesh.errors import ConfigurationError, NetworkUnavailable
 from mesh.running import run_until_stopped
 from mesh.settings import ChainSettings, NetworkSettings, TelemetrySettings, options_of
-from mesh.telemetry.context import Speaker
+from mesh.telemetry.context import LogSource
 from mesh.telemetry.log_service import LogService
 from mesh.telemetry.logs import introduce
 from schemas import parse_address
@@ -108,7 +108,7 @@ async def _introduce(bridge: IpfsBridge, network: Network, stack: AsyncExitStack
     """Say what the bridge is, and answer who asks for its log."""
     from mesh.network import Services
 
-    introduce(Speaker("bridge", parse_address(bridge.channels[0].address)))
+    introduce(LogSource("bridge", parse_address(bridge.channels[0].address)))
     for channel in bridge.channels:
         words = f"bridge {channel.address} carries {channel.lighthouse} to and from {bridge.daemon.api}"
         announce(log, words, bridge=channel.address)

@@ -16,7 +16,7 @@ from mesh.content.serving import CID_SELECTOR, HOLDER
 from mesh.errors import AiraError, ClosedError, InvalidKey
 from mesh.network.crossing import call_in_loop
 from schemas import CidKey, InputError, parse_block, parse_key
-from schemas.status import ContentFigures
+from schemas.status import ContentMetrics
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine
@@ -154,10 +154,10 @@ class ContentBridge:
         """As `add`, without waiting; what is not there or not taken is tried again, what fails logged and counted."""
         self._start(self._try_to_add(cid), f"add {cid}")
 
-    def figures(self) -> ContentFigures:
+    def figures(self) -> ContentMetrics:
         """What was done so far."""
         counts = self._counts
-        return ContentFigures(
+        return ContentMetrics(
             fetched=counts["fetched"],
             fetched_bytes=self._sources.bytes,
             lies=self._sources.lies.total(),

@@ -10,7 +10,7 @@ from schemas.status import ALIVE
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-    from schemas.status import BridgeStatus, ContentFigures, Way
+    from schemas.status import BridgeStatus, ContentMetrics, Way
 
 
 class Standing(NamedTuple):
@@ -28,7 +28,7 @@ def bridge_families(bridges: Iterable[Standing]) -> tuple[Family, ...]:
     )
 
 
-def content_families(content: ContentFigures) -> tuple[Family, ...]:
+def content_families(content: ContentMetrics) -> tuple[Family, ...]:
     """What was done with content, for all lighthouses together."""
     return (
         counter("aira_bridge_content_fetched_total", "Files fetched from IPFS and kept", content.fetched),

@@ -18,7 +18,7 @@ from bridges.ipfs.metrics import bridge_families, content_families, parts_of
 from bridges.ipfs.sources import Sources
 from mesh.content import Exchange, Store
 from mesh.errors import ConfigurationError
-from mesh.network.figures import network_families
+from mesh.network.metrics import network_families
 from mesh.role import Role
 from schemas import Demand, Result, decode
 

@@ -23,7 +23,7 @@ from schemas.values import decode_value, encode_value
 
 if TYPE_CHECKING:
     from mesh.agent import Agent
-    from mesh.work.run import Run
+    from mesh.work.job import Job
 
 LOOK: Final = 0.25
 """Seconds between two looks for a device that is not present."""
@@ -71,10 +71,10 @@ class Device:
         self._patience = patience
         self._in_doubt = in_doubt
 
-    async def call(self, topic: str, message: object = Empty(), *, job: Run | None = None) -> Answer:
+    async def call(self, topic: str, message: object = Empty(), *, job: Job | None = None) -> Answer:
         """Have the device do something; returns when it is done. With a `job` both are in its recording.
 
-        `message` is what `Run.publish` takes. Raises `CallNotDone` (it certainly was not), `CallRefused` (the device
+        `message` is what `Job.publish` takes. Raises `CallNotDone` (it certainly was not), `CallRefused` (the device
         said no, or can't), `CallInDoubt`, and never takes longer than `patience` and a few seconds. Cancelling stops
         the waiting, not the device.
         """
@@ -108,7 +108,7 @@ class Device:
     def _session(self) -> zenoh.Session:
         return self._agent.parts.network.session
 
-    def _key(self, topic: str, job: Run | None) -> str:
+    def _key(self, topic: str, job: Job | None) -> str:
         if job is None:
             return self._device_id.key(topic)
         return str(LiabilityTopicKey(self._agent.address, job.liability.address, topic))

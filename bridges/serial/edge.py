@@ -29,7 +29,7 @@ from bridges.serial.names import Names
 from bridges.serial.replying import is_meant_for, patience_of, refuse, reply
 from bridges.serial.tally import Tally
 from mesh.errors import InvalidKey
-from mesh.telemetry.context import concerning
+from mesh.telemetry.context import liability_context
 from schemas.chunks import topic_chunks
 from schemas.keys import DeviceTopicKey, LiabilityTopicKey, event_selector, parse_key
 from schemas.payloads import STRING, String, payload_type
@@ -101,7 +101,7 @@ class Edge:
         self._line.stop()
 
     def _deliver(self, happening: Happening) -> None:
-        with concerning(self._jobs.current):
+        with liability_context(self._jobs.current):
             self._take(happening)
 
     def _take(self, happening: Happening) -> None:
@@ -179,7 +179,7 @@ class Edge:
         try:
             self._line.dialect.submit(Command(topic.name, payload, now + self._patience), now)
         except (UnfitMessage, BoardBusy) as error:
-            with concerning(job):
+            with liability_context(job):
                 log.warning("%s", error)
 
     def _heard_call(self, query: zenoh.Query) -> None:

@@ -19,7 +19,7 @@ from mesh.cli.announcing import announce
 from mesh.network.opening import Opening
 from mesh.running import INTERRUPTED
 from mesh.starting import AGAIN, lacking
-from mesh.telemetry.context import Speaker
+from mesh.telemetry.context import LogSource
 from mesh.telemetry.logs import introduce
 from schemas.address import parse_address
 
@@ -82,10 +82,10 @@ def telling(listen: str) -> Iterator[Told]:
     if not listen:
         yield lambda edge, session: None
         return
-    from bridges.serial.figures import EdgeFigures
+    from bridges.serial.metrics import EdgeMetrics
     from mesh.telemetry.opening import open_server
 
-    figures = EdgeFigures()
+    figures = EdgeMetrics()
     with open_server(listen, figures.families, figures.health):
         yield figures.begin
 
@@ -105,7 +105,7 @@ def serve(device: DeviceId, wiring: Wiring, *, endpoints: Endpoints, told: Told)
             signal.signal(number, lambda number, frame: edge.stop())
         words = f"edge of {device.agent}: {device.name} on {name}, {wiring.protocol}, Zenoh id {session.zid()}"
         told(edge, session)
-        introduce(Speaker("edge", parse_address(device.agent)))
+        introduce(LogSource("edge", parse_address(device.agent)))
         announce(log, words, device=device.name)
         with tell_log(session, device):
             edge.run()

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from bridges.serial import Device
 from mesh import Agent
-from mesh.work.run import Run
+from mesh.work.job import Job
 from schemas import Demand, Verified, cid_of_file
 
 agent = Agent(cid_of_file(Path(__file__).with_name("model.md")))
@@ -17,7 +17,7 @@ async def offer(demand: Verified[Demand]) -> None:
 
 
 @agent.on("/blink")
-async def blink(job: Run, message: object) -> None:
+async def blink(job: Job, message: object) -> None:
     answer = await board.call("/blink_led", job=job)
     print(f"the lamp has blinked ({answer.ending.value})", flush=True)
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from bridges.serial import Device
 from mesh import Agent, JobFailed
-from mesh.work.run import Run
+from mesh.work.job import Job
 from schemas import Demand, String, Verified, cid_of_file
 
 LAMPS = ("red", "blue")
@@ -19,7 +19,7 @@ async def offer(demand: Verified[Demand]) -> None:
 
 
 @agent.on("/blink", String)
-async def blink(job: Run, colour: String) -> None:
+async def blink(job: Job, colour: String) -> None:
     if colour.data not in LAMPS:
         raise JobFailed(f"there is no {colour.data} lamp")
     answer = await board.call("/blink_led", colour, job=job)

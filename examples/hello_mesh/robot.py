@@ -4,7 +4,7 @@ import asyncio
 from pathlib import Path
 
 from mesh import Agent
-from mesh.work.run import Run
+from mesh.work.job import Job
 from schemas import Demand, Verified, cid_of_file
 
 agent = Agent(cid_of_file(Path(__file__).with_name("model.md")))
@@ -16,7 +16,7 @@ async def offer(demand: Verified[Demand]) -> None:
 
 
 @agent.on("/blink")
-async def blink(job: Run, message: object) -> None:
+async def blink(job: Job, message: object) -> None:
     print("the lamp is on", flush=True)
     job.publish("/led", "on")
     await asyncio.sleep(0.2)

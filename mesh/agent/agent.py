@@ -8,15 +8,15 @@ from contextlib import AsyncExitStack
 from functools import partial
 from typing import TYPE_CHECKING, Final, Self, TypeVar
 
-from mesh.agent.hooks import Handler, HandlerPerformer, Hooks, hear, repeat
-from mesh.agent.parts import watching, working
+from mesh.agent.components import watching, working
+from mesh.agent.hooks import Handler, HandlerTopics, Hooks, hear, repeat
 from mesh.agent.watcher import Watcher
 from mesh.background import Background
 from mesh.composition import load_account
 from mesh.errors import ClosedError, ConfigurationError
 from mesh.settings import load
 from mesh.starting import entered, files
-from mesh.telemetry.context import Speaker, speaking
+from mesh.telemetry.context import LogSource, source_context
 from mesh.telemetry.logs import introduce
 from mesh.telemetry.serving import Telemetry
 from schemas import Demand, Offer, Result, Verified
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import TracebackType
 
+    from mesh.agent.components import AgentComponents
     from mesh.agent.contract import Contract
-    from mesh.agent.parts import Parts
-    from mesh.agent.party import Worker
+    from mesh.agent.runtime import AgentRuntime
     from mesh.chain import Account, Chain
     from mesh.network import Channel
     from mesh.recording import Objective
@@ -71,7 +71,7 @@ class Agent:
         self.telemetry = Telemetry(self.settings.metrics_listen)
         """Where its metrics and its health are told, if the settings say so."""
         self._channel: Channel | None = None
-        self._worker: Worker | None = None
+        self._worker: AgentRuntime | None = None
 
     def on(self, topic: str, kind: type | None = None) -> Callable[[H], H]:
         """Handle what an objective plays on `topic` (`*`: on any other): `async def handler(job, message)`.
@@ -142,7 +142,7 @@ class Agent:
             await asyncio.Event().wait()
 
     @property
-    def parts(self) -> Parts:
+    def parts(self) -> AgentComponents:
         """What the agent consists of while it runs. Raises `ClosedError` when it doesn't, or has no account."""
         return self._working().parts
 
@@ -234,9 +234,9 @@ class Agent:
         account = self._account
         if account is None and self.settings.keyfile:
             account = await asyncio.to_thread(load_account, self.settings)
-        who = Speaker("agent", "" if account is None else account.address, self.settings.lighthouse_contract.lower())
+        who = LogSource("agent", "" if account is None else account.address, self.settings.lighthouse_contract.lower())
         introduce(who)
-        with speaking(who):
+        with source_context(who):
             await self._open_as(stack, account)
 
     async def _open_as(self, stack: AsyncExitStack, account: Account | None) -> None:
@@ -244,7 +244,7 @@ class Agent:
         if account is None:
             network, channel = await stack.enter_async_context(watching(self.settings))
             self._channel = channel
-            role: Watcher | Worker = Watcher(network, channel)
+            role: Watcher | AgentRuntime = Watcher(network, channel)
             log.info("watching %s, Zenoh id %s", self.channel.lighthouse, network.id)
         else:
             role = await self._open_working(stack, account)
@@ -270,13 +270,13 @@ class Agent:
         self._running = False
         self._channel = self._worker = None
 
-    async def _open_working(self, stack: AsyncExitStack, account: Account) -> Worker:
-        from mesh.agent.party import Worker  # loads web3, which an agent that watches does without
+    async def _open_working(self, stack: AsyncExitStack, account: Account) -> AgentRuntime:
+        from mesh.agent.runtime import AgentRuntime  # loads web3, which an agent that watches does without
 
         make = partial(working, self.settings, account, self._given_chain)
         parts = await entered(stack, self.settings, make, role="agent", waits=self.telemetry.starting)
-        performer = HandlerPerformer(self._hooks) if self._hooks.topics else None
-        worker = self._worker = Worker(parts, performer=performer, witnesses=self._hooks.liabilities)
+        performer = HandlerTopics(self._hooks) if self._hooks.topics else None
+        worker = self._worker = AgentRuntime(parts, performer=performer, witnesses=self._hooks.liabilities)
         self._channel = parts.channel
         self._channel.announce("agent", account.address)
         log.info("account %s on %s, Zenoh id %s", account.address, parts.channel.lighthouse, parts.network.id)
@@ -286,7 +286,7 @@ class Agent:
         self._hooks.market.setdefault(kind, []).append(handler)
         return handler
 
-    def _working(self) -> Worker:
+    def _working(self) -> AgentRuntime:
         self.channel  # raises when the agent is not running  # noqa: B018
         if self._worker is None:
             raise ConfigurationError(

@@ -9,7 +9,7 @@ from schemas.rpc import Accounts, Allowance, Balance, BlockNumber, Transaction
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from mesh.agent.parts import Parts
+    from mesh.agent.components import AgentComponents
     from schemas import Record
     from schemas.rpc import AccountBalance, AccountToAddressAllowance, Approve, Nothing, Transfer, TransferFrom
 
@@ -20,7 +20,7 @@ class ChainServices:
     Accounts may be given as addresses or ENS names. What the chain refuses travels to who asked.
     """
 
-    def __init__(self, parts: Parts) -> None:
+    def __init__(self, parts: AgentComponents) -> None:
         self._chain = parts.chain
         self._account = parts.signer.address
         self._token = parts.settings.erc20_token

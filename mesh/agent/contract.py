@@ -12,7 +12,7 @@ from mesh.content import ContentUnavailable
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.agent.parts import Parts
+    from mesh.agent.components import AgentComponents
     from schemas import Liability
 
 
@@ -26,7 +26,7 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
 class Contract:
     """A contract of the chain: `await contract.outcome()`, then `await contract.recording()`."""
 
-    def __init__(self, liability: Liability, ended: asyncio.Future[Outcome], parts: Parts) -> None:
+    def __init__(self, liability: Liability, ended: asyncio.Future[Outcome], parts: AgentComponents) -> None:
         self.liability = liability
         """Its terms, as they were when the contract was first seen."""
         self._ended = ended

@@ -17,7 +17,7 @@ from schemas.values import decode_value
 
 if TYPE_CHECKING:
     from mesh.recording import Played
-    from mesh.work.run import Run
+    from mesh.work.job import Job
     from schemas import Demand, Offer, Result
 
 log = logging.getLogger(__name__)
@@ -38,7 +38,7 @@ class Hooks:
     periodic: list[tuple[float, Handler]] = field(default_factory=list)
 
 
-class HandlerPerformer:
+class HandlerTopics:
     """Does a job by handing each played message to the handler of its topic."""
 
     def __init__(self, hooks: Hooks) -> None:
@@ -59,7 +59,7 @@ class HandlerPerformer:
             return str(error)
         return ""
 
-    async def perform(self, run: Run, message: Played) -> None:
+    async def perform(self, run: Job, message: Played) -> None:
         """Decode the message and wait for its handler."""
         hook = self._hook(message.topic)
         assert hook is not None, "preflight lets no other topic pass"

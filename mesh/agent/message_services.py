@@ -14,7 +14,7 @@ from schemas.rpc import Published
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from mesh.agent.parts import Parts
+    from mesh.agent.components import AgentComponents
     from schemas import Record
     from schemas.rpc import SendDemand, SendOffer, SendResult, SignDemand, SignOffer, SignResult
 
@@ -30,7 +30,7 @@ class MessageServices:
     several that are signed before one is taken, only one can be.
     """
 
-    def __init__(self, parts: Parts) -> None:
+    def __init__(self, parts: AgentComponents) -> None:
         self._parts = parts
         self._chain = parts.chain
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-class Purse:
+class Allowances:
     """What `account` has promised the factory, by order and token, in the token's smallest unit."""
 
     def __init__(self, chain: Chain, account: str) -> None:

@@ -22,7 +22,7 @@ from schemas.rpc import GUARDED, Done, LiabilityRead, Nothing
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from mesh.agent.parts import Parts
+    from mesh.agent.components import AgentComponents
     from mesh.work.executor import Executor
     from schemas import Record
     from schemas.rpc import FinishLiability, ReadLiability, RestartLiability, ResumeLiability, StartLiability
@@ -64,7 +64,7 @@ class JobServices:
         return Nothing()
 
 
-def offer_services(parts: Parts, executor: Executor, *, drives_itself: bool) -> None:
+def offer_services(parts: AgentComponents, executor: Executor, *, drives_itself: bool) -> None:
     """Offer all services of the agent that these parts make up; `drives_itself` where its own code does the jobs."""
     jobs, is_open = JobServices(executor), parts.settings.open_services
     answers: dict[str, Answer] = {

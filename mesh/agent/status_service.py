@@ -7,11 +7,11 @@ import time
 from typing import TYPE_CHECKING
 
 import mesh
-from mesh.network.figures import link_state
+from mesh.network.metrics import link_state
 from schemas.status import ALIVE, OFF, Status, StoreUse, Work
 
 if TYPE_CHECKING:
-    from mesh.agent.parts import Parts
+    from mesh.agent.components import AgentComponents
     from mesh.work.executor import Executor
     from mesh.work.listener import Listener
     from schemas.rpc import Nothing
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 class StatusService:
     """`status`: how the agent that these parts make up is. It changes nothing, and asks neither chain nor network."""
 
-    def __init__(self, parts: Parts, executor: Executor, listener: Listener) -> None:
+    def __init__(self, parts: AgentComponents, executor: Executor, listener: Listener) -> None:
         self._parts = parts
         self._executor = executor
         self._listener = listener

@@ -11,18 +11,18 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from mesh.agent.contract import Contract, Outcome
 from mesh.agent.errors import ContractTakenBack, OrderExpired, OrderRejected
-from mesh.agent.purse import Purse
+from mesh.agent.purse import Allowances
 from mesh.agent.rejections import Rejections
 from mesh.chain import NodeUnreachable, RequestRefused
 from mesh.errors import AiraError, ClosedError
 from mesh.market.book import Refusal
-from mesh.telemetry.context import concerning, log_event
+from mesh.telemetry.context import liability_context, log_event
 from schemas import ZERO_ADDRESS, Demand, Offer, message_hash
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from mesh.agent.parts import Parts
+    from mesh.agent.components import AgentComponents
     from mesh.chain import Chain
     from schemas import Liability
     from schemas.rejection import Rejection
@@ -41,11 +41,11 @@ class _Overtaken(Exception):
 class Trader:
     """Makes the orders of one account and waits for what comes of them, until `close`."""
 
-    def __init__(self, parts: Parts, chain: Chain) -> None:
+    def __init__(self, parts: AgentComponents, chain: Chain) -> None:
         self._parts = parts
         self._chain = chain
         self._address = parts.signer.address
-        self._purse = Purse(chain, self._address)
+        self._purse = Allowances(chain, self._address)
         self._rejections = Rejections(
             parts.network.session,
             chain,
@@ -168,7 +168,7 @@ class Trader:
         ended = self._endings.pop(address, None)
         self._contracts = {demand: made for demand, made in self._contracts.items() if made.address != address}
         if ended is not None and not ended.done():
-            with concerning(address):
+            with liability_context(address):
                 log.info("it has ended, %s", "paid" if outcome.success else "refunded")
             ended.set_result(outcome)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from mesh.network.figures import link_state, message_families, network_families
+from mesh.network.metrics import link_state, message_families, network_families
 from mesh.telemetry.families import labelled
 
 if TYPE_CHECKING:

@@ -51,12 +51,12 @@ from mesh.chain.fees import GWEI, FeePolicy
 from mesh.chain.history import History
 from mesh.chain.names import namehash
 from mesh.chain.node import Node
-from mesh.chain.reader import BlockEvents, Reorganised
+from mesh.chain.reader import BlockEvents, Reorganisation
 from mesh.chain.records import Created, LighthouseState, RefundState, Settled
 from mesh.chain.recursion import restrain_recursion
 from mesh.chain.timing import Timing
 from mesh.chain.tokens import Token
-from mesh.chain.transactions import Receipt, Sender
+from mesh.chain.transactions import Receipt, TransactionSender
 
 restrain_recursion()
 
@@ -94,16 +94,16 @@ __all__ = [
     "Online",
     "Receipt",
     "RefundState",
-    "Reorganised",
+    "Reorganisation",
     "ReorganisedTooDeep",
     "RequestRefused",
     "Reverted",
-    "Sender",
     "Settled",
     "SignedTransaction",
     "StakeTooSmall",
     "Timing",
     "Token",
+    "TransactionSender",
     "TransactionTimeout",
     "Transfer",
     "UnknownName",

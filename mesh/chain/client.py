@@ -13,7 +13,7 @@ from mesh.chain.lighthouses import Lighthouses
 from mesh.chain.names import Names, find_registry
 from mesh.chain.node import Node
 from mesh.chain.tokens import Tokens
-from mesh.chain.transactions import Sender
+from mesh.chain.transactions import TransactionSender
 from mesh.chain.versions import contract_version
 from mesh.errors import ClosedError
 
@@ -157,7 +157,7 @@ class Chain:
             version=contract_version(self._kind, self.node, factory, self.generation),
             factory=factory,
             xrt=xrt,
-            sender=None if self.account is None else Sender(self.node, self.account),
+            sender=None if self.account is None else TransactionSender(self.node, self.account),
         )
 
     def _opened(self) -> Contracts:

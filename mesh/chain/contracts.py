@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from mesh.chain.names import Names
     from mesh.chain.node import Node
-    from mesh.chain.transactions import Receipt, Sender
+    from mesh.chain.transactions import Receipt, TransactionSender
     from mesh.chain.versions import ContractVersion
 
 
@@ -26,21 +26,21 @@ class Contracts:
     version: ContractVersion
     factory: str
     xrt: str
-    sender: Sender | None
+    sender: TransactionSender | None
 
     @property
     def own_address(self) -> str:
         """The address of the account that signs. Raises `NoAccount`."""
         return self.signing().account.address
 
-    def signing(self) -> Sender:
+    def signing(self) -> TransactionSender:
         """What sends the account's transactions. Raises `NoAccount`."""
         if self.sender is None:
             raise NoAccount
         return self.sender
 
     async def send(self, function: AsyncContractFunction) -> Receipt:
-        """Send a call of a contract's function as the account, and wait until it is mined. Raises as `Sender.send`."""
+        """Send a call as the account and wait until it is mined. Raises as `TransactionSender.send` does."""
         return await self.signing().call(function)
 
     async def address_or_own(self, name_or_address: str | None) -> str:

@@ -10,7 +10,7 @@ from mesh.chain.artifacts import load_artifact
 from mesh.chain.events import lighthouse_created
 from mesh.chain.names import GENERATIONS, namehash
 from mesh.chain.node import Node
-from mesh.chain.transactions import Sender
+from mesh.chain.transactions import TransactionSender
 from schemas.keccak import keccak256
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ class _Deployer:
 
     def __init__(self, node: Node, account: Account, plan: DeploymentPlan) -> None:
         self._node = node
-        self._sender = Sender(node, account)
+        self._sender = TransactionSender(node, account)
         self._owner = account.address
         self._plan = plan
         self._gas_used = 0

@@ -33,7 +33,7 @@ def follow(
     """Events from a block on, for ever (see `read_blocks`); those of lighthouses only of the given addresses.
 
     Transfers and approvals are those of the token at the address `token`, XRT by default. Blocks that the chain
-    replaced come as `Reorganised`, also from before where the `history` is given that an earlier iterator filled.
+    replaced come as `Reorganisation`, also from before where the `history` is given that an earlier iterator filled.
     """
     sources = Sources(
         factory=contracts.factory,

@@ -12,11 +12,11 @@ from web3.exceptions import BadFunctionCallOutput
 from mesh.chain.artifacts import load_artifact
 from mesh.chain.errors import NoContracts
 from mesh.chain.fees import FeePolicy
-from mesh.chain.journal import Journal
-from mesh.chain.outbox import Outbox
+from mesh.chain.node_metrics import NodeMetrics
+from mesh.chain.pending import PendingTransactions
 from mesh.chain.provider import open_provider
-from mesh.chain.tally import Tally
 from mesh.chain.timing import Timing
+from mesh.chain.transaction_store import TransactionStore
 from mesh.errors import ClosedError
 
 if TYPE_CHECKING:
@@ -61,11 +61,11 @@ class Node:
         self.fees = fees or FeePolicy()
         self._journal = journal
         self._chain_folder: Path | None = None
-        self.tally = Tally()
+        self.tally = NodeMetrics()
         self._provider = open_provider(endpoint, self.timing, self.tally)
         self._chain_id: int | None = None
         self.web3: AsyncWeb3[Any] = AsyncWeb3(self._provider, middleware=[])
-        self._outboxes: dict[str, Outbox] = {}
+        self._outboxes: dict[str, PendingTransactions] = {}
         self.contract = lru_cache(maxsize=CONTRACTS_KEPT)(self._contract)
 
     @property
@@ -134,12 +134,12 @@ class Node:
             raise failed.exceptions[0] from None
         return [task.result() for task in tasks]
 
-    def outbox(self, address: str) -> Outbox:
+    def outbox(self, address: str) -> PendingTransactions:
         """What all senders of one account through this node share. Raises `ConfigurationError` for the journal."""
         if address not in self._outboxes:
             folder = self._chain_folder
-            journal = None if folder is None else Journal(folder / address.lower())
-            self._outboxes[address] = Outbox(journal)
+            journal = None if folder is None else TransactionStore(folder / address.lower())
+            self._outboxes[address] = PendingTransactions(journal)
         return self._outboxes[address]
 
     async def _chain_name(self) -> str:

@@ -15,8 +15,8 @@ from web3.exceptions import Web3Exception
 from web3.providers.async_base import AsyncBaseProvider
 
 from mesh.chain.errors import NodeUnreachable, RequestRefused, WrongChain
+from mesh.chain.node_metrics import NodeMetrics
 from mesh.chain.reverts import decode_revert
-from mesh.chain.tally import Tally
 from mesh.chain.transports import HttpTransport, WebSocketTransport
 from mesh.errors import AiraError, ClosedError, ConfigurationError
 
@@ -46,7 +46,7 @@ class NotJsonRpc(ValueError):
     """What answers is no JSON-RPC server, or none of this chain."""
 
 
-class Way:
+class Upstream:
     """One of the nodes that requests can go to. `owned` is the transport that is closed with the provider."""
 
     def __init__(self, provider: AsyncBaseProvider, *, endpoint: str, owned: Transport | None = None) -> None:
@@ -67,7 +67,7 @@ class ReliableProvider(AsyncBaseProvider):
     passed over later.
     """
 
-    def __init__(self, ways: Sequence[Way], *, timing: Timing, tally: Tally) -> None:
+    def __init__(self, ways: Sequence[Upstream], *, timing: Timing, tally: NodeMetrics) -> None:
         super().__init__()
         self.endpoint = ", ".join(way.endpoint for way in ways)
         self._ways = tuple(ways)
@@ -91,7 +91,7 @@ class ReliableProvider(AsyncBaseProvider):
             elif chain_id != expected:
                 raise WrongChain(way.endpoint, found=chain_id, expected=expected)
 
-    async def _chain_of(self, way: Way) -> int | None:
+    async def _chain_of(self, way: Upstream) -> int | None:
         """The number of the chain that a node is on; None if it does not say."""
         try:
             async with asyncio.timeout(CHECK_TIMEOUT):
@@ -130,7 +130,7 @@ class ReliableProvider(AsyncBaseProvider):
         self._tally.failed()
         raise NodeUnreachable(self.endpoint, why) from failures[-1]
 
-    async def _ask(self, way: Way, method: RPCEndpoint, params: Any) -> dict[str, Any]:
+    async def _ask(self, way: Upstream, method: RPCEndpoint, params: Any) -> dict[str, Any]:
         """What a node answers. Raises `CONNECTION_ERRORS`."""
         async with asyncio.timeout(self._timing.request_timeout):
             if not way.is_on_chain and len(self._ways) > 1:
@@ -140,7 +140,7 @@ class ReliableProvider(AsyncBaseProvider):
             raise NotJsonRpc("what answers is not a JSON-RPC server")
         return response
 
-    async def _check_chain(self, way: Way) -> None:
+    async def _check_chain(self, way: Upstream) -> None:
         response: Any = await way.provider.make_request("eth_chainId", [])  # type: ignore[arg-type]
         found = response.get("result") if isinstance(response, dict) else None
         if self._chain_id is None:
@@ -149,7 +149,7 @@ class ReliableProvider(AsyncBaseProvider):
             raise NotJsonRpc(f"it is on the chain {found}, the others are on {self._chain_id}")
         way.is_on_chain = True
 
-    def _turn_from(self, way: Way, why: str) -> None:
+    def _turn_from(self, way: Upstream, why: str) -> None:
         """Ask another node first from now on; the one that failed comes last."""
         way.is_on_chain = False  # it may come back as another
         if len(self._ways) > 1 and self._ways[0] is way:
@@ -172,21 +172,21 @@ class ReliableProvider(AsyncBaseProvider):
                 await way.owned.close()
 
 
-def open_provider(endpoint: Endpoint, timing: Timing, tally: Tally | None = None) -> ReliableProvider:
+def open_provider(endpoint: Endpoint, timing: Timing, tally: NodeMetrics | None = None) -> ReliableProvider:
     """The provider of an endpoint: `http(s)://…`, `ws(s)://…`, several of them, or a provider object.
 
     Several are a sequence, or one text with commas. Nothing is connected yet. `tally` counts whether they answer.
     Raises `ConfigurationError` for any other text.
     """
-    tally = tally or Tally()
+    tally = tally or NodeMetrics()
     if isinstance(endpoint, AsyncBaseProvider):
-        return ReliableProvider([Way(endpoint, endpoint=str(endpoint))], timing=timing, tally=tally)
+        return ReliableProvider([Upstream(endpoint, endpoint=str(endpoint))], timing=timing, tally=tally)
     texts = [endpoint] if isinstance(endpoint, str) else endpoint
     urls = [url.strip() for text in texts for url in text.split(",")] or [""]
     return ReliableProvider([_way(url) for url in urls], timing=timing, tally=tally)
 
 
-def _way(url: str) -> Way:
+def _way(url: str) -> Upstream:
     transport: Transport
     if url.startswith(("http://", "https://")):
         transport = HttpTransport(url)
@@ -197,7 +197,7 @@ def _way(url: str) -> Way:
             f"{url!r} is not the address of a node",
             hint="an address begins with http://, https://, ws:// or wss://; several are separated by commas",
         )
-    return Way(transport, endpoint=url, owned=transport)
+    return Upstream(transport, endpoint=url, owned=transport)
 
 
 def _checked(method: str, response: dict[str, Any]) -> RPCResponse:

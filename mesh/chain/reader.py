@@ -39,7 +39,7 @@ class BlockEvents:
 
 
 @dataclass(frozen=True, slots=True)
-class Reorganised(BlockEvents):
+class Reorganisation(BlockEvents):
     """The chain replaced what came after `block_number`: all events of `events_taken_back` did not happen.
 
     They are those told of the blocks above, the newest first, which is the order to undo them in. `events` is empty;
@@ -86,7 +86,7 @@ Read: TypeAlias = "Callable[[int, int], Awaitable[list[Remembered]]]"
 async def read_blocks(
     node: Node, read: Read, from_block: int, *, history: History | None = None
 ) -> AsyncGenerator[BlockEvents, None]:
-    """Events from `from_block` on, for ever; block numbers only grow, but for `Reorganised`.
+    """Events from `from_block` on, for ever; block numbers only grow, but for `Reorganisation`.
 
     A block without events comes where nothing else would tell how far was read. With the `history` of an earlier
     reading, blocks that were replaced since then are taken back first. Raises `ChainWentBack` at the start,
@@ -198,7 +198,7 @@ async def _check_start(node: Node, history: History, *, from_block: int, head: H
     raise ChainWentBack(from_block, head.number)
 
 
-async def _find_replaced(node: Node, history: History, head: Head) -> Reorganised | None:
+async def _find_replaced(node: Node, history: History, head: Head) -> Reorganisation | None:
     """What was told of blocks that the chain has replaced; None as long as it only grew.
 
     A chain that is shorter than what is remembered has not replaced anything yet: the node may only be behind.
@@ -208,7 +208,7 @@ async def _find_replaced(node: Node, history: History, head: Head) -> Reorganise
         if await _is_there(node, block, head):
             if block is known[-1]:
                 return None
-            return Reorganised(block.block_number, (), history.forget_above(block.block_number))
+            return Reorganisation(block.block_number, (), history.forget_above(block.block_number))
     if known:
         raise ReorganisedTooDeep(known[0].block_number, head.number)
     return None

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from mesh.chain.errors import InsufficientFunds, NodeUnreachable, RequestRefused, Reverted
-from mesh.chain.outbox import Outbox, Pending, effect_of
+from mesh.chain.node_metrics import TransactionOutcome
+from mesh.chain.pending import Pending, PendingTransactions, effect_of
 from mesh.chain.submission import (
     count_all,
     count_mined,
@@ -23,7 +24,6 @@ from mesh.chain.submission import (
     is_waiting_elsewhere,
     submit,
 )
-from mesh.chain.tally import Fate
 from mesh.chain.watching import NumberLost, Watch
 from schemas.address import parse_address
 
@@ -58,7 +58,7 @@ class Receipt:
     logs: tuple[Any, ...]
 
 
-class Sender:
+class TransactionSender:
     """Sends transactions of one account; safe to use from many tasks of one event loop at once.
 
     Transactions of one account through one node are numbered one after another under a lock; with the node's journal,
@@ -95,18 +95,18 @@ class Sender:
             except NumberLost:
                 log.info("the number %d was another transaction's; sending with the next", entry.nonce)
                 await outbox.forget(entry)
-                self._node.tally.count(Fate.LOST)
+                self._node.tally.count(TransactionOutcome.LOST)
                 continue
             finally:
                 outbox.abandon(entry)
             went_through = receipt["status"] == 1
-            self._node.tally.count(Fate.MINED if went_through else Fate.FAILED)
+            self._node.tally.count(TransactionOutcome.MINED if went_through else TransactionOutcome.FAILED)
             self._node.tally.paid(gas_used=int(receipt["gasUsed"]), wei=_wei(receipt))
             if not went_through:
                 raise await self._why_failed(entry.fields, receipt)
             return _receipt(signed, receipt)
 
-    async def _taken_up(self, outbox: Outbox, fields: dict[str, Any]) -> Pending | None:
+    async def _taken_up(self, outbox: PendingTransactions, fields: dict[str, Any]) -> Pending | None:
         """The transaction that was sent before to the same effect, and that nobody watches; None if there is none."""
         async with outbox.lock:
             await outbox.refresh()
@@ -131,7 +131,7 @@ class Sender:
             return await is_known(self._node, entry.versions)
         return True
 
-    async def _sent(self, outbox: Outbox, fields: dict[str, Any]) -> Pending:
+    async def _sent(self, outbox: PendingTransactions, fields: dict[str, Any]) -> Pending:
         """The transaction, simulated, priced and sent."""
         gas = await self._estimate(fields)
         limit = gas + gas * GAS_MARGIN_PERCENT // 100
@@ -148,10 +148,10 @@ class Sender:
             await self._raise_if_poor(fields, refused)
             raise
         except Reverted:
-            self._node.tally.count(Fate.REFUSED)
+            self._node.tally.count(TransactionOutcome.REFUSED)
             raise
 
-    async def _send_numbered(self, outbox: Outbox, fields: dict[str, Any]) -> Pending:
+    async def _send_numbered(self, outbox: PendingTransactions, fields: dict[str, Any]) -> Pending:
         """Sign with the next number and send; again where another client was faster."""
         refused_numbers: set[int] = set()
         for attempt in range(1, NONCE_ATTEMPTS + 1):
@@ -175,11 +175,11 @@ class Sender:
                 outbox.abandon(entry)
                 raise
             else:
-                self._node.tally.count(Fate.SENT)
+                self._node.tally.count(TransactionOutcome.SENT)
                 return entry
         raise NodeUnreachable(self._node.endpoint, "other clients of the account take all its numbers")
 
-    async def _next_nonce(self, outbox: Outbox, refused: set[int]) -> int:
+    async def _next_nonce(self, outbox: PendingTransactions, refused: set[int]) -> int:
         """The first number that no transaction has, of those that the node knows and of those sent by us."""
         await outbox.refresh()
         counted = await count_all(self._node, self.account.address)

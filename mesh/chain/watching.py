@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Final
 
 from mesh.chain.errors import RequestRefused, TransactionTimeout
 from mesh.chain.fees import Fees
+from mesh.chain.node_metrics import TransactionOutcome
 from mesh.chain.submission import count_mined, find_receipt, is_known, submit
-from mesh.chain.tally import Fate
 
 if TYPE_CHECKING:
     from web3.types import TxReceipt
 
     from mesh.chain.accounts import Account, SignedTransaction
     from mesh.chain.node import Node
-    from mesh.chain.outbox import Outbox, Pending
+    from mesh.chain.pending import Pending, PendingTransactions
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +31,7 @@ class NumberLost(Exception):
 class Watch:
     """One wait for a transaction of an account's. The transaction stays in the outbox."""
 
-    def __init__(self, node: Node, account: Account, outbox: Outbox, entry: Pending) -> None:
+    def __init__(self, node: Node, account: Account, outbox: PendingTransactions, entry: Pending) -> None:
         self._node = node
         self._account = account
         self._outbox = outbox
@@ -122,7 +122,7 @@ class Watch:
             fields = entry.fields | fees.fields()
             signed = self._account.sign_transaction({**fields, "nonce": entry.nonce})
             await self._outbox.add_version(entry, fields, signed)
-            self._node.tally.count(Fate.REPLACED)
+            self._node.tally.count(TransactionOutcome.REPLACED)
             log.warning("the transaction %s is stuck; replaced by %s with higher fees", stuck.hash, signed.hash)
         await self._send_again(entry)
 

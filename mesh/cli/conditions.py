@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from mesh.watching import How
-    from schemas.status import ContentFigures, Market, Way, Work
+    from schemas.status import ContentMetrics, Market, Way, Work
 
 PHASES: Final = ("incoming", "ready", "running", "complete")
 """Of jobs that are not at their end."""
@@ -99,7 +99,7 @@ def _bridge(how: BridgeStatus) -> dict[str, str]:
     }
 
 
-def _content(figures: ContentFigures) -> str:
+def _content(figures: ContentMetrics) -> str:
     brought = f"{plural(figures.fetched, 'file')} fetched ({size_words(figures.fetched_bytes)})"
     taken = f"{figures.added:,} added ({size_words(figures.added_bytes)})"
     return f"{brought}, {taken}, {plural(figures.answered, 'block')} given, {figures.lies:,} false ones refused"

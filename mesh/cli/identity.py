@@ -149,7 +149,7 @@ def check(settings: Settings, agent: str, device: str) -> None:
 
 
 async def _check(settings: Settings, address: str, agent: str, device: str) -> None:
-    from mesh.identity.standing import check_standing
+    from mesh.identity.admission import check_standing
     from mesh.network.endpoints import Endpoints
 
     await check_standing(Endpoints.from_settings(settings), address, agent=agent, device=device)

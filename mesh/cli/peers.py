@@ -29,7 +29,7 @@ def command(settings: Settings, as_json: bool) -> None:
 
 
 async def _peers(settings: Settings, *, as_json: bool) -> None:
-    from mesh.agent.parts import watching
+    from mesh.agent.components import watching
     from mesh.watching import present, statuses
     from schemas.status import BridgeStatus
 

@@ -15,7 +15,7 @@ from mesh.cli.announcing import announce
 from mesh.cli.options import with_settings
 from mesh.running import run_until_stopped
 from mesh.settings import ChainSettings, NetworkSettings, TelemetrySettings, options_of
-from mesh.telemetry.context import Speaker
+from mesh.telemetry.context import LogSource
 from mesh.telemetry.logs import introduce
 from mesh.telemetry.serving import Telemetry
 
@@ -61,7 +61,7 @@ async def _serve(settings: Settings) -> None:
         telemetry = await stack.enter_async_context(Telemetry(settings.metrics_listen))
         await files(settings)
         account = await asyncio.to_thread(load_account, settings)
-        introduce(Speaker("provider", account.address, lighthouse.lower()))
+        introduce(LogSource("provider", account.address, lighthouse.lower()))
         make = partial(_opened, settings, account, telemetry)
         network, provider = await entered(stack, settings, make, role="provider", waits=telemetry.starting)
         words = f"provider {provider.address} serves {lighthouse}, Zenoh id {network.id}"
@@ -77,9 +77,9 @@ async def _opened(
 ) -> AsyncIterator[tuple[Network, Provider]]:
     """The provider with all that it needs: a node, contracts, a stake, a router; and with its figures to be seen."""
     from mesh.composition import chain_of, endpoints_of
+    from mesh.market.preflight import check_standing
     from mesh.market.process import ProviderProcess
     from mesh.market.provider import Provider
-    from mesh.market.standing import check_standing
     from mesh.network import Network
 
     lighthouse = settings.lighthouse_contract

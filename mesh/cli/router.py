@@ -121,7 +121,7 @@ async def _serve(settings: Settings) -> None:
 
 def _shown(telemetry: Telemetry, network: Network) -> AbstractContextManager[None]:
     """A router's figures and health: that it listens, and who is linked to it."""
-    from mesh.network.figures import link_state, network_families
+    from mesh.network.metrics import link_state, network_families
 
     async def measure() -> Iterable[Family]:
         return network_families(network)

@@ -39,7 +39,7 @@ def command(settings: Settings, address: str | None, timeout: float, as_json: bo
 
 
 async def _one(settings: Settings, named: str, *, timeout: float, as_json: bool) -> None:
-    from mesh.agent.parts import watching
+    from mesh.agent.components import watching
     from mesh.cli.conditions import spoken
     from mesh.watching import status_of
 
@@ -61,7 +61,7 @@ async def _one(settings: Settings, named: str, *, timeout: float, as_json: bool)
 
 
 async def _everybody(settings: Settings, *, timeout: float, as_json: bool) -> None:
-    from mesh.agent.parts import watching
+    from mesh.agent.components import watching
     from mesh.cli.conditions import in_short
     from mesh.watching import present, statuses
 

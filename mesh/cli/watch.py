@@ -54,7 +54,7 @@ def command(settings: Settings, model: str | None, with_open: bool, readings: bo
 async def _watch(
     settings: Settings, model: str | None, *, with_open: bool, as_json: bool, readings: bool = False
 ) -> None:
-    from mesh.agent.parts import watching
+    from mesh.agent.components import watching
     from mesh.cli.happenings import Words
     from mesh.watching import MarketWatch, Readings
 

@@ -15,8 +15,8 @@ from mesh.content.dag import Place, children_of, most_blocks, node_at
 from mesh.content.errors import ContentCorrupt, ContentTooLarge, StoreFull
 from mesh.content.files import PART_PREFIX, PUT_PREFIX, TemporaryFile
 from mesh.content.index import Span
-from mesh.content.opening import DAMAGED_SUFFIX
 from mesh.content.reading import read_or_nothing
+from mesh.content.recovery import DAMAGED_SUFFIX
 from schemas.cid import parse_cid
 from schemas.unixfs import CHUNK_SIZE, MAX_BLOCK_SIZE, blocks_of_stream
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from types import TracebackType
 
     from mesh.content.index import BlockIndex
-    from mesh.content.room import Room
+    from mesh.content.quota import Room
     from mesh.content.store import Store
 
 _BATCH: Final = 128

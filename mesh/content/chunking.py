@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mesh.content.files import TemporaryFile
     from mesh.content.holdings import Progress
     from mesh.content.index import BlockIndex
-    from mesh.content.room import Room
+    from mesh.content.quota import Room
 
 _BATCH: Final = 128
 """Blocks entered in the index at once: 32 MiB of a file, so that a file of any size takes constant memory."""

@@ -133,7 +133,7 @@ def no_room_is_store_full(directory: Path) -> Iterator[None]:
 
 @contextmanager
 def directory_lock(directory: Path) -> Iterator[None]:
-    """Hold the directory for this process (and thread) alone; waits for whoever has it."""
+    """LockedEntry the directory for this process (and thread) alone; waits for whoever has it."""
     descriptor = os.open(directory / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)

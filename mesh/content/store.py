@@ -21,13 +21,13 @@ from typing import TYPE_CHECKING, BinaryIO, Final, cast
 
 from mesh.content.assembly import Assembly
 from mesh.content.chunking import CopiedStream, enter_blocks, told
+from mesh.content.directory import Shelf
 from mesh.content.errors import ContentCorrupt, ContentUnavailable, StoreFull
 from mesh.content.files import PUT_PREFIX, TemporaryFile, directory_lock, stamp, sync_directory
 from mesh.content.holdings import Check
-from mesh.content.opening import DAMAGED_SUFFIX, is_cid, set_aside
 from mesh.content.pins import check_label
 from mesh.content.reading import CheckedFile, is_tree, read_or_nothing
-from mesh.content.shelf import Shelf
+from mesh.content.recovery import DAMAGED_SUFFIX, is_cid, set_aside
 from mesh.errors import ContentError
 from schemas.cid import parse_cid
 from schemas.unixfs import CHUNK_SIZE, cid_of_stream

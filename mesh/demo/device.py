@@ -9,7 +9,7 @@ from schemas import Empty, String
 
 if TYPE_CHECKING:
     from mesh.demo.story import Story
-    from mesh.work.run import Run
+    from mesh.work.job import Job
 
 BLINK: Final = 0.1
 """Seconds that the lamp is lit for a message."""
@@ -25,7 +25,7 @@ class Lamp:
         self.blinks = 0
         """How often it has blinked."""
 
-    async def play(self, job: Run, message: Any) -> None:
+    async def play(self, job: Job, message: Any) -> None:
         """Blink once, and publish `on` and `off` on the job's topic `/led`."""
         colour = message.data if isinstance(message, String) else ""
         self._story.tell("robot", "played", f"plays {_shown(message)}", message=_shown(message))
@@ -34,7 +34,7 @@ class Lamp:
         await self._switch(job, "off", colour)
         self.blinks += 1
 
-    async def _switch(self, job: Run, state: str, colour: str) -> None:
+    async def _switch(self, job: Job, state: str, colour: str) -> None:
         name = f"{colour} LED" if colour in ("red", "blue") else "LED"
         lamp = "●" if state == "on" else "○"
         self._story.tell("device", "led", f"{lamp} {name} {state}", state=state, colour=colour)

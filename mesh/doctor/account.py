@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from mesh.chain import Account
 from mesh.doctor.checks import aside
 from mesh.doctor.findings import Finding, broken, doubtful, sound
-from mesh.market.standing import GAS_OF_ONE
+from mesh.market.preflight import GAS_OF_ONE
 
 if TYPE_CHECKING:
     from mesh.doctor.case import Case

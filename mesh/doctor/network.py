@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from mesh.doctor.clock import against_router
 from mesh.doctor.findings import Finding, broken, doubtful, sound
 from mesh.doctor.writing import Pair
+from mesh.identity.admission import NotAdmittedYet
 from mesh.identity.routers import is_loopback
-from mesh.identity.standing import NotHeeded
 from mesh.network import Endpoints, Network
 from mesh.network.endpoints import SECURE
 from schemas.chunks import address_chunk, lighthouse_chunk, name_chunk
@@ -88,14 +88,14 @@ class Wire:
         return sound(f"open in {took * 1000:.0f} ms, at the router {routers}")
 
     async def check_own_write(self) -> Finding:
-        """That the router passes on what this identity may write. Raises `NotHeeded`."""
+        """That the router passes on what this identity may write. Raises `NotAdmittedYet`."""
         pair = self._opened()
         if self._roles == ("watcher",):
             await self._check_heard(pair)
             return sound("a watcher writes nothing; what it wants to hear, the router sends")
         took = await pair.round_trip(self._keys.own)
         if took is None:
-            raise NotHeeded(self._address)
+            raise NotAdmittedYet(self._address)
         return sound(f"heard back through the router in {took * 1000:.1f} ms")
 
     async def check_denied_write(self) -> Finding:
@@ -123,7 +123,7 @@ class Wire:
 
     async def _check_heard(self, pair: Pair) -> None:
         if not await pair.is_heeded(self._keys.own):
-            raise NotHeeded(self._address)
+            raise NotAdmittedYet(self._address)
 
     def _open(self, where: str) -> Finding:
         """The router let a write pass that no role may make."""

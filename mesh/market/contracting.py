@@ -8,24 +8,24 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from mesh.chain import NodeUnreachable, RequestRefused, Reverted
 from mesh.errors import AiraError, InputError
-from mesh.market.blame import at_fault, word_for
+from mesh.market.faults import at_fault, word_for
 from mesh.market.patience import Patience, may_pass
-from mesh.telemetry.context import concerning, log_event
+from mesh.telemetry.context import liability_context, log_event
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from mesh.chain import Chain
     from mesh.market.book import Match, Order
-    from mesh.market.earnings import Books
+    from mesh.market.earnings import EarningsLedger
     from mesh.market.sending import Sending
-    from mesh.market.used import Used
+    from mesh.market.settled import SettledMessages
     from schemas import Result, Verified
 
 log = logging.getLogger(__name__)
 
 
-class Desk(Protocol):
+class ProviderCallbacks(Protocol):
     """Where orders and Results come from, and go back to."""
 
     def put_back(self, order: Verified[Order]) -> None:
@@ -42,7 +42,14 @@ class Contracting:
     """The contracts of the lighthouse at the address `lighthouse`. Whatever is asked for is done in its turn."""
 
     def __init__(
-        self, chain: Chain, lighthouse: str, desk: Desk, *, sending: Sending, books: Books, used: Used
+        self,
+        chain: Chain,
+        lighthouse: str,
+        desk: ProviderCallbacks,
+        *,
+        sending: Sending,
+        books: EarningsLedger,
+        used: SettledMessages,
     ) -> None:
         self._chain = chain
         self._lighthouse = lighthouse
@@ -77,7 +84,7 @@ class Contracting:
             self._books.made(created, fee=offer.message.lighthouse_fee)
             self._used.add(created.liability, demand, offer)
             known = log_event("unnamed", demand=demand.hash.hex(), offer=offer.hash.hex(), gas=created.gas_used)
-            with concerning(created.liability):
+            with liability_context(created.liability):
                 log.info("created, gas %d", created.gas_used, extra=known)
 
     def _again(
@@ -107,7 +114,7 @@ class Contracting:
             return False  # the contracts will say so when it is matched
 
     async def _end(self, result: Verified[Result], patience: Patience) -> None:
-        with concerning(result.message.liability):
+        with liability_context(result.message.liability):
             await self._finalize(result, patience)
 
     async def _finalize(self, result: Verified[Result], patience: Patience) -> None:

@@ -64,7 +64,7 @@ class Turnover(NamedTuple):
     """What of it the chain took back again."""
 
 
-class Books:
+class EarningsLedger:
     """The account of one provider."""
 
     def __init__(self) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mesh.chain.figures import ChainFigures
-from mesh.network.figures import link_state, network_families
+from mesh.chain.metrics import ChainMetrics
+from mesh.network.metrics import link_state, network_families
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ class ProviderProcess:
 
     def __init__(self, network: Network, chain: Chain, providers: Sequence[Provider]) -> None:
         self._network = network
-        self._chain = ChainFigures(chain)
+        self._chain = ChainMetrics(chain)
         self._providers = providers
 
     async def measure(self) -> tuple[Family, ...]:

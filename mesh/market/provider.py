@@ -12,20 +12,20 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from mesh.chain import NotALiability, RequestRefused
-from mesh.market.blame import USED
 from mesh.market.book import LIMIT, Match, OrderBook, Refusal
 from mesh.market.contracting import Contracting
-from mesh.market.earnings import Books, Earnings
-from mesh.market.figures import MarketFigures
-from mesh.market.memory import Memory
+from mesh.market.earnings import Earnings, EarningsLedger
+from mesh.market.faults import USED
+from mesh.market.metrics import MarketMetrics
+from mesh.market.order_book_service import OrderBookService
 from mesh.market.sending import Sending
+from mesh.market.settled import SettledMessages
 from mesh.market.telling import StatusService
-from mesh.market.used import Used
 from mesh.market.watching import Watching
 from mesh.network.channel import Channel
 from mesh.network.services import Services
 from mesh.role import Role
-from mesh.telemetry.context import Speaker, concerning, log_event, speaking
+from mesh.telemetry.context import LogSource, liability_context, log_event, source_context
 from mesh.telemetry.log_service import LogService
 from schemas import ZERO_ADDRESS, Demand, Offer, RejectKey, Result, Verified
 from schemas.rejection import Rejection
@@ -75,8 +75,8 @@ class Provider(Role):
         self._lighthouse = lighthouse.lower()
         self._limit = limit
         self._matched = matched
-        self._books = Books()
-        self._speaker = Speaker("provider", self.address, self._lighthouse)
+        self._books = EarningsLedger()
+        self._speaker = LogSource("provider", self.address, self._lighthouse)
 
     async def _open(self, stack: AsyncExitStack) -> None:
         market, head = await self._chain.names.address(self._lighthouse), await self._chain.block_number()
@@ -95,8 +95,8 @@ class Provider(Role):
         self._demands = await stack.enter_async_context(self.channel.subscribe(Demand))
         self._offers = await stack.enter_async_context(self.channel.subscribe(Offer))
         self._results = await stack.enter_async_context(self.channel.subscribe(Result))
-        await stack.enter_async_context(Memory(self._session, self._lighthouse, self.book))
-        self._figures = MarketFigures(
+        await stack.enter_async_context(OrderBookService(self._session, self._lighthouse, self.book))
+        self._figures = MarketMetrics(
             self.channel,
             self._chain,
             subscriptions=(self._demands, self._offers, self._results),
@@ -106,14 +106,14 @@ class Provider(Role):
             watching=self._watching,
         )
         services = await stack.enter_async_context(Services(self._session, self.address))
-        with speaking(self._speaker):
+        with source_context(self._speaker):
             services.offer("status", self._telling.status)
             services.offer("logs", LogService("provider", self.address).logs)
         self.channel.announce("provider", self.address)
 
     def _prepare(self, market: str, head: int) -> None:
         """What works on the chain, for the lighthouse at the address `market`."""
-        used = Used()
+        used = SettledMessages()
         self._sending = Sending(self._chain, market, provider=self.address, head=lambda: self._watching.head)
         self._contracting = Contracting(self._chain, market, self, sending=self._sending, books=self._books, used=used)
         self._watching = Watching(
@@ -137,7 +137,7 @@ class Provider(Role):
         )
 
     async def _work(self) -> None:
-        with speaking(self._speaker):
+        with source_context(self._speaker):
             await self._serve()
 
     async def _serve(self) -> None:
@@ -206,7 +206,7 @@ class Provider(Role):
     async def _take_results(self) -> None:
         async for result in self._results:
             await self._sending.room()
-            with concerning(result.message.liability):
+            with liability_context(result.message.liability):
                 await self._take_result(result)
 
     async def _take_result(self, result: Verified[Result]) -> None:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from mesh.chain import Chain
     from mesh.market.book import OrderBook
-    from mesh.market.earnings import Books
+    from mesh.market.earnings import EarningsLedger
     from mesh.market.sending import Sending
     from mesh.market.watching import Watching
     from schemas.rpc import Nothing
@@ -29,7 +29,7 @@ class StatusService:
         lighthouse: str,
         *,
         book: OrderBook,
-        books: Books,
+        books: EarningsLedger,
         sending: Sending,
         watching: Watching,
     ) -> None:

@@ -15,20 +15,20 @@ from mesh.chain import (
     NoContracts,
     NodeUnreachable,
     NotALiability,
-    Reorganised,
+    Reorganisation,
     RequestRefused,
 )
 from mesh.market.sending import RETRY
 from mesh.outage_log import OutageLog
-from mesh.telemetry.context import concerning, log_event
+from mesh.telemetry.context import liability_context, log_event
 from schemas import Demand, Offer, Result, address_bytes
 
 if TYPE_CHECKING:
     from mesh.chain import BlockEvents, Chain
     from mesh.market.book import OrderBook
-    from mesh.market.contracting import Contracting, Desk
-    from mesh.market.earnings import Books
-    from mesh.market.used import Used
+    from mesh.market.contracting import Contracting, ProviderCallbacks
+    from mesh.market.earnings import EarningsLedger
+    from mesh.market.settled import SettledMessages
     from schemas import Liability
 
 log = logging.getLogger(__name__)
@@ -44,13 +44,13 @@ class Watching:
         self,
         chain: Chain,
         lighthouse: str,
-        desk: Desk,
+        desk: ProviderCallbacks,
         *,
         head: int,
         book: OrderBook,
         contracting: Contracting,
-        books: Books,
-        used: Used,
+        books: EarningsLedger,
+        used: SettledMessages,
     ) -> None:
         self.head = head
         """The latest block that was read."""
@@ -75,7 +75,7 @@ class Watching:
                 async with aclosing(self._chain.follow(self.head + 1, history=self._history)) as blocks:
                     async for block in blocks:
                         self._trouble.recovered(f"the chain can be read again, from block {block.block_number}")
-                        if isinstance(block, Reorganised):
+                        if isinstance(block, Reorganisation):
                             self._take_back(block)
                         else:
                             await self._take_block(block)
@@ -117,14 +117,14 @@ class Watching:
             if len(self._open) > OPEN:
                 del self._open[next(iter(self._open))]
 
-    def _take_back(self, block: Reorganised) -> None:
+    def _take_back(self, block: Reorganisation) -> None:
         """What the chain has undone is done again, unless it comes again by itself: then the contracts say so."""
         self.head = block.back_to
         created = [event.liability for event in block.events_taken_back if isinstance(event, NewLiability)]
         finalized = [event.liability for event in block.events_taken_back if isinstance(event, Finalized)]
         log.warning("the chain took back %d contracts and %d endings", len(created), len(finalized))
         for address in created:
-            with concerning(address):
+            with liability_context(address):
                 log.warning("the chain took the contract back")
             self._open.pop(address, None)
             self._books.unmade(address)

@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from mesh.network.session import Network, NetworkChange
     from mesh.network.subscription import Subscription
     from mesh.network.tls import Tls
-    from mesh.network.verification import Door, Statistics
+    from mesh.network.validation import MessageValidator, Statistics
 
 _HOMES: Final = {
     "Channel": "mesh.network.channel",
-    "Door": "mesh.network.verification",
+    "MessageValidator": "mesh.network.validation",
     "Endpoints": "mesh.network.endpoints",
     "Network": "mesh.network.session",
     "NetworkChange": "mesh.network.session",
@@ -28,7 +28,7 @@ _HOMES: Final = {
     "Pump": "mesh.network.pump",
     "ServiceFailed": "mesh.network.services",
     "Services": "mesh.network.services",
-    "Statistics": "mesh.network.verification",
+    "Statistics": "mesh.network.validation",
     "Subscription": "mesh.network.subscription",
     "Tls": "mesh.network.tls",
     "call": "mesh.network.services",
@@ -42,8 +42,8 @@ __getattr__ = on_demand(__name__, _HOMES)
 
 __all__ = [
     "Channel",
-    "Door",
     "Endpoints",
+    "MessageValidator",
     "Network",
     "NetworkChange",
     "NotAdmitted",

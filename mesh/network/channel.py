@@ -16,7 +16,7 @@ import zenoh
 from mesh.errors import ClosedError, InputError, InvalidKey
 from mesh.network.addressing import KINDS, message_key
 from mesh.network.subscription import RECALL_LIMIT, RECALL_TIMEOUT, Subscription
-from mesh.network.verification import Door, M
+from mesh.network.validation import M, MessageValidator
 from schemas import (
     Result,
     SignedMessage,
@@ -112,7 +112,9 @@ class Channel:
         selector = market_selector(self.lighthouse, KINDS[kind], model)
         if liability != "*":
             selector = self._result_selector(kind, liability)
-        door: Door[M] = Door(kind, lighthouse=self.lighthouse, address=self.address, head=self._head)
+        door: MessageValidator[M] = MessageValidator(
+            kind, lighthouse=self.lighthouse, address=self.address, head=self._head
+        )
         return Subscription(self._session, selector, door, self._resolver)
 
     def announce(self, role: str, address: str) -> None:

@@ -11,7 +11,7 @@ import zenoh
 
 from mesh.errors import AiraError
 from mesh.network.pump import Pump
-from mesh.network.verification import Door, M, Statistics, Unresolved
+from mesh.network.validation import M, MessageValidator, Statistics, Unresolved
 from schemas import Verified, names_in
 
 if TYPE_CHECKING:
@@ -37,10 +37,12 @@ class Subscription(Generic[M]):
     overtaken by others while they are looked up. Raises `ClosedError` before it is entered.
     """
 
-    def __init__(self, session: zenoh.Session, selector: str, door: Door[M], resolver: Resolver | None) -> None:
+    def __init__(
+        self, session: zenoh.Session, selector: str, door: MessageValidator[M], resolver: Resolver | None
+    ) -> None:
         self._session = session
         self._selector = selector
-        self._door: Door[M] = door
+        self._door: MessageValidator[M] = door
         self._resolver = resolver
         self._pump: Pump[Verified[M] | Unresolved[M]] = Pump(session, selector, door)
         self._named: asyncio.Queue[Unresolved[M]] = asyncio.Queue(LOOKING_UP)

@@ -13,6 +13,7 @@ import msgspec
 
 from mesh.errors import ConfigurationError
 from mesh.settings.groups import DEFAULTS, MEANING, OPTIONS, Settings
+from mesh.telemetry.context import log_event
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from mesh.content import Store
-from mesh.content.opening import is_in_use
+from mesh.content.recovery import is_in_use
 from mesh.state.archive import read_archive
 from mesh.state.errors import NoState
 from mesh.state.layout import LEDGER, PINS, RECORDINGS, homes_in, parts_in, transactions_in

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from pathlib import Path
 
-    from mesh.work import Job
+    from mesh.work import JobRecord
 
 ACTIVE: Final = (
     "SELECT CASE type WHEN 'table' THEN 'virtual table' ELSE type END FROM sqlite_master"
@@ -36,7 +36,7 @@ CURSOR: Final = "listener"
 class LedgerFacts:
     """What a ledger held at one moment. `block` is the last one handled, None before the first."""
 
-    jobs: Mapping[str, Job]
+    jobs: Mapping[str, JobRecord]
     """Those that are not finalized, by the address of their liability."""
     phases: Mapping[str, int]
     block: int | None

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final
 
 from mesh.content.files import no_room_is_store_full, sync_directory
-from mesh.content.opening import is_in_use
+from mesh.content.recovery import is_in_use
 from mesh.errors import ConfigurationError
 from mesh.state.archive import read_about, read_archive
 from mesh.state.errors import ArchiveUnusable, StateExists, StateInUse
@@ -25,7 +25,7 @@ from mesh.state.ledgers import check_ledger, kept_out, read_ledger
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from mesh.work import Job
+    from mesh.work import JobRecord
 
 STAGING: Final = ".restore-"
 """Begins the name of the folder in which a backup is unpacked."""
@@ -51,7 +51,7 @@ class Restored:
 
     made: str
     parts: tuple[str, ...]
-    jobs: tuple[Job, ...]
+    jobs: tuple[JobRecord, ...]
     aside: Path | None
 
 
@@ -68,7 +68,7 @@ async def restore(archive: Path, folder: Path, *, existing: Existing = Existing.
         _check_free(folder, about.parts, existing, locks=None)
         await asyncio.to_thread(_unpack, archive, staging)
         parts = tuple(part for part in about.parts if (staging / part).is_dir())
-        jobs: list[Job] = []
+        jobs: list[JobRecord] = []
         for ledger in sorted(staging.glob(f"*/*/{LEDGER}")):
             await asyncio.to_thread(check_ledger, ledger)
             jobs += (await read_ledger(ledger)).jobs.values()

@@ -21,7 +21,7 @@ T = TypeVar("T")
 P = ParamSpec("P")
 
 
-class Speaker(NamedTuple):
+class LogSource(NamedTuple):
     """Whose event it is."""
 
     role: str = ""
@@ -31,13 +31,13 @@ class Speaker(NamedTuple):
     """The ENS name of its market."""
 
 
-NOBODY: Final = Speaker()
+NOBODY: Final = LogSource()
 
-_speaker: ContextVar[Speaker] = ContextVar("speaker", default=NOBODY)
+_speaker: ContextVar[LogSource] = ContextVar("speaker", default=NOBODY)
 _liability: ContextVar[str] = ContextVar("liability", default="")
 
 
-def speaker() -> Speaker:
+def speaker() -> LogSource:
     """Who speaks here; `NOBODY` where that is not said."""
     return _speaker.get()
 
@@ -48,7 +48,7 @@ def liability() -> str:
 
 
 @contextmanager
-def speaking(who: Speaker) -> Iterator[None]:
+def source_context(who: LogSource) -> Iterator[None]:
     """What is logged within is said by `who`."""
     token = _speaker.set(who)
     try:
@@ -58,7 +58,7 @@ def speaking(who: Speaker) -> Iterator[None]:
 
 
 @contextmanager
-def concerning(liability: str) -> Iterator[None]:
+def liability_context(liability: str) -> Iterator[None]:
     """What is logged within concerns the contract at the address `liability`."""
     token = _liability.set(_canonical(liability))
     try:
@@ -67,14 +67,14 @@ def concerning(liability: str) -> Iterator[None]:
         _liability.reset(token)
 
 
-def of_its_liability(
+def with_liability_context(
     method: Callable[Concatenate[S, L, P], Coroutine[Any, Any, T]],
 ) -> Callable[Concatenate[S, L, P], Coroutine[Any, Any, T]]:
     """Decorate a method whose first argument is a liability, or the address of one: its events concern that."""
 
     @wraps(method)
     async def concerned(self: S, which: L, /, *arguments: P.args, **options: P.kwargs) -> T:
-        with concerning(which if isinstance(which, str) else which.address):
+        with liability_context(which if isinstance(which, str) else which.address):
             return await method(self, which, *arguments, **options)
 
     return concerned

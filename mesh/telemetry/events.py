@@ -16,7 +16,7 @@ from schemas.logs import LEVELS, LogEvent
 if TYPE_CHECKING:
     import logging
 
-    from mesh.telemetry.context import Speaker
+    from mesh.telemetry.context import LogSource
 
 LONGEST_MESSAGE: Final = 4_000
 """Characters of a message that are kept, and of an error; an event must fit into a reply."""
@@ -36,7 +36,7 @@ NAMES: Final = frozenset(LogEvent.__struct_fields__)
 """No fact can have the name of a field."""
 
 
-def event_of(record: logging.LogRecord, *, default: Speaker = context.NOBODY) -> LogEvent:
+def event_of(record: logging.LogRecord, *, default: LogSource = context.NOBODY) -> LogEvent:
     """What `record` says, in its context; `default` speaks where nobody is said to."""
     who = context.speaker()
     if who is context.NOBODY:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from mesh.settings import Settings
-    from mesh.telemetry.context import Speaker
+    from mesh.telemetry.context import LogSource
     from schemas.logs import LogEvent
 
 log = logging.getLogger(__name__)
@@ -28,7 +28,7 @@ OTHERS: Final = ("aiohttp", "asyncio", "eth", "eth_tester", "urllib3", "web3", "
 class Log(logging.Handler):
     """Keeps events in `ring`, and writes them to stderr with `line` (None: does not write)."""
 
-    def __init__(self, line: Any = None, *, speaker: Speaker = context.NOBODY) -> None:
+    def __init__(self, line: Any = None, *, speaker: LogSource = context.NOBODY) -> None:
         super().__init__()
         self.ring: Final = Ring()
         self.speaker = speaker
@@ -72,7 +72,7 @@ def start_log(*, level: str = "info", form: str = "human", role: str = "") -> No
     root = logging.getLogger()
     if root.handlers:
         return
-    handler = Log(json_line if form == "json" else human_line, speaker=context.Speaker(role))
+    handler = Log(json_line if form == "json" else human_line, speaker=context.LogSource(role))
     root.addHandler(handler)
     least = getattr(logging, level.upper())
     root.setLevel(least)
@@ -115,10 +115,10 @@ def writes_json() -> bool:
     return own is not None and own.writes_json
 
 
-def introduce(who: Speaker) -> None:
+def introduce(who: LogSource) -> None:
     """Say as whom this process speaks, where it is known by its role only so far."""
     own = own_log()
-    if own is not None and own.speaker == context.Speaker(who.role):
+    if own is not None and own.speaker == context.LogSource(who.role):
         own.speaker = who
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mesh.telemetry.server import Server
 
     Measure = Callable[[], Awaitable[Iterable[Family]]]
-    Parts = Callable[[], Mapping[str, str]]
+    AgentComponents = Callable[[], Mapping[str, str]]
 
 T = TypeVar("T")
 
@@ -37,7 +37,7 @@ class _Shown(NamedTuple):
     """What one role of the process shows."""
 
     measure: Measure
-    health: Parts
+    health: AgentComponents
 
 
 class Telemetry:
@@ -80,7 +80,7 @@ class Telemetry:
         self._starting = f"waits: {why}"
 
     @contextmanager
-    def showing(self, *, health: Parts, measure: Measure = no_figures) -> Iterator[None]:
+    def showing(self, *, health: AgentComponents, measure: Measure = no_figures) -> Iterator[None]:
         """Show these figures and parts, beside those that are shown already, until the `with` ends.
 
         `measure` (figures now) and `health` (part → `ALIVE`, `OFF`, or what it waits for) are called in the event loop.

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from mesh.errors import ClosedError, ContentError, InputError
-from mesh.telemetry.context import concerning, of_its_liability
+from mesh.telemetry.context import liability_context, with_liability_context
 from mesh.work.lifecycle import Phase, WrongPhase, advance
 from mesh.work.objectives import Objectives
 from mesh.work.playbacks import Playbacks
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable
 
     from mesh.recording import Objective
-    from mesh.work.ledger import Job
-    from mesh.work.lifecycle import Witness
-    from mesh.work.run import Performer
+    from mesh.work.job import TopicHandler
+    from mesh.work.ledger import JobRecord
+    from mesh.work.lifecycle import PhaseListener
     from mesh.work.workshop import Workshop
     from schemas import Liability
 
@@ -44,7 +44,7 @@ class Executor:
     `start` and `finish`.
     """
 
-    def __init__(self, workshop: Workshop, *, performer: Performer | None, witness: Witness) -> None:
+    def __init__(self, workshop: Workshop, *, performer: TopicHandler | None, witness: PhaseListener) -> None:
         self._shop = workshop
         self._performer = performer
         self._witness = witness
@@ -87,7 +87,7 @@ class Executor:
         self._objectives.prepare(liability.address, self._prepare(liability), self._begun())
 
     @asynccontextmanager
-    async def halted(self, address: str) -> AsyncIterator[Job | None]:
+    async def halted(self, address: str) -> AsyncIterator[JobRecord | None]:
         """Stop whatever runs for a job, keeping its files, and let nothing change meanwhile; gives it if it is ours."""
         async with self._changing:
             job = await self._shop.ledger.job(address)
@@ -98,7 +98,7 @@ class Executor:
             if job is not None:
                 await self._shop.unpin(address)
 
-    @of_its_liability
+    @with_liability_context
     async def start(self, address: str) -> None:
         """Play the objective of a ready job. Returns when the playback has begun. Raises `WrongPhase`."""
         await self._objective_at_hand(address)
@@ -108,7 +108,7 @@ class Executor:
                 raise WrongPhase(address, asked="start", phase=job.phase)
             await self._begin(job, 0)
 
-    @of_its_liability
+    @with_liability_context
     async def restart(self, address: str) -> None:
         """Begin a running or ready job anew: a fresh recording, the objective from its first message."""
         await self._objective_at_hand(address)
@@ -120,7 +120,7 @@ class Executor:
             await asyncio.to_thread(self._shop.discard_recording, address)
             await self._begin(job, 0)
 
-    @of_its_liability
+    @with_liability_context
     async def resume(self, address: str) -> None:
         """Go on with an interrupted job at the position in the ledger, adding to its recording."""
         await self._objective_at_hand(address)
@@ -140,7 +140,7 @@ class Executor:
             is_finalized=job.phase is Phase.FINALIZED,
         )
 
-    @of_its_liability
+    @with_liability_context
     async def finish(self, address: str, *, success: bool, note: str = "") -> str:
         """End a job: close the recording, keep it under its CID, sign and send the Result. Returns the CID.
 
@@ -161,13 +161,13 @@ class Executor:
         await self._shop.outbox.send()
         return cid
 
-    async def _job(self, address: str, *, asked: str) -> Job:
+    async def _job(self, address: str, *, asked: str) -> JobRecord:
         job = await self._shop.ledger.job(address)
         if job is None:
             raise WrongPhase(address, asked=asked, phase=None)
         return job
 
-    async def _startable(self, address: str, *, asked: str) -> Job:
+    async def _startable(self, address: str, *, asked: str) -> JobRecord:
         job = await self._job(address, asked=asked)
         if job.phase not in STARTED or address not in self._objectives:
             raise WrongPhase(address, asked=asked, phase=job.phase)
@@ -180,7 +180,7 @@ class Executor:
         if job is not None and job.phase in STARTED:
             await self._objectives.wait(address)
 
-    @of_its_liability
+    @with_liability_context
     async def _prepare(self, liability: Liability) -> None:
         address = liability.address
         try:
@@ -206,7 +206,7 @@ class Executor:
         while True:
             address = await self._ready.get()
             if self._performer is not None:
-                with concerning(address):
+                with liability_context(address):
                     await self._unless_ended(self._serve(address))
 
     async def _serve(self, address: str) -> None:
@@ -219,7 +219,7 @@ class Executor:
         async with self._changing:
             return self._playbacks.under_way(address)
 
-    async def _begin(self, job: Job, position: int) -> None:
+    async def _begin(self, job: JobRecord, position: int) -> None:
         objective = self._objectives[job.liability.address]
         await self._playbacks.begin(job, objective, self._begun(), position=position)
 

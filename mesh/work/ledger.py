@@ -25,7 +25,7 @@ SPENT_KEPT: Final = 4096
 """Orders that are kept after they became contracts; the chain replaces its last blocks only."""
 
 
-class Job(msgspec.Struct, frozen=True, kw_only=True):
+class JobRecord(msgspec.Struct, frozen=True, kw_only=True):
     """A job as the ledger holds it.
 
     `success` and `result` (CIDv0 of the recording) are there from COMPLETE on; `position` counts the objective's
@@ -97,12 +97,12 @@ class Ledger:
             (ended, (Phase.COMPLETE, success, result, note, time.time(), liability)), (POST, _posted(outgoing))
         )
 
-    async def job(self, liability: str) -> Job | None:
+    async def job(self, liability: str) -> JobRecord | None:
         """The job at `liability` (EIP-55 address), if it is ours."""
         rows = await self._database.rows("SELECT * FROM jobs WHERE liability = ? AND NOT aside", (liability,))
         return _job(rows[0]) if rows else None
 
-    async def jobs(self, phases: Iterable[Phase] = UNFINISHED) -> list[Job]:
+    async def jobs(self, phases: Iterable[Phase] = UNFINISHED) -> list[JobRecord]:
         """The jobs in the given phases, oldest first."""
         wanted = tuple(phases)
         marks = ",".join("?" * len(wanted))
@@ -181,8 +181,8 @@ class Ledger:
         )
 
 
-def _job(row: Any) -> Job:
-    return Job(
+def _job(row: Any) -> JobRecord:
+    return JobRecord(
         liability=Liability.decode(row[2]),
         phase=Phase(row[1]),
         success=None if row[3] is None else bool(row[3]),

@@ -50,7 +50,7 @@ class WrongPhase(AiraError):
         self.phase = phase
 
 
-class Witness(Protocol):
+class PhaseListener(Protocol):
     """Whoever is told that a job has come into a phase (after the ledger knows)."""
 
     async def __call__(self, phase: Phase, liability: Liability) -> None: ...

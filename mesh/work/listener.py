@@ -15,12 +15,12 @@ from mesh.chain import (
     NoContracts,
     NodeUnreachable,
     NotALiability,
-    Reorganised,
+    Reorganisation,
     RequestRefused,
     Transfer,
 )
 from mesh.outage_log import OutageLog
-from mesh.telemetry.context import concerning
+from mesh.telemetry.context import liability_context
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -35,7 +35,7 @@ RETRY: Final = 1.0
 """Seconds before a node is asked again that was lost, or that refused to answer."""
 
 
-class Party(Protocol):
+class ChainEventHandler(Protocol):
     """Who a listener reads for."""
 
     async def new_liability(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
@@ -63,13 +63,15 @@ class Party(Protocol):
 class Listener:
     """Reads from the block after the ledger's cursor, so that nothing is missed while the agent is down.
 
-    An agent that never ran begins at the head. A block is handled again after a crash in its middle: what a `Party`
-    does must bear that. Token events are those of `token` (name or address), XRT by default.
+    An agent that never ran begins at the head. A block is handled again after a crash in its middle: handling is
+    idempotent. Token events are those of `token` (name or address), XRT by default.
     """
 
     NAME = "listener"
 
-    def __init__(self, chain: Chain, ledger: Ledger, account: str, party: Party, *, token: str = "") -> None:
+    def __init__(
+        self, chain: Chain, ledger: Ledger, account: str, party: ChainEventHandler, *, token: str = ""
+    ) -> None:
         self._chain = chain
         self._ledger = ledger
         self._account = account
@@ -99,7 +101,7 @@ class Listener:
         async with aclosing(self._chain.follow(cursor + 1, token=token, history=history)) as blocks:
             async for block in blocks:
                 self._trouble.recovered(f"the chain can be read again, from block {block.block_number}")
-                if isinstance(block, Reorganised):
+                if isinstance(block, Reorganisation):
                     await self._take_back(block)
                 await self._handle(block.events)
                 await self._ledger.set_cursor(self.NAME, block.block_number, history=history.encode())
@@ -131,14 +133,14 @@ class Listener:
         try:
             liability = await self._chain.liabilities.get(event.liability)
         except NotALiability as error:
-            with concerning(event.liability):
+            with liability_context(event.liability):
                 log.warning("a reorganisation was quicker: %s", error)
             return
         if self._account in (liability.promisor, liability.promisee):
             demand_hash, offer_hash = await self._chain.liabilities.order_hashes(event.liability)
             await self._party.new_liability(liability, demand_hash=demand_hash, offer_hash=offer_hash)
 
-    async def _take_back(self, block: Reorganised) -> None:
+    async def _take_back(self, block: Reorganisation) -> None:
         """The chain replaced blocks: what was told of them did not happen, unless the new blocks say so again."""
         log.warning("the chain replaced all after block %d", block.back_to)
         for event in block.events_taken_back:

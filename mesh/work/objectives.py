@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Coroutine
 
     from mesh.recording import Objective
-    from mesh.work.run import Performer
+    from mesh.work.job import TopicHandler
     from mesh.work.workshop import Workshop
 
 FETCHES: Final = 32
@@ -23,7 +23,7 @@ EXAMINATIONS: Final = 1
 class Objectives:
     """Objectives by the address of their liability, each fit to be played by the performer (None: by anybody)."""
 
-    def __init__(self, shop: Workshop, *, performer: Performer | None) -> None:
+    def __init__(self, shop: Workshop, *, performer: TopicHandler | None) -> None:
         self._shop = shop
         self._performer = performer
         self._fetching = asyncio.Semaphore(FETCHES)

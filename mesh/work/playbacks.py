@@ -9,15 +9,15 @@ from contextvars import ContextVar
 from typing import TYPE_CHECKING, Final, Protocol
 
 from mesh.errors import AiraError
-from mesh.telemetry.context import concerning
+from mesh.telemetry.context import liability_context
 from mesh.work.database import LedgerUnusable
 from mesh.work.lifecycle import Phase
 
 if TYPE_CHECKING:
     from mesh.recording import Objective
-    from mesh.work.ledger import Job
-    from mesh.work.lifecycle import Witness
-    from mesh.work.run import Performer, Run
+    from mesh.work.job import Job, TopicHandler
+    from mesh.work.ledger import JobRecord
+    from mesh.work.lifecycle import PhaseListener
     from mesh.work.workshop import Workshop
 
 log = logging.getLogger(__name__)
@@ -41,21 +41,23 @@ class Playbacks:
     With a `performer`, or when it fails, a playback ends with `finish`; else its run stays open.
     """
 
-    def __init__(self, shop: Workshop, *, performer: Performer | None, witness: Witness, finish: Finish) -> None:
+    def __init__(
+        self, shop: Workshop, *, performer: TopicHandler | None, witness: PhaseListener, finish: Finish
+    ) -> None:
         self._shop = shop
         self._performer = performer
         self._witness = witness
         self._finish = finish
-        self._runs: dict[str, Run] = {}
+        self._runs: dict[str, Job] = {}
         self._plays: dict[str, asyncio.Task[None]] = {}
 
     def __contains__(self, address: str) -> bool:
         return address in self._runs
 
-    def __getitem__(self, address: str) -> Run:
+    def __getitem__(self, address: str) -> Job:
         return self._runs[address]
 
-    async def begin(self, job: Job, objective: Objective, tasks: asyncio.TaskGroup, *, position: int) -> None:
+    async def begin(self, job: JobRecord, objective: Objective, tasks: asyncio.TaskGroup, *, position: int) -> None:
         """Open a run of the job and play its objective from a message on, as one of `tasks`."""
         address = job.liability.address
         run = self._runs[address] = await self._shop.new_run(job.liability, objective=objective, position=position)
@@ -71,7 +73,7 @@ class Playbacks:
             return None
         return playing
 
-    async def stop(self, address: str) -> Run | None:
+    async def stop(self, address: str) -> Job | None:
         """End the playback of a job and give its run, which is the caller's to close; None if there is none."""
         await self._stop_playing(address)
         return self._runs.pop(address, None)
@@ -85,13 +87,13 @@ class Playbacks:
     async def suspend(self) -> None:
         """Leave the running jobs as another run of the agent can go on with them; their playbacks have ended."""
         for address in tuple(self._runs):
-            with concerning(address):
+            with liability_context(address):
                 try:
                     await self._put_away(address)
                 except AiraError as error:
                     log.error("how far it has come is not written down: %s", error)
 
-    async def _play(self, run: Run) -> None:
+    async def _play(self, run: Job) -> None:
         """Play to the end; with a performer, finish as it went."""
         address = run.liability.address
         _playing.set(address)

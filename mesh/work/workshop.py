@@ -11,9 +11,9 @@ from mesh.errors import InputError
 from mesh.recording import AtOnce, Limits, RecordedTimes, Recorder, RecordingAbout, preflight
 from mesh.recording.recorders import Recorders
 from mesh.settings import LONGEST
+from mesh.work.job import Job, Plan
 from mesh.work.lifecycle import Phase
 from mesh.work.outbox import outgoing
-from mesh.work.run import Plan, Run
 from schemas import Result
 
 if TYPE_CHECKING:
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from mesh.content import Exchange, Store
     from mesh.recording import Objective
     from mesh.settings import Settings
+    from mesh.work.job import TopicHandler
     from mesh.work.ledger import Ledger
     from mesh.work.outbox import Outbox
-    from mesh.work.run import Performer
     from schemas import Liability, Signer
 
 
@@ -86,7 +86,7 @@ class Workshop:
             cid, size_limit=settings.objective_size_limit, timeout=min(patience, settings.fetch_timeout)
         )
 
-    async def examine(self, cid: str, path: Path, *, performer: Performer | None) -> Objective:
+    async def examine(self, cid: str, path: Path, *, performer: TopicHandler | None) -> Objective:
         """The objective of that CID, which is at `path`, found fit to be played by the performer, or by anybody.
 
         Raises `UnfitObjective`.
@@ -98,7 +98,7 @@ class Workshop:
             raise UnfitObjective(cid, outcome.reason, outcome.detail)
         return outcome.objective
 
-    async def new_run(self, liability: Liability, *, objective: Objective | None = None, position: int = 0) -> Run:
+    async def new_run(self, liability: Liability, *, objective: Objective | None = None, position: int = 0) -> Job:
         """A run of `objective` from message `position` on; without an objective, one that only records.
 
         What an interrupted run of the same liability has recorded is gone on with.
@@ -107,7 +107,7 @@ class Workshop:
         pace = AtOnce() if self.settings.playback == "at-once" else RecordedTimes()
         plan = Plan(liability=liability, objective=objective, pace=pace, position=position, topics=chosen or None)
         recorder = await asyncio.to_thread(self._new_recorder, liability)
-        return Run(self.session, self.signer.address, plan, recorder)
+        return Job(self.session, self.signer.address, plan, recorder)
 
     async def owe_result(self, address: str, *, success: bool, result: str, note: str) -> None:
         """Write down how the job at `address` has ended, and its signed Result, to be sent until the chain has it."""

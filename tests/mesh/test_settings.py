@@ -183,7 +183,7 @@ def test_a_retired_option_is_reported_and_not_obeyed(
     ],
 )
 def test_a_value_that_can_not_be_names_its_option_and_what_it_means(option: str, value: Any) -> None:
-    with pytest.raises(ConfigurationError, match=f"^the setting {option} can't be used: [^\n]+$") as error:
+    with pytest.raises(ConfigurationError, match=f"^the setting {option} is invalid: [^\n]+$") as error:
         load(environ=NOTHING, flags={option: value})
 
     assert error.value.hint == f"{option}: {MEANING[option]}"

@@ -125,11 +125,11 @@ async def _followed(chain: Chain, cursor: int) -> AsyncIterator[Happening | Take
 
 async def _happenings(chain: Chain, block: BlockEvents) -> list[Happening | TakenBack]:
     """What a block, or its going, means for liabilities, in order."""
-    from mesh.chain import Finalized, NewLiability, NoContracts, Reorganised
+    from mesh.chain import Finalized, NewLiability, NoContracts, Reorganisation
 
     words = {NewLiability: "made", Finalized: "ended"}
     found: list[Happening | TakenBack] = []
-    for event in block.events_taken_back if isinstance(block, Reorganised) else ():
+    for event in block.events_taken_back if isinstance(block, Reorganisation) else ():
         if isinstance(event, NewLiability | Finalized):
             found.append(TakenBack(what=words[type(event)], liability=event.liability, tx=event.tx))
     for event in block.events:

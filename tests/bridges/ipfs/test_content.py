@@ -55,7 +55,7 @@ async def agent(endpoint: str, folder: Path) -> AsyncIterator[Agent]:
 
 
 @dataclass
-class Door:
+class MessageValidator:
     """A content bridge with its store."""
 
     content: ContentBridge
@@ -64,7 +64,7 @@ class Door:
 
 
 @asynccontextmanager
-async def door(endpoint: str, api: str, folder: Path, *more: Source, **options: Any) -> AsyncIterator[Door]:
+async def door(endpoint: str, api: str, folder: Path, *more: Source, **options: Any) -> AsyncIterator[MessageValidator]:
     async with AsyncExitStack() as stack:
         network = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,))))
         store = stack.enter_context(Store(folder))
@@ -72,7 +72,7 @@ async def door(endpoint: str, api: str, folder: Path, *more: Source, **options: 
         daemon = await stack.enter_async_context(Daemon(api))
         settings = {"size_limit": 2**26, "timeout": 30.0} | options
         bridge = ContentBridge(network.session, store, exchange, Sources(daemon, *more), daemon, **settings)
-        yield Door(await stack.enter_async_context(bridge), store, daemon)
+        yield MessageValidator(await stack.enter_async_context(bridge), store, daemon)
 
 
 def content_of(size: int, seed: str) -> bytes:

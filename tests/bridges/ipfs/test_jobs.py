@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
 
     from mesh.agent import Agent
-    from mesh.work.run import Run
+    from mesh.work.job import Job
     from schemas import Liability
     from tests.bridges.ipfs.conftest import Swarm
 
@@ -176,7 +176,7 @@ def working(robot: Agent) -> Agent:
     """The same robot, which does whatever it is asked and played."""
 
     @robot.on("*")
-    async def nothing(job: Run, message: Any) -> None:
+    async def nothing(job: Job, message: Any) -> None:
         pass
 
     return obliging(robot)

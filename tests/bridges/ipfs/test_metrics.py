@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from bridges.ipfs.metrics import Standing, bridge_families, content_families, parts_of
 from mesh.telemetry.families import merged
-from schemas.status import ALIVE, ContentFigures
+from schemas.status import ALIVE, ContentMetrics
 from tests.bridges.ipfs.pages import health, metrics
 from tests.bridges.ipfs.replays import OldDaemon
 from tests.bridges.ipfs.statuses import status, way
@@ -70,8 +70,8 @@ def test_each_direction_of_each_lighthouse_has_figures_of_its_own() -> None:
 
 
 def test_all_that_is_told_of_content_is_a_figure() -> None:
-    names = ContentFigures.__struct_fields__
-    told = ContentFigures(**{name: number for number, name in enumerate(names, 1)})
+    names = ContentMetrics.__struct_fields__
+    told = ContentMetrics(**{name: number for number, name in enumerate(names, 1)})
     assert sorted(figures(content_families(told)).values()) == list(range(1, len(names) + 1))
 
 

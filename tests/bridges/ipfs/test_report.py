@@ -4,7 +4,7 @@ import logging
 from typing import TYPE_CHECKING
 
 from bridges.ipfs.report import figures_of, news
-from schemas.status import ContentFigures
+from schemas.status import ContentMetrics
 from tests.bridges.ipfs.bridges import bridging, on_mesh, until_seen
 from tests.bridges.ipfs.statuses import status, way
 from tests.support.orders import demand
@@ -27,7 +27,7 @@ def test_only_what_is_new_is_said() -> None:
 
 
 def test_content_is_counted_too() -> None:
-    content = ContentFigures(
+    content = ContentMetrics(
         fetched=1, fetched_bytes=100, lies=0, answered=0, added=0, added_bytes=0, by_blocks=0, pinned=0, failed=0
     )
     assert news({}, figures_of(status(content=content))) == "content.fetched=+1 content.fetched_bytes=+100"

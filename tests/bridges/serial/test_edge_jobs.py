@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from bridges.serial.boards import SimulatedBoard
-    from mesh.work.run import Run
+    from mesh.work.job import Job
     from tests.support.market import Place
 
 __all__ = ["founded", "place"]
@@ -42,7 +42,7 @@ def counting(robot: Agent) -> Agent:
     device = Device(robot, patience=LONG)
 
     @robot.on("/work")
-    async def work(job: Run, message: object) -> None:
+    async def work(job: Job, message: object) -> None:
         await device.call("/slow", 1, job=job)
 
     return obliging(robot)
@@ -91,7 +91,7 @@ async def test_a_ros_bag_is_an_objective_for_a_board(place: Place) -> None:
     device = Device(robot, patience=LONG)
 
     @robot.on("/work", String)
-    async def work(job: Run, number: String) -> None:
+    async def work(job: Job, number: String) -> None:
         await device.call("/add", int(number.data), job=job)
 
     bag = Bag([Sent("/work", string(str(number)), number * 10**6) for number in (2, 3)], compression="lz4")
@@ -112,7 +112,7 @@ async def test_of_devices_with_the_same_topics_a_call_reaches_the_one_that_it_na
     address = place.address("robot")
 
     @robot.on("/work")
-    async def work(job: Run, message: object) -> None:
+    async def work(job: Job, message: object) -> None:
         await left.call("/add", 5, job=job)
         await right.call("/add", 7, job=job)
 
@@ -139,7 +139,7 @@ async def test_a_command_in_a_job_reaches_only_the_device_whose_topics_are_calle
     address = place.address("robot")
 
     @robot.on("/work")
-    async def work(job: Run, message: object) -> None:
+    async def work(job: Job, message: object) -> None:
         await left.call("/left/sum", job=job)
         await right.call("/right/sum", job=job)
         job.publish("/left/add", 5)
@@ -172,7 +172,7 @@ async def test_two_boards_do_jobs_of_one_market_at_the_same_time(place: Place) -
     counter = Device(first, patience=LONG)
 
     @first.on("/work")
-    async def work(job: Run, message: object) -> None:
+    async def work(job: Job, message: object) -> None:
         counting_began.set()
         await talking_began.wait()
         await counter.call("/slow", 1, job=job)
@@ -182,7 +182,7 @@ async def test_two_boards_do_jobs_of_one_market_at_the_same_time(place: Place) -
         talker = Device(second, patience=LONG)
 
         @second.on("/say", String)
-        async def say(job: Run, text: String) -> None:
+        async def say(job: Job, text: String) -> None:
             talking_began.set()
             await counting_began.wait()
             await talker.call("/hear", text, job=job)

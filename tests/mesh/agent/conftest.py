@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.chain import Sender
+from mesh.chain import TransactionSender
 from mesh.chain.artifacts import load_artifact
 from mesh.network import Endpoints, Network, ServiceFailed, call
 from schemas.rpc import Nothing
@@ -28,7 +28,7 @@ async def other_token(place: Place, role: str, *, supply: int) -> str:
     chain, artifact = place.chains[role], load_artifact("XRT")
     made = chain.node.web3.eth.contract(abi=artifact.abi, bytecode=artifact.bytecode).constructor(supply)
     data = bytes.fromhex(made.data_in_transaction.removeprefix("0x"))
-    receipt = await Sender(chain.node, place.market.accounts[role]).send(to=None, data=data)
+    receipt = await TransactionSender(chain.node, place.market.accounts[role]).send(to=None, data=data)
     assert receipt.contract is not None
     return receipt.contract
 

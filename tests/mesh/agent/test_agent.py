@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.network import Channel
-    from mesh.work.run import Run
+    from mesh.work.job import Job
     from tests.support.market import Place
 
 __all__ = ["channel", "settings"]
@@ -186,7 +186,7 @@ async def test_trading_without_account_is_one_clear_error(settings: Settings) ->
 async def test_two_handlers_for_one_topic_are_refused() -> None:
     agent = Agent(settings=Settings())
 
-    async def handler(job: Run, message: Any) -> None:
+    async def handler(job: Job, message: Any) -> None:
         pass
 
     agent.on("/go")(handler)

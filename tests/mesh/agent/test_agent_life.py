@@ -20,7 +20,7 @@ from tests.support.ports import free_endpoint
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
-    from mesh.work.run import Run
+    from mesh.work.job import Job
     from schemas import Demand, Verified
     from tests.support.market import Place
     from tests.support.routers import EmbeddedRouter
@@ -133,7 +133,7 @@ async def test_a_job_handler_that_uses_the_agent_while_it_ends_does_not_fail_its
     begun = asyncio.Event()
 
     @robot.on("/go")
-    async def go(job: Run, message: Any) -> None:
+    async def go(job: Job, message: Any) -> None:
         while True:
             begun.set()
             robot.channel.put(f"aira/agent/{robot.address.lower()}/device/arm/state", b"")

@@ -18,7 +18,7 @@ from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from mesh.agent import Agent
-    from mesh.work.run import Run
+    from mesh.work.job import Job
 
 
 MISSING = cid_of_bytes(b"nobody has this objective")
@@ -34,7 +34,7 @@ def going(robot: Agent) -> Agent:
     """The same robot, which takes the topic `/go` and no other."""
 
     @robot.on("/go")
-    async def go(job: Run, message: Any) -> None:
+    async def go(job: Job, message: Any) -> None:
         pass
 
     return robot
@@ -62,7 +62,7 @@ async def test_no_offer_is_made_for_a_message_that_its_handler_can_not_take(
     speeds: list[Speed] = []
 
     @robot.on("/go", Speed)
-    async def go(job: Run, speed: Speed) -> None:
+    async def go(job: Job, speed: Speed) -> None:
         speeds.append(speed)
 
     async with place.at_work(robot) as person:

@@ -9,7 +9,7 @@ import pytest
 from web3.providers.async_base import AsyncBaseProvider
 
 from mesh.agent import ShortOfFunds
-from mesh.agent.purse import Purse
+from mesh.agent.purse import Allowances
 from mesh.chain import Chain
 from schemas import Demand, Offer
 from tests.support.market import QUICK
@@ -54,8 +54,8 @@ async def chain(place: Place, road: Overtaken) -> AsyncIterator[Chain]:
 
 
 @pytest.fixture
-def purse(place: Place, chain: Chain) -> Purse:
-    return Purse(chain, place.address("person"))
+def purse(place: Place, chain: Chain) -> Allowances:
+    return Allowances(chain, place.address("person"))
 
 
 async def allowance(chain: Chain) -> int:
@@ -72,26 +72,26 @@ async def spend(place: Place, cost: int) -> None:
     await place.chains["provider"].liabilities.create(deployment.lighthouse_name, demand, offer)
 
 
-async def test_promises_add_up_and_are_allowed_together(chain: Chain, purse: Purse) -> None:
+async def test_promises_add_up_and_are_allowed_together(chain: Chain, purse: Allowances) -> None:
     await purse.promise("one", {chain.xrt: 10})
     await purse.promise("other", {chain.xrt: 5})
     assert await allowance(chain) == 15
 
 
-async def test_what_is_allowed_already_costs_no_transaction(chain: Chain, purse: Purse) -> None:
+async def test_what_is_allowed_already_costs_no_transaction(chain: Chain, purse: Allowances) -> None:
     await chain.tokens.approve(chain.factory, 100)
     before = await chain.block_number()
     await purse.promise("one", {chain.xrt: 100})
     assert await chain.block_number() == before
 
 
-async def test_a_promise_of_nothing_asks_nothing(chain: Chain, purse: Purse) -> None:
+async def test_a_promise_of_nothing_asks_nothing(chain: Chain, purse: Allowances) -> None:
     before = await chain.block_number()
     await purse.promise("one", {chain.xrt: 0})
     assert await chain.block_number() == before
 
 
-async def test_a_forgotten_promise_makes_room(chain: Chain, purse: Purse) -> None:
+async def test_a_forgotten_promise_makes_room(chain: Chain, purse: Allowances) -> None:
     balance = await chain.tokens.balance()
     await purse.promise("one", {chain.xrt: balance})
     with pytest.raises(ShortOfFunds) as caught:
@@ -103,7 +103,7 @@ async def test_a_forgotten_promise_makes_room(chain: Chain, purse: Purse) -> Non
 
 
 async def test_an_allowance_that_is_used_up_on_the_way_is_given_once_more(
-    place: Place, road: Overtaken, chain: Chain, purse: Purse
+    place: Place, road: Overtaken, chain: Chain, purse: Allowances
 ) -> None:
     """Gas is estimated for changing an allowance; to set one anew costs more."""
     await chain.tokens.approve(chain.factory, 100)

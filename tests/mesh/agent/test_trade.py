@@ -18,7 +18,7 @@ from tests.support.market import MODEL, Place, obliging
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
-    from mesh.work.run import Run
+    from mesh.work.job import Job
     from schemas import Verified
 
 GENERATIONS = pytest.mark.parametrize("generation", [3, 5])
@@ -171,7 +171,7 @@ async def test_an_offer_without_demand_waits_for_one(place: Place) -> None:
     working_on: list[str] = []
 
     @robot.on("*")
-    async def work(job: Run, message: Any) -> None:
+    async def work(job: Job, message: Any) -> None:
         working_on.append(message.data)
 
     async with place.provider(), robot, place.agent("person") as person:
@@ -201,7 +201,7 @@ async def test_the_lighthouse_fee_of_an_offer_is_paid_and_then_promised_no_more(
     robot = place.agent("robot")
 
     @robot.on("*")
-    async def nothing(job: Run, message: Any) -> None:
+    async def nothing(job: Job, message: Any) -> None:
         pass
 
     @robot.on_demand

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.agent import Agent
-    from mesh.work.run import Run
+    from mesh.work.job import Job
 
 OBJECTIVE = cid_of_bytes(b"something to be done")
 
@@ -22,7 +22,7 @@ def working(robot: Agent) -> Agent:
     """The same robot, which does whatever it is asked and played."""
 
     @robot.on("*")
-    async def nothing(job: Run, message: Any) -> None:
+    async def nothing(job: Job, message: Any) -> None:
         pass
 
     return careless(robot)

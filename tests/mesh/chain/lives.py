@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.chain import Account, Node, Sender, new_private_key
+from mesh.chain import Account, Node, TransactionSender, new_private_key
 from tests.mesh.chain.conftest import QUICK
 from tests.support.nodes import Anvil
 
@@ -30,10 +30,10 @@ async def anvil() -> AsyncIterator[Anvil]:
 
 
 @asynccontextmanager
-async def life(anvil: Anvil, timing: Timing = QUICK, **options: Any) -> AsyncIterator[tuple[Node, Sender]]:
+async def life(anvil: Anvil, timing: Timing = QUICK, **options: Any) -> AsyncIterator[tuple[Node, TransactionSender]]:
     """One life of a process that sends for anvil's first account."""
     async with Node(anvil.url, timing=timing, **options) as node:
-        yield node, Sender(node, Account.from_key(anvil.private_keys[0]))
+        yield node, TransactionSender(node, Account.from_key(anvil.private_keys[0]))
 
 
 def stranger() -> str:

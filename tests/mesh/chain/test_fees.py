@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.chain import GWEI, Account, FeePolicy, FeeTooHigh, Node, Sender, new_private_key
+from mesh.chain import GWEI, Account, FeePolicy, FeeTooHigh, Node, TransactionSender, new_private_key
 from mesh.chain.fees import Fees
 from mesh.chain.transports import HttpTransport
 from mesh.errors import ConfigurationError
@@ -27,8 +27,8 @@ async def anvil() -> AsyncIterator[Anvil]:
         yield anvil
 
 
-def _sender(node: Node, anvil: Anvil) -> Sender:
-    return Sender(node, Account.from_key(anvil.private_keys[0]))
+def _sender(node: Node, anvil: Anvil) -> TransactionSender:
+    return TransactionSender(node, Account.from_key(anvil.private_keys[0]))
 
 
 def _stranger() -> str:

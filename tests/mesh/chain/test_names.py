@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from mesh.chain import Account, Chain, InvalidName, Sender, UnknownName, deploy, namehash
+from mesh.chain import Account, Chain, InvalidName, TransactionSender, UnknownName, deploy, namehash
 from mesh.chain.names import parse_name, root_of
 from mesh.devchain import EmbeddedChain
 from schemas.cid import parse_cid
@@ -72,7 +72,7 @@ async def test_a_model_is_a_cid_or_a_name_of_one() -> None:
                 await chain.names.model("Qm")
             with pytest.raises(UnknownName):
                 await chain.names.model("sensor.model.5.robonomics.eth")
-            sender = Sender(chain.node, account)
+            sender = TransactionSender(chain.node, account)
             resolver = (await sender.send(to=None, data=_content_resolver(parse_cid(cid(1))))).contract
             registry = chain.node.contract("ENSRegistry", chain.ens)
             await sender.call(registry.functions.setResolver(namehash("3.robonomics.eth"), resolver))

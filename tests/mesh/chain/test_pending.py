@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.chain import GWEI, Account, FeePolicy, Node, NodeUnreachable, Sender, TransactionTimeout
+from mesh.chain import GWEI, Account, FeePolicy, Node, NodeUnreachable, TransactionSender, TransactionTimeout
 from mesh.chain.transports import HttpTransport
 from tests.mesh.chain.conftest import QUICK
 from tests.mesh.chain.lives import SHORT, anvil, ask, life, stranger, until_waiting
@@ -60,7 +60,7 @@ async def test_the_version_that_was_replaced_may_be_the_one_that_is_mined(anvil:
     wire, friend = _Swallowing(anvil.url), stranger()
     async with Node(wire, timing=replace(QUICK, replace_after=0.05)) as node:
         sending = asyncio.create_task(
-            Sender(node, Account.from_key(anvil.private_keys[0])).send(to=friend, data=b"", value=5)
+            TransactionSender(node, Account.from_key(anvil.private_keys[0])).send(to=friend, data=b"", value=5)
         )
         first = (await until_waiting(node, 1))[0]
         wire.swallows = True
@@ -133,7 +133,7 @@ async def test_a_node_that_is_still_indexing_is_asked_for_the_receipt_again(anvi
     wire, friend = _Indexing(anvil.url), stranger()
     async with Node(wire, timing=QUICK) as node:
         await ask(node, "evm_setAutomine", True)
-        await Sender(node, Account.from_key(anvil.private_keys[0])).send(to=friend, data=b"", value=5)
+        await TransactionSender(node, Account.from_key(anvil.private_keys[0])).send(to=friend, data=b"", value=5)
         assert await node.eth_balance(friend) == 5
         assert wire.asked == 5
     await wire.close()
@@ -143,7 +143,7 @@ async def test_after_a_lost_answer_sending_the_same_again_means_the_first(anvil:
     """The node takes the transaction and is gone before it says so; the caller tries again when it is back."""
     wire, friend = _Deaf(anvil.url), stranger()
     async with Node(wire, timing=QUICK) as node:
-        sender = Sender(node, Account.from_key(anvil.private_keys[0]))
+        sender = TransactionSender(node, Account.from_key(anvil.private_keys[0]))
         wire.loses = True
         with pytest.raises(NodeUnreachable):
             await sender.send(to=friend, data=b"", value=5)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.chain import GWEI, Account, Node, Sender, TransactionTimeout
+from mesh.chain import GWEI, Account, Node, TransactionSender, TransactionTimeout
 from mesh.errors import ConfigurationError
 from tests.mesh.chain.conftest import QUICK
 from tests.mesh.chain.lives import NEVER, SHORT, anvil, ask, life, stranger, until_waiting, waiting
@@ -117,7 +117,7 @@ async def test_a_number_that_another_transaction_took_at_last_is_replaced(anvil:
     """Somebody sends with the same key and number through another node, and wins."""
     account, friend = Account.from_key(anvil.private_keys[0]), stranger()
     async with Node(anvil.url, timing=QUICK) as node:
-        sending = asyncio.create_task(Sender(node, account).send(to=friend, data=b"", value=5))
+        sending = asyncio.create_task(TransactionSender(node, account).send(to=friend, data=b"", value=5))
         await until_waiting(node, 1)
         prices = {"type": 2, "maxFeePerGas": 100 * GWEI, "maxPriorityFeePerGas": 50 * GWEI}
         fields = {"to": friend, "data": "0x", "value": 70, "gas": 21_000, "chainId": node.chain_id, "nonce": 0}
@@ -133,7 +133,7 @@ async def test_a_number_that_another_transaction_took_at_last_is_replaced(anvil:
 CHILD = """
 import asyncio, sys
 from pathlib import Path
-from mesh.chain import Account, Node, Sender, Timing
+from mesh.chain import Account, Node, TransactionSender, Timing
 from mesh.chain.transports import HttpTransport
 
 class Forgetful(HttpTransport):
@@ -146,7 +146,7 @@ async def main(url, key, friend, journal, count):
     wire = Forgetful(url)
     timing = Timing(poll_interval=0.05, receipt_interval=0.01)
     async with Node(wire, timing=timing, journal=Path(journal)) as node:
-        sender = Sender(node, Account.from_key(bytes.fromhex(key)))
+        sender = TransactionSender(node, Account.from_key(bytes.fromhex(key)))
         await asyncio.gather(*(sender.send(to=friend, data=b"", value=1) for _ in range(int(count))))
     await wire.close()
 

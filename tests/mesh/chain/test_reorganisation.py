@@ -18,7 +18,7 @@ from mesh.chain import (
     History,
     Node,
     NodeUnreachable,
-    Reorganised,
+    Reorganisation,
     ReorganisedTooDeep,
     deploy,
 )
@@ -99,7 +99,7 @@ def _reaches(number: int) -> Callable[[BlockEvents], bool]:
 
 
 def _is_reorganised(block: BlockEvents) -> bool:
-    return isinstance(block, Reorganised)
+    return isinstance(block, Reorganisation)
 
 
 def _values(events: tuple[ChainEvent, ...]) -> list[int]:
@@ -116,7 +116,7 @@ async def test_events_of_replaced_blocks_are_taken_back_newest_first_before_the_
         await _until(events, _reaches(head))
         await fork.replace_last(2)
         *_, back = await _until(events, _is_reorganised)
-        assert isinstance(back, Reorganised)
+        assert isinstance(back, Reorganisation)
         assert (back.back_to, back.block_number, back.events) == (start, start, ())
         assert _values(back.events_taken_back) == [3, 2]
         head = await fork.approve(4)
@@ -137,7 +137,7 @@ async def test_a_reorganisation_while_nobody_read_is_told_first_with_the_history
     kept = History.decode(history.encode())
     async with aclosing(chain.follow(head + 1, history=kept)) as events:
         back = await anext(events)
-        assert isinstance(back, Reorganised)
+        assert isinstance(back, Reorganisation)
         assert (back.back_to, _values(back.events_taken_back)) == (start, [2])
         assert await anext(events) == BlockEvents(head + 1, ())
 
@@ -157,7 +157,7 @@ async def test_a_reorganisation_of_eventless_blocks_takes_nothing_back(fork: For
         await _until(events, _reaches(start + 1))
         await fork.replace_last(1)
         *_, back = await _until(events, _is_reorganised)
-    assert back == Reorganised(start, (), ())
+    assert back == Reorganisation(start, (), ())
 
 
 async def test_a_reorganisation_of_the_whole_depth_is_unwound_and_a_deeper_one_is_an_error(fork: Fork) -> None:
@@ -170,7 +170,7 @@ async def test_a_reorganisation_of_the_whole_depth_is_unwound_and_a_deeper_one_i
             await _until(events, _reaches(head))
         await fork.replace_last(3)
         *_, back = await _until(events, _is_reorganised)
-        assert isinstance(back, Reorganised)
+        assert isinstance(back, Reorganisation)
         assert (back.back_to, _values(back.events_taken_back)) == (start, [4, 3, 2])
         for value in (5, 6, 7, 8):
             head = await fork.approve(value)
@@ -192,7 +192,7 @@ async def test_a_block_that_was_handled_in_part_is_told_again_or_taken_back(fork
     await fork.replace_last(1)
     async with aclosing(chain.follow(start, history=history)) as events:
         back = await anext(events)
-    assert isinstance(back, Reorganised)
+    assert isinstance(back, Reorganisation)
     assert (back.back_to, _values(back.events_taken_back)) == (start - 1, [1])
 
 
@@ -213,7 +213,7 @@ async def test_a_node_that_is_behind_is_waited_for_by_who_read_further(fork: For
         await fork.request("evm_mine")
         await fork.request("evm_mine")
         back = await waiting
-    assert isinstance(back, Reorganised)
+    assert isinstance(back, Reorganisation)
     assert back.back_to == head
 
 
@@ -251,7 +251,7 @@ async def test_a_node_that_is_killed_and_started_from_its_state_takes_back_what_
             await fork.approve(3)
             async with aclosing(chain.follow(lost + 1, history=history)) as events:
                 back, new = await anext(events), await anext(events)
-    assert isinstance(back, Reorganised)
+    assert isinstance(back, Reorganisation)
     assert (back.back_to, _values(back.events_taken_back)) == (kept, [2])
     assert (new.block_number, _values(new.events)) == (lost, [3])
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from web3 import AsyncWeb3, WebSocketProvider
 
-from mesh.chain import XRT, Account, Chain, Deployment, Node, Sender, deploy
+from mesh.chain import XRT, Account, Chain, Deployment, Node, TransactionSender, deploy
 from schemas.keccak import keccak256
 from tests.mesh.chain.conftest import QUICK
 from tests.mesh.chain.pushing import connected, node, server
@@ -146,7 +146,7 @@ async def test_what_polls_whole_blocks_finds_its_transactions_in_them(
 ) -> None:
     """As the JavaScript of generation 3 does: by `to`, and then by the receipt's logs."""
     async with token(node) as (chain, deployment), Node(server.url, timing=QUICK) as way:
-        receipt = await Sender(chain.node, Account.from_key(node.funded_keys[0])).call(
+        receipt = await TransactionSender(chain.node, Account.from_key(node.funded_keys[0])).call(
             chain.node.contract("XRT", deployment.xrt).functions.transfer(deployment.factory, XRT)
         )
         ask: Any = way.web3.provider.make_request

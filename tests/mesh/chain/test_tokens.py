@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.chain import XRT, NoContracts, Sender, Token
+from mesh.chain import XRT, NoContracts, Token, TransactionSender
 
 if TYPE_CHECKING:
     from tests.mesh.chain.conftest import Market
@@ -35,7 +35,7 @@ async def _deployed(market: Market, runtime: bytes) -> str:
     """A contract with that code."""
     init = bytes.fromhex("60") + bytes([len(runtime)]) + bytes.fromhex("80600b6000396000f3")
     async with market.chain(market.stranger) as chain:
-        receipt = await Sender(chain.node, market.stranger).send(to=None, data=init + runtime)
+        receipt = await TransactionSender(chain.node, market.stranger).send(to=None, data=init + runtime)
     assert receipt.contract is not None
     return receipt.contract
 

@@ -15,7 +15,7 @@ from mesh.chain import (
     Node,
     NodeUnreachable,
     Reverted,
-    Sender,
+    TransactionSender,
     TransactionTimeout,
     deploy,
     new_private_key,
@@ -68,7 +68,7 @@ def _stranger() -> str:
 async def test_a_transaction_whose_answer_was_lost_goes_through_once(node: EmbeddedChain) -> None:
     wire, friend = _Wire(node), _stranger()
     async with Node(wire, timing=QUICK) as way:
-        sender = Sender(way, Account.from_key(node.funded_keys[0]))
+        sender = TransactionSender(way, Account.from_key(node.funded_keys[0]))
         wire.answers_to_lose = 1
         receipt = await sender.send(to=friend, data=b"", value=5)
         assert receipt.block_number == 1
@@ -79,7 +79,7 @@ async def test_a_transaction_whose_answer_was_lost_goes_through_once(node: Embed
 async def test_a_node_that_stays_away_while_sending_is_told(node: EmbeddedChain) -> None:
     wire = _Wire(node)
     async with Node(wire, timing=QUICK) as way:
-        sender = Sender(way, Account.from_key(node.funded_keys[0]))
+        sender = TransactionSender(way, Account.from_key(node.funded_keys[0]))
         wire.answers_to_lose = 100
         with pytest.raises(NodeUnreachable, match="lost"):
             await sender.send(to=_stranger(), data=b"", value=5)
@@ -90,8 +90,8 @@ async def test_a_number_taken_by_another_client_is_replaced(node: EmbeddedChain)
     wire, friend = _Wire(node), _stranger()
     account = Account.from_key(node.funded_keys[0])
     async with Node(wire, timing=QUICK) as one, Node(node.provider, timing=QUICK) as other:
-        wire.before = lambda: Sender(other, account).send(to=friend, data=b"", value=5)
-        await Sender(one, account).send(to=friend, data=b"", value=5)
+        wire.before = lambda: TransactionSender(other, account).send(to=friend, data=b"", value=5)
+        await TransactionSender(one, account).send(to=friend, data=b"", value=5)
         assert await one.eth_balance(friend) == 10
 
 
@@ -116,7 +116,7 @@ async def test_transactions_of_one_node_do_not_fight_for_numbers(node: EmbeddedC
     wire, friend = _Wire(node), _stranger()
     account = Account.from_key(node.funded_keys[0])
     async with Node(wire, timing=QUICK) as way:
-        await asyncio.gather(*(Sender(way, account).send(to=friend, data=b"", value=1) for _ in range(10)))
+        await asyncio.gather(*(TransactionSender(way, account).send(to=friend, data=b"", value=1) for _ in range(10)))
         assert await way.eth_balance(friend) == 10
     assert wire.sent == 10
 
@@ -126,7 +126,7 @@ async def test_senders_of_one_node_fill_a_block_together() -> None:
     friend = _stranger()
     async with Anvil(arguments=("--block-time", "1")) as anvil, Node(anvil.url, timing=QUICK) as node:
         account = Account.from_key(anvil.private_keys[0])
-        senders = [Sender(node, account) for _ in range(3)]
+        senders = [TransactionSender(node, account) for _ in range(3)]
         receipts = await asyncio.gather(*(sender.send(to=friend, data=b"", value=1) for sender in senders * 5))
         assert await node.eth_balance(friend) == 15
         assert len({receipt.block_number for receipt in receipts}) < 15
@@ -146,7 +146,7 @@ async def test_numbers_go_on_where_the_node_forgets_what_is_pending() -> None:
     async with Anvil(arguments=("--block-time", "1")) as anvil:
         forgetful = _Forgetful(anvil.url)
         async with Node(forgetful, timing=QUICK) as node:
-            sender = Sender(node, Account.from_key(anvil.private_keys[0]))
+            sender = TransactionSender(node, Account.from_key(anvil.private_keys[0]))
             await asyncio.gather(*(sender.send(to=friend, data=b"", value=value) for value in (1, 2, 4)))
             assert await node.eth_balance(friend) == 7
         await forgetful.close()
@@ -156,7 +156,7 @@ async def test_a_transaction_that_is_not_mined_is_given_up_and_the_next_waits_be
     timing = replace(QUICK, receipt_timeout=0.1)
     friend = _stranger()
     async with Anvil(arguments=("--no-mining",)) as anvil, Node(anvil.url, timing=timing) as node:
-        sender = Sender(node, Account.from_key(anvil.private_keys[0]))
+        sender = TransactionSender(node, Account.from_key(anvil.private_keys[0]))
         with pytest.raises(TransactionTimeout) as caught:
             await sender.send(to=friend, data=b"", value=1)
         assert caught.value.tx.startswith("0x")
@@ -173,7 +173,7 @@ async def test_the_number_of_a_transaction_that_the_node_dropped_is_used_again()
         Anvil(arguments=("--no-mining",)) as anvil,
         Node(anvil.url, timing=replace(QUICK, receipt_timeout=0.1)) as node,
     ):
-        sender = Sender(node, Account.from_key(anvil.private_keys[0]))
+        sender = TransactionSender(node, Account.from_key(anvil.private_keys[0]))
         with pytest.raises(TransactionTimeout) as dropped:
             await sender.send(to=friend, data=b"", value=1)
         await node.web3.provider.make_request("anvil_dropTransaction", [dropped.value.tx])
@@ -187,7 +187,7 @@ async def test_a_chain_without_a_base_fee_is_paid_by_gas_price() -> None:
     arguments = ("--hardfork", "berlin", "--gas-price", "1000000000")
     friend = _stranger()
     async with Anvil(arguments=arguments) as anvil, Node(anvil.url, timing=QUICK) as node:
-        await Sender(node, Account.from_key(anvil.private_keys[0])).send(to=friend, data=b"", value=1)
+        await TransactionSender(node, Account.from_key(anvil.private_keys[0])).send(to=friend, data=b"", value=1)
         assert await node.eth_balance(friend) == 1
 
 
@@ -200,7 +200,7 @@ async def test_cancelling_does_not_hold_up_the_next(node: EmbeddedChain) -> None
         await asyncio.Event().wait()
 
     async with Node(wire, timing=QUICK) as way:
-        sender = Sender(way, Account.from_key(node.funded_keys[0]))
+        sender = TransactionSender(way, Account.from_key(node.funded_keys[0]))
         wire.before = hang
         sending = asyncio.create_task(sender.send(to=friend, data=b"", value=1))
         await reached.wait()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.chain import XRT, Account, Chain, Sender, new_private_key
+from mesh.chain import XRT, Account, Chain, TransactionSender, new_private_key
 from mesh.chain.artifacts import load_artifact
 from mesh.chain.recognition import is_code_of
 from mesh.cli.chain.deploy import DEPLOYMENT_GAS
@@ -72,7 +72,7 @@ def test_an_account_that_can_not_pay_for_all_of_it_deploys_nothing(desert: Town,
 
     async def give() -> None:
         async with desert.chain("person").node as node:
-            await Sender(node, desert.people["person"].account).send(to=address, data=b"", value=10**15)
+            await TransactionSender(node, desert.people["person"].account).send(to=address, data=b"", value=10**15)
 
     desert.run(give())
     hint = refused(desert.aira(*DEPLOY, AIRA_KEYFILE=str(keyfile)), 1, f"{address} has 0.001 ETH")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.chain import XRT, Sender
+from mesh.chain import XRT, TransactionSender
 from mesh.chain.artifacts import load_artifact
 from schemas import Liability
 from tests.mesh.cli.chains import REFUND_DELAY, Town, columns, refused
@@ -185,7 +185,7 @@ def test_a_token_of_another_name_is_not_taken_for_xrt(town: Town) -> None:
             contract = chain.node.web3.eth.contract(abi=artifact.abi, bytecode=artifact.bytecode)
             data = bytes.fromhex(contract.constructor(1_000 * XRT).data_in_transaction[2:])
             assert chain.account is not None
-            receipt = await Sender(chain.node, chain.account).send(to=None, data=data)
+            receipt = await TransactionSender(chain.node, chain.account).send(to=None, data=data)
             assert receipt.contract is not None
             await chain.tokens.approve(chain.factory, XRT, token=receipt.contract)
             return receipt.contract

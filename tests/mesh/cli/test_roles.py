@@ -27,7 +27,7 @@ from tests.support.waiting import until
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
-    from mesh.work.run import Run
+    from mesh.work.job import Job
 
 MODEL = cid_of_bytes(b"what is asked for on the command line")
 ORDER = {"model": MODEL, "cost": "0", "validator": "", "validator_fee": "0", "lifetime": 1000}
@@ -102,7 +102,7 @@ async def test_a_job_from_up_to_the_recording(tmp_path: Path, printed: Printed) 
 
 def moving(robot: Agent) -> Agent:
     @robot.on("/go")
-    async def go(job: Run, message: object) -> None:
+    async def go(job: Job, message: object) -> None:
         job.publish("/gone", message)
 
     return robot

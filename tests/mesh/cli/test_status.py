@@ -16,7 +16,7 @@ from mesh.cli.status import _everybody, _one
 from mesh.devchain import JsonRpcServer
 from mesh.errors import InvalidAddress, RemoteError
 from mesh.settings import Settings
-from schemas.status import ContentFigures, Market, Status, StoreUse, Work
+from schemas.status import ContentMetrics, Market, Status, StoreUse, Work
 from tests.mesh.cli.chains import columns
 from tests.mesh.market.floor import QUICK
 from tests.mesh.watching.test_presence import WAY, bridge_status, status
@@ -180,8 +180,8 @@ def test_a_bridge_in_words() -> None:
     assert shown["to IPFS"] == "12 carried (0.5/s), 4 waiting, 3 (3 no-room) dropped"
     assert (shown["losses"], shown["last error"]) == ("2 of the daemon", "refused")
     assert "content" not in shown
-    figures = dict.fromkeys(ContentFigures.__struct_fields__, 0) | {"fetched": 2, "fetched_bytes": 2048, "lies": 1}
-    content = spoken(msgspec.structs.replace(bridge_status(), content=ContentFigures(**figures)))["content"]
+    figures = dict.fromkeys(ContentMetrics.__struct_fields__, 0) | {"fetched": 2, "fetched_bytes": 2048, "lies": 1}
+    content = spoken(msgspec.structs.replace(bridge_status(), content=ContentMetrics(**figures)))["content"]
     assert content == "2 files fetched (2.0 KiB), 0 added (0 bytes), 0 blocks given, 1 false ones refused"
 
 

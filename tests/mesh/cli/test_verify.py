@@ -37,23 +37,22 @@ if TYPE_CHECKING:
 
     from click.testing import Result
 
-    from mesh.work.run import Run
-    from tests.mesh.evidence.jobs import Job
+    from tests.mesh.evidence.jobs import JobFiles
 
 MODEL = cid_of_bytes(b"what is verified")
 
 
 @pytest.fixture
-def job(tmp_path: Path) -> Job:
+def job(tmp_path: Path) -> JobFiles:
     return made(tmp_path)
 
 
-def verified(job: Job, *more: str | Path) -> Result:
+def verified(job: JobFiles, *more: str | Path) -> Result:
     words = ["verify", "--objective", job.objective, "--result", job.result, "--data-dir", job.result.parent / "data"]
     return CliRunner().invoke(main, [str(word) for word in [*words, *more]])
 
 
-def test_two_files_are_verified_without_chain_and_network(job: Job) -> None:
+def test_two_files_are_verified_without_chain_and_network(job: JobFiles) -> None:
     done = verified(job)
     assert done.exit_code == 0, done.output
     lines = done.stdout.splitlines()
@@ -62,7 +61,7 @@ def test_two_files_are_verified_without_chain_and_network(job: Job) -> None:
     assert lines[-1] == "0 things of 14 failed; 7 things stayed open"
 
 
-def test_what_fails_is_named_and_the_exit_code_is_1(job: Job) -> None:
+def test_what_fails_is_named_and_the_exit_code_is_1(job: JobFiles) -> None:
     job.forge(lambda messages, metadata: messages[:4])
     done = verified(job)
     assert done.exit_code == 1
@@ -71,14 +70,14 @@ def test_what_fails_is_named_and_the_exit_code_is_1(job: Job) -> None:
     assert done.stdout.splitlines()[-1].startswith("1 thing of 14 failed")
 
 
-def test_an_address_is_compared_with_what_the_recording_says(job: Job) -> None:
+def test_an_address_is_compared_with_what_the_recording_says(job: JobFiles) -> None:
     assert verified(job, LIABILITY, "--offline").exit_code == 0
     done = verified(job, OTHER, "--offline")
     assert done.exit_code == 1
     assert f"names the liability '{LIABILITY}'" in done.stdout
 
 
-def test_with_the_message_the_signature_is_verified(job: Job, tmp_path: Path) -> None:
+def test_with_the_message_the_signature_is_verified(job: JobFiles, tmp_path: Path) -> None:
     message = tmp_path / "result.json"
     message.write_bytes(job.message())
     done = verified(job, "--message", message, "--json")
@@ -90,7 +89,7 @@ def test_with_the_message_the_signature_is_verified(job: Job, tmp_path: Path) ->
     assert found["finalized"] is None
 
 
-def test_a_strangers_text_does_not_steer_the_terminal(job: Job) -> None:
+def test_a_strangers_text_does_not_steer_the_terminal(job: JobFiles) -> None:
     def evil(messages: list[Any], metadata: dict[str, dict[str, str]]) -> list[Any]:
         metadata["aira"]["liability"] = "\x1b[2J" + LIABILITY
         return messages
@@ -122,14 +121,14 @@ def test_what_can_not_be_looked_at_is_one_clear_line_and_exit_code_2(
     assert "Traceback" not in done.stderr
 
 
-def test_a_result_that_is_no_recording_fails(job: Job) -> None:
+def test_a_result_that_is_no_recording_fails(job: JobFiles) -> None:
     job.result.write_bytes(b"no recording")
     done = verified(job)
     assert done.exit_code == 1
     assert "it is neither an MCAP file nor a ROS 1 bag" in done.stdout
 
 
-def test_as_a_program(job: Job) -> None:
+def test_as_a_program(job: JobFiles) -> None:
     done = aira("verify", "--objective", job.objective, "--result", job.result, AIRA_DATA_DIR=str(job.result.parent))
     assert (done.returncode, done.stderr) == (0, "")
 
@@ -157,7 +156,7 @@ def moving(robot: Settings) -> Agent:
     agent = obliging(Agent(MODEL, settings=robot, account=load_account(robot)))
 
     @agent.on("/go")
-    async def go(job: Run, message: object) -> None:
+    async def go(job: Job, message: object) -> None:
         job.publish("/gone", message)
 
     return agent

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.chain import XRT, Account, Sender, new_private_key
+from mesh.chain import XRT, Account, TransactionSender, new_private_key
 from mesh.chain.artifacts import load_artifact
 from tests.mesh.cli.chains import MONEY, Town, columns, refused, write_quick_keyfile
 from tests.support.ports import free_port
@@ -76,7 +76,7 @@ async def _deploy_token(town: Town) -> str:
         contract = chain.node.web3.eth.contract(abi=artifact.abi, bytecode=artifact.bytecode)
         data = bytes.fromhex(contract.constructor(123_450_000_000).data_in_transaction[2:])
         assert chain.account is not None
-        receipt = await Sender(chain.node, chain.account).send(to=None, data=data)
+        receipt = await TransactionSender(chain.node, chain.account).send(to=None, data=data)
         assert receipt.contract is not None
         return receipt.contract
 

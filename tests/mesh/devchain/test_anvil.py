@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.chain import XRT, Account, Chain, Node, Sender
+from mesh.chain import XRT, Account, Chain, Node, TransactionSender
 from mesh.devchain import EmbeddedChain
 from mesh.devchain.anvil import STOP_SECONDS, NodeEnded, find_anvil, serve_anvil
 from mesh.devchain.development import serve_chain
@@ -156,7 +156,7 @@ async def test_a_kept_chain_without_a_market_is_not_built_upon(program: Path, tm
         serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=state) as node,
         Node(node.url) as client,
     ):
-        await Sender(client, Account.from_key(node.funded_keys[0])).send(to=NOBODY, data=b"", value=1)
+        await TransactionSender(client, Account.from_key(node.funded_keys[0])).send(to=NOBODY, data=b"", value=1)
     with pytest.raises(ConfigurationError, match=r"state\.json has no market on it, and is not new$"):
         async with serve_chain(
             Settings(data_dir=str(tmp_path)), host="127.0.0.1", port=0, block_time=None, anvil=program, state=state

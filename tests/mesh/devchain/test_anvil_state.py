@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.chain import Account, Node, Sender
+from mesh.chain import Account, Node, TransactionSender
 from mesh.devchain.anvil import serve_anvil
 from mesh.devchain.anvil_state import being_founded, founding, kept, prepare_state
 from mesh.devchain.development import serve_chain
@@ -29,7 +29,7 @@ async def test_a_chain_whose_writing_was_cut_off_goes_on_from_the_last_whole_one
         serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=state) as node,
         Node(node.url) as client,
     ):
-        await Sender(client, Account.from_key(node.funded_keys[0])).send(to=NOBODY, data=b"", value=7)
+        await TransactionSender(client, Account.from_key(node.funded_keys[0])).send(to=NOBODY, data=b"", value=7)
         await until(
             lambda: kept(state).exists() and NOBODY[2:].lower() in kept(state).read_text().lower(),
             what="a copy with the payment in it",
@@ -54,7 +54,7 @@ async def test_a_chain_that_was_killed_while_its_contracts_were_made_begins_anew
         serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=state) as node,
         Node(node.url) as client,
     ):
-        await Sender(client, Account.from_key(node.funded_keys[0])).send(to=NOBODY, data=b"", value=7)
+        await TransactionSender(client, Account.from_key(node.funded_keys[0])).send(to=NOBODY, data=b"", value=7)
         with pytest.raises(RuntimeError, match="killed"), founding(state):
             raise RuntimeError("killed")
     async with serve_chain(settings, host="127.0.0.1", port=0, block_time=None, anvil=program, state=state) as chain:

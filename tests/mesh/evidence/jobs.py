@@ -30,7 +30,7 @@ Metadata = dict[str, dict[str, str]]
 
 
 @dataclass
-class Job:
+class JobFiles:
     """The files of a job, and what the contract says of it."""
 
     objective: Path
@@ -71,7 +71,7 @@ class Job:
         return encode(signer.sign(Result(**said)))
 
 
-def made(folder: Path, *, played: tuple[str, ...] = WORDS, topics: str = "", **about: str) -> Job:
+def made(folder: Path, *, played: tuple[str, ...] = WORDS, topics: str = "", **about: str) -> JobFiles:
     """A job whose objective has five messages on `/say`, of which these were `played`; the device answered each."""
     path = folder / "objective.mcap"
     path.write_bytes(objective(*(("/say", word) for word in WORDS), ("/stop", b"")))
@@ -89,7 +89,7 @@ def made(folder: Path, *, played: tuple[str, ...] = WORDS, topics: str = "", **a
         success=True,
         finalized=True,
     )
-    return Job(path, folder / "result.mcap", claim)
+    return JobFiles(path, folder / "result.mcap", claim)
 
 
 def record(recorder: Recorder, words: tuple[str, ...]) -> None:

@@ -7,12 +7,12 @@ import pytest
 from mesh.evidence import Claim
 from schemas import Demand, cid_of_bytes, encode
 from tests.mesh.evidence.findings import job, wrong
-from tests.mesh.evidence.jobs import OTHER, ROBOT, THIEF, Job
+from tests.mesh.evidence.jobs import OTHER, ROBOT, THIEF, JobFiles
 
 __all__ = ["job"]
 
 
-def test_a_held_result_message_proves_who_signed_it(job: Job) -> None:
+def test_a_held_result_message_proves_who_signed_it(job: JobFiles) -> None:
     verdict = job.verify(job.message(), finalized=None)
     assert verdict.holds
     signature = verdict.of("signature")
@@ -29,7 +29,7 @@ def test_a_held_result_message_proves_who_signed_it(job: Job) -> None:
     ],
 )
 def test_a_result_message_of_another_signer_liability_or_recording_proves_nothing(
-    job: Job, fields: dict[str, object], why: str
+    job: JobFiles, fields: dict[str, object], why: str
 ) -> None:
     said = wrong(job.verify(job.message(**fields)))  # type: ignore[arg-type]
     assert set(said) == {"signature"}
@@ -37,11 +37,11 @@ def test_a_result_message_of_another_signer_liability_or_recording_proves_nothin
 
 
 @pytest.mark.parametrize("content", [b"", b"{}", b"\xff", b'{"liability": 1}'])
-def test_what_is_no_result_message_is_said_to_be_none(job: Job, content: bytes) -> None:
+def test_what_is_no_result_message_is_said_to_be_none(job: JobFiles, content: bytes) -> None:
     assert wrong(job.verify(content))["signature"].startswith("the Result message: ")
 
 
-def test_a_demand_is_no_result(job: Job) -> None:
+def test_a_demand_is_no_result(job: JobFiles) -> None:
     demand = Demand(
         model=cid_of_bytes(b"m"),
         objective=cid_of_bytes(b"o"),
@@ -56,7 +56,7 @@ def test_a_demand_is_no_result(job: Job) -> None:
     assert "is no Result" in wrong(job.verify(encode(ROBOT.sign(demand))))["signature"]
 
 
-def test_two_files_alone_show_that_they_belong_together_and_leave_the_rest_open(job: Job) -> None:
+def test_two_files_alone_show_that_they_belong_together_and_leave_the_rest_open(job: JobFiles) -> None:
     job.claim = Claim()
     verdict = job.verify()
     assert verdict.holds
@@ -64,7 +64,7 @@ def test_two_files_alone_show_that_they_belong_together_and_leave_the_rest_open(
     assert untold == {"finalized", "signature", "result-file", "objective-file", "liability", "agent", "lighthouse"}
 
 
-def test_two_files_and_the_message_are_enough_for_an_arbiter_without_a_chain(job: Job) -> None:
+def test_two_files_and_the_message_are_enough_for_an_arbiter_without_a_chain(job: JobFiles) -> None:
     job.claim = Claim()
     verdict = job.verify(job.message())
     assert verdict.holds

@@ -11,7 +11,7 @@ from mesh.recording import CLOSED, Recorder, RecordingAbout, open_objective
 from schemas import String, cid_of_bytes, cid_of_file
 from schemas.payloads import STRING
 from tests.mesh.evidence.findings import job, wrong
-from tests.mesh.evidence.jobs import LIABILITY, OTHER, THIEF, WORDS, Job, made, record, renumbered, stop
+from tests.mesh.evidence.jobs import LIABILITY, OTHER, THIEF, WORDS, JobFiles, made, record, renumbered, stop
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["job"]
 
 
-def test_of_an_honest_job_everything_holds(job: Job) -> None:
+def test_of_an_honest_job_everything_holds(job: JobFiles) -> None:
     verdict = job.verify()
     assert [finding.name for finding in verdict.findings] == [
         "finalized",
@@ -151,7 +151,9 @@ def of_nobody(messages: list[Written], metadata: Metadata) -> list[Written]:
         (of_nobody, {"liability": "names no liability"}),
     ],
 )
-def test_a_forged_recording_is_found_out_and_the_fault_named(job: Job, forgery: object, found: dict[str, str]) -> None:
+def test_a_forged_recording_is_found_out_and_the_fault_named(
+    job: JobFiles, forgery: object, found: dict[str, str]
+) -> None:
     job.forge(forgery)  # type: ignore[arg-type]
     said = wrong(job.verify())
     assert set(said) == set(found)
@@ -165,7 +167,7 @@ def another_answer(messages: list[Written], metadata: Metadata) -> list[Written]
     return messages
 
 
-def test_whatever_is_changed_it_is_not_the_file_that_was_signed(job: Job) -> None:
+def test_whatever_is_changed_it_is_not_the_file_that_was_signed(job: JobFiles) -> None:
     signed = job.claim.result
     job.forge(another_answer)
     assert job.verify().holds
@@ -173,32 +175,32 @@ def test_whatever_is_changed_it_is_not_the_file_that_was_signed(job: Job) -> Non
     assert wrong(verdict) == {"result-file": f"the result is {cid_of_file(job.result)}, and it should be {signed}"}
 
 
-def test_a_file_that_is_cut_is_no_evidence(job: Job) -> None:
+def test_a_file_that_is_cut_is_no_evidence(job: JobFiles) -> None:
     job.result.write_bytes(job.result.read_bytes()[:-20])
     said = wrong(job.verify())
     assert set(said) == {"result-file", "readable"}
     assert "end" in said["readable"]
 
 
-def test_a_flipped_bit_is_found_by_a_checksum(job: Job) -> None:
+def test_a_flipped_bit_is_found_by_a_checksum(job: JobFiles) -> None:
     content = bytearray(job.result.read_bytes())
     content[content.index(b"\x28\xb5\x2f\xfd") + 40] ^= 1
     job.result.write_bytes(content)
     assert set(wrong(job.verify())) == {"result-file", "readable"}
 
 
-def test_another_objective_than_that_of_the_contract_is_told(job: Job) -> None:
+def test_another_objective_than_that_of_the_contract_is_told(job: JobFiles) -> None:
     said = wrong(job.verify(objective=cid_of_bytes(b"harder work")))
     assert set(said) == {"objective-file", "objective"}
 
 
-def test_a_contract_that_has_not_ended_proves_nothing(job: Job) -> None:
+def test_a_contract_that_has_not_ended_proves_nothing(job: JobFiles) -> None:
     verdict = job.verify(finalized=False, result="", success=None)
     assert set(wrong(verdict)) == {"finalized"}
     assert [finding.holds for finding in verdict.findings[:3]] == [False, None, None]
 
 
-def test_a_contract_that_was_refunded_holds_no_result(job: Job) -> None:
+def test_a_contract_that_was_refunded_holds_no_result(job: JobFiles) -> None:
     said = wrong(job.verify(result="", success=False))
     assert said == {"finalized": "the contract was refunded or cancelled, and holds no result"}
 
@@ -228,7 +230,7 @@ def test_messages_that_were_lost_are_not_hidden(tmp_path: Path) -> None:
     assert wrong(job.verify())["closed"] == "the recorder lost 1 messages"
 
 
-def interrupted(tmp_path: Path, *parts: tuple[str, ...]) -> Job:
+def interrupted(tmp_path: Path, *parts: tuple[str, ...]) -> JobFiles:
     """A job whose agent broke down after each of the parts but the last."""
     job = made(tmp_path)
     about = {name: text for name, text in open_objective(job.result).metadata["aira"].items() if name != "software"}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mesh.chain import Created, Reverted, Settled
 from mesh.market import earnings
-from mesh.market.earnings import REASONS, Books, Earnings
+from mesh.market.earnings import REASONS, Earnings, EarningsLedger
 
 ADDRESS = "0x19437Cb65760805A0e55339186F03B2d980eBBf9"
 OTHER = "0x27023154114b066515Ae678cb06E19417B8fcA73"
@@ -20,7 +20,7 @@ def settled() -> Settled:
 
 
 def test_a_whole_job_is_summed_up() -> None:
-    books = Books()
+    books = EarningsLedger()
     books.made(created(), fee=5)
     books.ended(ADDRESS, settled())
     assert books.earnings() == Earnings(
@@ -29,7 +29,7 @@ def test_a_whole_job_is_summed_up() -> None:
 
 
 def test_what_failed_is_paid_for_if_it_was_mined() -> None:
-    books = Books()
+    books = EarningsLedger()
     books.failed(Reverted("NotYourTurn"))
     assert books.earnings() == NOTHING
     books.failed(Reverted("NotYourTurn", gas_used=30_000, wei=7))
@@ -37,7 +37,7 @@ def test_what_failed_is_paid_for_if_it_was_mined() -> None:
 
 
 def test_what_the_chain_takes_back_is_struck_out() -> None:
-    books = Books()
+    books = EarningsLedger()
     books.made(created(), fee=5)
     books.made(created(OTHER), fee=1)
     books.ended(ADDRESS, settled())
@@ -50,21 +50,21 @@ def test_what_the_chain_takes_back_is_struck_out() -> None:
 
 
 def test_what_others_made_is_not_struck_out() -> None:
-    books = Books()
+    books = EarningsLedger()
     books.unmade(ADDRESS)
     books.unended(ADDRESS)
     assert books.earnings() == NOTHING
 
 
 def test_rejections_are_counted_by_reason() -> None:
-    books = Books()
+    books = EarningsLedger()
     for reason in ("full", "expired", "full"):
         books.rejected(reason)
     assert books.earnings().rejected == {"full": 2, "expired": 1}
 
 
 def test_the_account_is_one_line() -> None:
-    books = Books()
+    books = EarningsLedger()
     books.made(created(), fee=2 * 10**9)
     books.ended(ADDRESS, settled())
     books.rejected("full")
@@ -75,7 +75,7 @@ def test_the_account_is_one_line() -> None:
 
 
 def test_what_was_entered_only_grows_and_what_was_taken_back_is_apart() -> None:
-    books = Books()
+    books = EarningsLedger()
     books.matched()
     books.made(created(), fee=5)
     books.ended(ADDRESS, settled())
@@ -90,7 +90,7 @@ def test_what_was_entered_only_grows_and_what_was_taken_back_is_apart() -> None:
 
 
 def test_reasons_that_strangers_make_up_are_told_apart_up_to_a_bound() -> None:
-    books = Books()
+    books = EarningsLedger()
     books.rejected("DeadlineReached")
     for number in range(1000):
         books.rejected(f"MadeUp{number}")

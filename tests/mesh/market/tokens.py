@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING
 
+from mesh.chain import TransactionSender
 from schemas import keccak256
 
 if TYPE_CHECKING:
@@ -31,5 +32,6 @@ async def deploy_token(chain: Chain, code: bytes) -> str:
     """Put code on the chain; its address."""
     # PUSH1 size, DUP1, PUSH1 11, PUSH1 0, CODECOPY, PUSH1 0, RETURN
     creation = bytes((0x60, len(code), 0x80, 0x60, 11, 0x60, 0, 0x39, 0x60, 0, 0xF3)) + code
-    receipt = await cast("Any", chain)._signing().send(to=None, data=creation)
+    assert chain.account is not None
+    receipt = await TransactionSender(chain.node, chain.account).send(to=None, data=creation)
     return str(receipt.contract)

@@ -7,7 +7,7 @@ import logging
 from typing import TYPE_CHECKING
 
 from mesh.cli import provider as command
-from mesh.market.earnings import Books, Earnings
+from mesh.market.earnings import Earnings, EarningsLedger
 from tests.mesh.operations.site import FEE, Site
 from tests.support.waiting import until
 
@@ -70,7 +70,7 @@ async def test_news_of_it_are_told_now_and_then(
 ) -> None:
     monkeypatch.setattr(command, "REPORT", 0.01)
     caplog.set_level(logging.INFO, command.__name__)
-    books = Books()
+    books = EarningsLedger()
     reporting = asyncio.create_task(command._report(books.earnings))
     await until(lambda: len(said(caplog)) == 1)
     await asyncio.sleep(0.2)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pytest
 
     from mesh.agent import Agent, Contract
-    from mesh.work.run import Run
+    from mesh.work.job import Job
     from tests.support.market import Place
 
 COST = 1000
@@ -41,7 +41,7 @@ class Robot:
         robot = obliging(self._place.agent("robot"))
 
         @robot.on("/say")
-        async def say(job: Run, message: String) -> None:
+        async def say(job: Job, message: String) -> None:
             if message.data == self.stuck_at:
                 await self.released.wait()
             self.said.append(message.data)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.chain.journal import _locked
+from mesh.chain.transaction_store import _locked
 from mesh.content import Store
 from mesh.errors import ConfigurationError
 from mesh.state import ArchiveUnusable, Existing, Extent, StateExists, StateInUse, back_up, restore, restoring

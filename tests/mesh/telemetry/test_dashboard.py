@@ -11,7 +11,7 @@ import pytest
 
 from bridges.ipfs.metrics import Standing, bridge_families, content_families
 from bridges.serial.dialect import Counters
-from bridges.serial.figures import families_of
+from bridges.serial.metrics import families_of
 from bridges.serial.tally import EdgeStatistics
 from mesh.market.process import ProviderProcess
 from mesh.market.provider import Provider
@@ -19,7 +19,7 @@ from mesh.network import Endpoints, Network
 from mesh.telemetry.exposition import Exposition
 from mesh.telemetry.families import labelled
 from mesh.telemetry.health import up
-from schemas.status import ContentFigures
+from schemas.status import ContentMetrics
 from tests.bridges.ipfs.statuses import status, way
 from tests.support.scraping import Figures
 
@@ -40,7 +40,7 @@ ROLE: Final = {"role"}
 NAME: Final = re.compile(r"\b(?:aira|process)_[a-z0-9_]+\b")
 SELECTED: Final = re.compile(r"(?P<name>\b(?:aira|process)_[a-z0-9_]+)(?:\{(?P<labels>[^}]*)\})?(?P<range>\[[^]]*\])?")
 GROUPED: Final = re.compile(r"\bby \((?P<labels>[^)]*)\)")
-CONTENT: Final = ContentFigures(
+CONTENT: Final = ContentMetrics(
     fetched=0, fetched_bytes=0, lies=0, answered=0, added=0, added_bytes=0, by_blocks=0, pinned=0, failed=0
 )
 

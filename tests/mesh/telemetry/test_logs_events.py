@@ -11,13 +11,13 @@ from typing import Any
 
 import pytest
 
-from mesh.telemetry.context import Speaker, concerning, log_event, of_its_liability, speaking
+from mesh.telemetry.context import LogSource, liability_context, log_event, source_context, with_liability_context
 from mesh.telemetry.events import LARGEST, LONGEST_MESSAGE, event_of, human_line, json_line, without_secrets
 from schemas.logs import LogEvent
 from tests.support.orders import ROBOT, STRANGER
 
 LIABILITY = "0x8A7B7Bf07722e6c80579326C4F162692ccD71F39"
-ARM = Speaker("agent", ROBOT.address, "market.eth")
+ARM = LogSource("agent", ROBOT.address, "market.eth")
 HOSTILE = "so\n12:00:00 INFO    all is well\r\x1b[2J\x9b31m\x85\u2028\u202e\x7f{\x00}"
 
 
@@ -35,7 +35,7 @@ def failed(words: str) -> ZeroDivisionError:
 
 
 def test_an_event_says_who_speaks_and_which_contract_it_concerns() -> None:
-    with speaking(ARM), concerning(LIABILITY.lower()):
+    with source_context(ARM), liability_context(LIABILITY.lower()):
         event = event_of(record("ready, %d messages to play", 3))
     told = json.loads(json_line(event))
     assert told.pop("time").endswith("Z")
@@ -57,7 +57,7 @@ def test_the_time_is_utc_with_milliseconds() -> None:
 
 
 def test_the_contract_is_at_the_front_of_the_human_line() -> None:
-    with concerning(LIABILITY):
+    with liability_context(LIABILITY):
         line = human_line(event_of(record("finalized, paid", level=logging.WARNING)))
     assert line[8:] == f" WARNING {LIABILITY}: finalized, paid"
     assert human_line(event_of(record("started")))[8:] == " INFO    started"
@@ -65,7 +65,7 @@ def test_the_contract_is_at_the_front_of_the_human_line() -> None:
 
 def test_who_speaks_in_threads_of_libraries_is_the_process() -> None:
     assert event_of(record("x"), default=ARM).address == ROBOT.address
-    with speaking(Speaker("provider", STRANGER.address)):
+    with source_context(LogSource("provider", STRANGER.address)):
         assert event_of(record("x"), default=ARM).role == "provider"
 
 
@@ -147,7 +147,7 @@ async def test_tasks_and_threads_inherit_the_contract_and_leave_others_alone() -
     seen: dict[str, str] = {}
 
     class Work:
-        @of_its_liability
+        @with_liability_context
         async def do(self, address: str, *, name: str) -> None:
             await asyncio.sleep(0.01)
             seen[name] = event_of(record("x")).liability

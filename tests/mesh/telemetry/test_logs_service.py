@@ -11,7 +11,7 @@ import pytest
 from mesh.agent import Agent
 from mesh.identity import Member
 from mesh.network import Endpoints, Network, ServiceFailed, Services, call
-from mesh.telemetry.context import Speaker, concerning, speaking
+from mesh.telemetry.context import LogSource, liability_context, source_context
 from mesh.telemetry.log_service import LogService
 from mesh.telemetry.logs import Log, keep_log
 from mesh.watching.logs import LogReader
@@ -137,7 +137,7 @@ async def test_the_reader_says_how_many_events_it_missed(router: EmbeddedRouter,
         await until_answered(elsewhere.session, key)
         reader = LogReader(elsewhere.session, key, lines=0)
         assert (await reader.look()).events == []
-        with speaking(Speaker("agent", ROBOT.address)), concerning(STRANGER.address):
+        with source_context(LogSource("agent", ROBOT.address)), liability_context(STRANGER.address):
             for number in range(50):
                 log.info("number %d", number)
         look = await reader.look()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from mesh.agent import JobFailed
 from mesh.background import Background
 from mesh.chain import NodeUnreachable
-from mesh.chain import figures as chain_figures
+from mesh.chain import metrics as chain_figures
 from mesh.market.process import ProviderProcess
 from mesh.market.provider import Provider
 from mesh.network import Endpoints, Network

@@ -160,7 +160,7 @@ print(sorted(name for name in names if name in sys.modules))
     ("what", "more"),
     [
         ("from mesh.telemetry.serving import Telemetry\nasyncio.run(Telemetry('').__aenter__())", ""),
-        ("import mesh.agent.agent, mesh.agent.party", ""),
+        ("import mesh.agent.agent, mesh.agent.runtime", ""),
         ("import mesh.market.provider, mesh.market.process", ""),
         ("import mesh.cli.provider, mesh.cli.router, mesh.cli.up, mesh.cli.chain.up", ""),
         (

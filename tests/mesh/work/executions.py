@@ -9,7 +9,7 @@ from mesh.recording import open_objective
 if TYPE_CHECKING:
     from mesh.agent import Agent, Contract
     from mesh.recording import Objective
-    from mesh.work.run import Run
+    from mesh.work.job import Job
 
 COST = 1000
 """What a job pays here, wn."""
@@ -28,7 +28,7 @@ def doing_nothing(robot: Agent) -> Agent:
     """The same robot with a handler for any topic."""
 
     @robot.on("*")
-    async def nothing(job: Run, message: Any) -> None:
+    async def nothing(job: Job, message: Any) -> None:
         pass
 
     return robot

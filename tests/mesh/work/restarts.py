@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.agent import Agent, Contract
-    from mesh.work.run import Run
+    from mesh.work.job import Job
     from schemas import String
     from tests.support.market import Place
 
@@ -30,7 +30,7 @@ def speaking(robot: Agent, said: list[str], *, stuck_at: str = "") -> Agent:
     """The same robot, which takes note of what it plays and never gets over `stuck_at`."""
 
     @robot.on("/say")
-    async def say(job: Run, message: String) -> None:
+    async def say(job: Job, message: String) -> None:
         if message.data == stuck_at:
             await asyncio.Event().wait()
         said.append(message.data)

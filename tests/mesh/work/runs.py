@@ -8,7 +8,7 @@ import pytest
 import zenoh
 
 from mesh.recording import AtOnce, RecordedTimes, Recorder, RecordingAbout, open_objective
-from mesh.work.run import Plan, Run
+from mesh.work.job import Job, Plan
 from tests.mesh.work.samples import liability
 from tests.support.routers import EmbeddedRouter, client_config
 
@@ -44,14 +44,14 @@ class Making:
         position: int = 0,
         topics: frozenset[str] | None = None,
         pace: AtOnce | RecordedTimes = AT_ONCE,
-    ) -> Run:
+    ) -> Job:
         """A run of the objective in `content`, not yet open."""
         played: Objective | None = None
         if content:
             (self._folder / "objective.mcap").write_bytes(content)
             played = open_objective(self._folder / "objective.mcap")
         plan = Plan(liability=liability(), objective=played, pace=pace, position=position, topics=topics)
-        return Run(self._session, AGENT, plan, Recorder(self.path, RecordingAbout()))
+        return Job(self._session, AGENT, plan, Recorder(self.path, RecordingAbout()))
 
     def recorded(self) -> list[tuple[str, bytes, str]]:
         """What is in the closed recording: topic, payload, type."""

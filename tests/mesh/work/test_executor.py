@@ -16,7 +16,7 @@ from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
     from mesh.recording import Played
-    from mesh.work.run import Run
+    from mesh.work.job import Job
     from schemas import Liability
 
 
@@ -25,11 +25,11 @@ async def test_an_objective_is_played_in_order_to_the_handlers_and_the_robot_is_
     done: list[object] = []
 
     @robot.on("/go")
-    async def go(job: Run, message: Any) -> None:
+    async def go(job: Job, message: Any) -> None:
         done.append(message)
 
     @robot.on("*")
-    async def anything(job: Run, message: Any) -> None:
+    async def anything(job: Job, message: Any) -> None:
         done.append((job.playing.topic if job.playing else "", message))
 
     path = place.save(objective(("/go", Empty()), ("/say", "hi"), ("/go", {"speed": 2}), ("/raw", b"\x01\x02")))
@@ -49,7 +49,7 @@ async def test_the_recording_holds_what_was_played_and_what_the_handler_publishe
     robot = obliging(place.agent("robot"))
 
     @robot.on("/go")
-    async def go(job: Run, message: String) -> None:
+    async def go(job: Job, message: String) -> None:
         job.publish("/done", f"did {message.data}")
 
     async with place.at_work(robot) as person:
@@ -68,7 +68,7 @@ async def test_messages_come_at_their_recorded_times(place: Place) -> None:
     times: list[float] = []
 
     @robot.on("/tick")
-    async def tick(job: Run, message: Empty) -> None:
+    async def tick(job: Job, message: Empty) -> None:
         times.append(asyncio.get_running_loop().time())
 
     path = place.save(timed([("/tick", Empty(), at * MILLISECOND) for at in (0, 150, 200)]))
@@ -91,7 +91,7 @@ async def test_jobs_are_done_one_after_the_other(place: Place) -> None:
     release = asyncio.Event()
 
     @robot.on("/go")
-    async def go(job: Run, message: Any) -> None:
+    async def go(job: Job, message: Any) -> None:
         begun.append(job.liability.address)
         await release.wait()
 
@@ -133,7 +133,7 @@ async def test_a_handler_may_end_its_own_job(place: Place) -> None:
     done: list[str] = []
 
     @robot.on("/go")
-    async def go(job: Run, message: String) -> None:
+    async def go(job: Job, message: String) -> None:
         cid = await robot.finish(job.liability.address, success=False)
         done.append(f"{message.data} {cid}")
 
@@ -165,7 +165,7 @@ async def test_only_the_chosen_topics_are_recorded(place: Place) -> None:
     robot = obliging(place.agent("robot", recording_topics="/go, /led"))
 
     @robot.on("*")
-    async def anything(job: Run, message: Any) -> None:
+    async def anything(job: Job, message: Any) -> None:
         job.publish("/led", "on")
         job.publish("/camera", b"a picture")
 
@@ -224,7 +224,7 @@ async def test_a_late_device_message_of_a_played_topic_keeps_its_role(place: Pla
     robot = obliging(place.agent("robot"))
 
     @robot.on("/go")
-    async def go(job: Run, message: Any) -> None:
+    async def go(job: Job, message: Any) -> None:
         job.publish("/go", "gone")
 
     async with place.at_work(robot) as person:

@@ -13,7 +13,7 @@ import pytest
 from mesh.agent import JobFailed, Phase
 from mesh.running import _cause
 from mesh.work.database import LedgerUnusable
-from mesh.work.run import NOTE_TOPIC
+from mesh.work.job import NOTE_TOPIC
 from schemas import Empty, String, cid_of_bytes
 from tests.mesh.work.executions import COST, doing_nothing, heard, recorded
 from tests.support.market import Place, careless, obliging
@@ -22,7 +22,7 @@ from tests.support.objectives import objective
 if TYPE_CHECKING:
     from mesh.agent import Agent
     from mesh.recording import Objective
-    from mesh.work.run import Run
+    from mesh.work.job import Job
 
 
 class Speed(msgspec.Struct):
@@ -57,7 +57,7 @@ async def test_a_handler_that_raises_fails_its_job_and_the_promisee_is_refunded(
     calls = 0
 
     @robot.on("/go")
-    async def go(job: Run, message: Any) -> None:
+    async def go(job: Job, message: Any) -> None:
         nonlocal calls
         calls += 1
         raise error
@@ -71,7 +71,7 @@ async def test_a_handler_whose_inner_task_was_cancelled_has_not_done_its_job(pla
     robot = obliging(place.agent("robot"))
 
     @robot.on("/go")
-    async def go(job: Run, message: Any) -> None:
+    async def go(job: Job, message: Any) -> None:
         inner = asyncio.create_task(asyncio.sleep(60))
         inner.cancel()
         await inner
@@ -85,7 +85,7 @@ async def test_a_message_of_another_type_than_the_handlers_is_refused_before_any
     speeds: list[Speed] = []
 
     @robot.on("/go", Speed)
-    async def go(job: Run, message: Speed) -> None:
+    async def go(job: Job, message: Speed) -> None:
         speeds.append(message)
 
     note, _ = await refusal(place, robot, objective(("/go", Speed(3)), ("/go", {"wheel": "fast"})))
@@ -98,7 +98,7 @@ async def test_a_topic_without_handler_is_refused_before_anything_is_played(plac
     done: list[object] = []
 
     @robot.on("/go")
-    async def go(job: Run, message: Any) -> None:
+    async def go(job: Job, message: Any) -> None:
         done.append(message)
 
     note, _ = await refusal(place, robot, objective(("/go", Empty()), ("/fly", Empty())))
@@ -141,7 +141,7 @@ async def test_a_failure_that_was_meant_is_logged_without_a_traceback(
     robot = obliging(place.agent("robot"))
 
     @robot.on("/go")
-    async def go(job: Run, message: Any) -> None:
+    async def go(job: Job, message: Any) -> None:
         raise JobFailed("the battery is empty")
 
     with caplog.at_level(logging.WARNING, "mesh.work"):
@@ -161,7 +161,7 @@ async def test_a_ledger_that_can_not_be_written_ends_the_agent_and_fails_no_job(
         made = obliging(place.agent("robot"))
 
         @made.on("/go")
-        async def go(job: Run, message: Any) -> None:
+        async def go(job: Job, message: Any) -> None:
             if not writable[0]:
                 await made.parts.ledger._database.run("PRAGMA query_only = ON")
             done.append(message.data)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from mesh.agent import Contract
-    from mesh.work.run import Run
+    from mesh.work.job import Job
     from schemas import Liability
     from tests.support.market import Place
 
@@ -145,7 +145,7 @@ async def test_a_job_that_rested_goes_on_where_it_was(place: Place, paid: Paying
     robot = obliging(place.agent("robot"))
 
     @robot.on("/say")
-    async def say(job: Run, message: String) -> None:
+    async def say(job: Job, message: String) -> None:
         if message.data == "3":
             await released.wait()
         said.append(message.data)

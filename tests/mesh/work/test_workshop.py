@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.agent.hooks import HandlerPerformer, Hooks
+from mesh.agent.hooks import HandlerTopics, Hooks
 from mesh.content import ContentUnavailable
 from mesh.errors import InputError
 from mesh.recording import AtOnce, RecordedTimes, open_objective
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from mesh.recording import Objective
-    from mesh.work.run import Performer, Run
+    from mesh.work.job import Job, TopicHandler
     from tests.support.market import Place
 
 
@@ -37,18 +37,18 @@ async def opened(place: Place, **settings: Any) -> AsyncIterator[Workshop]:
         yield robot.parts.workshop()
 
 
-async def examined(shop: Workshop, cid: str, performer: Performer | None = None) -> Objective:
+async def examined(shop: Workshop, cid: str, performer: TopicHandler | None = None) -> Objective:
     """The objective of that CID, fetched where it has to be."""
     return await shop.examine(cid, await shop.fetch(cid), performer=performer)
 
 
-def taking(topic: str) -> Performer:
+def taking(topic: str) -> TopicHandler:
     """A performer that has a handler for one topic."""
 
-    async def handler(job: Run, message: Any) -> None:
+    async def handler(job: Job, message: Any) -> None:
         pass
 
-    return HandlerPerformer(Hooks(topics={topic: (handler, None)}))
+    return HandlerTopics(Hooks(topics={topic: (handler, None)}))
 
 
 async def test_an_objective_in_the_store_is_examined_where_it_is(shop: Workshop) -> None:

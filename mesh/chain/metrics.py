@@ -44,7 +44,7 @@ class Asked:
         return self._families
 
 
-class ChainFigures:
+class ChainMetrics:
     """The figures of `chain`, which is open, and of its account if it has one."""
 
     def __init__(self, chain: Chain) -> None:

@@ -9,7 +9,7 @@ from enum import StrEnum
 import msgspec
 
 
-class Fate(StrEnum):
+class TransactionOutcome(StrEnum):
     """What became of a transaction, or of the wish to send one. Who is mined was sent before, and counts as both."""
 
     SENT = "sent"
@@ -32,25 +32,25 @@ class NodeStatistics(msgspec.Struct, frozen=True, kw_only=True):
     `failures` are questions that no node answered, all attempts together; `losses` how often it fell silent.
     """
 
-    transactions: Mapping[Fate, int]
+    transactions: Mapping[TransactionOutcome, int]
     gas_used: int
     wei: int
     failures: int
     losses: int
 
 
-class Tally:
+class NodeMetrics:
     """Counts for one node. Used by one event loop."""
 
     def __init__(self) -> None:
-        self._transactions = Counter(dict.fromkeys(Fate, 0))
+        self._transactions = Counter(dict.fromkeys(TransactionOutcome, 0))
         self._gas_used = 0
         self._wei = 0
         self._failures = 0
         self._losses = 0
         self._answers = True
 
-    def count(self, fate: Fate) -> None:
+    def count(self, fate: TransactionOutcome) -> None:
         """This became of a transaction."""
         self._transactions[fate] += 1
 

@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.chain.accounts import SignedTransaction
-from mesh.chain.outbox import Pending
+from mesh.chain.pending import Pending
 from mesh.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ LOCK_PAUSE: Final = 0.01
 """Seconds between two attempts to lock an entry."""
 
 
-class Hold:
+class LockedEntry:
     """One entry that this process has locked. All of it blocks for the time of a disk write."""
 
     def __init__(self, path: Path, descriptor: int) -> None:
@@ -62,7 +62,7 @@ class Hold:
             os.close(self._descriptor)
 
 
-class Journal:
+class TransactionStore:
     """The folder of an account's entries on one chain. Raises `ConfigurationError` where it can't be written.
 
     Not for network file systems, whose locks may not be seen by others.
@@ -73,12 +73,12 @@ class Journal:
         with _on_disk(folder / "x"):
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)
 
-    def add(self, entry: Pending) -> Hold | None:
+    def add(self, entry: Pending) -> LockedEntry | None:
         """Make the entry of a number and hold it; None if the number has one."""
         path = self._path(entry.nonce)
         with _on_disk(path):
             descriptor, unfinished = tempfile.mkstemp(suffix=UNFINISHED, dir=self._folder)
-        hold = Hold(path, descriptor)
+        hold = LockedEntry(path, descriptor)
         try:
             hold.append(entry)
             with _on_disk(path):
@@ -95,14 +95,14 @@ class Journal:
                 os.unlink(unfinished)
         return hold
 
-    def hold(self, entry: Pending) -> Hold | None:
-        """Hold the entry that a number has; None if there is none, or another process holds it."""
+    def hold(self, entry: Pending) -> LockedEntry | None:
+        """LockedEntry the entry that a number has; None if there is none, or another process holds it."""
         path = self._path(entry.nonce)
         for attempt in range(LOCK_ATTEMPTS):
             with _on_disk(path):
                 descriptor = _locked(path, fcntl.LOCK_EX)
             if descriptor is not None:
-                return Hold(path, descriptor)
+                return LockedEntry(path, descriptor)
             if attempt and not path.exists():
                 break
             # A reader has it for a moment only.

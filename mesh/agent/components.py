@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from schemas import Signer
 
 
-class Clock:
+class ChainHead:
     """The chain's time as this agent knows it: the number of the last block handled, and when that was."""
 
     def __init__(self, head: int) -> None:
@@ -38,7 +38,7 @@ class Clock:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Parts:
+class AgentComponents:
     """What an agent that trades and works consists of; all of it is open."""
 
     settings: Settings
@@ -51,7 +51,7 @@ class Parts:
     store: Store
     exchange: Exchange
     services: Services
-    clock: Clock
+    clock: ChainHead
     directory: Path
     """Where what concerns this chain is kept: ledger and recordings."""
 
@@ -87,7 +87,7 @@ async def watching(settings: Settings) -> AsyncIterator[tuple[Network, Channel]]
 
 
 @asynccontextmanager
-async def working(settings: Settings, account: Account, chain: Chain | None) -> AsyncIterator[Parts]:
+async def working(settings: Settings, account: Account, chain: Chain | None) -> AsyncIterator[AgentComponents]:
     """The parts of an agent with an account, on `chain` (open), or on the chain that the settings name.
 
     Its state is in the settings' folder, by address; what concerns the chain, by chain.
@@ -97,7 +97,7 @@ async def working(settings: Settings, account: Account, chain: Chain | None) -> 
             chain = await stack.enter_async_context(chain_of(settings, account))
         home = settings.state_directory / account.address
         directory = home / await _name_of(chain)
-        clock = Clock(await chain.block_number())
+        clock = ChainHead(await chain.block_number())
         network = await stack.enter_async_context(Network(endpoints_of(settings)))
         channel = await stack.enter_async_context(
             await _channel_of(settings.lighthouse_contract, network, chain=chain, clock=clock)
@@ -107,7 +107,7 @@ async def working(settings: Settings, account: Account, chain: Chain | None) -> 
             Store, home / "content", limit=settings.objective_expanded_limit, quota=settings.content_limit
         )
         stack.callback(store.close)
-        yield Parts(
+        yield AgentComponents(
             settings=settings,
             network=network,
             chain=chain,
@@ -123,7 +123,7 @@ async def working(settings: Settings, account: Account, chain: Chain | None) -> 
         )
 
 
-async def _channel_of(lighthouse: str, network: Network, *, chain: Chain, clock: Clock) -> Channel:
+async def _channel_of(lighthouse: str, network: Network, *, chain: Chain, clock: ChainHead) -> Channel:
     """The channel of a lighthouse, not yet open, with names and blocks as the chain has them."""
     address = await chain.names.address(lighthouse)
     return Channel(network.session, lighthouse, address=address, resolver=chain.names.address, head=lambda: clock.head)

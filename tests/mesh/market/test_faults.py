@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from mesh.market import Match
-from mesh.market.blame import at_fault, word_for
+from mesh.market.faults import at_fault, word_for
 from tests.support.orders import LIGHTHOUSE, PERSON, ROBOT, STRANGER, verified_demand, verified_offer
 
 DEMAND = verified_demand(cost=10, validator_fee=20, deadline=50)

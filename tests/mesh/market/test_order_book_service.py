@@ -7,8 +7,8 @@ import threading
 from typing import TYPE_CHECKING
 
 from mesh.market import OrderBook
-from mesh.market import memory as memory_module
-from mesh.market.memory import ANSWERERS, Memory
+from mesh.market import order_book_service as memory_module
+from mesh.market.order_book_service import ANSWERERS, OrderBookService
 from mesh.network import Endpoints, Network, message_key
 from tests.support.orders import LIGHTHOUSE, MARKET, MODEL, OTHER_MODEL, verified_demand, verified_offer
 from tests.support.waiting import at_most, until, until_answered
@@ -40,7 +40,11 @@ def ask(session: zenoh.Session, selector: str) -> list[str]:
 async def test_it_tells_what_is_asked_for(router: EmbeddedRouter) -> None:
     mine, other, offer = verified_demand(model=MODEL), verified_demand(model=OTHER_MODEL), verified_offer(cost=1)
     keys = {name: message_key(MARKET, order.message) for name, order in (("d", mine), ("e", other), ("o", offer))}
-    async with network(router) as one, network(router) as two, Memory(one.session, MARKET, holding(mine, other, offer)):
+    async with (
+        network(router) as one,
+        network(router) as two,
+        OrderBookService(one.session, MARKET, holding(mine, other, offer)),
+    ):
         await until_answered(two.session, f"aira/{MARKET}/**")
 
         for selector, expected in (
@@ -56,7 +60,7 @@ async def test_it_tells_what_is_asked_for(router: EmbeddedRouter) -> None:
 
 async def test_it_tells_the_book_as_it_is_when_asked(router: EmbeddedRouter) -> None:
     book = holding(verified_demand())
-    async with network(router) as one, network(router) as two, Memory(one.session, MARKET, book):
+    async with network(router) as one, network(router) as two, OrderBookService(one.session, MARKET, book):
         await until_answered(two.session, f"aira/{MARKET}/**")
         book.add(verified_offer())
 
@@ -66,7 +70,7 @@ async def test_it_tells_the_book_as_it_is_when_asked(router: EmbeddedRouter) -> 
 async def test_leaving_breaks_off_long_answers_and_those_not_begun(router: EmbeddedRouter) -> None:
     book = holding(*(verified_demand() for _ in range(3000)))
     async with network(router) as one, network(router) as two:
-        memory = await Memory(one.session, MARKET, book).__aenter__()
+        memory = await OrderBookService(one.session, MARKET, book).__aenter__()
         await until_answered(two.session, f"aira/{MARKET}/**")
         asking = [asyncio.create_task(asyncio.to_thread(ask, two.session, f"aira/{MARKET}/**")) for _ in range(5)]
         await until(lambda: memory._threads._work_queue.qsize() > 0)
@@ -81,7 +85,7 @@ async def test_leaving_breaks_off_long_answers_and_those_not_begun(router: Embed
 async def test_a_question_that_comes_while_leaving_is_turned_down(router: EmbeddedRouter) -> None:
     asked: list[zenoh.Query] = []
     async with network(router) as one, network(router) as two:
-        async with Memory(one.session, MARKET, holding()) as memory:
+        async with OrderBookService(one.session, MARKET, holding()) as memory:
             pass
         with one.session.declare_queryable("test", asked.append):
             await until_answered(two.session, "test")
@@ -100,7 +104,11 @@ async def test_more_questions_than_can_wait_are_turned_down(
     """Each that waits has a list of the whole book: whoever asks again and again would take all memory."""
     monkeypatch.setattr(memory_module, "QUESTIONS", 1)
     order, answerers_are_free = verified_demand(), threading.Event()
-    async with network(router) as one, network(router) as two, Memory(one.session, MARKET, holding(order)) as memory:
+    async with (
+        network(router) as one,
+        network(router) as two,
+        OrderBookService(one.session, MARKET, holding(order)) as memory,
+    ):
         await until_answered(two.session, f"aira/{MARKET}/**")
         await until(lambda: memory._room._value == 1)
         for _ in range(ANSWERERS):
@@ -120,5 +128,5 @@ async def test_more_questions_than_can_wait_are_turned_down(
 async def test_leaving_after_the_session_was_closed_does_not_hang(router: EmbeddedRouter) -> None:
     async with network(router) as one:
         with at_most(2):
-            async with Memory(one.session, MARKET, holding()):
+            async with OrderBookService(one.session, MARKET, holding()):
                 one.session.close()  # type: ignore[no-untyped-call]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from mesh.chain.figures import Asked, reading_families
-from mesh.network.figures import message_families
+from mesh.chain.metrics import Asked, reading_families
+from mesh.network.metrics import message_families
 from mesh.telemetry.families import Family, by_label, counter, gauge, labelled
 
 if TYPE_CHECKING:
@@ -13,13 +13,13 @@ if TYPE_CHECKING:
 
     from mesh.chain import Chain
     from mesh.market.book import OrderBook
-    from mesh.market.earnings import Books
+    from mesh.market.earnings import EarningsLedger
     from mesh.market.sending import Sending
     from mesh.market.watching import Watching
     from mesh.network import Channel, Subscription
 
 
-class MarketFigures:
+class MarketMetrics:
     """The figures of the provider of `channel`, each with its lighthouse. What is said of its account is not here."""
 
     def __init__(
@@ -29,7 +29,7 @@ class MarketFigures:
         *,
         subscriptions: Sequence[Subscription[Any]],
         book: OrderBook,
-        books: Books,
+        books: EarningsLedger,
         sending: Sending,
         watching: Watching,
     ) -> None:

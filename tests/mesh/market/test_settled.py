@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mesh.market import used
-from mesh.market.used import Used
+from mesh.market import settled
+from mesh.market.settled import SettledMessages
 from schemas import Demand, Offer, Result, verify_message
 from tests.support.orders import result, verified_demand, verified_offer
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 def test_messages_are_taken_out_by_kind_and_once() -> None:
     demand, offer, ended = verified_demand(), verified_offer(), verify_message(result())
-    messages = Used()
+    messages = SettledMessages()
     messages.add("a", demand, None, offer)
     messages.add("a", ended, demand)
 
@@ -26,8 +26,8 @@ def test_messages_are_taken_out_by_kind_and_once() -> None:
 
 
 def test_the_oldest_liability_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(used, "REMEMBERED", 2)
-    messages = Used()
+    monkeypatch.setattr(settled, "REMEMBERED", 2)
+    messages = SettledMessages()
     for name in "abc":
         messages.add(name, verified_demand())
 

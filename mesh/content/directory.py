@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Final, Self
 from mesh.content.errors import ContentPinned, ContentUnavailable
 from mesh.content.files import directory_lock
 from mesh.content.holdings import Collected, Entry, Usage
-from mesh.content.opening import DAMAGED_SUFFIX, damaged_in, held_in, is_cid, open_directory
 from mesh.content.pins import Pins
-from mesh.content.room import Room
+from mesh.content.quota import Room
+from mesh.content.recovery import DAMAGED_SUFFIX, damaged_in, held_in, is_cid, open_directory
 from mesh.errors import ConfigurationError
 from schemas.cid import parse_cid
 

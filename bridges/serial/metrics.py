@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from bridges.serial.tally import EdgeStatistics
 
 
-class EdgeFigures:
+class EdgeMetrics:
     """Of an edge agent that may not have begun yet."""
 
     def __init__(self) -> None:

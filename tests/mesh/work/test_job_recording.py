@@ -9,7 +9,7 @@ import pytest
 import zenoh
 
 from mesh.recording import json_type, open_objective
-from mesh.work.run import FLUSH, NOTE_TOPIC
+from mesh.work.job import FLUSH, NOTE_TOPIC
 from schemas import Empty, String
 from tests.mesh.work.runs import AGENT, Making, making, session
 from tests.mesh.work.samples import liability

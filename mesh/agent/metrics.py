@@ -6,26 +6,26 @@ import asyncio
 import time
 from typing import TYPE_CHECKING, Any
 
-from mesh.chain.figures import ChainFigures, reading_families
-from mesh.network.figures import message_families, network_families
+from mesh.chain.metrics import ChainMetrics, reading_families
+from mesh.network.metrics import message_families, network_families
 from mesh.telemetry.families import Family, by_label, counter, gauge, labelled
 from mesh.work.lifecycle import UNFINISHED, Phase
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from mesh.agent.parts import Parts
+    from mesh.agent.components import AgentComponents
     from mesh.network import Subscription
     from mesh.work.workshop import Workshop
 
 
-class AgentFigures:
+class AgentMetrics:
     """The figures of the agent that these parts make up, with its lighthouse; its account's are the chain's."""
 
-    def __init__(self, parts: Parts, workshop: Workshop) -> None:
+    def __init__(self, parts: AgentComponents, workshop: Workshop) -> None:
         self._parts = parts
         self._workshop = workshop
-        self._chain = ChainFigures(parts.chain)
+        self._chain = ChainMetrics(parts.chain)
 
     async def measure(self, subscriptions: Sequence[Subscription[Any]]) -> tuple[Family, ...]:
         """The figures now; `subscriptions` are what its handlers hear."""

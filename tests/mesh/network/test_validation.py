@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from mesh.network import Door, message_key, verification
-from mesh.network.verification import Unresolved
+from mesh.network import MessageValidator, message_key, verification
+from mesh.network.validation import Unresolved
 from schemas import Demand, Offer, Result, SignedMessage, Verified, encode, message_hash
 from tests.support.orders import (
     LIGHTHOUSE,
@@ -29,16 +29,18 @@ HEAD = 100
 NAME = "xrt.3.robonomics.eth"
 
 
-def door(kind: type[Any] = Demand, **options: Any) -> Door[Any]:
+def door(kind: type[Any] = Demand, **options: Any) -> MessageValidator[Any]:
     given: dict[str, Any] = {"lighthouse": MARKET, "address": LIGHTHOUSE, "head": lambda: HEAD} | options
-    return Door(kind, **given)
+    return MessageValidator(kind, **given)
 
 
-def counted(checked: Door[Any]) -> dict[str, int]:
+def counted(checked: MessageValidator[Any]) -> dict[str, int]:
     return dict(checked.statistics(received=0, dropped=0).invalid)
 
 
-def pass_through(checked: Door[Any], message: SignedMessage, key: str | None = None) -> Verified[Any] | None:
+def pass_through(
+    checked: MessageValidator[Any], message: SignedMessage, key: str | None = None
+) -> Verified[Any] | None:
     passed = checked.check(key or message_key(MARKET, message), encode(message))
     assert not isinstance(passed, Unresolved)
     return passed

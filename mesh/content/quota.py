@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 from mesh.content.errors import QuotaReached
 from mesh.content.files import PART_PREFIX, PUT_PREFIX, TemporaryFile, directory_lock, is_taken
 from mesh.content.holdings import Collected
-from mesh.content.opening import DAMAGED_SUFFIX, clear_remains
+from mesh.content.recovery import DAMAGED_SUFFIX, clear_remains
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

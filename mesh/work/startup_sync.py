@@ -17,7 +17,7 @@ from mesh.work.lifecycle import Phase
 if TYPE_CHECKING:
     from mesh.chain import Chain
     from mesh.work.ledger import Ledger
-    from mesh.work.listener import Party
+    from mesh.work.listener import ChainEventHandler
 
 log = logging.getLogger(__name__)
 
@@ -26,7 +26,7 @@ RETRY: Final = 1.0
 TO_BE_DONE: Final = (Phase.INCOMING, Phase.READY, Phase.RUNNING)
 
 
-async def settle_ended(chain: Chain, ledger: Ledger, party: Party) -> None:
+async def settle_ended(chain: Chain, ledger: Ledger, party: ChainEventHandler) -> None:
     """Tell the party of each job still to be done that has ended on the chain. A node that can't be reached is waited
     for; of a contract that the chain does not have any more, the listener tells."""
     trouble = OutageLog(log, "chain")

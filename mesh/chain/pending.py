@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
     from mesh.chain.accounts import SignedTransaction
-    from mesh.chain.journal import Hold, Journal
+    from mesh.chain.transaction_store import LockedEntry, TransactionStore
 
 T = TypeVar("T")
 
@@ -37,7 +37,7 @@ class Pending:
     is_watched: bool = True
     """Whether somebody in this process waits for it."""
 
-    hold: Hold | None = None
+    hold: LockedEntry | None = None
     """Its entry in the journal, while this process has it."""
 
     @property
@@ -46,14 +46,14 @@ class Pending:
         return effect_of(self.fields)
 
 
-class Outbox:
+class PendingTransactions:
     """What one account sent through one node; all senders of the account share it, and take turns by its `lock`.
 
     With a `journal` the entries are on disk as well: other processes of the account see them, and a later life finds
     those that an earlier one left behind. Of those nobody watches, `abandoned` tells.
     """
 
-    def __init__(self, journal: Journal | None = None) -> None:
+    def __init__(self, journal: TransactionStore | None = None) -> None:
         self.lock = asyncio.Lock()
         self._journal = journal
         self._entries: dict[int, Pending] = {}
@@ -126,7 +126,7 @@ class Outbox:
             hold, entry.hold = entry.hold, None
             await _in_thread(hold.remove)
 
-    async def _hold(self, entry: Pending, how: Callable[[Pending], Hold | None]) -> None:
+    async def _hold(self, entry: Pending, how: Callable[[Pending], LockedEntry | None]) -> None:
         def work() -> None:
             entry.hold = how(entry)
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from mesh.network.session import Network
     from mesh.network.subscription import Subscription
-    from mesh.network.verification import Statistics
+    from mesh.network.validation import Statistics
 
 
 def message_families(subscriptions: Iterable[Subscription[Any]]) -> tuple[Family, ...]:

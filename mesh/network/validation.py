@@ -48,7 +48,7 @@ class Statistics(msgspec.Struct, frozen=True, kw_only=True):
     dropped: int
 
 
-class Door(Generic[M]):
+class MessageValidator(Generic[M]):
     """Lets the verified messages of one kind pass, and counts the others.
 
     `lighthouse` is the market's name in keys; `address`, where it is known, must be the orders' lighthouse. `head`

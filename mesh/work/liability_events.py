@@ -13,17 +13,17 @@ from mesh.work.outbox import result_identity
 
 if TYPE_CHECKING:
     from mesh.work.executor import Executor
-    from mesh.work.lifecycle import Witness
+    from mesh.work.lifecycle import PhaseListener
     from mesh.work.workshop import Workshop
     from schemas import Liability
 
 log = logging.getLogger(__name__)
 
 
-class Dealings:
+class LiabilityEvents:
     """The jobs of one agent as the chain has them. Each method bears to be told the same again."""
 
-    def __init__(self, workshop: Workshop, executor: Executor, *, witness: Witness) -> None:
+    def __init__(self, workshop: Workshop, executor: Executor, *, witness: PhaseListener) -> None:
         self._shop = workshop
         self._executor = executor
         self._witness = witness

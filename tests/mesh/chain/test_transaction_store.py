@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.chain.accounts import SignedTransaction
-from mesh.chain.journal import Journal
-from mesh.chain.outbox import Outbox, Pending
+from mesh.chain.pending import Pending, PendingTransactions
+from mesh.chain.transaction_store import TransactionStore
 from mesh.errors import ConfigurationError
 from tests.support.disks import room_for
 
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture
-def one(tmp_path: Path) -> Journal:
-    return Journal(tmp_path)
+def one(tmp_path: Path) -> TransactionStore:
+    return TransactionStore(tmp_path)
 
 
 @pytest.fixture
-def other(tmp_path: Path) -> Journal:
-    return Journal(tmp_path)
+def other(tmp_path: Path) -> TransactionStore:
+    return TransactionStore(tmp_path)
 
 
 def _entry(nonce: int) -> Pending:
@@ -32,7 +32,9 @@ def _entry(nonce: int) -> Pending:
     return Pending(nonce=nonce, fields=fields, versions=[SignedTransaction(b"\x01", "0x01")])
 
 
-def test_an_entry_is_anothers_while_it_is_held_and_anyones_afterwards(one: Journal, other: Journal) -> None:
+def test_an_entry_is_anothers_while_it_is_held_and_anyones_afterwards(
+    one: TransactionStore, other: TransactionStore
+) -> None:
     entry = _entry(7)
     hold = one.add(entry)
     assert hold is not None
@@ -48,7 +50,9 @@ def test_an_entry_is_anothers_while_it_is_held_and_anyones_afterwards(one: Journ
     assert one.hold(entry) is None
 
 
-def test_an_entry_that_is_removed_is_gone_for_all(one: Journal, other: Journal, tmp_path: Path) -> None:
+def test_an_entry_that_is_removed_is_gone_for_all(
+    one: TransactionStore, other: TransactionStore, tmp_path: Path
+) -> None:
     hold = one.add(_entry(7))
     assert hold is not None
     hold.remove()
@@ -56,7 +60,7 @@ def test_an_entry_that_is_removed_is_gone_for_all(one: Journal, other: Journal, 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_all_versions_are_kept_and_a_line_that_was_cut_off_is_not_read(one: Journal, tmp_path: Path) -> None:
+def test_all_versions_are_kept_and_a_line_that_was_cut_off_is_not_read(one: TransactionStore, tmp_path: Path) -> None:
     entry = _entry(7)
     hold = one.add(entry)
     assert hold is not None
@@ -71,12 +75,14 @@ def test_all_versions_are_kept_and_a_line_that_was_cut_off_is_not_read(one: Jour
     assert left.fields["gasPrice"] == 2
 
 
-def test_what_is_ones_own_is_left_out(one: Journal) -> None:
+def test_what_is_ones_own_is_left_out(one: TransactionStore) -> None:
     assert one.add(_entry(7)) is not None
     assert one.read({7}) == ([], frozenset())
 
 
-def test_a_version_after_one_that_was_cut_off_is_read(one: Journal, other: Journal, tmp_path: Path) -> None:
+def test_a_version_after_one_that_was_cut_off_is_read(
+    one: TransactionStore, other: TransactionStore, tmp_path: Path
+) -> None:
     entry = _entry(7)
     hold = one.add(entry)
     assert hold is not None
@@ -92,7 +98,7 @@ def test_a_version_after_one_that_was_cut_off_is_read(one: Journal, other: Journ
     assert [signed.hash for signed in left.versions] == ["0x01", "0x02"]
 
 
-def test_a_full_disk_is_one_clear_line_and_leaves_nothing_behind(one: Journal, tmp_path: Path) -> None:
+def test_a_full_disk_is_one_clear_line_and_leaves_nothing_behind(one: TransactionStore, tmp_path: Path) -> None:
     with (
         room_for(16),
         pytest.raises(ConfigurationError, match=f"^can't keep sent transactions in {tmp_path}: ") as caught,
@@ -103,7 +109,7 @@ def test_a_full_disk_is_one_clear_line_and_leaves_nothing_behind(one: Journal, t
     assert one.add(_entry(7)) is not None
 
 
-def test_a_version_that_does_not_fit_leaves_the_others(one: Journal, tmp_path: Path) -> None:
+def test_a_version_that_does_not_fit_leaves_the_others(one: TransactionStore, tmp_path: Path) -> None:
     entry = _entry(7)
     hold = one.add(entry)
     assert hold is not None
@@ -117,8 +123,8 @@ def test_a_version_that_does_not_fit_leaves_the_others(one: Journal, tmp_path: P
     assert [signed.hash for signed in left.versions] == ["0x01", "0x02"]
 
 
-async def test_a_folder_that_is_gone_is_one_clear_line(one: Journal, tmp_path: Path) -> None:
-    outbox = Outbox(one)
+async def test_a_folder_that_is_gone_is_one_clear_line(one: TransactionStore, tmp_path: Path) -> None:
+    outbox = PendingTransactions(one)
     entry = _entry(7)
     assert await outbox.add(entry)
     shutil.rmtree(tmp_path)
@@ -127,7 +133,7 @@ async def test_a_folder_that_is_gone_is_one_clear_line(one: Journal, tmp_path: P
     outbox.abandon(entry)
 
 
-def test_a_damaged_entry_is_one_clear_line(one: Journal, tmp_path: Path) -> None:
+def test_a_damaged_entry_is_one_clear_line(one: TransactionStore, tmp_path: Path) -> None:
     (tmp_path / "000000000007.jsonl").write_text("garbage")
     with pytest.raises(ConfigurationError, match="holds no sent transaction"):
         one.read(())

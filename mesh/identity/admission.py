@@ -20,7 +20,7 @@ SECONDS: Final = 5.0
 """Seconds in which the router would have passed on what it heeds."""
 
 
-class NotHeeded(RemoteError):
+class NotAdmittedYet(RemoteError):
     """The identity with this `address` was let in, and nothing that it does has an effect."""
 
     code = "not-heeded"
@@ -37,7 +37,7 @@ async def check_standing(endpoints: Endpoints, address: str, *, agent: str = "",
     """Return when the router has let in this identity and passes on what it does.
 
     Tried with a subscription below the own address, as every role but `edge` may have; for that one below the device
-    `device` of the agent at `agent`. Raises `NotHeeded`, `NotAdmitted`, `NetworkUnavailable`, `InvalidKey`.
+    `device` of the agent at `agent`. Raises `NotAdmittedYet`, `NotAdmitted`, `NetworkUnavailable`, `InvalidKey`.
     """
     keys = [str(DeviceTopicKey(address, "check", "/check"))]
     if agent:
@@ -58,4 +58,4 @@ async def check_standing(endpoints: Endpoints, address: str, *, agent: str = "",
                 async with asyncio.timeout(SECONDS):
                     await heeded.wait()
             except TimeoutError:
-                raise NotHeeded(address) from None
+                raise NotAdmittedYet(address) from None

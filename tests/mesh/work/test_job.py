@@ -9,7 +9,7 @@ import pytest
 
 from mesh.errors import ClosedError
 from mesh.recording import RecordedTimes
-from mesh.work.run import AHEAD, NOTE_TOPIC, HandlerCancelled, Run
+from mesh.work.job import AHEAD, NOTE_TOPIC, HandlerCancelled, Job
 from schemas import InvalidPayload, String
 from tests.mesh.work.runs import Making, making, session
 from tests.support.objectives import objective
@@ -28,13 +28,13 @@ class Performing:
 
     topics = None
 
-    def __init__(self, function: Callable[[Run, Played], Awaitable[object]]) -> None:
+    def __init__(self, function: Callable[[Job, Played], Awaitable[object]]) -> None:
         self._function = function
 
     def obstacle(self, topic: str, said: Any) -> str:
         return ""
 
-    async def perform(self, run: Run, message: Played) -> None:
+    async def perform(self, run: Job, message: Played) -> None:
         await self._function(run, message)
 
 
@@ -52,7 +52,7 @@ async def test_only_chosen_topics_are_recorded_and_all_are_played(making: Making
     run.publish("/unsaid", "y")
     performed: list[str] = []
 
-    async def note(_: Run, message: Played) -> None:
+    async def note(_: Job, message: Played) -> None:
         performed.append(message.topic)
 
     await run.play(Performing(note), progress=Positions())
@@ -77,7 +77,7 @@ async def test_the_handler_gets_one_message_after_the_other_and_sees_which(makin
     run.open()
     busy = 0
 
-    async def slow(run: Run, message: Played) -> None:
+    async def slow(run: Job, message: Played) -> None:
         nonlocal busy
         assert busy == 0
         busy += 1
@@ -93,7 +93,7 @@ async def test_a_failing_handler_stops_the_playing_with_its_error_and_its_cause(
     run = making.run(objective(*(("/a", str(number)) for number in range(5)), step_ns=10**10))
     run.open()
 
-    async def fail(_: Run, message: Played) -> None:
+    async def fail(_: Job, message: Played) -> None:
         raise ValueError("no") from KeyError("why")
 
     with pytest.raises(ValueError, match="no") as caught:
@@ -107,7 +107,7 @@ async def test_a_handler_that_ends_cancelled_is_a_failure_and_not_the_end(making
     run = making.run(objective(("/a", "0"), ("/a", "1")))
     run.open()
 
-    async def wait_for_what_is_cancelled(_: Run, message: Played) -> None:
+    async def wait_for_what_is_cancelled(_: Job, message: Played) -> None:
         future: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         future.cancel()
         await future
@@ -122,7 +122,7 @@ async def test_cancelling_the_playing_cancels_the_handler_and_counts_what_was_do
     run.open()
     ended: list[str] = []
 
-    async def stay_at_the_second(_: Run, message: Played) -> None:
+    async def stay_at_the_second(_: Job, message: Played) -> None:
         if message.payload == String("1").encode():
             try:
                 await asyncio.sleep(60)
@@ -145,7 +145,7 @@ async def test_a_handler_may_close_its_own_run_and_is_the_last_to_be_called(maki
     run.open()
     calls = 0
 
-    async def close(run: Run, message: Played) -> None:
+    async def close(run: Job, message: Played) -> None:
         nonlocal calls
         calls += 1
         await run.close("enough")

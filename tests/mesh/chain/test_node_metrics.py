@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.chain import XRT, Account, Chain, Node, NodeUnreachable, Reverted, Sender, deploy
-from mesh.chain.tally import Fate
+from mesh.chain import XRT, Account, Chain, Node, NodeUnreachable, Reverted, TransactionSender, deploy
+from mesh.chain.node_metrics import TransactionOutcome
 from mesh.devchain import EmbeddedChain
 from mesh.devchain.embedded import EmbeddedProvider
 from tests.mesh.chain.conftest import QUICK
@@ -49,7 +49,7 @@ async def test_a_transaction_that_goes_through_is_sent_and_mined_and_costs_its_g
     async with Node(node.provider, timing=QUICK) as way:
         account = Account.from_key(node.funded_keys[0])
         before = await way.eth_balance(account.address)
-        receipt = await Sender(way, account).send(to=stranger(), data=b"", value=5)
+        receipt = await TransactionSender(way, account).send(to=stranger(), data=b"", value=5)
         counted = way.tally.statistics()
         assert counted.transactions == NONE | {"sent": 1, "mined": 1}
         assert (counted.gas_used, counted.wei) == (receipt.gas_used, receipt.wei)
@@ -94,5 +94,9 @@ async def test_a_stuck_transaction_is_replaced_and_mined_once(anvil: Anvil) -> N
                 await asyncio.sleep(0.05)
         await sending
         counted = way.tally.statistics().transactions
-        assert (counted[Fate.SENT], counted[Fate.MINED], counted[Fate.FAILED]) == (1, 1, 0)
-        assert counted[Fate.REPLACED] >= 1
+        assert (
+            counted[TransactionOutcome.SENT],
+            counted[TransactionOutcome.MINED],
+            counted[TransactionOutcome.FAILED],
+        ) == (1, 1, 0)
+        assert counted[TransactionOutcome.REPLACED] >= 1

@@ -7,31 +7,31 @@ import logging
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.agent.contract import Outcome
-from mesh.agent.figures import AgentFigures
 from mesh.agent.hooks import call
+from mesh.agent.metrics import AgentMetrics
 from mesh.agent.services import offer_services
 from mesh.agent.status_service import StatusService
 from mesh.agent.token_events import TokenEvents
 from mesh.agent.trade import Trader
-from mesh.telemetry.context import of_its_liability
+from mesh.telemetry.context import with_liability_context
 from mesh.telemetry.log_service import LogService
-from mesh.work.dealings import Dealings
 from mesh.work.executor import Executor
+from mesh.work.liability_events import LiabilityEvents
 from mesh.work.lifecycle import Phase
 from mesh.work.listener import Listener
 from mesh.work.outbox import result_identity
-from mesh.work.returning import settle_ended
+from mesh.work.startup_sync import settle_ended
 from schemas.keys import EventKey, LiabilityEvent
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from mesh.agent.components import AgentComponents
     from mesh.agent.hooks import Handler
-    from mesh.agent.parts import Parts
     from mesh.chain import Approval, Transfer
     from mesh.network import Subscription
     from mesh.telemetry.families import Family
-    from mesh.work.run import Performer
+    from mesh.work.job import TopicHandler
     from schemas import Liability
 
 log = logging.getLogger(__name__)
@@ -45,15 +45,15 @@ PUBLISHED: Final[dict[Phase, LiabilityEvent]] = {
 """Phases that are told on the agent's keys, and what they are called there."""
 
 
-class Worker:
+class AgentRuntime:
     """The working side of an agent: `run` in a task; the listener's party, the executor's witness."""
 
-    def __init__(self, parts: Parts, *, performer: Performer | None, witnesses: Sequence[Handler]) -> None:
+    def __init__(self, parts: AgentComponents, *, performer: TopicHandler | None, witnesses: Sequence[Handler]) -> None:
         self.parts = parts
         self.trader = Trader(parts, parts.chain)
         workshop = parts.workshop()
         self.executor = Executor(workshop, performer=performer, witness=self._phase)
-        self._dealings = Dealings(workshop, self.executor, witness=self._phase)
+        self._dealings = LiabilityEvents(workshop, self.executor, witness=self._phase)
         self._witnesses = witnesses
         self._token_events = TokenEvents(parts.channel.put, parts.signer.address)
         offer_services(parts, self.executor, drives_itself=performer is not None)
@@ -62,7 +62,7 @@ class Worker:
         )
         parts.services.offer("logs", LogService("agent", parts.signer.address).logs)
         self._status = StatusService(parts, self.executor, self._listener)
-        self._figures = AgentFigures(parts, workshop)
+        self._figures = AgentMetrics(parts, workshop)
         parts.services.offer("status", self._status.status)
 
     async def run(self) -> None:
@@ -89,26 +89,26 @@ class Worker:
         """The state of each of its parts, as `aira status` shows it."""
         return self._status.parts()
 
-    @of_its_liability
+    @with_liability_context
     async def new_liability(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
         """A contract names us: trade it as a promisee, work for it as a promisor (an account may be both)."""
         await self.trader.matched(liability, demand_hash=demand_hash, offer_hash=offer_hash)
         if liability.promisor == self.parts.signer.address and self.parts.settings.enable_executor:
             await self._dealings.accept(liability)
 
-    @of_its_liability
+    @with_liability_context
     async def finalized(self, address: str, *, success: bool, result: str) -> None:
         """A contract has ended, perhaps one of ours."""
         await self._dealings.finalized(address, success=success)
         await self.parts.outbox.settle(result_identity(address))  # of no job, but signed for somebody else
         self.trader.finalized(address, Outcome(success=success, result=result))
 
-    @of_its_liability
+    @with_liability_context
     async def taken_back(self, address: str) -> None:
         """The end of a contract, perhaps one of ours, did not happen after all."""
         await self._dealings.taken_back(address)
 
-    @of_its_liability
+    @with_liability_context
     async def unmade(self, address: str) -> None:
         """A contract, perhaps one of ours, was not made after all."""
         await self._dealings.unmade(address)

@@ -12,7 +12,7 @@ REMEMBERED: Final = 4096
 """Liabilities whose messages are kept; the chain replaces its last blocks only."""
 
 
-class Used:
+class SettledMessages:
     """The orders and the Result that each of the latest liabilities was made of and ended with."""
 
     def __init__(self) -> None:

@@ -25,8 +25,8 @@ QUESTIONS: Final = 64
 """Questions that are answered or wait for it, each with a list of the book as it was; more are turned down."""
 
 
-class Memory:
-    """Answers queries on all of a lighthouse's keys from its `book`: `async with Memory(session, lighthouse, book)`.
+class OrderBookService:
+    """Answers queries on the keys of a lighthouse from its `book`, inside `async with`.
 
     `lighthouse` is the ENS name. Leaving `async with` breaks off what is not answered yet.
     """

@@ -41,7 +41,7 @@ class HandlerCancelled(AiraError):
     code = "handler-cancelled"
 
 
-class Performer(Protocol):
+class TopicHandler(Protocol):
     """What does the work: the code that talks to the device."""
 
     @property
@@ -51,7 +51,7 @@ class Performer(Protocol):
     def obstacle(self, topic: str, said: Any) -> str:
         """Why it can't do what a message on one of its topics says, decoded; empty if it can."""
 
-    async def perform(self, run: Run, message: Played) -> None:
+    async def perform(self, run: Job, message: Played) -> None:
         """Do what one played message asks; the next one waits. An exception fails the job."""
 
 
@@ -66,7 +66,7 @@ class Plan:
     topics: frozenset[str] | None = None
 
 
-class Run:
+class Job:
     """A run on an open session. `open`, then `play` once, then `close`; `publish` at any time between.
 
     The recorder owns its file; what arrives on the liability's topics goes into it from Zenoh's thread directly,
@@ -117,7 +117,7 @@ class Run:
             self._types[topic, kind.zenoh_encoding] = kind
         self._put(key, payload, kind)
 
-    async def play(self, performer: Performer | None, *, progress: Callable[[int], Awaitable[None]]) -> None:
+    async def play(self, performer: TopicHandler | None, *, progress: Callable[[int], Awaitable[None]]) -> None:
         """Play the objective from its position to its end, each message at its time; returns when all is done.
 
         Every message goes to the mesh, into the recording and, where there is a `performer`, to it: in order, one
@@ -160,7 +160,7 @@ class Run:
             await self._waiting.put(message)
         await self._waiting.put(None)
 
-    async def _perform(self, performer: Performer | None, progress: Callable[[int], Awaitable[None]]) -> None:
+    async def _perform(self, performer: TopicHandler | None, progress: Callable[[int], Awaitable[None]]) -> None:
         while (message := await self._waiting.get()) is not None and not self._closing:
             if performer is not None:
                 self.playing = message
@@ -168,7 +168,7 @@ class Run:
             self.position += 1
             await progress(self.position)
 
-    async def _perform_one(self, performer: Performer, message: Played) -> None:
+    async def _perform_one(self, performer: TopicHandler, message: Played) -> None:
         try:
             await performer.perform(self, message)
         except asyncio.CancelledError:
