@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
     from click.testing import Result
 
+    from mesh.work.job import Job
     from tests.mesh.evidence.jobs import JobFiles
 
 MODEL = cid_of_bytes(b"what is verified")
