@@ -12,8 +12,10 @@ INSTALLED := .venv/.installed
 LOCK := requirements/lock.txt
 TYPED := schemas mesh bridges peers tests bench examples
 BENCHES := $(shell grep -l __main__ bench/*.py)
-# Processes that run the tests. They wait more than they compute, so more than there are cores; 0 runs all in one.
+# Processes that run the tests. They wait more than they compute, so there are more than cores; 0 runs all in one.
 JOBS ?= 3
+# CI measures coverage, which takes time.
+COVERAGE := $(if $(filter true,$(CI)),--cov --cov-report=term --durations=10)
 
 .PHONY: help setup demo test compose-test lint peers bench contracts contracts-check slither firmware lock clean
 
@@ -41,11 +43,11 @@ $(INSTALLED): $(LOCK) pyproject.toml
 demo: $(INSTALLED) ## a whole market on this machine, in one process; ARGS="..." are passed on
 	@$(BIN)/aira demo $(ARGS)
 
-test: $(INSTALLED) ## all tests, with coverage; ARGS="-k name" chooses some
-	@$(BIN)/pytest -n $(JOBS) --dist loadfile --cov --cov-report=term $(ARGS)
+test: $(INSTALLED) ## the tests, without containers; ARGS="-k name" chooses some
+	@$(BIN)/pytest -n $(JOBS) --dist loadfile -m "not compose" $(COVERAGE) $(ARGS)
 
-compose-test: $(INSTALLED) ## the compose files with real containers (`make peers` installs podman); ARGS are pytest's
-	@$(BIN)/pytest tests/deploy $(ARGS)
+compose-test: $(INSTALLED) ## the compose files in real containers (`make peers` installs podman)
+	@$(BIN)/pytest -m compose tests/deploy tests/support $(ARGS)
 
 lint: $(INSTALLED) ## style, types, the import rule, and the built contracts where node is there
 	@$(BIN)/ruff check .

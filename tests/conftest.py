@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import os
+from typing import TYPE_CHECKING, Final
 
 import pytest
 
@@ -14,14 +15,28 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
+IN_CI: Final = os.environ.get("CI") == "true"
+ALTERNATIVES: Final = frozenset({"anvil", "zenohd"})
+"""Parameters that name a second implementation of what another parameter of the same test names already."""
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """One EVM and one router by default; every implementation in CI."""
+    if IN_CI:
+        return
+    kept = [item for item in items if not _is_alternative(item)]
+    config.hook.pytest_deselected(items=[item for item in items if _is_alternative(item)])
+    items[:] = kept
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
-    """Share the tests out in our way where whole files are asked for, as `make test` does."""
+    """Run whole files in each process, the longest first, with `--dist loadfile` (as `make test` does)."""
     if config.getoption("dist") != "loadfile":
         return None
-    from tests.support.sharing import Sharing
+    from tests.support.scheduling import LongestFirst
 
-    return Sharing(config, log)
+    return LongestFirst(config, log)
 
 
 @pytest.fixture
@@ -50,3 +65,8 @@ def js_ipfs() -> Iterator[JsIpfs]:
     """A js-ipfs daemon that all tests of a run share: it takes seconds to start, so tests use topics of their own."""
     with JsIpfs() as running:
         yield running
+
+
+def _is_alternative(item: pytest.Item) -> bool:
+    call = getattr(item, "callspec", None)
+    return call is not None and any(isinstance(value, str) and value in ALTERNATIVES for value in call.params.values())

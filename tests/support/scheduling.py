@@ -1,4 +1,4 @@
-"""How a run of several processes (`make test`) shares the tests out: a file at a time, the longest first."""
+"""How the processes of `make test` share the tests: a file at a time, the longest first."""
 
 from __future__ import annotations
 
@@ -9,13 +9,7 @@ from xdist.scheduler import LoadFileScheduling  # type: ignore[import-untyped]
 if TYPE_CHECKING:
     from xdist.workermanage import WorkerController  # type: ignore[import-untyped]
 
-TOGETHER: Final[dict[str, tuple[str, ...]]] = {
-    "containers": ("tests/deploy/", "tests/support/test_compose.py", "tests/support/test_containers.py"),
-}
-"""Files, and folders of them, that never run beside each other: together they are one piece, as any other file is."""
-
 SECONDS: Final[dict[str, int]] = {
-    "containers": 400,
     "tests/mesh/cli/test_serving.py": 100,
     "tests/bridges/ipfs/test_resilience.py": 80,
     "tests/bridges/ipfs/test_channel.py": 55,
@@ -31,14 +25,14 @@ SECONDS: Final[dict[str, int]] = {
     "tests/bridges/ipfs/test_jobs.py": 25,
     "tests/mesh/chain/test_reorganisation.py": 25,
 }
-"""What the longest files, and those that go together, take on a busy machine, roughly. All others are short."""
+"""Roughly how long the longest files take on a busy machine. All others are short."""
 
 
-class Sharing(LoadFileScheduling):  # type: ignore[misc]
-    """Gives each process whole files, so that what a module's tests have in common is made once."""
+class LongestFirst(LoadFileScheduling):  # type: ignore[misc]
+    """Gives each process whole files, so that fixtures of a module are set up once."""
 
     def remove_node(self, node: WorkerController) -> str | None:
-        """Pass on what a process leaves undone; the test with which it broke down, which nobody tries again."""
+        """Reassign what a crashed process left undone; returns the test that it crashed in, which is not run again."""
         workload = self.assigned_work[node]
         broken = next((test for unit in workload.values() for test, done in unit.items() if not done), None)
         for unit in workload.values():
@@ -49,13 +43,10 @@ class Sharing(LoadFileScheduling):  # type: ignore[misc]
         return broken
 
     def _split_scope(self, nodeid: str) -> str:
-        for name, places in TOGETHER.items():
-            if nodeid.startswith(places):
-                return name
         return nodeid.split("::", 1)[0]
 
     def _reschedule(self, node: WorkerController) -> None:
-        # One that is new may not have told yet what it has found.
+        # A process that just started may not have collected its tests yet.
         if node in self.registered_collections:
             super()._reschedule(node)
 
