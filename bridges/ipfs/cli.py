@@ -35,7 +35,7 @@ AGAIN: Final = 1.0
 """Seconds between two attempts to reach a router, each of which lasts as long as the settings say."""
 
 
-@click.command("ipfs")
+@click.command("ipfs", short_help="the legacy network's IPFS PubSub channel, and its content")
 @click.option("--api", help="the daemon's RPC, a multiaddr or a URL; the same as --ipfs-http-provider")
 @click.option("--lighthouse", "lighthouses", multiple=True, metavar="NAME", help="several channels: name each")
 @with_settings(

@@ -13,7 +13,7 @@ from mesh.running import INTERRUPTED, fail
 HELP = "lines to type: adc 0-7 MILLIVOLTS, noise 0-1, unplug, plug, reset, quit"
 
 
-@click.group("board")
+@click.group("board", short_help="run firmware on a simulated board")
 def command() -> None:
     """Run a board that is not there: firmware in a simulated Arduino Uno."""
 

@@ -47,7 +47,7 @@ def _number(text: str) -> int | float | str:
     return text
 
 
-@click.command("edge")
+@click.command("edge", short_help="connect a device on a serial line to the mesh")
 @click.argument("port")
 @click.option("--agent", required=True, metavar="ADDRESS", help="account of the agent that the device belongs to")
 @click.option("--name", default="board", show_default=True, help="what the device is called among the agent's keys")

@@ -1,11 +1,7 @@
-"""`aira bridge`: doors to other networks."""
+"""`aira bridge`: bridges to other networks. Packages add theirs as entry points `bridge NAME`."""
 
 from __future__ import annotations
 
 from mesh.cli.lazy import LazyGroup
 
-command = LazyGroup(
-    "bridge",
-    commands={"ipfs": ("bridges.ipfs.cli", "the legacy network's IPFS PubSub channel, and its content")},
-    help="Doors to other networks.",
-)
+command = LazyGroup("bridge", installed="bridge ", help="Bridges to other networks.")

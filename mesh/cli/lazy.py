@@ -1,45 +1,100 @@
-"""A click group whose commands are imported when they are called, and which Ctrl-C ends at any moment."""
+"""Command groups that import a command only when it is called, so that small commands start fast.
+
+Installed packages add commands by entry points of the group `aira.commands`: the name is what users type (`edge`, or
+`bridge ipfs` for a command of `aira bridge`), the value is `module:command`.
+"""
 
 from __future__ import annotations
 
 import difflib
 import sys
+from functools import cached_property
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from mesh.running import INTERRUPTED
+from mesh.errors import ConfigurationError
+from mesh.running import INTERRUPTED, fail
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from importlib.metadata import EntryPoint
+
+ENTRY_POINTS: Final = "aira.commands"
+HELP_WIDTH: Final = 100
+"""Characters of the line of help of an installed command."""
+
+
+class BrokenCommand(ConfigurationError):
+    """A command that an installed package registers can't be imported."""
+
+    code = "command-broken"
+
+    def __init__(self, name: str, entry: EntryPoint, error: Exception) -> None:
+        package = entry.dist.name if entry.dist is not None else "an installed package"
+        super().__init__(
+            f"can't load the command {name!r} of {package}: {type(error).__name__}: {error}",
+            hint=f"reinstall or uninstall {package}; other commands work without it",
+        )
+        self.name = name
+        self.package = package
 
 
 class LazyGroup(click.Group):
-    """`commands` maps a name to the module that holds its `command`, and to its line of help."""
+    """A group of commands of its own, of commands imported on first use, and of installed ones.
 
-    def __init__(self, *arguments: Any, commands: Mapping[str, tuple[str, str]], **options: Any) -> None:
+    `lazy` maps a name to where the command is (`module:attribute`) and its line of help. `installed` is the prefix of
+    the entry points that belong to the group: "" for the root, "bridge " for `aira bridge`, None for no entry points.
+    A name in `lazy` wins over an entry point of the same name.
+    """
+
+    def __init__(
+        self,
+        *arguments: Any,
+        lazy: Mapping[str, tuple[str, str]] | None = None,
+        installed: str | None = None,
+        **options: Any,
+    ) -> None:
         super().__init__(*arguments, **options)
-        self._lazy = commands
+        self._lazy = dict(lazy or {})
+        self._prefix = installed
+
+    @cached_property
+    def _installed(self) -> dict[str, EntryPoint]:
+        """The installed commands of this group. Reading them takes about 30 ms, so only what needs them does."""
+        if self._prefix is None:
+            return {}
+        from importlib.metadata import entry_points
+
+        found = {
+            entry.name.removeprefix(self._prefix): entry
+            for entry in entry_points(group=ENTRY_POINTS)
+            if entry.name.startswith(self._prefix)
+        }
+        return {name: entry for name, entry in found.items() if " " not in name}
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """All names, in alphabetical order."""
-        return sorted(self._lazy)
+        return sorted({*self.commands, *self._lazy, *self._installed})
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """The command, imported now."""
-        if cmd_name not in self._lazy:
-            return None
-        command: click.Command = import_module(self._lazy[cmd_name][0]).command
-        return command
+        """The command, imported now. Exits with 2 for an installed one that can't be imported."""
+        try:
+            return self._command(cmd_name)
+        except BrokenCommand as error:
+            fail(error)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """As click's, but an unknown command is answered with the nearest known one."""
-        if args and args[0] not in self._lazy and not args[0].startswith("-"):
-            near = difflib.get_close_matches(args[0], self._lazy, n=1)
-            ctx.fail(f"no such command {args[0]!r}" + (f"; did you mean {near[0]!r}?" if near else ""))
+        name = args[0] if args else ""
+        if name and not name.startswith("-") and name not in self.commands and name not in self._lazy:
+            known = self.list_commands(ctx)
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=1)
+                ctx.fail(f"no such command {name!r}" + (f"; did you mean {near[0]!r}?" if near else ""))
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
@@ -50,6 +105,35 @@ class LazyGroup(click.Group):
             sys.exit(INTERRUPTED)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """The list of commands, without importing any."""
+        """The list of commands, importing the installed ones only: their help is nowhere else."""
         with formatter.section("Commands"):
-            formatter.write_dl([(name, self._lazy[name][1]) for name in self.list_commands(ctx)])
+            formatter.write_dl([(name, self._help_of(name)) for name in self.list_commands(ctx)])
+
+    def _command(self, name: str) -> click.Command | None:
+        """The command of that name. Raises `BrokenCommand`."""
+        if name in self.commands:
+            return self.commands[name]
+        if name in self._lazy:
+            module, _, attribute = self._lazy[name][0].partition(":")
+            command: click.Command = getattr(import_module(module), attribute)
+            return command
+        entry = self._installed.get(name)
+        if entry is None:
+            return None
+        try:
+            loaded = entry.load()
+            if not isinstance(loaded, click.Command):
+                raise TypeError(f"{entry.value} is not a click command")
+        except Exception as error:  # whatever the import of another package raises
+            raise BrokenCommand(name, entry, error) from error
+        return loaded
+
+    def _help_of(self, name: str) -> str:
+        if name in self._lazy:
+            return self._lazy[name][1]
+        try:
+            command = self._command(name)
+        except BrokenCommand as error:
+            return str(error)
+        assert command is not None
+        return command.get_short_help_str(HELP_WIDTH)

@@ -10,11 +10,11 @@ command = LazyGroup(
 
     Stakes are in XRT (1.5), or with the ending wn in its smallest unit (1500000000wn). A lighthouse is named by its
     label (airalab), its ENS name or its address.""",
-    commands={
-        "create": ("mesh.cli.lighthouse.create", "make a lighthouse"),
-        "info": ("mesh.cli.lighthouse.info", "show one: its terms, its providers, whose turn it is"),
-        "join": ("mesh.cli.lighthouse.join", "stake, and be a provider"),
-        "leave": ("mesh.cli.lighthouse.leave", "take the stake back, or a part of it"),
-        "list": ("mesh.cli.lighthouse.list", "list all lighthouses"),
+    lazy={
+        "create": ("mesh.cli.lighthouse.create:command", "make a lighthouse"),
+        "info": ("mesh.cli.lighthouse.info:command", "show one: its terms, its providers, whose turn it is"),
+        "join": ("mesh.cli.lighthouse.join:command", "stake, and be a provider"),
+        "leave": ("mesh.cli.lighthouse.leave:command", "take the stake back, or a part of it"),
+        "list": ("mesh.cli.lighthouse.list:command", "list all lighthouses"),
     },
 )
