@@ -8,14 +8,13 @@ from collections import Counter
 from typing import TYPE_CHECKING, Final, Protocol
 
 from bridges.ipfs.errors import IpfsError
-from mesh.content import ContentUnavailable
-from mesh.content.assembly import is_block
+from mesh.content import ContentUnavailable, is_block
 from schemas.unixfs import MAX_BLOCK_SIZE
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.content import Assembly, Place, Store
+    from mesh.content import Assembly, BlockRef, Store
 
 log = logging.getLogger(__name__)
 
@@ -85,7 +84,7 @@ class Sources:
 
     async def _assemble(self, assembly: Assembly, patience: float) -> None:
         waiting = [assembly.root]
-        running: set[asyncio.Task[list[Place]]] = set()
+        running: set[asyncio.Task[list[BlockRef]]] = set()
         try:
             while waiting or running:
                 while waiting and len(running) < WIDTH:
@@ -100,7 +99,7 @@ class Sources:
             if running:
                 await asyncio.wait(running)
 
-    async def _take(self, assembly: Assembly, place: Place, patience: float) -> list[Place]:
+    async def _take(self, assembly: Assembly, place: BlockRef, patience: float) -> list[BlockRef]:
         block = await asyncio.to_thread(assembly.local, place)
         if block is None:
             block = await self.block(place.cid, timeout=patience)

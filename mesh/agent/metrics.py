@@ -77,6 +77,6 @@ class AgentMetrics:
             counter(
                 "aira_content_lies_total",
                 "Blocks of content that were not what they should be",
-                sum(known.lies.values()),
+                sum(known.corrupt_blocks.values()),
             ),
         )

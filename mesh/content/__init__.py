@@ -1,7 +1,7 @@
 """Files by CID: kept in a directory, and exchanged block by block over Zenoh."""
 
-from mesh.content.assembly import Assembly
-from mesh.content.dag import Place
+from mesh.content.assembly import Assembly, is_block
+from mesh.content.dag import BlockRef
 from mesh.content.errors import (
     ContentCorrupt,
     ContentPinned,
@@ -12,25 +12,26 @@ from mesh.content.errors import (
     StoreFull,
 )
 from mesh.content.exchange import Exchange, ExchangeStatistics
-from mesh.content.holdings import Check, Collected, Entry, Progress, Usage
+from mesh.content.holdings import EvictionReport, IntegrityReport, Progress, StoreEntry, Usage
 from mesh.content.store import Store
 
 __all__ = [
     "Assembly",
-    "Check",
-    "Collected",
+    "BlockRef",
     "ContentCorrupt",
     "ContentPinned",
     "ContentTooLarge",
     "ContentUnavailable",
-    "Entry",
+    "EvictionReport",
     "Exchange",
     "ExchangeStatistics",
-    "Place",
+    "IntegrityReport",
     "Progress",
     "QuotaReached",
     "Store",
     "StoreDamaged",
+    "StoreEntry",
     "StoreFull",
     "Usage",
+    "is_block",
 ]

@@ -11,10 +11,10 @@ import threading
 from contextlib import suppress
 from typing import TYPE_CHECKING, BinaryIO, Final, Self
 
-from mesh.content.dag import Place, children_of, most_blocks, node_at
+from mesh.content.dag import BlockRef, children_of, most_blocks, node_at
 from mesh.content.errors import ContentCorrupt, ContentTooLarge, StoreFull
 from mesh.content.files import PART_PREFIX, PUT_PREFIX, TemporaryFile
-from mesh.content.index import Span
+from mesh.content.index import BlockSpan
 from mesh.content.reading import read_or_nothing
 from mesh.content.recovery import DAMAGED_SUFFIX
 from schemas.cid import parse_cid
@@ -45,13 +45,13 @@ class Assembly:
     def __init__(self, store: Store, cid: str, *, index: BlockIndex, room: Room, size_limit: int) -> None:
         parse_cid(cid)
         self.cid: Final = cid
-        self.root: Final = Place(cid)
+        self.root: Final = BlockRef(cid)
         self._store = store
         self._index = index
         self._room = room
         self._limit = size_limit
         self._lock = threading.Lock()
-        self._spans: dict[bytes, Span] = {}
+        self._spans: dict[bytes, BlockSpan] = {}
         self._placed = 0
         self._size = 0
         self._have = 0
@@ -79,7 +79,7 @@ class Assembly:
             else:
                 self._index.forget(self._file.path.name)
 
-    def local(self, place: Place) -> bytes | None:
+    def local(self, place: BlockRef) -> bytes | None:
         """The block of a place, if it is on this disk: in this file, in another one, or left by an earlier attempt.
 
         Its hash was checked.
@@ -91,7 +91,7 @@ class Assembly:
             return span.block(self._file.read(span.length, offset=span.offset))
         return self._store.get_block(place.cid) or self._left_over(place)
 
-    def put(self, place: Place, block: bytes) -> list[Place]:
+    def put(self, place: BlockRef, block: bytes) -> list[BlockRef]:
         """Take the block of a place, and return the places of the blocks that it links to.
 
         Raises `ContentCorrupt` if these bytes do not hash to its name (see `is_block`: somebody else may have others)
@@ -101,7 +101,7 @@ class Assembly:
             raise ContentCorrupt(self.cid, f"the bytes of block {place.cid} hash to another name")
         return self.put_checked(place, block)
 
-    def put_checked(self, place: Place, block: bytes) -> list[Place]:
+    def put_checked(self, place: BlockRef, block: bytes) -> list[BlockRef]:
         """The same for a block that was checked: one that `local` gave, or that `is_block` was asked about."""
         try:
             node = node_at(place, block)
@@ -109,7 +109,7 @@ class Assembly:
             raise ContentCorrupt(self.cid, f"in block {place.cid}: {error.why}") from None
         if place.size is None:
             self._begin(node.file_size)
-        span = Span.of(parse_cid(place.cid)[2:], block, data=node.data, offset=place.offset)
+        span = BlockSpan.of(parse_cid(place.cid)[2:], block, data=node.data, offset=place.offset)
         self._file.write(node.data, offset=place.offset)
         with self._lock:
             self._spans.setdefault(span.digest, span)
@@ -146,7 +146,7 @@ class Assembly:
             spans, self._spans = self._spans, {}
         self._index.add(self._file.path.name, spans.values())
 
-    def _left_over(self, place: Place) -> bytes | None:
+    def _left_over(self, place: BlockRef) -> bytes | None:
         """A leaf of our own chunking, where it belongs: from an earlier attempt, or from a file found damaged."""
         if place.size is None or place.size > CHUNK_SIZE:
             return None
@@ -164,7 +164,7 @@ def is_block(cid: str, data: bytes) -> bool:
     return len(data) <= MAX_BLOCK_SIZE and hashlib.sha256(data).digest() == parse_cid(cid)[2:]
 
 
-def _leaf_of(data: bytes, place: Place) -> bytes | None:
+def _leaf_of(data: bytes, place: BlockRef) -> bytes | None:
     """The leaf around these bytes of a file, if it is the block of that place."""
     if len(data) != place.size:
         return None

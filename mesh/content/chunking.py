@@ -6,7 +6,7 @@ import io
 from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, cast
 
 from mesh.content.errors import ContentTooLarge
-from mesh.content.index import Span
+from mesh.content.index import BlockSpan
 from schemas.cid import parse_cid
 from schemas.unixfs import blocks_of_stream, parse_block
 
@@ -94,7 +94,7 @@ def enter_blocks(stream: BinaryIO, index: BlockIndex, name: str) -> tuple[str, i
     offset, spans, cid = 0, [], ""
     for block in blocks_of_stream(stream):
         data = parse_block(block.data).data
-        spans.append(Span.of(parse_cid(block.cid)[2:], block.data, data=data, offset=offset))
+        spans.append(BlockSpan.of(parse_cid(block.cid)[2:], block.data, data=data, offset=offset))
         offset, cid = offset + len(data), block.cid
         if len(spans) >= _BATCH:
             index.add(name, spans)

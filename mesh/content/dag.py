@@ -28,7 +28,7 @@ _FRAMING: Final = 256
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class BlockRef:
     """Where a block belongs: the file's bytes from `offset`, `size` of them (None for the root: it says so itself)."""
 
     cid: str
@@ -42,7 +42,7 @@ def most_blocks(size: int) -> int:
     return min(MAX_BLOCKS, _SPARE_BLOCKS + size // _SMALLEST_CHUNK)
 
 
-def node_at(place: Place, block: bytes) -> Node:
+def node_at(place: BlockRef, block: bytes) -> Node:
     """What the block at `place` says, checked against the link that led to it. Raises `ContentCorrupt`."""
     try:
         node = parse_block(block)
@@ -59,11 +59,11 @@ def node_at(place: Place, block: bytes) -> Node:
     return node
 
 
-def children_of(place: Place, node: Node) -> list[Place]:
+def children_of(place: BlockRef, node: Node) -> list[BlockRef]:
     """The places of the blocks that the one at `place` links to, in the order of the file."""
     offset = place.offset + len(node.data)
     places = []
     for link in node.links:
-        places.append(Place(link.cid, offset, link.size, place.depth + 1))
+        places.append(BlockRef(link.cid, offset, link.size, place.depth + 1))
         offset += link.size
     return places

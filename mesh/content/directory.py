@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, Self
 
 from mesh.content.errors import ContentPinned, ContentUnavailable
 from mesh.content.files import directory_lock
-from mesh.content.holdings import Collected, Entry, Usage
+from mesh.content.holdings import EvictionReport, StoreEntry, Usage
 from mesh.content.pins import Pins
 from mesh.content.quota import Room
 from mesh.content.recovery import DAMAGED_SUFFIX, damaged_in, held_in, is_cid, open_directory
@@ -67,11 +67,11 @@ class Shelf:
         """The CIDs of all files held, sorted."""
         return held_in(self.directory)
 
-    def entries(self) -> tuple[Entry, ...]:
+    def entries(self) -> tuple[StoreEntry, ...]:
         """All files held, the least recently used first: the order in which they are deleted to make room."""
         held, pins = frozenset(self.list()), self._pins.by_cid()
         return tuple(
-            Entry(cid=file.name, size=file.size, used=file.used_ns / 1e9, pins=pins.get(file.name, frozenset()))
+            StoreEntry(cid=file.name, size=file.size, used=file.used_ns / 1e9, pins=pins.get(file.name, frozenset()))
             for file in self._index.files()
             if file.name in held
         )
@@ -128,11 +128,11 @@ class Shelf:
         if not found:
             raise ContentUnavailable(cid, "it is not in this store")
 
-    def collect(self, quota: int | None = None) -> Collected:
+    def collect(self, quota: int | None = None) -> EvictionReport:
         """Delete what was set aside and then the least recently used files, never a pinned one, until all together
         are within `quota` bytes (the store's own if not given; without either, nothing)."""
         allowed = self._room.quota if quota is None else quota
-        return Collected(cids=(), bytes=0) if allowed is None else self._room.collect(allowed)
+        return EvictionReport(cids=(), bytes=0) if allowed is None else self._room.collect(allowed)
 
     def _path(self, cid: str) -> Path:
         parse_cid(cid)

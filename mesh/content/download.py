@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from mesh.content.asking import Asker
     from mesh.content.assembly import Assembly
-    from mesh.content.dag import Place
+    from mesh.content.dag import BlockRef
     from mesh.content.holdings import Progress
     from mesh.content.store import Store
 
@@ -67,7 +67,7 @@ class Download:
         """
         with self._store.assemble(self._cid, size_limit=self._size_limit) as assembly:
             waiting = [assembly.root]
-            running: set[Future[list[Place]]] = set()
+            running: set[Future[list[BlockRef]]] = set()
             try:
                 while waiting or running:
                     while waiting and len(running) < width:
@@ -82,7 +82,7 @@ class Download:
                 raise
             return assembly.finish()
 
-    def _take(self, assembly: Assembly, place: Place) -> list[Place]:
+    def _take(self, assembly: Assembly, place: BlockRef) -> list[BlockRef]:
         block = assembly.local(place)
         if block is None:
             block = self._get(place)
@@ -92,7 +92,7 @@ class Download:
                 self._progress(*assembly.progress())
         return places
 
-    def _get(self, place: Place) -> bytes:
+    def _get(self, place: BlockRef) -> bytes:
         """The block from the network, asked for again and again until nothing came for as long as patience lasts."""
         cid, pause, round_seconds = place.cid, _FIRST_PAUSE, _FIRST_ROUND
         # Only a node of links leads to so much; it is short, and asking everybody for it tells who has the file.

@@ -40,7 +40,7 @@ class ExchangeStatistics:
     """Queries for somebody else, or with a wildcard."""
     fetched_blocks: int
     fetched_bytes: int
-    lies: Mapping[str, int]
+    corrupt_blocks: Mapping[str, int]
     """Answers that were not what was asked for, by the holder's Zenoh id (which a liar may have made up)."""
 
 
@@ -112,7 +112,7 @@ class Exchange:
             ignored=server.ignored if server else 0,
             fetched_blocks=self._blocks,
             fetched_bytes=self._bytes,
-            lies=dict(self._lies),
+            corrupt_blocks=dict(self._lies),
         )
 
     async def _fetch(self, cid: str, size_limit: int | None, timeout: float, progress: Progress | None) -> Path:

@@ -84,7 +84,7 @@ class TemporaryFile:
 
     def write(self, data: bytes, *, offset: int) -> None:
         """Write all of `data` at `offset`. Raises `StoreFull`."""
-        with no_room_is_store_full(self.path.parent):
+        with raising_store_full(self.path.parent):
             view = memoryview(data)
             while view:
                 done = os.pwrite(self._descriptor, view, offset)
@@ -109,7 +109,7 @@ class TemporaryFile:
 
     def finish(self, size: int, *, mode: int = 0o444) -> None:
         """Put its first `size` bytes on the disk, and nothing after them. Raises `StoreFull`."""
-        with no_room_is_store_full(self.path.parent):
+        with raising_store_full(self.path.parent):
             os.ftruncate(self._descriptor, size)
             os.fchmod(self._descriptor, mode)
             os.fsync(self._descriptor)
@@ -121,7 +121,7 @@ class TemporaryFile:
 
 
 @contextmanager
-def no_room_is_store_full(directory: Path) -> Iterator[None]:
+def raising_store_full(directory: Path) -> Iterator[None]:
     """Turn an `OSError` that means a full disk into `StoreFull`."""
     try:
         yield

@@ -11,7 +11,7 @@ Progress: TypeAlias = Callable[[int, int | None], None]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Entry:
+class StoreEntry:
     """A file held. `used` is when it was last read, served or put (Unix time, seconds); `pins` are the labels."""
 
     cid: str
@@ -31,7 +31,7 @@ class Usage:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Collected:
+class EvictionReport:
     """What was deleted to make room: the files, and all bytes (remains of broken fetches count in these only)."""
 
     cids: tuple[str, ...]
@@ -39,7 +39,7 @@ class Collected:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check:
+class IntegrityReport:
     """What hashing the whole store found: how much was looked at, and which files are not what their names say."""
 
     files: int

@@ -38,7 +38,7 @@ CREATE INDEX block_by_file ON block (file);
 
 
 @dataclass(frozen=True, slots=True)
-class Span:
+class BlockSpan:
     """One block of a file: `head`, then `length` bytes of the file from `offset`, then `tail`."""
 
     digest: bytes
@@ -48,7 +48,7 @@ class Span:
     tail: bytes
 
     @classmethod
-    def of(cls, digest: bytes, block: bytes, *, data: bytes, offset: int) -> Span:
+    def of(cls, digest: bytes, block: bytes, *, data: bytes, offset: int) -> BlockSpan:
         """The span of `block`, which holds `data`, the bytes of the file from `offset`."""
         start = block.find(data)
         return cls(digest, offset, len(data), block[:start], block[start + len(data) :])
@@ -58,7 +58,7 @@ class Span:
         return self.head + data + self.tail
 
 
-class Indexed(NamedTuple):
+class IndexedFile(NamedTuple):
     """A file of the index: its name in the directory, its bytes, and when it was last used (Unix time, nanoseconds)."""
 
     name: str
@@ -100,12 +100,14 @@ class BlockIndex:
         with self._lock:
             self._connection.close()
 
-    def files(self) -> list[Indexed]:
+    def files(self) -> list[IndexedFile]:
         """All files of the index, the temporary ones too, the least recently used first."""
         with self._reading() as connection:
-            return [Indexed(*row) for row in connection.execute("SELECT name, size, used FROM file ORDER BY used, id")]
+            return [
+                IndexedFile(*row) for row in connection.execute("SELECT name, size, used FROM file ORDER BY used, id")
+            ]
 
-    def add(self, name: str, spans: Iterable[Span], *, size: int | None = None) -> None:
+    def add(self, name: str, spans: Iterable[BlockSpan], *, size: int | None = None) -> None:
         """Enter more blocks of a file, and its size if it is known. A block that occurs twice is kept where it was
         first."""
         with self._writing() as connection:
@@ -153,12 +155,12 @@ class BlockIndex:
         with self._writing() as connection:
             _forget(connection, name)
 
-    def find(self, digest: bytes) -> list[tuple[str, Span]]:
+    def find(self, digest: bytes) -> list[tuple[str, BlockSpan]]:
         """Every file that holds the block with this sha2-256 digest, with where it is."""
         query = "SELECT name, offset, length, head, tail FROM block JOIN file ON file.id = file WHERE digest = ?"
         with self._reading() as connection:
             rows = connection.execute(query, (digest,)).fetchall()
-        return [(name, Span(digest, *where)) for name, *where in rows]
+        return [(name, BlockSpan(digest, *where)) for name, *where in rows]
 
     @contextmanager
     def _reading(self) -> Iterator[sqlite3.Connection]:

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Final
 
 from mesh.content.errors import QuotaReached
 from mesh.content.files import PART_PREFIX, PUT_PREFIX, TemporaryFile, directory_lock, is_taken
-from mesh.content.holdings import Collected
+from mesh.content.holdings import EvictionReport
 from mesh.content.recovery import DAMAGED_SUFFIX, clear_remains
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
     from pathlib import Path
 
-    from mesh.content.index import BlockIndex, Indexed
+    from mesh.content.index import BlockIndex, IndexedFile
     from mesh.content.pins import Pins
 
 log = logging.getLogger(__name__)
@@ -55,12 +55,12 @@ class Room:
         self.reserve(name, size)
         return size
 
-    def collect(self, quota: int) -> Collected:
+    def collect(self, quota: int) -> EvictionReport:
         """Delete until all files together are within `quota` bytes, or only what must stay is left."""
         with directory_lock(self._directory):
             clear_remains(self._directory, self._index)
             excess = sum(file.size for file in self._index.files()) - quota
-            chosen: list[Indexed] = []
+            chosen: list[IndexedFile] = []
             for file in self._deletable():
                 if excess <= 0:
                     break
@@ -68,12 +68,12 @@ class Room:
                 excess -= file.size
             self._delete(chosen)
         cids = tuple(file.name for file in chosen if not _is_remains(file.name))
-        return Collected(cids=cids, bytes=sum(file.size for file in chosen))
+        return EvictionReport(cids=cids, bytes=sum(file.size for file in chosen))
 
-    def _chosen(self, missing: int) -> list[Indexed]:
+    def _chosen(self, missing: int) -> list[IndexedFile]:
         """Enough to be deleted to have `missing` bytes more. Raises `QuotaReached`."""
         assert self.quota is not None
-        chosen: list[Indexed] = []
+        chosen: list[IndexedFile] = []
         for file in self._deletable():
             chosen.append(file)
             missing -= file.size
@@ -82,7 +82,7 @@ class Room:
         kept = sum(file.size for file in self._index.files()) - sum(file.size for file in chosen)
         raise QuotaReached(self._directory, missing=missing, quota=self.quota, kept=kept)
 
-    def _deletable(self) -> Iterator[Indexed]:
+    def _deletable(self) -> Iterator[IndexedFile]:
         """What may be deleted, in the order in which it should be: what was set aside, then by last use."""
         pinned = self._pins.by_cid()
         for file in self._index.files():
@@ -92,7 +92,7 @@ class Room:
             if not (partly and is_taken(self._directory / file.name)):
                 yield file
 
-    def _delete(self, files: Iterable[Indexed]) -> None:
+    def _delete(self, files: Iterable[IndexedFile]) -> None:
         for file in files:
             path = self._directory / file.name
             if file.name.startswith(PART_PREFIX):

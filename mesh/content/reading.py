@@ -8,7 +8,7 @@ import io
 import os
 from typing import TYPE_CHECKING, Final
 
-from mesh.content.dag import MAX_BLOCKS, Place, children_of, node_at
+from mesh.content.dag import MAX_BLOCKS, BlockRef, children_of, node_at
 from mesh.content.errors import ContentCorrupt
 from schemas.cid import parse_cid
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from mesh.content.index import Span
+    from mesh.content.index import BlockSpan
     from schemas.unixfs import Node
 
-    SpanOf = Callable[[bytes], Span | None]
+    SpanOf = Callable[[bytes], BlockSpan | None]
     """Where the block of a digest is in the file that is read, and what is around it."""
 
 
@@ -35,10 +35,10 @@ class CheckedFile(io.RawIOBase):
         self._span_of = span_of
         self._damaged = damaged
         self._position = 0
-        self._path: list[tuple[Place, Node]] = []
+        self._path: list[tuple[BlockRef, Node]] = []
         """The nodes from the root to the one that was read last."""
         try:
-            self._size = self._node(Place(cid), 0).file_size
+            self._size = self._node(BlockRef(cid), 0).file_size
         except BaseException:
             self._file.close()
             raise
@@ -80,7 +80,7 @@ class CheckedFile(io.RawIOBase):
 
     def _data_at(self, position: int) -> tuple[int, bytes]:
         """The bytes of the block that has the byte at `position`, and where they begin."""
-        place, depth = Place(self._cid), 0
+        place, depth = BlockRef(self._cid), 0
         while True:
             node = self._node(place, depth)
             if position < place.offset + len(node.data):
@@ -88,7 +88,7 @@ class CheckedFile(io.RawIOBase):
             below = [child for child in children_of(place, node) if child.offset <= position]
             place, depth = below[-1], depth + 1
 
-    def _node(self, place: Place, depth: int) -> Node:
+    def _node(self, place: BlockRef, depth: int) -> Node:
         if depth < len(self._path) and self._path[depth][0] == place:
             return self._path[depth][1]
         try:
@@ -100,7 +100,7 @@ class CheckedFile(io.RawIOBase):
         return node
 
 
-def read_block(file: io.FileIO, place: Place, span_of: SpanOf) -> bytes:
+def read_block(file: io.FileIO, place: BlockRef, span_of: SpanOf) -> bytes:
     """The block of a place, from the open file. Raises `ContentCorrupt` when the disk has other bytes, or none."""
     digest = parse_cid(place.cid)[2:]
     span = span_of(digest)
@@ -124,7 +124,7 @@ def read_or_nothing(descriptor: int, length: int, offset: int) -> bytes:
 
 def is_tree(path: Path, cid: str, span_of: SpanOf) -> bool:
     """Whether a file is the one of its name by the tree in the index, with whatever settings it was chunked."""
-    waiting, seen = [Place(cid, size=path.stat().st_size)], 0
+    waiting, seen = [BlockRef(cid, size=path.stat().st_size)], 0
     with path.open("rb", buffering=0) as file:
         while waiting and seen < MAX_BLOCKS:
             place, seen = waiting.pop(), seen + 1

@@ -24,7 +24,7 @@ from mesh.content.chunking import CopiedStream, enter_blocks, told
 from mesh.content.directory import Shelf
 from mesh.content.errors import ContentCorrupt, ContentUnavailable, StoreFull
 from mesh.content.files import PUT_PREFIX, TemporaryFile, directory_lock, stamp, sync_directory
-from mesh.content.holdings import Check
+from mesh.content.holdings import IntegrityReport
 from mesh.content.pins import check_label
 from mesh.content.reading import CheckedFile, is_tree, read_or_nothing
 from mesh.content.recovery import DAMAGED_SUFFIX, is_cid, set_aside
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from mesh.content.chunking import Readable
     from mesh.content.holdings import Progress
-    from mesh.content.index import Span
+    from mesh.content.index import BlockSpan
 
 log = logging.getLogger(__name__)
 
@@ -120,7 +120,7 @@ class Store(Shelf):
                 log.warning("%s has rotted on the disk and was set aside", path)
                 raise ContentCorrupt(cid, "the bytes on the disk are others")
 
-    def check(self, *, progress: Progress | None = None) -> Check:
+    def check(self, *, progress: Progress | None = None) -> IntegrityReport:
         """Hash the whole store now. Damaged files are named and set aside; those that are gone meanwhile are left out.
 
         `progress` is told the bytes hashed, of all.
@@ -136,7 +136,7 @@ class Store(Shelf):
             except ContentUnavailable:
                 continue
             files, done = files + 1, done + size
-        return Check(files=files, bytes=done, damaged=tuple(damaged))
+        return IntegrityReport(files=files, bytes=done, damaged=tuple(damaged))
 
     def open(self, cid: str) -> BinaryIO:
         """The file, opened for reading. Every block is checked when it is read: a read raises `ContentCorrupt` where
@@ -193,7 +193,7 @@ class Store(Shelf):
         return Assembly(self, cid, index=self._index, room=self._room, size_limit=limit)
 
     def settle(
-        self, temporary: TemporaryFile, cid: str, *, size: int, spans: Iterable[Span] = (), pin: str | None = None
+        self, temporary: TemporaryFile, cid: str, *, size: int, spans: Iterable[BlockSpan] = (), pin: str | None = None
     ) -> Path:
         """Give a written file its CID, and enter the blocks that are not in the index yet. It counts as checked."""
         path, name = self._path(cid), temporary.path.name
@@ -238,7 +238,7 @@ class Store(Shelf):
         except FileNotFoundError:
             return True
 
-    def _span(self, name: str, digest: bytes) -> Span | None:
+    def _span(self, name: str, digest: bytes) -> BlockSpan | None:
         return next((span for found, span in self._index.find(digest) if found == name), None)
 
     def _suspect(self, cid: str) -> None:
@@ -269,7 +269,7 @@ def _is_chunked(path: Path, cid: str, progress: Progress | None) -> bool:
             return False
 
 
-def _read_span(path: Path, span: Span) -> bytes:
+def _read_span(path: Path, span: BlockSpan) -> bytes:
     with path.open("rb", buffering=0) as file:
         return span.block(read_or_nothing(file.fileno(), span.length, span.offset))
 

@@ -11,7 +11,7 @@ from mesh.recording import CLOSED, RECOVERED
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from mesh.recording import Objective, Written
+    from mesh.recording import ChannelMessage, Objective
 
 MILLISECOND: Final = 10**6
 
@@ -33,7 +33,7 @@ class Numbering:
     gaps: list[str] = field(default_factory=list)
     steps_back: list[str] = field(default_factory=list)
 
-    def take(self, written: Written) -> None:
+    def take(self, written: ChannelMessage) -> None:
         """Look at the next message."""
         message = written.message
         channel = self.channels.setdefault(written.channel, _Channel())
@@ -59,7 +59,7 @@ def check_completeness(recording: Objective, numbering: Numbering) -> Iterator[F
     yield _all_well("times", numbering.steps_back, "no message of a channel was recorded before the one in front of it")
 
 
-def _gap(written: Written, expected: int) -> str:
+def _gap(written: ChannelMessage, expected: int) -> str:
     topic, number = written.message.topic, written.message.sequence
     if number < expected:
         return f"message {number} on {topic} comes after message {expected - 1}"

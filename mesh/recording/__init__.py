@@ -13,16 +13,17 @@ from mesh.recording.errors import (
 )
 from mesh.recording.limits import GENEROUS, Limits
 from mesh.recording.lines import InvalidLine, messages_in
-from mesh.recording.objective import Objective, Played, Topic, Written, open_objective
-from mesh.recording.packing import Packed, pack
+from mesh.recording.objective import ChannelMessage, Objective, Played, Topic, open_objective
+from mesh.recording.packing import PackSummary, pack
 from mesh.recording.partial import ABOUT, CLOSED
-from mesh.recording.playback import AtOnce, Clock, MonotonicClock, Pace, Rate, RecordedTimes, Step, paced, timeline
+from mesh.recording.playback import AtOnce, Clock, FixedRate, MonotonicClock, Pace, RecordedTimes, Step, paced, timeline
 from mesh.recording.player import play
 from mesh.recording.preflight import Preflight, preflight
-from mesh.recording.rates import Rates, rates_of
+from mesh.recording.rates import TopicRates, rates_of
 from mesh.recording.recorder import Recorder, RecorderSettings, RecordingAbout, RecordingSummary
-from mesh.recording.recovery import RECOVERED, Recovered, recover
-from mesh.recording.source import Attachment, Statistics
+from mesh.recording.recorders import Recorders
+from mesh.recording.recovery import RECOVERED, RecoverySummary, recover
+from mesh.recording.source import Attachment, RecordingStatistics
 
 __all__ = [
     "ABOUT",
@@ -31,34 +32,35 @@ __all__ = [
     "RECOVERED",
     "AtOnce",
     "Attachment",
+    "ChannelMessage",
     "Clock",
     "CorruptRecording",
+    "FixedRate",
     "InvalidLine",
     "Limits",
     "MonotonicClock",
     "NotARecording",
     "Objective",
     "Pace",
-    "Packed",
+    "PackSummary",
     "Played",
     "Preflight",
-    "Rate",
-    "Rates",
     "RecordedTimes",
     "Recorder",
     "RecorderSettings",
+    "Recorders",
     "RecordingAbout",
     "RecordingError",
     "RecordingExists",
     "RecordingFailed",
+    "RecordingStatistics",
     "RecordingSummary",
     "RecordingTooLarge",
-    "Recovered",
-    "Statistics",
+    "RecoverySummary",
     "Step",
     "Topic",
+    "TopicRates",
     "Unrecordable",
-    "Written",
     "bag_to_mcap",
     "json_type",
     "messages_in",

@@ -14,7 +14,7 @@ from mcap.opcode import Opcode
 
 from mesh.recording.cursor import Cursor
 from mesh.recording.errors import CorruptRecording, NotARecording, RecordingTooLarge
-from mesh.recording.source import Attachment, Block, Channel, Record, Statistics
+from mesh.recording.source import Attachment, Block, Channel, Record, RecordingStatistics
 from schemas.payloads import PayloadType
 
 if TYPE_CHECKING:
@@ -147,7 +147,7 @@ def metadata_of(path: Path, data: bytes) -> tuple[str, dict[str, str]]:
     return cursor.text(), cursor.pairs()
 
 
-def statistics_of(path: Path, data: bytes) -> Statistics:
+def statistics_of(path: Path, data: bytes) -> RecordingStatistics:
     """What a statistics record says."""
     cursor = Cursor(path, data)
     messages, _schemas, channels = cursor.u64(), cursor.u16(), cursor.u32()
@@ -157,7 +157,7 @@ def statistics_of(path: Path, data: bytes) -> Statistics:
     while counts.left:
         number = counts.u16()
         by_channel[number] = counts.u64()
-    return Statistics(messages, channels, attachments, chunks, start, end, by_channel)
+    return RecordingStatistics(messages, channels, attachments, chunks, start, end, by_channel)
 
 
 def attachment_of(path: Path, file: BinaryIO, frame: Frame) -> Attachment:

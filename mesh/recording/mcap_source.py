@@ -36,9 +36,9 @@ from mesh.recording.source import (
     Channel,
     Expanding,
     Record,
+    RecordingStatistics,
     Segment,
     Source,
-    Statistics,
     check_counts,
     check_definitions,
     check_window,
@@ -105,7 +105,7 @@ class Reading:
     segments: list[Segment] = field(default_factory=list)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     attachments: list[Attachment] = field(default_factory=list)
-    statistics: Statistics | None = None
+    statistics: RecordingStatistics | None = None
     unchecked: int = 0
     _schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
     _said: dict[tuple[int, bytes], bytes] = field(default_factory=dict)
@@ -210,7 +210,7 @@ class Reading:
             raise CorruptRecording(self.path, f"two different definitions have the number {number}")
 
 
-def _check_outline(path: Path, file: BinaryIO, size: int, limits: Limits) -> tuple[Statistics | None, bool]:
+def _check_outline(path: Path, file: BinaryIO, size: int, limits: Limits) -> tuple[RecordingStatistics | None, bool]:
     """Check sizes and the two long checksums without expanding anything.
 
     Gives what the file says about itself at its end, and whether its data has a checksum as a whole.
@@ -237,7 +237,7 @@ def _check_outline(path: Path, file: BinaryIO, size: int, limits: Limits) -> tup
     return _said(path, file, said, limits), bool(data_crc)
 
 
-def _said(path: Path, file: BinaryIO, frame: Frame | None, limits: Limits) -> Statistics | None:
+def _said(path: Path, file: BinaryIO, frame: Frame | None, limits: Limits) -> RecordingStatistics | None:
     """The statistics of that frame, if there is one."""
     if frame is None:
         return None

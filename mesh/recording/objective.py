@@ -48,7 +48,7 @@ class Played(Struct, frozen=True):
     role: str = ""
 
 
-class Written(Struct, frozen=True):
+class ChannelMessage(Struct, frozen=True):
     """A message as it lies in its file: on the channel of that number."""
 
     channel: int
@@ -92,11 +92,11 @@ class Objective:
         for channel, sequence, log_time, publish_time, payload in self._source.in_time_order(skip=from_index):
             yield _played(channels[channel], payload, log_time, publish_time, sequence)
 
-    def in_file_order(self) -> Iterator[Written]:
+    def in_file_order(self) -> Iterator[ChannelMessage]:
         """The messages as they lie in the file, whatever their times. Otherwise as `messages`."""
         channels = self._source.channels
         for channel, sequence, log_time, publish_time, payload in self._source.in_file_order():
-            yield Written(channel, _played(channels[channel], payload, log_time, publish_time, sequence))
+            yield ChannelMessage(channel, _played(channels[channel], payload, log_time, publish_time, sequence))
 
 
 def open_objective(path: Path, limits: Limits = _DEFAULT, *, progress: Progress | None = None) -> Objective:

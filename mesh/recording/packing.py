@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Packed:
+class PackSummary:
     """What was written: how many messages on how many topics, and nanoseconds from the first to the last."""
 
     messages: int
@@ -25,7 +25,7 @@ class Packed:
 
 def pack(
     messages: Iterable[Played], target: Path, *, metadata: Mapping[str, Mapping[str, str]] | None = None
-) -> Packed:
+) -> PackSummary:
     """Write messages, in any order, to an MCAP file, with these metadata records. The same messages, the same bytes.
 
     Sequence numbers are made anew. Replaces what is at `target`, atomically, once all is written. Blocks on the disk.
@@ -50,4 +50,4 @@ def pack(
             last = max(last, message.log_time_ns)
             topics.add(message.topic)
         file.finish()
-    return Packed(messages=file.messages, topics=len(topics), duration_ns=last - first)
+    return PackSummary(messages=file.messages, topics=len(topics), duration_ns=last - first)

@@ -51,7 +51,7 @@ class AtOnce:
 
 
 @dataclass(frozen=True)
-class Rate:
+class FixedRate:
     """`hz` messages a second, whatever their times. Raises `ValueError` unless that is above 0."""
 
     hz: float
@@ -65,7 +65,7 @@ class Rate:
         return int(position * _SECOND / self.hz)
 
 
-Pace: TypeAlias = RecordedTimes | AtOnce | Rate
+Pace: TypeAlias = RecordedTimes | AtOnce | FixedRate
 
 
 class Step(Struct, frozen=True):

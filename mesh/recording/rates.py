@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from mesh.recording.objective import Played
 
 
-class Rates(Struct, frozen=True):
+class TopicRates(Struct, frozen=True):
     """Messages of each topic in equal spans of time, `span_ns` nanoseconds each, from the first message on."""
 
     span_ns: int
@@ -23,7 +23,7 @@ class Rates(Struct, frozen=True):
         return [count * 1e9 / self.span_ns for count in self.counts[topic]]
 
 
-def rates_of(messages: Iterable[Played], *, start_ns: int, duration_ns: int, spans: int) -> Rates:
+def rates_of(messages: Iterable[Played], *, start_ns: int, duration_ns: int, spans: int) -> TopicRates:
     """Count messages that lie between `start_ns` and `duration_ns` later in so many spans."""
     span = max(1, -(-(duration_ns + 1) // spans))
     counts: dict[str, list[int]] = {}
@@ -32,4 +32,4 @@ def rates_of(messages: Iterable[Played], *, start_ns: int, duration_ns: int, spa
         if counted is None:
             counted = counts[message.topic] = [0] * spans
         counted[(message.log_time_ns - start_ns) // span] += 1
-    return Rates(span, counts)
+    return TopicRates(span, counts)

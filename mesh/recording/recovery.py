@@ -39,7 +39,7 @@ _OURS: Final = Limits(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recovered:
+class RecoverySummary:
     """What was saved: `messages` of them, in the file at `path`; `why` others were not (empty: all were there)."""
 
     path: Path
@@ -47,7 +47,7 @@ class Recovered:
     why: str
 
 
-def recover(path: Path, target: Path | None = None) -> Recovered:
+def recover(path: Path, target: Path | None = None) -> RecoverySummary:
     """Write the readable beginning of the MCAP file at `path` to a new, whole file; the old one is left as it is.
 
     Without `target` that is `NAME.mcap` for `NAME.mcap.part`, else `NAME.recovered.mcap`. Messages, channels, schemas,
@@ -67,7 +67,7 @@ def recover(path: Path, target: Path | None = None) -> Recovered:
         copy_content(source, file)
         file.add_metadata(RECOVERED, {"messages": str(file.messages), "why": why})
         file.finish()
-    return Recovered(path=final, messages=file.messages, why=why)
+    return RecoverySummary(path=final, messages=file.messages, why=why)
 
 
 def readable_part(path: Path) -> tuple[Source, str]:

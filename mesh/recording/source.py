@@ -57,7 +57,7 @@ class Attachment(NamedTuple):
     size: int
 
 
-class Statistics(NamedTuple):
+class RecordingStatistics(NamedTuple):
     """What an MCAP file says at its end about itself. `by_channel` has the messages of each channel's number."""
 
     messages: int
@@ -111,7 +111,7 @@ class Source:
     metadata: Mapping[str, Mapping[str, str]]
     records: Callable[[bytes], Iterator[Record]]
     attachments: tuple[Attachment, ...] = ()
-    statistics: Statistics | None = None
+    statistics: RecordingStatistics | None = None
     unchecked: int = 0
     """Blocks of messages without a checksum."""
 

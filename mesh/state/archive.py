@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, Self, TypeVar
 import msgspec
 import zstandard
 
-from mesh.content.files import no_room_is_store_full, sync_directory
+from mesh.content.files import raising_store_full, sync_directory
 from mesh.errors import ConfigurationError
 from mesh.state.errors import ArchiveUnusable
 from mesh.state.layout import is_part, part_of
@@ -93,7 +93,7 @@ class ArchiveWriter:
     ) -> None:
         try:
             if error is None:
-                with no_room_is_store_full(self._path.parent):
+                with raising_store_full(self._path.parent):
                     self._finish()
         finally:
             self._file.close()
@@ -103,7 +103,7 @@ class ArchiveWriter:
     def add(self, name: str, source: BinaryIO, *, size: int) -> None:
         """Add the next `size` bytes of `source`. Raises `ConfigurationError` where it has fewer."""
         digest, left = hashlib.sha256(), size
-        with no_room_is_store_full(self._path.parent):
+        with raising_store_full(self._path.parent):
             self._begin(name, size)
             while left:
                 data = source.read(min(left, PIECE))

@@ -14,7 +14,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final
 
-from mesh.content.files import no_room_is_store_full, sync_directory
+from mesh.content.files import raising_store_full, sync_directory
 from mesh.content.recovery import is_in_use
 from mesh.errors import ConfigurationError
 from mesh.state.archive import read_about, read_archive
@@ -106,7 +106,7 @@ def _unpack(archive: Path, staging: Path) -> None:
             raise ArchiveUnusable(archive, "it needs more room than the disk has", hint="make room on that disk")
         path = staging / place_of(name)
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        with no_room_is_store_full(staging), path.open("xb") as file:
+        with raising_store_full(staging), path.open("xb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())

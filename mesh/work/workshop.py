@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import mesh
 from mesh.errors import InputError
-from mesh.recording import AtOnce, Limits, RecordedTimes, Recorder, RecordingAbout, preflight
-from mesh.recording.recorders import Recorders
+from mesh.recording import AtOnce, Limits, RecordedTimes, Recorder, Recorders, RecordingAbout, preflight
 from mesh.settings import LONGEST
 from mesh.work.job import Job, Plan
 from mesh.work.lifecycle import Phase

@@ -12,7 +12,7 @@ import pytest
 from mesh.recording import open_objective
 from schemas import cid_of_file
 from schemas.payloads import String
-from tests.support.bags import Bag, Sent, string
+from tests.support.bags import Bag, BagMessage, string
 from tests.support.commands import AIRA, aira, run
 from tests.support.lessons import EXAMPLES, PROTOCOLS, as_role, at_work, market
 
@@ -89,7 +89,7 @@ def test_a_demand_makes_the_lamp_blink_and_is_paid(protocol: str, market: dict[s
 
 def test_a_ros_bag_makes_the_lamp_blink_as_well(market: dict[str, str], tmp_path: Path) -> None:
     bag, out = tmp_path / "blue.bag", tmp_path / "result.mcap"
-    bag.write_bytes(Bag([Sent("/blink", string("blue"), 0)], compression="bz2").encode())
+    bag.write_bytes(Bag([BagMessage("/blink", string("blue"), 0)], compression="bz2").encode())
     with at_work("blink_arguments", "colours", "frames", market) as uno:
         done = demand("blink_arguments", bag, out, market)
         assert "paid" in done.stdout, done.stdout + done.stderr

@@ -19,7 +19,7 @@ _BAG_HEADER: Final = 4096
 
 
 @dataclass(frozen=True)
-class Sent:
+class BagMessage:
     """A message of a bag; `time_ns` is when it was recorded."""
 
     topic: str
@@ -34,7 +34,7 @@ class Sent:
 class Bag:
     """A bag of these messages, `per_chunk` in each chunk; `indexed=False` is one whose writer was killed."""
 
-    messages: Sequence[Sent]
+    messages: Sequence[BagMessage]
     compression: Compression = "none"
     per_chunk: int = 100
     indexed: bool = True
@@ -52,7 +52,7 @@ class Bag:
         header = self._bag_header(start + len(body))
         return MAGIC + header + body + (index if self.indexed else b"")
 
-    def _connections(self) -> dict[str, Sent]:
+    def _connections(self) -> dict[str, BagMessage]:
         return {message.topic: message for message in reversed(self.messages)}
 
     def _number(self, topic: str) -> int:
@@ -68,7 +68,7 @@ class Bag:
         padding = _BAG_HEADER - len(record(fields, b""))
         return record(fields, b" " * padding)
 
-    def _connection(self, message: Sent) -> bytes:
+    def _connection(self, message: BagMessage) -> bytes:
         described = {
             "topic": message.topic.encode(),
             "type": message.type.encode(),
@@ -79,7 +79,7 @@ class Bag:
         number = struct.pack("<I", self._number(message.topic))
         return record({"op": b"\x07", "conn": number, "topic": message.topic.encode()}, fields(described))
 
-    def _chunk(self, messages: Sequence[Sent], position: int) -> bytes:
+    def _chunk(self, messages: Sequence[BagMessage], position: int) -> bytes:
         known: set[str] = set()
         entries: dict[int, list[tuple[int, int]]] = {}
         data = b""

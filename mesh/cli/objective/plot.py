@@ -10,10 +10,10 @@ from mesh.errors import ConfigurationError
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.recording import Rates
+    from mesh.recording import TopicRates
 
 
-def draw(rates: Rates, path: Path, *, title: str) -> None:
+def draw(rates: TopicRates, path: Path, *, title: str) -> None:
     """Draw the messages a second of each topic over time, to a PNG at `path`.
 
     Raises `ConfigurationError` where matplotlib is missing or the file can't be written.

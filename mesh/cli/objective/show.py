@@ -12,7 +12,7 @@ from mesh.cli.holdings import MESH, fetch, file_or_cid, opened_store, readable
 from mesh.cli.options import with_settings
 from mesh.cli.printing import plural, print_facts, print_json, print_table, visible, with_json
 from mesh.cli.progress import progress
-from mesh.recording import GENEROUS, Objective, Rates, open_objective, rates_of
+from mesh.recording import GENEROUS, Objective, TopicRates, open_objective, rates_of
 from mesh.running import run_to_end
 from schemas import cid_of_file
 
@@ -71,7 +71,7 @@ def _show(path: Path, *, schemas: bool, png: Path | None, as_json: bool) -> None
         _print_schemas(objective)
 
 
-def _rates(objective: Objective, spans: int) -> Rates:
+def _rates(objective: Objective, spans: int) -> TopicRates:
     start, duration = objective.start_ns, objective.duration_ns
     return rates_of(objective.messages(), start_ns=start, duration_ns=duration, spans=spans)
 

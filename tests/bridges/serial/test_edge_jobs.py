@@ -12,7 +12,7 @@ from mesh.chain import Account, Chain
 from mesh.recording import open_objective
 from schemas import Empty, String, cid_of_bytes
 from schemas.values import decode_value
-from tests.support.bags import Bag, Sent, string
+from tests.support.bags import Bag, BagMessage, string
 from tests.support.boards import COUNTER, ROSSERIAL_ECHO, board, edge
 from tests.support.market import QUICK, founded, obliging, place
 from tests.support.objectives import objective
@@ -94,7 +94,7 @@ async def test_a_ros_bag_is_an_objective_for_a_board(place: Place) -> None:
     async def work(job: Job, number: String) -> None:
         await device.call("/add", int(number.data), job=job)
 
-    bag = Bag([Sent("/work", string(str(number)), number * 10**6) for number in (2, 3)], compression="lz4")
+    bag = Bag([BagMessage("/work", string(str(number)), number * 10**6) for number in (2, 3)], compression="lz4")
     source = place.save(bag.encode(), "objective.bag")
     with board(COUNTER) as uno, edge(uno.port, place.address("robot"), place.endpoint):
         async with place.at_work(robot) as person:

@@ -11,7 +11,7 @@ from mesh.chain.accounts import SignedTransaction
 from mesh.chain.pending import Pending, PendingTransactions
 from mesh.chain.transaction_store import TransactionStore
 from mesh.errors import ConfigurationError
-from tests.support.disks import room_for
+from tests.support.disks import file_size_limit
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -100,7 +100,7 @@ def test_a_version_after_one_that_was_cut_off_is_read(
 
 def test_a_full_disk_is_one_clear_line_and_leaves_nothing_behind(one: TransactionStore, tmp_path: Path) -> None:
     with (
-        room_for(16),
+        file_size_limit(16),
         pytest.raises(ConfigurationError, match=f"^can't keep sent transactions in {tmp_path}: ") as caught,
     ):
         one.add(_entry(7))
@@ -115,7 +115,7 @@ def test_a_version_that_does_not_fit_leaves_the_others(one: TransactionStore, tm
     assert hold is not None
     (path,) = tmp_path.iterdir()
     entry.versions.append(SignedTransaction(b"\x02", "0x02"))
-    with room_for(path.stat().st_size + 16), pytest.raises(ConfigurationError):
+    with file_size_limit(path.stat().st_size + 16), pytest.raises(ConfigurationError):
         hold.append(entry)
     hold.append(entry)
     hold.release()

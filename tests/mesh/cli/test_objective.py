@@ -14,7 +14,7 @@ from schemas import cid_of_bytes, cid_of_file
 from schemas.payloads import JSON, STRING, String
 from tests.mesh.cli.calls import call, refused
 from tests.mesh.recording.files import T0, with_messages
-from tests.support.bags import Bag, Sent, string
+from tests.support.bags import Bag, BagMessage, string
 from tests.support.commands import run
 from tests.support.objectives import objective
 
@@ -68,7 +68,7 @@ def test_lines_may_come_from_the_standard_input(tmp_path: Path) -> None:
 
 def test_a_bag_is_packed_without_losing_anything(tmp_path: Path) -> None:
     bag = tmp_path / "it.bag"
-    bag.write_bytes(Bag([Sent("/blink", string("blue"), T0)]).encode())
+    bag.write_bytes(Bag([BagMessage("/blink", string("blue"), T0)]).encode())
     assert call("pack", bag, "--out", tmp_path / "it.mcap").exit_code == 0
     assert open_objective(tmp_path / "it.mcap").metadata["aira"]["source"] == cid_of_file(bag)
 
@@ -110,7 +110,7 @@ def test_no_file_is_written_over(tmp_path: Path, sound: Path) -> None:
     for words in (["pack", "-", "--out"], ["get", cid_of_bytes(b"x"), "--out"], ["recover", sound, "--out"]):
         refused(call(*words, sound), f"{sound} is there already")
     bag = tmp_path / "it.bag"
-    bag.write_bytes(Bag([Sent("/blink", string("blue"), T0)]).encode())
+    bag.write_bytes(Bag([BagMessage("/blink", string("blue"), T0)]).encode())
     refused(call("convert", bag, sound), f"{sound} is there already")
     assert sound.read_bytes() == before
 
@@ -168,7 +168,7 @@ def test_a_file_that_is_no_recording_can_not_be_shown(tmp_path: Path) -> None:
 
 def test_a_bag_is_converted_beside_itself(tmp_path: Path) -> None:
     bag = tmp_path / "it.bag"
-    sent = [Sent("/blink", string(f"{n}"), T0 + n) for n in range(3)]
+    sent = [BagMessage("/blink", string(f"{n}"), T0 + n) for n in range(3)]
     bag.write_bytes(Bag(sent, "bz2").encode())
     done = call("convert", bag, "--json")
     made = tmp_path / "it.mcap"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.support.bags import Bag, Sent, string
+from tests.support.bags import Bag, BagMessage, string
 from tests.support.commands import AIRA
 from tests.support.objectives import objective
 
@@ -28,7 +28,7 @@ COMMANDS = {
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     (tmp_path / "it.mcap").write_bytes(objective(("/go", "there"), ("/go", "back")))
-    (tmp_path / "it.bag").write_bytes(Bag([Sent("/go", string("there"), 1)]).encode())
+    (tmp_path / "it.bag").write_bytes(Bag([BagMessage("/go", string("there"), 1)]).encode())
     return tmp_path
 
 

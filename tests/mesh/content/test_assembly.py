@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.content import Assembly, ContentCorrupt, ContentTooLarge, Place, Store
+from mesh.content import Assembly, BlockRef, ContentCorrupt, ContentTooLarge, Store
 from mesh.content.dag import MAX_DEPTH
 from schemas.unixfs import CHUNK_SIZE, blocks_of_stream
 from tests.mesh.content.trees import leaf, named, parent
@@ -169,4 +169,4 @@ def test_a_place_knows_where_it_belongs(store: Store) -> None:
         (CHUNK_SIZE, CHUNK_SIZE, 1),
         (2 * CHUNK_SIZE, 7, 1),
     ]
-    assert assembly.root == Place(cid)
+    assert assembly.root == BlockRef(cid)

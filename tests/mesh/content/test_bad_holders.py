@@ -38,7 +38,7 @@ async def test_a_liar_is_counted_and_named_and_somebody_elses_answer_used(
                 await asyncio.sleep(0.01)
             async with Exchange(other_session, holder_store):
                 assert (await fetching).read_bytes() == data
-            lies = exchange.statistics().lies
+            lies = exchange.statistics().corrupt_blocks
     assert list(lies) == [str(third_session.zid())]
     assert lies[str(third_session.zid())] >= 1
 
@@ -71,7 +71,7 @@ async def test_a_holder_of_the_root_that_lies_about_the_parts_is_left_for_anothe
             await lied.wait()
             async with Exchange(other_session, holder_store):
                 assert (await fetching).read_bytes() == data
-            assert str(third_session.zid()) in exchange.statistics().lies
+            assert str(third_session.zid()) in exchange.statistics().corrupt_blocks
 
 
 async def test_if_all_lie_the_content_is_corrupt_and_they_are_named(

@@ -190,7 +190,9 @@ async def test_a_holder_whose_file_has_rotted_sets_it_aside_and_the_other_holder
             await until(lambda: holder_store.damaged() == (cid,), what="the damage found", seconds=60)
             async with Exchange(third_session, good_store):
                 assert (await fetching).read_bytes() == data
-                assert exchange.statistics().lies == {}, "who finds its own file damaged gives nothing: it is no liar"
+                assert exchange.statistics().corrupt_blocks == {}, (
+                    "who finds its own file damaged gives nothing: it is no liar"
+                )
                 assert (await damaged.fetch(cid)).read_bytes() == data
     assert holder_store.check().damaged == ()
     assert holder_store.list() == (cid,)

@@ -104,11 +104,11 @@ async def test_of_two_holders_one_lies_in_every_tenth_block_and_is_named(
             await given_by(session, cid, holders=2)
             answers.clear()
             assert (await exchange.fetch(cid)).read_bytes() == data
-            assert exchange.statistics().lies == {str(third_session.zid()): answers["lies"]}
+            assert exchange.statistics().corrupt_blocks == {str(third_session.zid()): answers["lies"]}
             assert honest.statistics().served > 0
     assert answers["lies"] >= 1
     assert f"{third_session.zid()} answered for" in caplog.text
-    assert str(other_session.zid()) not in exchange.statistics().lies
+    assert str(other_session.zid()) not in exchange.statistics().corrupt_blocks
     assert store.check().damaged == ()
 
 

@@ -14,7 +14,7 @@ from mesh.demo.demo import COST, MODEL
 from mesh.demo.objective import write_objective
 from mesh.recording import open_objective
 from schemas import Empty, String, cid_of_file
-from tests.support.bags import Bag, Sent, string
+from tests.support.bags import Bag, BagMessage, string
 from tests.support.commands import SOON, Interrupted, aira
 from tests.support.objectives import objective
 
@@ -112,7 +112,7 @@ def test_people_read_a_story() -> None:
 def test_a_bag_is_played(tmp_path: Path) -> None:
     bag = tmp_path / "lamp.bag"
     bag.write_bytes(
-        Bag([Sent("/colour", string(colour), 10**18 + n * 10**8) for n, colour in enumerate(["red"])]).encode()
+        Bag([BagMessage("/colour", string(colour), 10**18 + n * 10**8) for n, colour in enumerate(["red"])]).encode()
     )
     *events, summed = told(demo("--json", "--objective", bag, "--out", tmp_path / "kept"))
     assert summed["paid"]

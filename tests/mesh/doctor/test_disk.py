@@ -11,7 +11,7 @@ from mesh.doctor.disk import LEAST, look_at_folder, look_at_room
 from mesh.settings import Settings
 from tests.mesh.doctor.examining import examined
 from tests.support.commands import run
-from tests.support.disks import room_for
+from tests.support.disks import file_size_limit
 from tests.support.routers import EmbeddedRouter
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ async def test_a_data_dir_that_is_a_file_is_named(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_is_said_to_be_full(tmp_path: Path) -> None:
-    with room_for(1024):
+    with file_size_limit(1024):
         finding = look_at_folder(tmp_path)
 
     assert not finding.ok

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from mesh.recording import Written
+    from mesh.recording import ChannelMessage
 
 ROBOT: Final = Signer(b"\x01" * 32)
 THIEF: Final = Signer(b"\x02" * 32)
@@ -42,7 +42,7 @@ class JobFiles:
         claim = msgspec.structs.replace(self.claim, **claimed)
         return verify(claim, objective=self.objective, result=self.result, message=message)
 
-    def forge(self, change: Callable[[list[Written], Metadata], list[Written]]) -> None:
+    def forge(self, change: Callable[[list[ChannelMessage], Metadata], list[ChannelMessage]]) -> None:
         """Write the recording anew, its messages and metadata changed, as a valid file under a CID of its own."""
         old = open_objective(self.result)
         metadata = {name: dict(values) for name, values in old.metadata.items()}
@@ -105,7 +105,7 @@ def stop(recorder: Recorder) -> None:
     recorder.record(last.topic, last.payload, last.type, role="objective")
 
 
-def renumbered(messages: list[Written]) -> list[Written]:
+def renumbered(messages: list[ChannelMessage]) -> list[ChannelMessage]:
     """The same with numbers without a gap, and the times of the originals in their order."""
     counts: dict[str, int] = {}
     times = sorted(one.message.log_time_ns for one in messages)

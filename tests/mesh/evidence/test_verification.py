@@ -16,7 +16,7 @@ from tests.mesh.evidence.jobs import LIABILITY, OTHER, THIEF, WORDS, JobFiles, m
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.recording import Written
+    from mesh.recording import ChannelMessage
     from tests.mesh.evidence.jobs import Metadata
 
 __all__ = ["job"]
@@ -45,78 +45,78 @@ def test_of_an_honest_job_everything_holds(job: JobFiles) -> None:
     assert verdict.of("played") is not None
 
 
-def dropped_answer(messages: list[Written], metadata: Metadata) -> list[Written]:
+def dropped_answer(messages: list[ChannelMessage], metadata: Metadata) -> list[ChannelMessage]:
     del messages[3]
     return messages
 
 
-def dropped_and_renumbered(messages: list[Written], metadata: Metadata) -> list[Written]:
+def dropped_and_renumbered(messages: list[ChannelMessage], metadata: Metadata) -> list[ChannelMessage]:
     del messages[4]
     metadata[CLOSED]["messages"] = str(len(messages))
     return renumbered(messages)
 
 
-def altered(messages: list[Written], metadata: Metadata) -> list[Written]:
+def altered(messages: list[ChannelMessage], metadata: Metadata) -> list[ChannelMessage]:
     message = msgspec.structs.replace(messages[2].message, payload=String("TWO").encode())
     messages[2] = msgspec.structs.replace(messages[2], message=message)
     return messages
 
 
-def reordered(messages: list[Written], metadata: Metadata) -> list[Written]:
+def reordered(messages: list[ChannelMessage], metadata: Metadata) -> list[ChannelMessage]:
     messages[2], messages[4] = messages[4], messages[2]
     return messages
 
 
-def reordered_and_renumbered(messages: list[Written], metadata: Metadata) -> list[Written]:
+def reordered_and_renumbered(messages: list[ChannelMessage], metadata: Metadata) -> list[ChannelMessage]:
     return renumbered(reordered(messages, metadata))
 
 
-def shortened(messages: list[Written], metadata: Metadata) -> list[Written]:
+def shortened(messages: list[ChannelMessage], metadata: Metadata) -> list[ChannelMessage]:
     return messages[:6]
 
 
-def shortened_without_a_trace(messages: list[Written], metadata: Metadata) -> list[Written]:
+def shortened_without_a_trace(messages: list[ChannelMessage], metadata: Metadata) -> list[ChannelMessage]:
     metadata[CLOSED]["messages"] = "6"
     return messages[:6]
 
 
-def added(messages: list[Written], metadata: Metadata) -> list[Written]:
+def added(messages: list[ChannelMessage], metadata: Metadata) -> list[ChannelMessage]:
     metadata[CLOSED]["messages"] = str(len(messages) + 1)
     message = msgspec.structs.replace(messages[0].message, payload=String("zero").encode())
     return renumbered([msgspec.structs.replace(messages[0], message=message), *messages])
 
 
-def on_another_topic(messages: list[Written], metadata: Metadata) -> list[Written]:
+def on_another_topic(messages: list[ChannelMessage], metadata: Metadata) -> list[ChannelMessage]:
     message = msgspec.structs.replace(messages[0].message, topic="/shout")
     return renumbered([msgspec.structs.replace(messages[0], message=message), *messages[1:]])
 
 
-def never_closed(messages: list[Written], metadata: Metadata) -> list[Written]:
+def never_closed(messages: list[ChannelMessage], metadata: Metadata) -> list[ChannelMessage]:
     del metadata[CLOSED]
     return messages
 
 
-def lossy(messages: list[Written], metadata: Metadata) -> list[Written]:
+def lossy(messages: list[ChannelMessage], metadata: Metadata) -> list[ChannelMessage]:
     metadata[CLOSED]["lost"] = "7"
     return messages
 
 
-def of_another_liability(messages: list[Written], metadata: Metadata) -> list[Written]:
+def of_another_liability(messages: list[ChannelMessage], metadata: Metadata) -> list[ChannelMessage]:
     metadata["aira"]["liability"] = OTHER
     return messages
 
 
-def of_another_agent(messages: list[Written], metadata: Metadata) -> list[Written]:
+def of_another_agent(messages: list[ChannelMessage], metadata: Metadata) -> list[ChannelMessage]:
     metadata["aira"]["agent"] = THIEF.address
     return messages
 
 
-def of_another_objective(messages: list[Written], metadata: Metadata) -> list[Written]:
+def of_another_objective(messages: list[ChannelMessage], metadata: Metadata) -> list[ChannelMessage]:
     metadata["aira"]["objective"] = cid_of_bytes(b"easier work")
     return messages
 
 
-def of_nobody(messages: list[Written], metadata: Metadata) -> list[Written]:
+def of_nobody(messages: list[ChannelMessage], metadata: Metadata) -> list[ChannelMessage]:
     del metadata["aira"]
     return messages
 
@@ -161,7 +161,7 @@ def test_a_forged_recording_is_found_out_and_the_fault_named(
         assert detail in said[name]
 
 
-def another_answer(messages: list[Written], metadata: Metadata) -> list[Written]:
+def another_answer(messages: list[ChannelMessage], metadata: Metadata) -> list[ChannelMessage]:
     message = msgspec.structs.replace(messages[1].message, payload=String("yes, one").encode())
     messages[1] = msgspec.structs.replace(messages[1], message=message)
     return messages

@@ -12,7 +12,7 @@ from mcap.opcode import Opcode
 
 from mesh.recording import Limits
 from tests.mesh.recording.raw import CHANNEL, SCHEMA, chunk, message, raw_file, record, text
-from tests.support.bags import MAGIC, Bag, Sent, compress, fields
+from tests.support.bags import MAGIC, Bag, BagMessage, compress, fields
 from tests.support.bags import record as bag_record
 
 if TYPE_CHECKING:
@@ -217,7 +217,7 @@ def empty_chunks() -> bytes:
 
 def huge_message() -> bytes:
     """A bag of one message that is larger than what is taken."""
-    return Bag([Sent("/a", bytes(CHUNK + 1), 1)]).encode()
+    return Bag([BagMessage("/a", bytes(CHUNK + 1), 1)]).encode()
 
 
 BOMBS: dict[Callable[[], bytes], str] = {

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 from mcap.writer import CompressionType
 
 from tests.mesh.recording.files import T0, with_messages
-from tests.support.bags import Bag, Sent, string
+from tests.support.bags import Bag, BagMessage, string
 
 if TYPE_CHECKING:
     import random
     from collections.abc import Callable
 
 TIMES = [T0 + n * 7919 % 400 for n in range(400)]
-SENT = [Sent("/a", string(f"message {n}"), time) for n, time in enumerate(TIMES)]
+SENT = [BagMessage("/a", string(f"message {n}"), time) for n, time in enumerate(TIMES)]
 FILES = {
     "mcap zstd": with_messages(TIMES),
     "mcap lz4": with_messages(TIMES, compression=CompressionType.LZ4),

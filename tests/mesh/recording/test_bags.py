@@ -8,12 +8,12 @@ import pytest
 from mesh.recording import CorruptRecording, Limits, NotARecording, RecordingTooLarge, open_objective
 from schemas.payloads import STRING, PayloadType
 from tests.mesh.recording.files import SECOND, T0
-from tests.support.bags import MAGIC, Bag, Compression, Sent, record, string
+from tests.support.bags import MAGIC, Bag, BagMessage, Compression, record, string
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-MESSAGES = [Sent("/blink" if n % 3 else "/other", string(f"message {n}"), T0 + n * SECOND) for n in range(250)]
+MESSAGES = [BagMessage("/blink" if n % 3 else "/other", string(f"message {n}"), T0 + n * SECOND) for n in range(250)]
 
 
 def kept(directory: Path, content: bytes) -> Path:
@@ -49,7 +49,7 @@ def test_messages_outside_chunks_are_read_too(tmp_path: Path) -> None:
 
 
 def test_the_type_is_what_the_connection_says(tmp_path: Path) -> None:
-    sent = Sent("/scan", b"\0", T0, type="sensor_msgs/LaserScan", md5sum="90c7", definition="float32 angle\n\xff")
+    sent = BagMessage("/scan", b"\0", T0, type="sensor_msgs/LaserScan", md5sum="90c7", definition="float32 angle\n\xff")
     (topic,) = open_objective(kept(tmp_path, Bag([sent]).encode())).topics
     assert topic.type == PayloadType("ros1", "sensor_msgs/LaserScan", "ros1msg", "float32 angle\n\xff".encode())
 

@@ -7,14 +7,14 @@ from mcap.reader import make_reader
 
 from mesh.recording import CorruptRecording, bag_to_mcap, open_objective
 from tests.mesh.recording.files import SECOND, T0
-from tests.support.bags import Bag, Compression, Sent, string
+from tests.support.bags import Bag, BagMessage, Compression, string
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 SENT = [
-    *(Sent("/blink", string(f"message {n}"), T0 + (n * 7 % 50) * SECOND) for n in range(50)),
-    Sent("/ping", b"", T0, type="std_msgs/Empty", md5sum="d41d8cd98f00b204e9800998ecf8427e", definition=""),
+    *(BagMessage("/blink", string(f"message {n}"), T0 + (n * 7 % 50) * SECOND) for n in range(50)),
+    BagMessage("/ping", b"", T0, type="std_msgs/Empty", md5sum="d41d8cd98f00b204e9800998ecf8427e", definition=""),
 ]
 
 

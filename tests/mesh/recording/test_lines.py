@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.recording import InvalidLine, Packed, messages_in, open_objective, pack
+from mesh.recording import InvalidLine, PackSummary, messages_in, open_objective, pack
 from schemas.payloads import EMPTY, JSON, RAW, STRING, PayloadType, String
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def test_a_line_that_is_no_message_is_named_by_its_number(line: bytes, why: str)
 def test_lines_become_a_recording_and_the_same_lines_the_same_bytes(tmp_path: Path) -> None:
     lines = [b'{"topic":"/b","time":2,"data":"late"}', b'{"topic":"/a","time":0.5}', b'{"topic":"/b","time":1}']
     packed = pack(messages_in(lines), tmp_path / "it.mcap")
-    assert packed == Packed(messages=3, topics=2, duration_ns=SECOND * 3 // 2)
+    assert packed == PackSummary(messages=3, topics=2, duration_ns=SECOND * 3 // 2)
     played = [(one.topic, one.log_time_ns) for one in open_objective(tmp_path / "it.mcap").messages()]
     assert played == [("/a", SECOND // 2), ("/b", SECOND), ("/b", 2 * SECOND)]
     pack(messages_in(lines), tmp_path / "again.mcap")

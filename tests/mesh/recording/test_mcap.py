@@ -15,7 +15,7 @@ from mesh.recording import CorruptRecording, Limits, NotARecording, RecordingToo
 from schemas.payloads import PayloadType
 from tests.mesh.recording.files import T0, mcap_file, with_messages
 from tests.mesh.recording.raw import CHANNEL, MAGIC, SCHEMA, chunk, message, raw_file, record, text
-from tests.support.bags import Bag, Sent
+from tests.support.bags import Bag, BagMessage
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -250,7 +250,7 @@ def test_a_message_record_is_read_as_the_package_writes_it() -> None:
     assert builder.end() == message(b"{}")  # type: ignore[no-untyped-call]
 
 
-@pytest.mark.parametrize("content", [with_messages([T0] * 500), Bag([Sent("/a", b"", T0)] * 500).encode()])
+@pytest.mark.parametrize("content", [with_messages([T0] * 500), Bag([BagMessage("/a", b"", T0)] * 500).encode()])
 def test_progress_is_told_in_bytes_of_the_file(tmp_path: Path, content: bytes) -> None:
     told: list[tuple[int, int | None]] = []
     open_objective(kept(tmp_path, content), progress=lambda done, total: told.append((done, total)))

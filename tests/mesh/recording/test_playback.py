@@ -9,9 +9,9 @@ import pytest
 from mesh.recording import (
     AtOnce,
     CorruptRecording,
+    FixedRate,
     Pace,
     Played,
-    Rate,
     RecordedTimes,
     open_objective,
     paced,
@@ -68,7 +68,7 @@ def objective(directory: Path, *times: int) -> Objective:
         (RecordedTimes(speed=2), [0, 5, 5, 125]),
         (RecordedTimes(speed=0.5), [0, 20, 20, 500]),
         (AtOnce(), [0, 0, 0, 0]),
-        (Rate(hz=100), [0, 10, 20, 30]),
+        (FixedRate(hz=100), [0, 10, 20, 30]),
     ],
 )
 def test_when_each_message_is_due(pace: Pace, due: list[int]) -> None:
@@ -88,7 +88,7 @@ def test_from_a_time_what_was_before_is_left_out_and_the_rest_due_as_if_it_began
     recorded = messages(0, 4, 10, 15)
     steps = list(timeline(recorded, RecordedTimes(), start_ns=6))
     assert [(step.index, step.due_ns) for step in steps] == [(2, 4), (3, 9)]
-    steps = list(timeline(recorded, Rate(hz=1), start_ns=6))
+    steps = list(timeline(recorded, FixedRate(hz=1), start_ns=6))
     assert [(step.index, step.due_ns) for step in steps] == [(2, 0), (3, SECOND)]
 
 
@@ -97,7 +97,7 @@ def test_a_pace_that_never_comes_to_an_end_is_refused(value: float) -> None:
     with pytest.raises(ValueError, match="does not play anything"):
         RecordedTimes(speed=value)
     with pytest.raises(ValueError, match="does not play anything"):
-        Rate(hz=value)
+        FixedRate(hz=value)
 
 
 async def test_messages_are_given_when_due_and_never_before() -> None:

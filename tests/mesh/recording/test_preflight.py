@@ -7,7 +7,7 @@ import pytest
 
 from mesh.recording import Limits, preflight
 from tests.mesh.recording.files import SECOND, T0, mcap_file, with_messages
-from tests.support.bags import Bag, Sent, string
+from tests.support.bags import Bag, BagMessage, string
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -24,7 +24,7 @@ def on_topic(topic: str, payload: bytes = b"{}") -> bytes:
     return mcap_file(write)
 
 
-@pytest.mark.parametrize("content", [with_messages([T0]), Bag([Sent("/a", string("x"), T0)]).encode()])
+@pytest.mark.parametrize("content", [with_messages([T0]), Bag([BagMessage("/a", string("x"), T0)]).encode()])
 def test_a_good_objective_comes_back_open(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "objective"
     path.write_bytes(content)
@@ -78,7 +78,7 @@ def test_what_is_no_file_is_no_recording(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("kind", "payload"), [("std_msgs/String", b"\x09\0\0\0x"), ("std_msgs/Empty", b"x")])
 def test_a_message_that_is_not_what_its_type_says_is_named(tmp_path: Path, kind: str, payload: bytes) -> None:
     path = tmp_path / "objective"
-    path.write_bytes(Bag([Sent("/b", payload, T0 + n, type=kind) for n in range(3)]).encode())
+    path.write_bytes(Bag([BagMessage("/b", payload, T0 + n, type=kind) for n in range(3)]).encode())
     outcome = preflight(path)
     assert outcome.reason == "unreadable-message"
     assert outcome.detail.startswith(f"message 0 on /b: not a {kind}: ")
@@ -86,7 +86,7 @@ def test_a_message_that_is_not_what_its_type_says_is_named(tmp_path: Path, kind:
 
 def test_a_type_that_nobody_here_knows_is_carried_as_it_is(tmp_path: Path) -> None:
     path = tmp_path / "objective"
-    path.write_bytes(Bag([Sent("/b", b"\xff", T0, type="my/Type")]).encode())
+    path.write_bytes(Bag([BagMessage("/b", b"\xff", T0, type="my/Type")]).encode())
     assert preflight(path).ok
 
 

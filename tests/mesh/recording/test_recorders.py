@@ -5,9 +5,8 @@ from __future__ import annotations
 import threading
 from typing import TYPE_CHECKING
 
-from mesh.recording import RecordingAbout
+from mesh.recording import Recorders, RecordingAbout
 from mesh.recording.partial import PartialFile
-from mesh.recording.recorders import Recorders
 from schemas.payloads import STRING
 from tests.support.waiting import SECONDS, wait_until
 

@@ -19,7 +19,7 @@ from mesh.work.outbox import outgoing
 from schemas import cid_of_bytes
 from tests.mesh.state.conftest import ADDRESS, CHAIN, JOB, NONCE, OBJECTIVE, UNUSED, Folder, members, names_in
 from tests.mesh.work.samples import liability
-from tests.support.disks import room_for
+from tests.support.disks import file_size_limit
 from tests.support.orders import result
 
 if TYPE_CHECKING:
@@ -170,7 +170,7 @@ async def test_a_folder_without_state_is_said_to_have_none(tmp_path: Path) -> No
 async def test_a_full_disk_is_told_and_leaves_no_file(folder: Folder, tmp_path: Path) -> None:
     with Store(folder.home / "content") as store:
         store.put_bytes(os.urandom(3 << 20), pin="user")
-    with room_for(1 << 20), pytest.raises(Exception, match=r"(full|room)"):
+    with file_size_limit(1 << 20), pytest.raises(Exception, match=r"(full|room)"):
         await back_up(folder.path, tmp_path / "it", content=Extent.ALL)
     assert not (tmp_path / "it").exists()
 

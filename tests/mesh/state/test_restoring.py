@@ -24,7 +24,7 @@ from mesh.work.database import VERSION, LedgerUnusable
 from schemas import cid_of_bytes
 from tests.mesh.state.conftest import ADDRESS, CHAIN, JOB, NONCE, OBJECTIVE, Folder, forge, members, names_in
 from tests.mesh.work.ledgers import mark_as_version
-from tests.support.disks import room_for
+from tests.support.disks import file_size_limit
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -242,7 +242,7 @@ def forge_ledger(archive: Path, forged: Path, data: bytes) -> Path:
 
 
 async def test_a_full_disk_is_told_and_changes_nothing(archive: Path, tmp_path: Path) -> None:
-    with room_for(4096), pytest.raises(Exception, match=r"(?i)full"):
+    with file_size_limit(4096), pytest.raises(Exception, match=r"(?i)full"):
         await restore(archive, tmp_path / "new")
     assert names_in(tmp_path / "new") == []
 

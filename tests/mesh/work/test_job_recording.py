@@ -13,7 +13,7 @@ from mesh.work.job import FLUSH, NOTE_TOPIC
 from schemas import Empty, String
 from tests.mesh.work.runs import AGENT, Making, making, session
 from tests.mesh.work.samples import liability
-from tests.support.bags import Bag, Sent
+from tests.support.bags import Bag, BagMessage
 from tests.support.routers import EmbeddedRouter, client_config
 from tests.support.waiting import until, until_heard
 
@@ -67,7 +67,7 @@ async def test_a_struct_is_recorded_with_the_schema_of_its_class(making: Making)
 
 
 async def test_a_type_that_the_objective_describes_is_recorded_with_that_description(making: Making) -> None:
-    scan = Sent("/scan", b"\0", 1, type="my/Scan", definition="float32 angle\n")
+    scan = BagMessage("/scan", b"\0", 1, type="my/Scan", definition="float32 angle\n")
     run = making.run(Bag([scan]).encode())
     run.open()
     making._session.put(f"{TOPICS}/scanned", b"\1", encoding="ros1;my/Scan")

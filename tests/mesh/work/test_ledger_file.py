@@ -16,7 +16,7 @@ from mesh.work import Ledger, Phase
 from mesh.work.database import VERSION, LedgerUnusable
 from tests.mesh.work.ledgers import RESULT, ledger, mark_as_version, path
 from tests.mesh.work.samples import liability, message
-from tests.support.disks import room_for
+from tests.support.disks import file_size_limit
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ async def test_a_full_disk_is_one_clear_line_and_nothing_is_half_written(ledger:
     await ledger.add_job(liability())
     address, signed = liability().address, message()
     room = path.with_name(path.name + "-wal").stat().st_size
-    with room_for(room):
+    with file_size_limit(room):
         with pytest.raises(LedgerUnusable, match=f"^can't use the ledger {path}: ") as caught:
             await ledger.set_phase(address, Phase.READY)
         with pytest.raises(LedgerUnusable):
