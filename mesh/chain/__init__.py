@@ -48,10 +48,9 @@ from mesh.chain.events import (
     Transfer,
 )
 from mesh.chain.fees import GWEI, FeePolicy
-from mesh.chain.history import History
+from mesh.chain.following import BlockEvents, History, Reorganisation
 from mesh.chain.names import namehash
 from mesh.chain.node import Node
-from mesh.chain.reader import BlockEvents, Reorganisation
 from mesh.chain.records import Created, LighthouseState, RefundState, Settled
 from mesh.chain.recursion import restrain_recursion
 from mesh.chain.timing import Timing

@@ -3,33 +3,38 @@
 from __future__ import annotations
 
 from contextlib import AsyncExitStack
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, TypeVar
 
 from mesh.chain.contracts import Contracts
 from mesh.chain.errors import NoContracts, UnknownName
-from mesh.chain.following import follow
+from mesh.chain.following import NODE_ERRORS, follow, retrying
 from mesh.chain.liabilities import Liabilities
 from mesh.chain.lighthouses import Lighthouses
 from mesh.chain.names import Names, find_registry
 from mesh.chain.node import Node
+from mesh.chain.reader import EventSources, read_events
 from mesh.chain.tokens import Tokens
 from mesh.chain.transactions import TransactionSender
 from mesh.chain.versions import contract_version
 from mesh.errors import ClosedError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Iterable
+    from collections.abc import AsyncGenerator, Awaitable, Callable, Iterable
     from pathlib import Path
     from types import TracebackType
     from typing import Self
 
     from mesh.chain.accounts import Account
     from mesh.chain.fees import FeePolicy
-    from mesh.chain.history import History
+    from mesh.chain.following import BlockEvents, History
     from mesh.chain.provider import Endpoint
-    from mesh.chain.reader import BlockEvents
     from mesh.chain.timing import Timing
     from mesh.chain.versions import Kind
+    from mesh.errors import AiraError
+    from mesh.outage_log import OutageLog
+
+T = TypeVar("T")
 
 
 class Chain:
@@ -137,10 +142,43 @@ class Chain:
         return await self.node.block_number()
 
     def follow(
-        self, from_block: int, *, lighthouses: Iterable[str] = (), token: str = "", history: History | None = None
+        self,
+        cursor: int,
+        *,
+        history: History | None = None,
+        token: str = "",
+        lighthouses: Iterable[str] = (),
+        outages: OutageLog | None = None,
     ) -> AsyncGenerator[BlockEvents, None]:
-        """Blocks with their events from a block on, for ever, and reorganisations; see `mesh.chain.following`."""
-        return follow(self._opened(), from_block, lighthouses=lighthouses, token=token, history=history)
+        """Blocks with their events from the block `cursor` on, for ever, and reorganisations: `mesh.chain.following`.
+
+        Transfers and approvals are those of `token` (an address; XRT by default); a lighthouse's turns are read for
+        the addresses in `lighthouses`. Outages of the node are logged to `outages` and survived. Raises
+        `ChainWentBack` and `ReorganisedTooDeep`.
+        """
+        contracts = self._opened()
+        sources = EventSources(
+            factory=contracts.factory,
+            token=token or contracts.xrt,
+            lighthouses=tuple(lighthouses),
+            is_liability=contracts.version.is_liability,
+            recognise=contracts.version.recognise,
+        )
+        read = partial(read_events, self.node, sources)
+        return follow(self.node, read, cursor, history=history, outages=outages)
+
+    async def retrying(
+        self,
+        question: Callable[[], Awaitable[T]],
+        *,
+        outages: OutageLog | None = None,
+        errors: tuple[type[AiraError], ...] = NODE_ERRORS,
+    ) -> T:
+        """The answer to a question to the chain, asked again with backoff after each of `errors` (a lost node).
+
+        The outage is logged to `outages`. Other errors are raised.
+        """
+        return await retrying(self.node, question, outages=outages, errors=errors)
 
     async def _find_contracts(self) -> Contracts:
         names = Names(self.node, await find_registry(self.node, self._ens), self.generation)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from eth_abi.abi import decode
@@ -16,7 +17,7 @@ from schemas.errors import InvalidCid
 from schemas.keccak import keccak256
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +94,14 @@ class Current:
     quota: int
     tx: str
 
+
+EVENT_CLASSES: Final[Mapping[str, type[ChainEvent]]] = MappingProxyType(
+    {
+        kind.__name__: kind
+        for kind in (NewLiability, Finalized, NewLighthouse, Transfer, Approval, Online, Offline, Current)
+    }
+)
+"""By name, as a saved history has them."""
 
 ChainEvent: TypeAlias = NewLiability | Finalized | NewLighthouse | Transfer | Approval | Online | Offline | Current
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-import logging
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from mesh.chain.errors import NoContracts, NodeUnreachable, NotALiability, RequestRefused
+from mesh.chain.errors import NoContracts, NotALiability
 from mesh.chain.events import NewLiability, liability_created, xrt_minted
-from mesh.chain.following import list_created
+from mesh.chain.following import retrying
+from mesh.chain.reader import list_created
 from mesh.chain.records import Created, RefundState, Settled, read_liability
-from mesh.outage_log import OutageLog
 from schemas.packing import cancellation_hash, order_abi
 from schemas.signing import recover
 
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from mesh.chain.transactions import Receipt
     from schemas.liability import Liability
     from schemas.messages import Demand, Offer, Result
-
-log = logging.getLogger(__name__)
 
 READ_AT_ONCE: Final = 8
 """Records that a listing asks a node for at the same time."""
@@ -58,11 +56,8 @@ class Liabilities:
         filters = {getter: await self._contracts.names.address(whose) for getter, whose in wanted.items() if whose}
         if lighthouse:
             filters["lighthouse"] = await self._contracts.names.lighthouse(lighthouse)
-        made = [
-            event.liability
-            async for event in list_created(self._contracts, from_block)
-            if isinstance(event, NewLiability)
-        ]
+        events = await list_created(self._contracts.node, self._contracts.factory, from_block)
+        made = [event.liability for event in events if isinstance(event, NewLiability)]
         found = []
         for start in range(0, len(made), READ_AT_ONCE):
             some = made[start : start + READ_AT_ONCE]
@@ -73,20 +68,15 @@ class Liabilities:
     async def watch(self, address: str) -> Liability:
         """The record of a liability once it has ended, as its contract has it; waits for that.
 
-        The end counts when it has the node's confirmations (`Timing.confirmations`). A node that is lost meanwhile is
-        waited for. Raises `NotALiability`, and `NodeUnreachable` when there is no node at the start.
+        The end counts when it has the node's confirmations (`Timing.confirmations`). Outages of the node are
+        survived, except at the start. Raises `NotALiability`, `NodeUnreachable`.
         """
-        address, trouble = await self._recognised(address), OutageLog(log, "chain")
+        address, node = await self._recognised(address), self._contracts.node
         while True:
-            try:
-                record = await self._ended(address)
-                trouble.recovered(f"{address} can be watched again")
-            except (NodeUnreachable, RequestRefused) as error:
-                trouble.failed(error, f"{address} can't be watched, trying again")
-                record = None
+            record = await retrying(node, partial(self._ended, address))
             if record is not None:
                 return record
-            await asyncio.sleep(self._contracts.node.timing.poll_interval)
+            await asyncio.sleep(node.timing.poll_interval)
 
     async def order_hashes(self, liability: str) -> tuple[bytes, bytes]:
         """The hashes of the demand and of the offer that a liability was made of."""

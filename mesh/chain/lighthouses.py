@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from contextlib import aclosing
+from functools import partial
 from typing import TYPE_CHECKING
 
 from mesh.chain.errors import InsufficientTokens, StakeTooSmall
 from mesh.chain.events import NewLighthouse, lighthouse_created
-from mesh.chain.following import follow_created, list_created
+from mesh.chain.following import follow
+from mesh.chain.reader import list_created, read_created
 from mesh.chain.tokens import Tokens
 
 if TYPE_CHECKING:
@@ -43,21 +45,24 @@ class Lighthouses:
 
     async def list(self, *, from_block: int = 0) -> Sequence[NewLighthouse]:
         """All lighthouses made since a block, in order."""
-        return [made async for made in list_created(self._contracts, from_block) if isinstance(made, NewLighthouse)]
+        created = await list_created(self._contracts.node, self._contracts.factory, from_block)
+        return [event for event in created if isinstance(event, NewLighthouse)]
 
     async def watch(self, from_block: int | None = None) -> AsyncGenerator[NewLighthouse, None]:
-        """Each lighthouse made from a block on (by default from the next), for ever and each once.
+        """Each lighthouse created from a block on (by default from the next), for ever and each once.
 
-        A lighthouse that a reorganisation takes back stays told. A node that is lost meanwhile is waited for; only
-        when there is none at the start, `NodeUnreachable` is raised.
+        A lighthouse that a reorganisation reverts is not yielded again when it is created again. Outages of the node
+        are survived, but without `from_block` one at the start raises `NodeUnreachable`.
         """
-        cursor = await self._contracts.node.block_number() + 1 if from_block is None else from_block
-        told: set[str] = set()
-        async with aclosing(follow_created(self._contracts, cursor)) as following:
-            async for made in following:
-                if isinstance(made, NewLighthouse) and made.lighthouse not in told:
-                    told.add(made.lighthouse)
-                    yield made
+        node = self._contracts.node
+        cursor = await node.block_number() + 1 if from_block is None else from_block
+        yielded: set[str] = set()
+        async with aclosing(follow(node, partial(read_created, node, self._contracts.factory), cursor)) as blocks:
+            async for block in blocks:
+                for event in block.events:
+                    if isinstance(event, NewLighthouse) and event.lighthouse not in yielded:
+                        yielded.add(event.lighthouse)
+                        yield event
 
     async def create(self, *, minimal_stake: int, timeout_blocks: int, name: str) -> NewLighthouse:
         """Make a market. `minimal_stake` in wn; `name` is one label of a to z, 0 to 9 and -."""

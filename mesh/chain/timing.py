@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
-from mesh.chain.history import DEPTH
 from mesh.errors import ConfigurationError
+from mesh.retry import RetryPolicy
+
+REORG_DEPTH: Final = 12
+"""Blocks behind the head that are remembered by default; public chains reorganise one or two."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,8 +43,13 @@ class Timing:
     retry_delay: float = 0.25
     """Before the second attempt; doubled before each further one."""
 
-    reorg_depth: int = DEPTH
+    reorg_depth: int = REORG_DEPTH
     """Blocks, not seconds: how far behind the head a reader of events notices that blocks were replaced."""
+
+    @property
+    def outage_retry(self) -> RetryPolicy:
+        """For a node that is gone for longer: from `poll_interval` to ten times as long, without end."""
+        return RetryPolicy(initial=self.poll_interval, ceiling=10 * self.poll_interval)
 
     def __post_init__(self) -> None:
         intervals = (self.poll_interval, self.receipt_interval, self.replace_after)

@@ -72,7 +72,9 @@ class Watching:
         book; what the chain takes back is done again."""
         while True:
             try:
-                async with aclosing(self._chain.follow(self.head + 1, history=self._history)) as blocks:
+                async with aclosing(
+                    self._chain.follow(self.head + 1, history=self._history, outages=self._trouble)
+                ) as blocks:
                     async for block in blocks:
                         self._trouble.recovered(f"the chain can be read again, from block {block.block_number}")
                         if isinstance(block, Reorganisation):
@@ -119,9 +121,9 @@ class Watching:
 
     def _take_back(self, block: Reorganisation) -> None:
         """What the chain has undone is done again, unless it comes again by itself: then the contracts say so."""
-        self.head = block.back_to
-        created = [event.liability for event in block.events_taken_back if isinstance(event, NewLiability)]
-        finalized = [event.liability for event in block.events_taken_back if isinstance(event, Finalized)]
+        self.head = block.block_number
+        created = [event.liability for event in block.reverted_events if isinstance(event, NewLiability)]
+        finalized = [event.liability for event in block.reverted_events if isinstance(event, Finalized)]
         log.warning("the chain took back %d contracts and %d endings", len(created), len(finalized))
         for address in created:
             with liability_context(address):

@@ -98,7 +98,9 @@ class Listener:
         """Read from the ledger's cursor on."""
         token = await self._chain.names.address(self._token) if self._token else ""
         cursor, history = await self._memory()
-        async with aclosing(self._chain.follow(cursor + 1, token=token, history=history)) as blocks:
+        async with aclosing(
+            self._chain.follow(cursor + 1, token=token, history=history, outages=self._trouble)
+        ) as blocks:
             async for block in blocks:
                 self._trouble.recovered(f"the chain can be read again, from block {block.block_number}")
                 if isinstance(block, Reorganisation):
@@ -142,8 +144,8 @@ class Listener:
 
     async def _take_back(self, block: Reorganisation) -> None:
         """The chain replaced blocks: what was told of them did not happen, unless the new blocks say so again."""
-        log.warning("the chain replaced all after block %d", block.back_to)
-        for event in block.events_taken_back:
+        log.warning("the chain replaced all after block %d", block.block_number)
+        for event in block.reverted_events:
             match event:
                 case NewLiability():
                     await self._party.unmade(event.liability)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from contextlib import aclosing
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -13,6 +15,7 @@ from mesh.cli.liability.show import print_liability
 from mesh.cli.liability.words import OUTCOMES, facts_of, short, state_of, units_of
 from mesh.cli.opening import for_reading, own_address, reading
 from mesh.cli.printing import print_json, say, with_json
+from mesh.outage_log import OutageLog
 from mesh.running import run_to_end
 
 if TYPE_CHECKING:
@@ -20,8 +23,11 @@ if TYPE_CHECKING:
 
     from mesh.chain import BlockEvents, Chain
     from mesh.cli.amounts import Unit
+    from mesh.errors import AiraError
     from mesh.settings import Settings
     from schemas.liability import Liability
+
+log = logging.getLogger(__name__)
 
 
 @click.command("watch")
@@ -103,24 +109,29 @@ class TakenBack:
         return f"the chain was reorganised: {self.liability} was not {self.what} after all"
 
 
-async def _followed(chain: Chain, cursor: int) -> AsyncIterator[Happening | TakenBack]:
-    """What happens to liabilities from a block on; a node that is lost is waited for, which is said once."""
-    from mesh.chain import History, NodeUnreachable, RequestRefused
+class _SaidOutages(OutageLog):
+    """Says on standard error that the node is lost, once an outage."""
 
-    history, is_lost = History(chain.node.timing.reorg_depth), False
-    while True:
-        try:
-            async with aclosing(chain.follow(cursor, history=history)) as blocks:
-                async for block in blocks:
-                    happenings = await _happenings(chain, block)
-                    cursor, is_lost = block.block_number + 1, False
-                    for happening in happenings:
-                        yield happening
-        except (NodeUnreachable, RequestRefused) as error:
-            if not is_lost:
-                click.echo(f"aira: {error}; waiting for it", err=True)
-            is_lost = True
-        await asyncio.sleep(chain.node.timing.poll_interval)
+    def __init__(self) -> None:
+        super().__init__(log, "chain")
+        self._is_down = False
+
+    def failed(self, error: AiraError, consequence: str) -> None:
+        if not self._is_down:
+            click.echo(f"aira: {error}; waiting for it", err=True)
+        self._is_down = True
+
+    def recovered(self, message: str) -> None:
+        self._is_down = False
+
+
+async def _followed(chain: Chain, cursor: int) -> AsyncIterator[Happening | TakenBack]:
+    """What happens to liabilities from a block on; outages of the node are survived, and said once."""
+    outages = _SaidOutages()
+    async with aclosing(chain.follow(cursor, outages=outages)) as blocks:
+        async for block in blocks:
+            for happening in await chain.retrying(partial(_happenings, chain, block), outages=outages):
+                yield happening
 
 
 async def _happenings(chain: Chain, block: BlockEvents) -> list[Happening | TakenBack]:
@@ -129,7 +140,7 @@ async def _happenings(chain: Chain, block: BlockEvents) -> list[Happening | Take
 
     words = {NewLiability: "made", Finalized: "ended"}
     found: list[Happening | TakenBack] = []
-    for event in block.events_taken_back if isinstance(block, Reorganisation) else ():
+    for event in block.reverted_events if isinstance(block, Reorganisation) else ():
         if isinstance(event, NewLiability | Finalized):
             found.append(TakenBack(what=words[type(event)], liability=event.liability, tx=event.tx))
     for event in block.events:

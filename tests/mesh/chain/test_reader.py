@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import logging
+from contextlib import aclosing
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -19,6 +21,7 @@ from mesh.chain import (
     NewLiability,
     NewLighthouse,
     NodeUnreachable,
+    NotALiability,
     Online,
     Transfer,
     deploy,
@@ -29,6 +32,8 @@ from mesh.devchain.embedded import EmbeddedProvider
 from mesh.devchain.jsonrpc import RpcError
 from schemas.address import ZERO_ADDRESS
 from tests.mesh.chain.conftest import QUICK, Flaky, events_of, read_to
+from tests.support.log_events import logged_events, logged_facts
+from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from web3.types import RPCEndpoint, RPCResponse
@@ -159,7 +164,7 @@ class _Choosy(EmbeddedProvider):
         return await super().make_request(method, params)
 
 
-async def test_a_node_that_refuses_long_ranges_is_asked_for_shorter_ones() -> None:
+async def test_a_node_that_refuses_long_ranges_is_asked_for_shorter_ones(caplog: pytest.LogCaptureFixture) -> None:
     async with EmbeddedChain() as node:
         deployer = await _prepare_lonely(node)
         async with Chain(node.provider, account=deployer, timing=QUICK) as chain:
@@ -175,9 +180,12 @@ async def test_a_node_that_refuses_long_ranges_is_asked_for_shorter_ones() -> No
         assert min(choosy.ranges) >= 3
 
         choosy.limit = 0
-        async with Chain(choosy, timing=QUICK) as chain:
-            with pytest.raises(RequestRefused, match="10000 results"):
-                await read_to(chain, 0, head)
+        async with Chain(choosy, timing=QUICK) as chain, aclosing(chain.follow(0)) as events:
+            reading = asyncio.create_task(anext(events))
+            await until(lambda: "chain-outage" in logged_events(caplog))
+            choosy.limit = 10
+            assert (await reading).block_number == 0
+        assert logged_facts(caplog, "chain-outage") == [{"code": RequestRefused.code}]
 
 
 async def _prepare_lonely(node: EmbeddedChain) -> Account:
@@ -187,7 +195,8 @@ async def _prepare_lonely(node: EmbeddedChain) -> Account:
     return deployer
 
 
-async def test_a_lost_node_ends_the_reading_and_the_cursor_takes_it_up() -> None:
+async def test_following_goes_on_after_an_outage_of_the_node(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
     async with EmbeddedChain() as node:
         await _prepare_lonely(node)
         flaky = Flaky(node)
@@ -196,8 +205,27 @@ async def test_a_lost_node_ends_the_reading_and_the_cursor_takes_it_up() -> None
             events = chain.follow(head + 1)
             waiting = asyncio.create_task(anext(events))
             flaky.is_lost = True
+            await until(lambda: "chain-outage" in logged_events(caplog))
             with pytest.raises(NodeUnreachable, match="wire is cut"):
-                await waiting
+                await chain.block_number()
+            assert not waiting.done()
             flaky.is_lost = False
+            await until(lambda: "chain-recovered" in logged_events(caplog))
             await node.mine(1)
-            assert (await read_to(chain, head + 1, head + 1))[-1] == BlockEvents(head + 1, ())
+            assert await waiting == BlockEvents(head + 1, ())
+        assert logged_facts(caplog, "chain-outage") == [{"code": NodeUnreachable.code}]
+
+
+async def test_a_question_is_repeated_until_the_node_answers(caplog: pytest.LogCaptureFixture) -> None:
+    async with EmbeddedChain() as node:
+        await _prepare_lonely(node)
+        flaky = Flaky(node)
+        async with Chain(flaky, timing=QUICK) as chain:
+            flaky.is_lost = True
+            asking = asyncio.create_task(chain.retrying(chain.block_number))
+            await until(lambda: "chain-outage" in logged_events(caplog))
+            flaky.is_lost = False
+            assert await asking == await chain.block_number()
+            with pytest.raises(NotALiability):
+                await chain.retrying(lambda: chain.liabilities.get(chain.factory))
+    assert logged_events(caplog).count("chain-outage") == 1

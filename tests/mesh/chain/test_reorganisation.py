@@ -17,16 +17,17 @@ from mesh.chain import (
     ChainWentBack,
     History,
     Node,
-    NodeUnreachable,
     Reorganisation,
     ReorganisedTooDeep,
     deploy,
 )
-from mesh.chain.history import Remembered
+from mesh.chain.reader import SeenBlock
 from mesh.devchain import EmbeddedChain
 from mesh.errors import ConfigurationError, InputError
 from tests.mesh.chain.conftest import QUICK
+from tests.support.log_events import logged_events
 from tests.support.nodes import Anvil
+from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterator, Callable
@@ -117,13 +118,13 @@ async def test_events_of_replaced_blocks_are_taken_back_newest_first_before_the_
         await fork.replace_last(2)
         *_, back = await _until(events, _is_reorganised)
         assert isinstance(back, Reorganisation)
-        assert (back.back_to, back.block_number, back.events) == (start, start, ())
-        assert _values(back.events_taken_back) == [3, 2]
+        assert (back.block_number, back.events) == (start, ())
+        assert _values(back.reverted_events) == [3, 2]
         head = await fork.approve(4)
         new = await _until(events, _reaches(head))
     assert [_values(block.events) for block in first] == [[1]]
     assert [value for block in new for value in _values(block.events)] == [4]
-    assert min(block.block_number for block in new) > back.back_to
+    assert min(block.block_number for block in new) > back.block_number
 
 
 async def test_a_reorganisation_while_nobody_read_is_told_first_with_the_history_that_was_kept(fork: Fork) -> None:
@@ -138,7 +139,7 @@ async def test_a_reorganisation_while_nobody_read_is_told_first_with_the_history
     async with aclosing(chain.follow(head + 1, history=kept)) as events:
         back = await anext(events)
         assert isinstance(back, Reorganisation)
-        assert (back.back_to, _values(back.events_taken_back)) == (start, [2])
+        assert (back.block_number, _values(back.reverted_events)) == (start, [2])
         assert await anext(events) == BlockEvents(head + 1, ())
 
 
@@ -171,7 +172,7 @@ async def test_a_reorganisation_of_the_whole_depth_is_unwound_and_a_deeper_one_i
         await fork.replace_last(3)
         *_, back = await _until(events, _is_reorganised)
         assert isinstance(back, Reorganisation)
-        assert (back.back_to, _values(back.events_taken_back)) == (start, [4, 3, 2])
+        assert (back.block_number, _values(back.reverted_events)) == (start, [4, 3, 2])
         for value in (5, 6, 7, 8):
             head = await fork.approve(value)
             await _until(events, _reaches(head))
@@ -193,7 +194,7 @@ async def test_a_block_that_was_handled_in_part_is_told_again_or_taken_back(fork
     async with aclosing(chain.follow(start, history=history)) as events:
         back = await anext(events)
     assert isinstance(back, Reorganisation)
-    assert (back.back_to, _values(back.events_taken_back)) == (start - 1, [1])
+    assert (back.block_number, _values(back.reverted_events)) == (start - 1, [1])
 
 
 async def test_a_node_that_is_behind_is_waited_for_by_who_read_further(fork: Fork) -> None:
@@ -203,7 +204,7 @@ async def test_a_node_that_is_behind_is_waited_for_by_who_read_further(fork: For
         head = await fork.approve(value)
     async with aclosing(chain.follow(head - 2, history=history)) as events:
         await _until(events, _reaches(head))
-    history.remember(Remembered(head + 2, bytes(32), ()))
+    history.remember(SeenBlock(head + 2, bytes(32), ()))
     with pytest.raises(ChainWentBack):
         await anext(chain.follow(head + 3))
     async with aclosing(chain.follow(head + 3, history=history)) as events:
@@ -214,7 +215,7 @@ async def test_a_node_that_is_behind_is_waited_for_by_who_read_further(fork: For
         await fork.request("evm_mine")
         back = await waiting
     assert isinstance(back, Reorganisation)
-    assert back.back_to == head
+    assert back.block_number == head
 
 
 @asynccontextmanager
@@ -225,7 +226,9 @@ async def _anvil_with_state(folder: Path) -> AsyncIterator[Anvil]:
         yield anvil
 
 
-async def test_a_node_that_is_killed_and_started_from_its_state_takes_back_what_it_lost(tmp_path: Path) -> None:
+async def test_a_node_that_is_killed_and_started_from_its_state_takes_back_what_it_lost(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     state = tmp_path / "state.json"
     async with _anvil_with_state(tmp_path) as anvil:
         account, friend = (Account.from_key(key) for key in anvil.private_keys[:2])
@@ -244,15 +247,14 @@ async def test_a_node_that_is_killed_and_started_from_its_state_takes_back_what_
                 lost = await fork.approve(2)
                 await _until(events, _reaches(lost))
                 await asyncio.to_thread(anvil.kill)
-                with pytest.raises(NodeUnreachable):
-                    await anext(events)
-            await asyncio.to_thread(anvil.start)
-            assert await chain.block_number() == kept
-            await fork.approve(3)
-            async with aclosing(chain.follow(lost + 1, history=history)) as events:
-                back, new = await anext(events), await anext(events)
+                following = asyncio.create_task(_until(events, _reaches(lost)))
+                await until(lambda: "chain-outage" in logged_events(caplog))
+                await asyncio.to_thread(anvil.start)
+                assert await chain.block_number() == kept
+                await fork.approve(3)
+                back, new = await following
     assert isinstance(back, Reorganisation)
-    assert (back.back_to, _values(back.events_taken_back)) == (kept, [2])
+    assert (back.block_number, _values(back.reverted_events)) == (kept, [2])
     assert (new.block_number, _values(new.events)) == (lost, [3])
 
 
@@ -278,7 +280,7 @@ async def test_a_chain_started_afresh_is_not_taken_for_the_one_that_was_read() -
 def test_a_history_survives_as_bytes_and_what_is_none_is_refused() -> None:
     history = History(depth=2)
     for number in (5, 6, 9):
-        history.remember(Remembered(number, number.to_bytes(32, "big"), (Approval("a", "b", 2**256 - 1, "0x"),)))
+        history.remember(SeenBlock(number, number.to_bytes(32, "big"), (Approval("a", "b", 2**256 - 1, "0x"),)))
     again = History.decode(history.encode())
     assert (again.depth, again.blocks) == (2, history.blocks)
     assert [block.block_number for block in again.blocks] == [6, 9]
