@@ -1,4 +1,4 @@
-"""What travels in the mesh: messages, keys, names of content, hashes and signatures. Pure: no network, no chain."""
+"""What travels in the mesh: messages, keys, CIDs, hashes and signatures. Pure: no network, no chain, no disk."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ if TYPE_CHECKING:
         address_bytes,
         checksum_address,
         is_ens_name,
+        keccak256,
         parse_address,
         parse_address_or_name,
     )
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
         InvalidPayload,
         InvalidRecord,
     )
-    from schemas.keccak import keccak256
     from schemas.keys import (
         AgentKey,
         CidKey,
@@ -54,7 +54,6 @@ if TYPE_CHECKING:
         presence_selector,
         topic_selector,
     )
-    from schemas.liability import Liability
     from schemas.messages import (
         MAX_UINT256,
         Demand,
@@ -65,119 +64,57 @@ if TYPE_CHECKING:
         Result,
         SignedMessage,
         TransactionFeedback,
+        names_in,
+        resolve_names,
     )
-    from schemas.names import names_in, resolve_names
-    from schemas.packing import cancellation_hash, message_hash, order_abi
     from schemas.payloads import EMPTY, JSON, RAW, STRING, Empty, PayloadType, String, payload_type
-    from schemas.records import Record, UInt256
+    from schemas.records import Liability, Record, UInt256
     from schemas.signing import Signer, Verified, recover, verify, verify_hashed, verify_message
     from schemas.unixfs import (
         CHUNK_SIZE,
         MAX_LINKS,
-        Block,
-        Link,
-        Node,
+        UnixfsBlock,
+        UnixfsLink,
+        UnixfsNode,
         blocks_of_stream,
         cid_of_bytes,
         cid_of_file,
         cid_of_stream,
         parse_block,
     )
-    from schemas.wire import MAX_MESSAGE_SIZE, decode, encode
+    from schemas.wire import MAX_MESSAGE_SIZE, cancellation_hash, decode, encode, message_hash, order_abi
 
-_HOMES: Final = {
-    "AgentKey": "schemas.keys",
-    "AiraError": "schemas.errors",
-    "Block": "schemas.unixfs",
-    "CHUNK_SIZE": "schemas.unixfs",
-    "CidKey": "schemas.keys",
-    "Demand": "schemas.messages",
-    "DemandKey": "schemas.keys",
-    "DeviceTopicKey": "schemas.keys",
-    "EMPTY": "schemas.payloads",
-    "Empty": "schemas.payloads",
-    "EthEventKey": "schemas.keys",
-    "EventKey": "schemas.keys",
-    "FeedbackKey": "schemas.keys",
-    "InputError": "schemas.errors",
-    "InvalidAddress": "schemas.errors",
-    "InvalidCid": "schemas.errors",
-    "InvalidKey": "schemas.errors",
-    "InvalidMessage": "schemas.errors",
-    "InvalidPayload": "schemas.errors",
-    "InvalidRecord": "schemas.errors",
-    "JSON": "schemas.payloads",
-    "Key": "schemas.keys",
-    "Liability": "schemas.liability",
-    "LiabilityTopicKey": "schemas.keys",
-    "Link": "schemas.unixfs",
-    "MAX_LINKS": "schemas.unixfs",
-    "MAX_MESSAGE_SIZE": "schemas.wire",
-    "MAX_UINT256": "schemas.messages",
-    "MarketKey": "schemas.keys",
-    "Message": "schemas.messages",
-    "Node": "schemas.unixfs",
-    "ObjectiveTopicKey": "schemas.keys",
-    "Offer": "schemas.messages",
-    "OfferKey": "schemas.keys",
-    "Order": "schemas.messages",
-    "OrderFeedback": "schemas.messages",
-    "PayloadType": "schemas.payloads",
-    "PendingKey": "schemas.keys",
-    "PresenceKey": "schemas.keys",
-    "RAW": "schemas.payloads",
-    "Record": "schemas.records",
-    "RejectKey": "schemas.keys",
-    "Result": "schemas.messages",
-    "ResultKey": "schemas.keys",
-    "RpcKey": "schemas.keys",
-    "STRING": "schemas.payloads",
-    "SignedMessage": "schemas.messages",
-    "Signer": "schemas.signing",
-    "String": "schemas.payloads",
-    "TransactionFeedback": "schemas.messages",
-    "UInt256": "schemas.records",
-    "Verified": "schemas.signing",
-    "ZERO_ADDRESS": "schemas.address",
-    "address_bytes": "schemas.address",
-    "blocks_of_stream": "schemas.unixfs",
-    "cancellation_hash": "schemas.packing",
-    "checksum_address": "schemas.address",
-    "cid_of_bytes": "schemas.unixfs",
-    "cid_of_digest": "schemas.cid",
-    "cid_of_file": "schemas.unixfs",
-    "cid_of_stream": "schemas.unixfs",
-    "decode": "schemas.wire",
-    "device_selector": "schemas.keys",
-    "encode": "schemas.wire",
-    "event_selector": "schemas.keys",
-    "format_cid": "schemas.cid",
-    "is_ens_name": "schemas.address",
-    "keccak256": "schemas.keccak",
-    "lighthouse_selector": "schemas.keys",
-    "market_selector": "schemas.keys",
-    "message_hash": "schemas.packing",
-    "names_in": "schemas.names",
-    "objective_selector": "schemas.keys",
-    "order_abi": "schemas.packing",
-    "parse_address": "schemas.address",
-    "parse_address_or_name": "schemas.address",
-    "parse_block": "schemas.unixfs",
-    "parse_cid": "schemas.cid",
-    "parse_key": "schemas.keys",
-    "payload_type": "schemas.payloads",
-    "presence_selector": "schemas.keys",
-    "recover": "schemas.signing",
-    "resolve_names": "schemas.names",
-    "topic_selector": "schemas.keys",
-    "verify": "schemas.signing",
-    "verify_hashed": "schemas.signing",
-    "verify_message": "schemas.signing",
+_NAMES: Final = {
+    "address": (
+        "ZERO_ADDRESS address_bytes checksum_address is_ens_name keccak256 parse_address parse_address_or_name"
+    ),
+    "cid": ("cid_of_digest format_cid parse_cid"),
+    "errors": ("AiraError InputError InvalidAddress InvalidCid InvalidKey InvalidMessage InvalidPayload InvalidRecord"),
+    "keys": (
+        "AgentKey CidKey DemandKey DeviceTopicKey EthEventKey EventKey FeedbackKey Key LiabilityTopicKey "
+        "MarketKey ObjectiveTopicKey OfferKey PendingKey PresenceKey RejectKey ResultKey RpcKey "
+        "device_selector event_selector lighthouse_selector market_selector objective_selector parse_key "
+        "presence_selector topic_selector"
+    ),
+    "messages": (
+        "Demand MAX_UINT256 Message Offer Order OrderFeedback Result SignedMessage TransactionFeedback "
+        "names_in resolve_names"
+    ),
+    "payloads": ("EMPTY Empty JSON PayloadType RAW STRING String payload_type"),
+    "records": ("Liability Record UInt256"),
+    "signing": ("Signer Verified recover verify verify_hashed verify_message"),
+    "unixfs": (
+        "CHUNK_SIZE MAX_LINKS UnixfsBlock UnixfsLink UnixfsNode blocks_of_stream cid_of_bytes cid_of_file "
+        "cid_of_stream parse_block"
+    ),
+    "wire": ("MAX_MESSAGE_SIZE cancellation_hash decode encode message_hash order_abi"),
 }
-"""The module of each name, which is loaded when the name is asked for."""
+"""The public names of each module, which is loaded when one of them is first used."""
 
-# A device's agent speaks of keys and payloads, and must not pay for signatures.
-__getattr__ = on_demand(__name__, _HOMES)
+# A device's agent uses keys and payloads, and must not load what signatures need.
+__getattr__ = on_demand(
+    __name__, {name: f"schemas.{module}" for module, names in _NAMES.items() for name in names.split()}
+)
 
 __all__ = [
     "CHUNK_SIZE",
@@ -191,7 +128,6 @@ __all__ = [
     "ZERO_ADDRESS",
     "AgentKey",
     "AiraError",
-    "Block",
     "CidKey",
     "Demand",
     "DemandKey",
@@ -210,10 +146,8 @@ __all__ = [
     "Key",
     "Liability",
     "LiabilityTopicKey",
-    "Link",
     "MarketKey",
     "Message",
-    "Node",
     "ObjectiveTopicKey",
     "Offer",
     "OfferKey",
@@ -232,6 +166,9 @@ __all__ = [
     "String",
     "TransactionFeedback",
     "UInt256",
+    "UnixfsBlock",
+    "UnixfsLink",
+    "UnixfsNode",
     "Verified",
     "address_bytes",
     "blocks_of_stream",

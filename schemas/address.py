@@ -1,7 +1,7 @@
-"""Ethereum addresses and the ENS names that may stand in for them.
+"""Ethereum addresses, the ENS names that may replace them, and the hash that both rest on.
 
-Inside the program an address is its EIP-55 text (`0x` and 40 digits in mixed case), so that equal addresses are equal
-strings. Everything here is cached, because the same few lighthouses, tokens and agents occur in every message.
+Inside the program an address is its EIP-55 text (`0x` and 40 digits in mixed case), so equal addresses are equal
+strings. Parsing is cached, because the same few lighthouses, tokens and agents occur in every message.
 """
 
 from __future__ import annotations
@@ -9,8 +9,9 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Final
 
+from sha3 import keccak_256  # type: ignore[import-untyped]
+
 from schemas.errors import InvalidAddress
-from schemas.keccak import keccak256
 
 ZERO_ADDRESS: Final = "0x0000000000000000000000000000000000000000"
 
@@ -19,6 +20,12 @@ _MAX_NAME: Final = 255
 _LABEL: Final = frozenset("abcdefghijklmnopqrstuvwxyz0123456789-_")
 _TOP_LEVEL: Final = (".eth", ".sid", ".test")
 _LOW_BIT_OF_40: Final = int.from_bytes(b"\x01" * 40, "big")
+
+
+def keccak256(data: bytes) -> bytes:
+    """The 32-byte Keccak-256 digest of `data`, with Ethereum's padding (not that of SHA3-256)."""
+    digest: bytes = keccak_256(data).digest()
+    return digest
 
 
 def checksum_address(raw: bytes) -> str:

@@ -15,8 +15,8 @@ from typing import Final, Literal, TypeAlias
 from msgspec import Struct
 from msgspec.structs import force_setattr
 
-from schemas.chunks import CANONICAL, address_chunk, check_event, cid_chunk, lighthouse_chunk, name_chunk
 from schemas.errors import InvalidKey
+from schemas.key_chunks import CANONICAL, address_chunk, check_event, cid_chunk, lighthouse_chunk, name_chunk
 
 LiabilityEvent: TypeAlias = Literal["incoming", "ready", "complete", "finalized"]
 EthEvent: TypeAlias = Literal["transfer", "approval"]

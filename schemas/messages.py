@@ -1,8 +1,12 @@
 """The messages of a market: Demand, Offer and Result, and the feedback of generation 5.
 
-A message that exists is well-formed: the constructors check every field, bring it to its canonical form (addresses in
-EIP-55, ENS names and hexadecimal digits in lower case and without `0x`) and raise `InvalidMessage` for what can't be.
-What they can't know is whether the signature is right; `schemas.signing` says that.
+Every message object is well-formed: the constructors check each field, bring it to its canonical form (addresses in
+EIP-55, ENS names and hexadecimal digits in lower case and without `0x`) and raise `InvalidMessage` for what is wrong.
+They don't verify the signature; `schemas.signing` does. A message is hashed with addresses only: collect its ENS names
+with `names_in`, look them up on a chain, and replace them with `resolve_names`.
+
+To add a kind of message: its class here, in `MESSAGE_TYPES`; what its hash covers in `schemas.wire`; its key in
+`schemas.keys`.
 
 Amounts are integers of at most 256 bits: `cost` in the token's smallest unit, fees in wn (10^-9 XRT), `deadline` is a
 block number (the order is valid while `block.number < deadline`). Source: the wire format of the legacy network.
@@ -11,26 +15,46 @@ block number (the order is valid while `block.number < deadline`). Source: the w
 from __future__ import annotations
 
 from sys import intern
-from typing import Final, Literal, NoReturn, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, Final, Literal, NoReturn, TypeAlias, TypeVar
 
 from msgspec import Struct
-from msgspec.structs import force_setattr
+from msgspec.structs import force_setattr, replace
 
-from schemas.address import parse_address_or_name
+from schemas.address import parse_address, parse_address_or_name
 from schemas.cid import parse_cid
 from schemas.errors import InvalidAddress, InvalidCid, InvalidMessage
+from schemas.keys import MarketKind  # msgspec reads the annotations
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 MAX_UINT256: Final = 2**256 - 1
 
 SIGNATURE_SIZE: Final = 65
 
+_NO_NAMES: Final[frozenset[str]] = frozenset()
+
 
 class _Message(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True, gc=False):
-    """What all messages have in common: an unknown field is an error, and one that is not set is not written."""
+    """The base of all messages: an unknown field is an error, and a field that is not set is not written."""
+
+    kind: ClassVar[MarketKind]
+    """The name of the kind, as keys and metrics have it."""
+    mark: ClassVar[str]
+    """The field on the wire by which a reader recognizes the kind."""
+    address_fields: ClassVar[tuple[str, ...]] = ()
+    """The fields that hold an address or an ENS name."""
+
+    @property
+    def key_chunk(self) -> str:
+        """What its key names before the message's hash."""
+        raise NotImplementedError
 
 
-class _Terms(_Message, frozen=True, kw_only=True, rename="camel"):
-    """What a Demand and an Offer have in common."""
+class _Order(_Message, frozen=True, kw_only=True, rename="camel"):
+    """The fields that a Demand and an Offer have in common."""
+
+    address_fields: ClassVar[tuple[str, ...]] = ("token", "lighthouse", "validator", "sender")
 
     model: str
     objective: str
@@ -42,6 +66,11 @@ class _Terms(_Message, frozen=True, kw_only=True, rename="camel"):
     nonce: str | int
     sender: str | None = None
     signature: str = ""
+
+    @property
+    def key_chunk(self) -> str:
+        """The model's CID."""
+        return self.model
 
     @property
     def generation(self) -> Literal[3, 5]:
@@ -71,40 +100,44 @@ class _Terms(_Message, frozen=True, kw_only=True, rename="camel"):
             if type(nonce) is not int:
                 raise InvalidMessage("nonce", "the nonce of a generation-5 order is an integer")
             _check_uint256("nonce", nonce)
-        elif type(nonce) is not str:
+            return
+        digits = _hex_digits(nonce, 32) if type(nonce) is str else None
+        if digits is None:
             raise InvalidMessage("nonce", "the nonce of a generation-3 order is 64 hexadecimal digits")
-        else:
-            digits = _hex_digits(nonce, 32)
-            if digits is None:
-                raise InvalidMessage("nonce", "the nonce of a generation-3 order is 64 hexadecimal digits")
-            if digits != nonce:
-                force_setattr(self, "nonce", digits)
+        if digits != nonce:
+            force_setattr(self, "nonce", digits)
 
 
-class Demand(_Terms, frozen=True, kw_only=True):
+class Demand(_Order, frozen=True, kw_only=True):
     """A promisee's order: who does `objective` by `model` until `deadline` gets `cost` of `token`.
 
     `nonce` is 64 hexadecimal digits in generation 3 and the factory's `nonceOf(sender)` in generation 5; `sender` is
     there in generation 5 only. `validator` is the zero address if there is none; `validator_fee` is in wn.
     """
 
+    kind: ClassVar[MarketKind] = "demand"
+    mark: ClassVar[str] = "validatorFee"
+
     validator_fee: int
 
     def __post_init__(self) -> None:
-        _Terms.__post_init__(self)
+        _Order.__post_init__(self)
         _check_uint256("validatorFee", self.validator_fee)
 
 
-class Offer(_Terms, frozen=True, kw_only=True):
+class Offer(_Order, frozen=True, kw_only=True):
     """A promisor's order: does `objective` by `model` for `cost` of `token`.
 
     It pays `lighthouse_fee` wn to the provider; `nonce` and `sender` are as in a `Demand`.
     """
 
+    kind: ClassVar[MarketKind] = "offer"
+    mark: ClassVar[str] = "lighthouseFee"
+
     lighthouse_fee: int
 
     def __post_init__(self) -> None:
-        _Terms.__post_init__(self)
+        _Order.__post_init__(self)
         _check_uint256("lighthouseFee", self.lighthouse_fee)
 
 
@@ -115,10 +148,19 @@ class Result(_Message, frozen=True, kw_only=True):
     address of the one who asked.
     """
 
+    kind: ClassVar[MarketKind] = "result"
+    mark: ClassVar[str] = "liability"
+    address_fields: ClassVar[tuple[str, ...]] = ("liability",)
+
     liability: str
     result: str
     success: bool
     signature: str = ""
+
+    @property
+    def key_chunk(self) -> str:
+        """The liability's address, in lower case."""
+        return self.liability.lower()
 
     def __post_init__(self) -> None:
         try:
@@ -137,9 +179,17 @@ class OrderFeedback(_Message, frozen=True, kw_only=True):
     What its signature covers is not documented, so it can't be verified.
     """
 
+    kind: ClassVar[MarketKind] = "feedback"
+    mark: ClassVar[str] = "accepted"
+
     order: str
     accepted: int
     signature: str
+
+    @property
+    def key_chunk(self) -> str:
+        """The order's hash."""
+        return self.order
 
     def __post_init__(self) -> None:
         _settle_hash(self, "order", self.order)
@@ -150,7 +200,15 @@ class OrderFeedback(_Message, frozen=True, kw_only=True):
 class TransactionFeedback(_Message, frozen=True, kw_only=True):
     """A generation-5 provider's word that it has sent a transaction: `tx` is its hash, 64 hexadecimal digits."""
 
+    kind: ClassVar[MarketKind] = "pending"
+    mark: ClassVar[str] = "tx"
+
     tx: str
+
+    @property
+    def key_chunk(self) -> str:
+        """The transaction's hash."""
+        return self.tx
 
     def __post_init__(self) -> None:
         _settle_hash(self, "tx", self.tx)
@@ -159,6 +217,34 @@ class TransactionFeedback(_Message, frozen=True, kw_only=True):
 Order: TypeAlias = Demand | Offer
 SignedMessage: TypeAlias = Demand | Offer | Result
 Message: TypeAlias = Demand | Offer | Result | OrderFeedback | TransactionFeedback
+
+MESSAGE_TYPES: Final[tuple[type[Message], ...]] = (Demand, Offer, OrderFeedback, TransactionFeedback, Result)
+"""Every kind of message, in the order in which a reader looks for their marks: the first that is present decides."""
+
+
+_AnyMessage = TypeVar("_AnyMessage", bound=Message)
+
+
+def names_in(message: Message) -> frozenset[str]:
+    """The ENS names in the address fields of a message, in lower case."""
+    # Every ENS name has a dot, and no address has one. Every message passes here.
+    texts = (getattr(message, field) for field in message.address_fields)
+    names = [text for text in texts if text is not None and "." in text]
+    return frozenset(names) if names else _NO_NAMES
+
+
+def resolve_names(message: _AnyMessage, addresses: Mapping[str, str]) -> _AnyMessage:
+    """The message with every ENS name replaced by its address; `addresses` maps lower-case names to addresses.
+
+    Raises `InvalidMessage` (`unresolved-name`) if a name is missing, `InvalidAddress` if it maps to no address.
+    """
+    names = names_in(message)
+    if not names:
+        return message
+    if missing := names - addresses.keys():
+        raise InvalidMessage("unresolved-name", f"no address is known for {', '.join(sorted(missing))}")
+    texts = {field: getattr(message, field) for field in message.__struct_fields__}
+    return replace(message, **{field: parse_address(addresses[text]) for field, text in texts.items() if text in names})
 
 
 def _settle_address(message: Struct, field: str, text: str) -> None:

@@ -7,8 +7,9 @@ use, std_msgs/Empty and std_msgs/String, are here in full; of other types only t
 from __future__ import annotations
 
 from struct import Struct as Layout
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
+import msgspec
 from msgspec import Struct
 
 from schemas.errors import InvalidPayload
@@ -23,6 +24,8 @@ _MEDIA_TYPES: Final = {
 _ENCODINGS: Final = {media_type: encoding for encoding, media_type in _MEDIA_TYPES.items()}
 _SCHEMA_ENCODINGS: Final = {"ros1": "ros1msg", "json": "jsonschema", "cdr": "ros2msg", "protobuf": "protobuf"}
 _NO_ENCODINGS: Final = ("", "zenoh/bytes")
+_ENCODER: Final = msgspec.json.Encoder()
+_DECODER: Final = msgspec.json.Decoder()
 
 
 class PayloadType(Struct, frozen=True):
@@ -112,3 +115,40 @@ def payload_type(zenoh_encoding: str) -> PayloadType:
     media_type, _, name = zenoh_encoding.partition(";")
     encoding = _ENCODINGS.get(media_type, media_type)
     return PayloadType(encoding, name, _SCHEMA_ENCODINGS.get(encoding, ""))
+
+
+def encode_value(value: object) -> tuple[bytes, PayloadType]:
+    """The payload of a value, and its type.
+
+    `Empty`, `String` and str become the ROS types, bytes travel as they are; a msgspec Struct, a dict or anything else
+    that JSON can hold becomes JSON. Raises `InvalidPayload` for what can't travel.
+    """
+    match value:
+        case Empty() | String():
+            return value.encode(), value.type
+        case str():
+            return String(value).encode(), STRING
+        case bytes() | bytearray() | memoryview():
+            return bytes(value), RAW
+    try:
+        return _ENCODER.encode(value), JSON
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise InvalidPayload(type(value).__name__, str(error)) from None
+
+
+def decode_value(payload: bytes, kind: PayloadType) -> Any:
+    """What a payload of `kind` says: `Empty`, `String`, JSON data, or the bytes themselves for any other type.
+
+    Raises `InvalidPayload` if the payload is not what its type says.
+    """
+    match kind.encoding, kind.schema_name:
+        case "ros1", EMPTY.schema_name:
+            return Empty.decode(payload)
+        case "ros1", STRING.schema_name:
+            return String.decode(payload)
+        case "json", _:
+            try:
+                return _DECODER.decode(payload)
+            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+                raise InvalidPayload("json", str(error)) from None
+    return payload

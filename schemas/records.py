@@ -60,6 +60,29 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return record
 
 
+class Liability(Record, frozen=True, kw_only=True, rename="camel"):
+    """A liability: who does what for whom, for how much, and how it ended.
+
+    Addresses are in EIP-55, `validator` is the zero address if there is none. `model`, `objective` and `result` are
+    CIDs; `result` is empty until the liability is finalized. `cost` is in the token's smallest unit, the fees in wn.
+    """
+
+    address: str
+    model: str
+    objective: str
+    result: str
+    promisee: str
+    promisor: str
+    lighthouse: str
+    lighthouse_fee: UInt256
+    token: str
+    cost: UInt256
+    validator: str
+    validator_fee: UInt256
+    is_success: bool
+    is_finalized: bool
+
+
 @lru_cache(maxsize=128)
 def _amount_fields(kind: type[Record]) -> tuple[str, ...]:
     return tuple(field.name for field in msgspec.structs.fields(kind) if field.type is UInt256)

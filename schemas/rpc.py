@@ -1,8 +1,8 @@
-"""The services of an agent, queryables under `aira/agent/{address}/rpc/`: what is asked and what is answered.
+"""The services of an agent, queryables under `aira/agent/{address}/rpc/`: their requests and replies.
 
-The fields bear the names they had in the legacy stack's ROS services. Amounts are in wei (`eth_balance`) or in the
+The fields have the names they had in the legacy stack's ROS services. Amounts are in wei (`eth_balance`) or in the
 smallest unit of the agent's token, which is XRT (wn) unless its settings name another.
-`SERVICES` says which request and reply belong to a service; an error is Zenoh's error reply with one line of text.
+`SERVICES` maps a service to its request and reply; an error is Zenoh's error reply with one line of text.
 """
 
 from __future__ import annotations
@@ -10,10 +10,9 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from schemas.liability import Liability  # msgspec reads the annotations
 from schemas.logs import LogsRead, ReadLogs
-from schemas.posting import Published, SendDemand, SendOffer, SendResult, SignDemand, SignOffer, SignResult
-from schemas.records import Record, UInt256
+from schemas.message_requests import Published, SendDemand, SendOffer, SendResult, SignDemand, SignOffer, SignResult
+from schemas.records import Liability, Record, UInt256  # msgspec reads the annotations
 from schemas.status import Status
 
 if TYPE_CHECKING:
@@ -82,14 +81,14 @@ class AccountToAddressAllowance(Record, frozen=True):
     to: str
 
 
-class Transfer(Record, frozen=True):
+class TransferRequest(Record, frozen=True):
     """Send `value` wn to `to`."""
 
     to: str
     value: UInt256
 
 
-class TransferFrom(Record, frozen=True):
+class TransferFromRequest(Record, frozen=True):
     """Send `value` wn of `owner`, who has approved it, to `to`."""
 
     owner: str
@@ -176,8 +175,8 @@ SERVICES: Final[Mapping[str, Service]] = MappingProxyType(
         "eth/account_eth_balance": Service(AccountBalance, Balance),
         "eth/eth_balance": Service(Nothing, Balance),
         "eth/current_block": Service(Nothing, BlockNumber),
-        "eth/transfer": Service(Transfer, Transaction),
-        "eth/transfer_from": Service(TransferFrom, Transaction),
+        "eth/transfer": Service(TransferRequest, Transaction),
+        "eth/transfer_from": Service(TransferFromRequest, Transaction),
         "eth/approve": Service(Approve, Transaction),
         "eth/account_xrt_balance": Service(AccountBalance, Balance),
         "eth/xrt_balance": Service(Nothing, Balance),
@@ -199,40 +198,3 @@ GUARDED: Final = SPENDING | {
     "send/result",
 }
 """The services that sign, spend or speak in an agent's name: offered to others only where its settings say so."""
-
-__all__ = [
-    "GUARDED",
-    "SERVICES",
-    "SPENDING",
-    "AccountBalance",
-    "AccountToAddressAllowance",
-    "Accounts",
-    "Allowance",
-    "ApprovalEvent",
-    "Approve",
-    "Balance",
-    "BlockNumber",
-    "Done",
-    "FinishLiability",
-    "LiabilityRead",
-    "LogsRead",
-    "Nothing",
-    "Published",
-    "ReadLiability",
-    "ReadLogs",
-    "RestartLiability",
-    "ResumeLiability",
-    "SendDemand",
-    "SendOffer",
-    "SendResult",
-    "Service",
-    "SignDemand",
-    "SignOffer",
-    "SignResult",
-    "StartLiability",
-    "Status",
-    "Transaction",
-    "Transfer",
-    "TransferEvent",
-    "TransferFrom",
-]

@@ -10,15 +10,14 @@ for a hash and a key, so that a message can't travel twice under two texts.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Final, Generic, TypeVar
+from typing import Final, Generic, Self, TypeVar
 
 from coincurve import PrivateKey, PublicKey
 from msgspec import Struct
 from msgspec.structs import replace
 
-from schemas.address import ZERO_ADDRESS, checksum_address
+from schemas.address import ZERO_ADDRESS, checksum_address, keccak256
 from schemas.errors import InputError, InvalidMessage
-from schemas.keccak import keccak256
 from schemas.messages import (
     SIGNATURE_SIZE,
     OrderFeedback,
@@ -26,8 +25,8 @@ from schemas.messages import (
     SignedMessage,
     TransactionFeedback,
 )
-from schemas.packing import message_hash
-from schemas.wire import decode
+from schemas.records import Record
+from schemas.wire import decode, message_hash
 
 _M = TypeVar("_M", bound=SignedMessage)
 _M_co = TypeVar("_M_co", bound=SignedMessage, covariant=True)
@@ -37,6 +36,8 @@ _CURVE_ORDER: Final = 0xFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFEBAAEDCE6AF48A03BBFD25E8C
 _HIGHEST_S: Final = (_CURVE_ORDER // 2).to_bytes(32, "big")
 _V_OFFSET: Final = 27
 _CACHED: Final = 8192
+_REJECTION_DOMAIN: Final = b"aira rejection\0"
+"""The prefix of what a rejection's signature covers; no message of the market begins like this."""
 
 
 class Verified(Struct, Generic[_M_co], frozen=True, gc=False):
@@ -132,6 +133,38 @@ def verify_hashed(message: _M, digest: bytes) -> Verified[_M]:
     signer = recover(digest, message.signature)
     _check_sender(message, signer)
     return Verified(message, digest, signer)
+
+
+class Rejection(Record, frozen=True, kw_only=True):
+    """Why a provider will not use a message.
+
+    `order` is the message's hash (64 hexadecimal digits), `reason` a machine-readable word (a refusal of the order
+    book, or the name of the contracts' error), `detail` is for people, `provider` the EIP-55 address of who says so,
+    `signature` (130 hexadecimal digits) that account's. Anybody may write one: believe what `is_signed`, of a provider
+    of the lighthouse.
+    """
+
+    order: str
+    reason: str
+    detail: str
+    provider: str
+    signature: str = ""
+
+    def signed_by(self, signer: Signer) -> Self:
+        """The same with the signature of `signer`, whose address `provider` has to be."""
+        return replace(self, signature=signer.sign_hash(self._hash()).hex())
+
+    @property
+    def is_signed(self) -> bool:
+        """Whether the signature is the provider's."""
+        try:
+            return recover(self._hash(), self.signature) == self.provider
+        except InvalidMessage:
+            return False
+
+    def _hash(self) -> bytes:
+        """Of the JSON without the signature, which is written in one way only."""
+        return keccak256(_REJECTION_DOMAIN + replace(self, signature="").encode())
 
 
 def _check_sender(message: SignedMessage, signer: str) -> None:

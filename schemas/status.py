@@ -38,7 +38,7 @@ class Work(Record, frozen=True, kw_only=True, rename="camel", forbid_unknown_fie
     store: StoreUse
 
 
-class Market(Record, frozen=True, kw_only=True, rename="camel", forbid_unknown_fields=False):
+class MarketStatus(Record, frozen=True, kw_only=True, rename="camel", forbid_unknown_fields=False):
     """A provider's market since it began: open orders, contracts, messages rejected by reason, money.
 
     `fees` and `minted` (XRT for gas) are in wn, `spent` is in wei.
@@ -78,10 +78,10 @@ class Status(Record, frozen=True, kw_only=True, rename="camel", forbid_unknown_f
     uptime: float = 0.0
     """Seconds since it began."""
     work: Work | None = None
-    market: Market | None = None
+    market: MarketStatus | None = None
 
 
-class Way(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
+class DirectionStatus(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
     """One direction of a bridge in figures. Counts are since it started; `per_second` is over the last ten seconds."""
 
     received: int
@@ -153,8 +153,8 @@ class BridgeStatus(Record, frozen=True, kw_only=True, rename="camel", forbid_unk
     losses: int
     """How often the daemon was lost."""
     last_error: str
-    to_ipfs: Way
-    to_mesh: Way
+    to_ipfs: DirectionStatus
+    to_mesh: DirectionStatus
     content: ContentMetrics | None = None
     uptime: float = 0.0
     """Seconds since it began."""
@@ -163,17 +163,3 @@ class BridgeStatus(Record, frozen=True, kw_only=True, rename="camel", forbid_unk
 def bridge_status_key(bridge: str, lighthouse: str) -> str:
     """The key on which the bridge of that address answers how it is."""
     return str(RpcKey(bridge, f"{BRIDGE_SERVICE}/{lighthouse}"))
-
-
-__all__ = [
-    "ALIVE",
-    "OFF",
-    "BridgeStatus",
-    "ContentMetrics",
-    "Market",
-    "Status",
-    "StoreUse",
-    "Way",
-    "Work",
-    "bridge_status_key",
-]

@@ -1,8 +1,8 @@
-"""Files as trees of blocks, and their names: what `ipfs add` makes with its long-standing settings.
+"""Files as trees of blocks, and their CIDs, as `ipfs add` has always made them by default.
 
-Chunks of 262,144 bytes, each a UnixFS file leaf in dag-pb; a balanced tree with at most 174 links a node; every block
-named by its sha2-256 digest. The name of the root, a CIDv0, is the name of the file.
-Sources: the dag-pb and UnixFS specifications of IPFS; the CIDs of the legacy network.
+Chunks of 262,144 bytes, each a UnixFS file leaf in dag-pb; a balanced tree with at most 174 links per node; every block
+is named by its sha2-256 digest. The CIDv0 of the root is that of the file. The module ends with as much of the protobuf
+encoding as blocks need. Sources: the dag-pb and UnixFS specifications of IPFS; the CIDs of the legacy network.
 """
 
 from __future__ import annotations
@@ -15,10 +15,9 @@ from msgspec import Struct
 
 from schemas.cid import MULTIHASH_PREFIX, cid_of_digest, format_cid
 from schemas.errors import InputError
-from schemas.protobuf import read_fields, write_bytes, write_length, write_number
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
     from os import PathLike
 
 CHUNK_SIZE: Final = 262_144
@@ -31,25 +30,29 @@ _NODE_DATA, _NODE_LINK = 1, 2
 _LINK_HASH, _LINK_NAME, _LINK_TREE_SIZE = 1, 2, 3
 _UNIXFS_TYPE, _UNIXFS_DATA, _UNIXFS_FILE_SIZE, _UNIXFS_BLOCK_SIZE = 1, 2, 3, 4
 
+_VARINT: Final = 0
+_BYTES: Final = 2
+_MAX_NUMBER: Final = 2**64 - 1
 
-class Block(Struct, frozen=True, gc=False):
+
+class UnixfsBlock(Struct, frozen=True, gc=False):
     """The bytes of one node of the tree, and the CIDv0 that names them."""
 
     cid: str
     data: bytes
 
 
-class Link(Struct, frozen=True, gc=False):
+class UnixfsLink(Struct, frozen=True, gc=False):
     """A link to a part of a file: the CIDv0 of its root block, and how many bytes of the file are below it."""
 
     cid: str
     size: int
 
 
-class Node(Struct, frozen=True, gc=False):
+class UnixfsNode(Struct, frozen=True, gc=False):
     """What a block holds: links to the parts of a file in their order, or the bytes of a part, `file_size` in all."""
 
-    links: tuple[Link, ...]
+    links: tuple[UnixfsLink, ...]
     data: bytes
     file_size: int
 
@@ -62,19 +65,18 @@ class _Child(Struct, frozen=True, gc=False):
     tree_size: int
 
 
-def blocks_of_stream(stream: BinaryIO) -> Iterator[Block]:
+def blocks_of_stream(stream: BinaryIO) -> Iterator[UnixfsBlock]:
     """The blocks of the file that `stream` holds, children before their parents, the root last.
 
-    Reads a chunk at a time (short reads are made up) and keeps no more than a chunk and the open nodes of the tree, so
-    the memory does not grow with the file. Errors of the stream pass through.
+    Memory does not grow with the file: it holds one chunk and the open nodes. Errors of the stream pass through.
     """
-    return _blocks(stream, _leaf)
+    return _blocks(stream, with_data=True)
 
 
 def cid_of_stream(stream: BinaryIO) -> str:
     """The CIDv0 of the file that `stream` holds, from its current position to its end."""
     cid = ""
-    for block in _blocks(stream, _named_leaf):
+    for block in _blocks(stream, with_data=False):
         cid = block.cid
     return cid
 
@@ -90,8 +92,8 @@ def cid_of_file(path: str | PathLike[str]) -> str:
         return cid_of_stream(stream)
 
 
-def parse_block(data: bytes) -> Node:
-    """What a block of a file holds. That its bytes are those its CID names is for the caller to check first.
+def parse_block(data: bytes) -> UnixfsNode:
+    """What a block of a file holds. The caller checks first that the bytes match the block's CID.
 
     Raises `InputError` if the bytes are no dag-pb node with a part of a UnixFS file whose sizes agree, and `InvalidCid`
     if a link's name is no CIDv0.
@@ -112,12 +114,12 @@ def parse_block(data: bytes) -> Node:
     return _node(names, unixfs)
 
 
-def _blocks(stream: BinaryIO, leaf: Callable[[bytes], tuple[Block, _Child]]) -> Iterator[Block]:
+def _blocks(stream: BinaryIO, *, with_data: bool) -> Iterator[UnixfsBlock]:
     levels: list[list[_Child]] = [[]]
     chunk = _read_chunk(stream)
     while True:
         yield from _make_room(levels)
-        block, child = leaf(chunk)
+        block, child = _leaf(chunk, with_data=with_data)
         levels[0].append(child)
         yield block
         if len(chunk) < CHUNK_SIZE:
@@ -129,29 +131,22 @@ def _blocks(stream: BinaryIO, leaf: Callable[[bytes], tuple[Block, _Child]]) -> 
 
 
 def _read_chunk(stream: BinaryIO) -> bytes:
-    parts = []
-    missing = CHUNK_SIZE
+    parts, missing = [], CHUNK_SIZE
     while missing and (part := stream.read(missing)):
         parts.append(part)
         missing -= len(part)
     return parts[0] if len(parts) == 1 else b"".join(parts)
 
 
-def _leaf(chunk: bytes) -> tuple[Block, _Child]:
-    head, tail = _leaf_framing(len(chunk))
-    data = b"".join((head, chunk, tail))
-    digest = sha256(data).digest()
-    return Block(cid_of_digest(digest), data), _Child(digest, len(chunk), len(data))
-
-
-def _named_leaf(chunk: bytes) -> tuple[Block, _Child]:
-    """The same without the block's bytes: to make these takes half as long as to hash them."""
+def _leaf(chunk: bytes, *, with_data: bool) -> tuple[UnixfsBlock, _Child]:
+    """A leaf; without its block's bytes where only names are wanted, as copying them takes half as long as hashing."""
     head, tail = _leaf_framing(len(chunk))
     hashed = sha256(head)
     hashed.update(chunk)
     hashed.update(tail)
     digest = hashed.digest()
-    return Block(cid_of_digest(digest), b""), _Child(digest, len(chunk), len(head) + len(chunk) + len(tail))
+    data = b"".join((head, chunk, tail)) if with_data else b""
+    return UnixfsBlock(cid_of_digest(digest), data), _Child(digest, len(chunk), len(head) + len(chunk) + len(tail))
 
 
 def _leaf_framing(size: int) -> tuple[bytes, bytes]:
@@ -161,7 +156,7 @@ def _leaf_framing(size: int) -> tuple[bytes, bytes]:
     return write_length(_NODE_DATA, len(head) + size + len(tail)) + head, tail
 
 
-def _parent(children: list[_Child]) -> tuple[Block, _Child]:
+def _parent(children: list[_Child]) -> tuple[UnixfsBlock, _Child]:
     file_size = sum(child.file_size for child in children)
     links = b"".join(
         write_bytes(
@@ -180,10 +175,10 @@ def _parent(children: list[_Child]) -> tuple[Block, _Child]:
     data = links + write_bytes(_NODE_DATA, unixfs)
     digest = sha256(data).digest()
     tree_size = len(data) + sum(child.tree_size for child in children)
-    return Block(cid_of_digest(digest), data), _Child(digest, file_size, tree_size)
+    return UnixfsBlock(cid_of_digest(digest), data), _Child(digest, file_size, tree_size)
 
 
-def _make_room(levels: list[list[_Child]]) -> Iterator[Block]:
+def _make_room(levels: list[list[_Child]]) -> Iterator[UnixfsBlock]:
     """Close the nodes that are full, from the lowest level up, because one more leaf is to come."""
     height = 0
     while len(levels[height]) == MAX_LINKS:
@@ -191,7 +186,7 @@ def _make_room(levels: list[list[_Child]]) -> Iterator[Block]:
         height += 1
 
 
-def _close_tree(levels: list[list[_Child]]) -> Iterator[Block]:
+def _close_tree(levels: list[list[_Child]]) -> Iterator[UnixfsBlock]:
     """Close all open nodes, because no more leaf is to come; the last block is the root."""
     height = 0
     while height + 1 < len(levels) or len(levels[height]) > 1:
@@ -199,7 +194,7 @@ def _close_tree(levels: list[list[_Child]]) -> Iterator[Block]:
         height += 1
 
 
-def _close_node(levels: list[list[_Child]], height: int) -> Block:
+def _close_node(levels: list[list[_Child]], height: int) -> UnixfsBlock:
     if height + 1 == len(levels):
         levels.append([])
     block, parent = _parent(levels[height])
@@ -208,11 +203,9 @@ def _close_node(levels: list[list[_Child]], height: int) -> Block:
     return block
 
 
-def _node(names: list[str], unixfs: bytes) -> Node:
-    kind = None
-    data = b""
+def _node(names: list[str], unixfs: bytes) -> UnixfsNode:
+    kind, file_size, data = None, None, b""
     sizes: list[int] = []
-    file_size = None
     for number, value in read_fields(unixfs):
         match number, value:
             case 1, int() if kind is None:
@@ -232,8 +225,8 @@ def _node(names: list[str], unixfs: bytes) -> Node:
     total = len(data) + sum(sizes)
     if file_size not in (None, total):
         raise InputError(f"{total} bytes in the parts, but {file_size} in all")
-    links = tuple(Link(cid, size) for cid, size in zip(names, sizes, strict=True))
-    return Node(links, data, total)
+    links = tuple(UnixfsLink(cid, size) for cid, size in zip(names, sizes, strict=True))
+    return UnixfsNode(links, data, total)
 
 
 def _link_cid(link: bytes) -> str:
@@ -247,3 +240,62 @@ def _expect_bytes(value: int | bytes) -> bytes:
     if isinstance(value, int):
         raise InputError("a dag-pb field holds a number where bytes belong")
     return value
+
+
+def write_number(field: int, value: int) -> bytes:
+    """A field that holds an unsigned integer of at most 64 bits."""
+    return _varint(field << 3 | _VARINT) + _varint(value)
+
+
+def write_bytes(field: int, value: bytes) -> bytes:
+    """A field that holds a byte string."""
+    return write_length(field, len(value)) + value
+
+
+def write_length(field: int, length: int) -> bytes:
+    """What comes before a byte string of that length."""
+    return _varint(field << 3 | _BYTES) + _varint(length)
+
+
+def read_fields(data: bytes) -> Iterator[tuple[int, int | bytes]]:
+    """The fields of a message in their order, as number and value.
+
+    Raises `InputError` for anything but whole numbers and byte strings.
+    """
+    position = 0
+    while position < len(data):
+        key, position = _read_varint(data, position)
+        number, position = _read_varint(data, position)
+        if key & 7 == _VARINT:
+            yield key >> 3, number
+        elif key & 7 == _BYTES:
+            if number > len(data) - position:
+                raise InputError("a protobuf field is longer than what holds it")
+            yield key >> 3, data[position : position + number]
+            position += number
+        else:
+            raise InputError(f"protobuf wire type {key & 7} is not used here")
+
+
+def _varint(value: int) -> bytes:
+    encoded = bytearray()
+    while value > 0x7F:
+        encoded.append(value & 0x7F | 0x80)
+        value >>= 7
+    encoded.append(value)
+    return bytes(encoded)
+
+
+def _read_varint(data: bytes, position: int) -> tuple[int, int]:
+    value = 0
+    for shift in range(0, 70, 7):
+        if position == len(data):
+            raise InputError("a protobuf field is cut off")
+        byte = data[position]
+        position += 1
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            break
+    if byte >= 0x80 or value > _MAX_NUMBER:
+        raise InputError("a protobuf number has more than 64 bits")
+    return value, position

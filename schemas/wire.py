@@ -1,40 +1,42 @@
-"""The JSON of the legacy channel: one message, one object.
+"""Market messages as bytes: the JSON that travels, the hash that is signed, and what the contracts take.
 
-Reading is strict: unknown, repeated and missing fields, fractions where integers belong, and texts that are not quite
-addresses, names or hashes are refused with a reason. Writing is canonical: compact, no `0x` on nonces and signatures.
+Reading JSON is strict: unknown, repeated and missing fields, fractions where integers belong, and texts that are not
+quite addresses, names or hashes are rejected with a reason. Writing is canonical: compact, no `0x` on nonces and
+signatures. Hashes and contract bytes are Solidity's `abi.encodePacked` and `abi.encode`, written out field by field.
 """
 
 from __future__ import annotations
 
-from typing import Final, NoReturn
+from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 import msgspec
 
-from schemas.errors import InvalidMessage
-from schemas.messages import Demand, Message, Offer, OrderFeedback, Result, TransactionFeedback
+from schemas.address import address_bytes, keccak256
+from schemas.cid import parse_cid
+from schemas.errors import InvalidAddress, InvalidMessage
+from schemas.messages import MESSAGE_TYPES, Demand, Message, Offer, Order, Result, TransactionFeedback
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 MAX_MESSAGE_SIZE: Final = 65_536
-"""The longest payload, in bytes, that is looked at. Real messages have about 600."""
+"""The longest payload, in bytes, that is decoded. Real messages have about 600."""
 
-_KINDS: Final[dict[str, type[Message]]] = {
-    "validatorFee": Demand,
-    "lighthouseFee": Offer,
-    "accepted": OrderFeedback,
-    "tx": TransactionFeedback,
-    "liability": Result,
-}
-"""The field that tells the kind of a message; the first that is there decides."""
-
-_MARKS: Final = tuple((f'"{field}"'.encode(), kind) for field, kind in _KINDS.items())
-_DECODERS: Final = {kind: msgspec.json.Decoder(kind) for kind in _KINDS.values()}
-_FIELDS: Final = {kind: msgspec.structs.fields(kind) for kind in _KINDS.values()}
+_TYPE_OF_MARK: Final[dict[str, type[Message]]] = {kind.mark: kind for kind in MESSAGE_TYPES}
+_MARKS: Final = tuple((f'"{mark}"'.encode(), kind) for mark, kind in _TYPE_OF_MARK.items())
+_DECODERS: Final = {kind: msgspec.json.Decoder(kind) for kind in MESSAGE_TYPES}
+_FIELDS: Final = {kind: msgspec.structs.fields(kind) for kind in MESSAGE_TYPES}
 _FIELD_COUNTS: Final = {kind: len(fields) for kind, fields in _FIELDS.items()}
 _ANY_OBJECT: Final = msgspec.json.Decoder(dict[str, msgspec.Raw])
 _ENCODER: Final = msgspec.json.Encoder()
 
+_WORD: Final = 32
+_ABI_HEAD: Final = 10 * _WORD
+_TWELVE_ZEROS: Final = bytes(12)
+
 
 def decode(payload: bytes) -> Message:
-    """The message in `payload`, checked and in canonical form; its signature is there, but not verified.
+    """The message in `payload`, checked and in canonical form; its signature is present, but not verified.
 
     Raises `InvalidMessage` and nothing else, whatever the bytes are. Its `reason` is one of `too-large`, `not-json`,
     `unknown-kind`, `unknown-field`, `duplicate-field`, `field` (missing or of the wrong type), `address`, `cid`,
@@ -42,7 +44,7 @@ def decode(payload: bytes) -> Message:
     """
     if len(payload) > MAX_MESSAGE_SIZE:
         raise InvalidMessage("too-large", f"{len(payload)} bytes, and {MAX_MESSAGE_SIZE} are the most")
-    kind = _kind_of(payload)
+    kind = _type_of(payload)
     try:
         message = _DECODERS[kind].decode(payload)
     except msgspec.ValidationError as error:
@@ -56,8 +58,8 @@ def decode(payload: bytes) -> Message:
         _explain(payload, kind, "the signature is empty", reason="signature")
     if isinstance(message, (Demand, Offer)) and message.sender is None:
         count -= 1
-    # The decoder takes the last of repeated fields. No value of a well-formed message holds a colon, so there is one a
-    # field, and any more belong to repeated ones.
+    # The decoder takes the last of repeated fields. No value of a well-formed message contains a colon, so there is
+    # one colon per field; any more belong to repeated fields.
     if payload.count(b":") != count:
         _explain(payload, kind, "a field is repeated", reason="duplicate-field")
     return message
@@ -66,24 +68,84 @@ def decode(payload: bytes) -> Message:
 def encode(message: Message) -> bytes:
     """The compact JSON of a message, with exactly the fields that the legacy network knows.
 
-    Raises `InvalidMessage` (`signature`) if the message should be signed and isn't: such a one must not travel.
+    Raises `InvalidMessage` (`signature`) if the message should be signed and is not.
     """
     if not isinstance(message, TransactionFeedback) and not message.signature:
         raise InvalidMessage("signature", "the message is not signed; sign it before it travels")
     return _ENCODER.encode(message)
 
 
-def _kind_of(payload: bytes) -> type[Message]:
-    # No value of a well-formed message holds a quotation mark, so a mark that is found is a key. A writer may spell
-    # keys with escapes, and then none is found.
+def message_hash(message: Message) -> bytes:
+    """The 32-byte hash that names a message and that its signature covers: keccak256 of the packed fields.
+
+    Raises `InvalidMessage`: `unresolved-name` if an address is still an ENS name, `unsigned` for the feedback messages,
+    for which no hash is defined.
+    """
+    pack = _PACKERS.get(type(message))
+    if pack is None:
+        raise InvalidMessage("unsigned", f"what is signed in a {type(message).__name__} is not defined")
+    try:
+        return keccak256(pack(message))
+    except InvalidAddress as error:
+        raise _unresolved(error) from None
+
+
+def cancellation_hash(liability: str) -> bytes:
+    """The 32-byte hash that both parties sign to cancel the liability at this address, each with `Signer.sign_hash`.
+
+    It is the keccak256 of the address and the six letters `cancel`: 26 bytes, a length that no message has. Raises
+    `InvalidAddress`.
+    """
+    return keccak256(address_bytes(liability) + b"cancel")
+
+
+def order_abi(order: Order) -> bytes:
+    """The plain `abi.encode` of a signed order's fields: what `createLiability` takes for a demand or an offer.
+
+    Generation 3 carries its nonce in the ninth place, generation 5 its sender, and contracts tell them apart by the
+    twelve zero bytes before an address. Raises `InvalidMessage`: `signature` if the order is not signed,
+    `unresolved-name`, or `nonce` if a generation-3 nonce would be taken for an address.
+    """
+    if not order.signature:
+        raise InvalidMessage("signature", "the order is not signed")
+    try:
+        ninth = _ninth_word(order)
+        parties = (address_bytes(order.lighthouse), address_bytes(order.validator))
+        token = address_bytes(order.token)
+    except InvalidAddress as error:
+        raise _unresolved(error) from None
+    fee = order.validator_fee if isinstance(order, Demand) else order.lighthouse_fee
+    first, second = parties if isinstance(order, Demand) else reversed(parties)
+    contents = (parse_cid(order.model), parse_cid(order.objective), bytes.fromhex(order.signature))
+    tails = [_abi_bytes(content) for content in contents]
+    objective_at = _ABI_HEAD + len(tails[0])
+    signature_at = objective_at + len(tails[1])
+    head = (
+        _word(_ABI_HEAD),
+        _word(objective_at),
+        _padded(token),
+        _word(order.cost),
+        _padded(first),
+        _padded(second),
+        _word(fee),
+        _word(order.deadline),
+        ninth,
+        _word(signature_at),
+    )
+    return b"".join((*head, *tails))
+
+
+def _type_of(payload: bytes) -> type[Message]:
+    # No value of a well-formed message contains a quotation mark, so a mark that is found is a key. A writer may spell
+    # keys with escapes; then none is found and the object is parsed.
     for mark, kind in _MARKS:
         if mark in payload:
             return kind
     present = _fields_of(payload)
-    for field, kind in _KINDS.items():
+    for field, kind in _TYPE_OF_MARK.items():
         if field in present:
             return kind
-    raise InvalidMessage("unknown-kind", f"none of {', '.join(_KINDS)} is there")
+    raise InvalidMessage("unknown-kind", f"none of {', '.join(_TYPE_OF_MARK)} is present")
 
 
 def _fields_of(payload: bytes) -> dict[str, msgspec.Raw]:
@@ -96,10 +158,10 @@ def _fields_of(payload: bytes) -> dict[str, msgspec.Raw]:
 
 
 def _explain(payload: bytes, kind: type[Message], detail: str, *, reason: str = "field") -> NoReturn:
-    """Say in our own words why `payload` is no message, away from the hot path."""
+    """Raise `InvalidMessage` with our own reason why `payload` is no message; not on the hot path."""
     present = _fields_of(payload)
     if "validatorFee" in present and "lighthouseFee" in present:
-        raise InvalidMessage("unknown-kind", "both validatorFee and lighthouseFee are there")
+        raise InvalidMessage("unknown-kind", "it has both validatorFee and lighthouseFee")
     fields = _FIELDS[kind]
     unknown = present.keys() - {field.encode_name for field in fields}
     if unknown:
@@ -110,3 +172,66 @@ def _explain(payload: bytes, kind: type[Message], detail: str, *, reason: str = 
     if bytes(present.get("sender", b"")) == b"null":
         raise InvalidMessage("field", "sender: expected an address")
     raise InvalidMessage(reason, detail)
+
+
+def _pack_order(message: Order) -> bytes:
+    lighthouse = address_bytes(message.lighthouse)
+    validator = address_bytes(message.validator)
+    if isinstance(message, Demand):
+        parties, fee = lighthouse + validator, message.validator_fee
+    else:
+        parties, fee = validator + lighthouse, message.lighthouse_fee
+    if message.sender is None:
+        tail = bytes.fromhex(message.nonce)  # type: ignore[arg-type]  # a text in generation 3
+    else:
+        tail = message.nonce.to_bytes(_WORD, "big") + address_bytes(message.sender)  # type: ignore[union-attr]
+    return b"".join(
+        (
+            parse_cid(message.model),
+            parse_cid(message.objective),
+            address_bytes(message.token),
+            message.cost.to_bytes(_WORD, "big"),
+            parties,
+            fee.to_bytes(_WORD, "big"),
+            message.deadline.to_bytes(_WORD, "big"),
+            tail,
+        )
+    )
+
+
+def _pack_result(message: Result) -> bytes:
+    return address_bytes(message.liability) + parse_cid(message.result) + (b"\1" if message.success else b"\0")
+
+
+_PACKERS: Final[dict[type[Message], Callable[[Any], bytes]]] = {
+    Demand: _pack_order,
+    Offer: _pack_order,
+    Result: _pack_result,
+}
+"""What the hash of a message covers, by its type; for the feedback messages it is not defined."""
+
+
+def _ninth_word(order: Order) -> bytes:
+    if order.sender is not None:
+        return _padded(address_bytes(order.sender))
+    nonce = bytes.fromhex(order.nonce)  # type: ignore[arg-type]  # a text in generation 3
+    if nonce.startswith(_TWELVE_ZEROS):
+        raise InvalidMessage("nonce", "twelve leading zero bytes would make a contract take the nonce for a sender")
+    return nonce
+
+
+def _word(value: int) -> bytes:
+    return value.to_bytes(_WORD, "big")
+
+
+def _padded(address: bytes) -> bytes:
+    return _TWELVE_ZEROS + address
+
+
+def _abi_bytes(data: bytes) -> bytes:
+    return _word(len(data)) + data + bytes(-len(data) % _WORD)
+
+
+def _unresolved(error: InvalidAddress) -> InvalidMessage:
+    # An address field of a message holds an address or a name, so a text that is no address is a name.
+    return InvalidMessage("unresolved-name", f"{error.text} has to be resolved to an address first")

@@ -10,7 +10,7 @@ from schemas.status import ALIVE
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-    from schemas.status import BridgeStatus, ContentMetrics, Way
+    from schemas.status import BridgeStatus, ContentMetrics, DirectionStatus
 
 
 class Standing(NamedTuple):
@@ -68,7 +68,7 @@ def _bridge(bridge: Standing) -> Iterator[Family]:
     yield gauge("aira_bridge_mesh_peers", "Who is on the lighthouse's channel in the mesh", len(status.mesh_peers))
 
 
-def _way(way: Way) -> tuple[Family, ...]:
+def _way(way: DirectionStatus) -> tuple[Family, ...]:
     return (
         counter("aira_bridge_received_total", "Messages that came in on the other side", way.received),
         by_label("aira_bridge_accepted_total", "counter", "Messages let through, by kind", "kind", way.kinds),

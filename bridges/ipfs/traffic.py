@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 from bridges.ipfs.memory import Memory, Side
 from bridges.ipfs.outbox import Outbox, Waiting
 from bridges.ipfs.turns import Turn, first_before
-from schemas.status import Way
+from schemas.status import DirectionStatus
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -145,10 +145,10 @@ class Traffic:
         """The turns of the other bridges that can carry now."""
         return frozenset(self._others)
 
-    def way(self, to: Side, *, per_second: float) -> Way:
+    def way(self, to: Side, *, per_second: float) -> DirectionStatus:
         """The direction towards `to` in figures."""
         counts, outbox = self.counts[to], self.to[to]
-        return Way(
+        return DirectionStatus(
             received=counts["received"],
             invalid=dict(self.invalid[to]),
             known=counts["known"],

@@ -9,8 +9,8 @@ from bridges.serial import roswire
 from bridges.serial.dialect import About, BoardTopic, Flow
 from bridges.serial.errors import UnfitMessage
 from bridges.serial.rostypes import known_type, payload_type_of
-from schemas.chunks import topic_chunks
 from schemas.errors import InvalidKey, InvalidPayload
+from schemas.key_chunks import topic_chunks
 
 if TYPE_CHECKING:
     from bridges.serial.dialect import Command

@@ -18,8 +18,7 @@ from bridges.serial.errors import REASONS, CallFailed, CallInDoubt, CallNotDone
 from mesh.network import Pump
 from schemas import LiabilityTopicKey, payload_type
 from schemas.errors import InvalidPayload
-from schemas.payloads import Empty
-from schemas.values import decode_value, encode_value
+from schemas.payloads import Empty, decode_value, encode_value
 
 if TYPE_CHECKING:
     from mesh.agent import Agent

@@ -30,7 +30,7 @@ from bridges.serial.replying import is_meant_for, patience_of, refuse, reply
 from bridges.serial.tally import Tally
 from mesh.errors import InvalidKey
 from mesh.telemetry.context import liability_context
-from schemas.chunks import topic_chunks
+from schemas.key_chunks import topic_chunks
 from schemas.keys import DeviceTopicKey, LiabilityTopicKey, event_selector, parse_key
 from schemas.payloads import STRING, String, payload_type
 

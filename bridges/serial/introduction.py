@@ -9,8 +9,8 @@ import msgspec
 
 from bridges.serial.dialect import BoardTopic, Flow
 from bridges.serial.values import TYPES
-from schemas.chunks import topic_chunks
 from schemas.errors import InvalidKey
+from schemas.key_chunks import topic_chunks
 from schemas.payloads import JSON
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from mesh.errors import InputError
-from schemas.chunks import topic_chunks
+from schemas.key_chunks import topic_chunks
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -11,7 +11,14 @@ if TYPE_CHECKING:
 
     from mesh.agent.components import AgentComponents
     from schemas import Record
-    from schemas.rpc import AccountBalance, AccountToAddressAllowance, Approve, Nothing, Transfer, TransferFrom
+    from schemas.rpc import (
+        AccountBalance,
+        AccountToAddressAllowance,
+        Approve,
+        Nothing,
+        TransferFromRequest,
+        TransferRequest,
+    )
 
 
 class ChainServices:
@@ -73,11 +80,11 @@ class ChainServices:
         """What the factory may take of this agent's tokens, for costs and fees."""
         return Allowance(await self._chain.tokens.allowance(self._account, self._chain.factory, token=self._token))
 
-    async def transfer(self, request: Transfer) -> Transaction:
+    async def transfer(self, request: TransferRequest) -> Transaction:
         """Send tokens of this agent; answered once they are there."""
         return Transaction(await self._chain.tokens.transfer(request.to, int(request.value), token=self._token))
 
-    async def transfer_from(self, request: TransferFrom) -> Transaction:
+    async def transfer_from(self, request: TransferFromRequest) -> Transaction:
         """Send tokens that their owner has approved for this agent; answered once they are there."""
         tx = await self._chain.tokens.transfer_from(request.owner, request.to, int(request.value), token=self._token)
         return Transaction(tx)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from mesh.errors import AiraError
 
 if TYPE_CHECKING:
-    from schemas.rejection import Rejection
+    from schemas.signing import Rejection
 
 
 class JobFailed(AiraError):

@@ -13,7 +13,7 @@ import msgspec
 from mesh.agent.errors import JobFailed
 from mesh.errors import AiraError
 from schemas.errors import InvalidPayload
-from schemas.values import decode_value
+from schemas.payloads import decode_value
 
 if TYPE_CHECKING:
     from mesh.recording import Played

@@ -9,14 +9,14 @@ from msgspec.structs import replace
 
 from mesh.errors import InputError
 from schemas import Result, SignedMessage, message_hash, names_in, resolve_names, verify_message
-from schemas.rpc import Published
+from schemas.message_requests import Published
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from mesh.agent.components import AgentComponents
     from schemas import Record
-    from schemas.rpc import SendDemand, SendOffer, SendResult, SignDemand, SignOffer, SignResult
+    from schemas.message_requests import SendDemand, SendOffer, SendResult, SignDemand, SignOffer, SignResult
 
 M = TypeVar("M", bound=SignedMessage)
 

@@ -11,7 +11,7 @@ from mesh.background import Background
 from mesh.chain import NodeUnreachable, RequestRefused
 from mesh.network.crossing import call_in_loop
 from schemas import InvalidRecord, market_selector
-from schemas.rejection import Rejection
+from schemas.signing import Rejection
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from mesh.agent.components import AgentComponents
     from mesh.chain import Chain
     from schemas import Liability
-    from schemas.rejection import Rejection
+    from schemas.signing import Rejection
 
     Terms = Mapping[str, Any]
 

@@ -11,7 +11,7 @@ from mesh.chain.events import lighthouse_created
 from mesh.chain.names import GENERATIONS, namehash
 from mesh.chain.node import Node
 from mesh.chain.transactions import TransactionSender
-from schemas.keccak import keccak256
+from schemas import keccak256
 
 if TYPE_CHECKING:
     from web3.contract import AsyncContract

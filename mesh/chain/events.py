@@ -11,10 +11,10 @@ from eth_abi.abi import decode
 from eth_abi.exceptions import DecodingError
 
 from mesh.chain.artifacts import load_artifact, signature_of
+from schemas import keccak256
 from schemas.address import ZERO_ADDRESS, checksum_address
 from schemas.cid import format_cid
 from schemas.errors import InvalidCid
-from schemas.keccak import keccak256
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

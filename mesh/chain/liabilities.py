@@ -11,16 +11,16 @@ from mesh.chain.events import NewLiability, liability_created, xrt_minted
 from mesh.chain.following import retrying
 from mesh.chain.reader import list_created
 from mesh.chain.records import Created, RefundState, Settled, read_liability
-from schemas.packing import cancellation_hash, order_abi
 from schemas.signing import recover
+from schemas.wire import cancellation_hash, order_abi
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from mesh.chain.contracts import Contracts
     from mesh.chain.transactions import Receipt
-    from schemas.liability import Liability
     from schemas.messages import Demand, Offer, Result
+    from schemas.records import Liability
 
 READ_AT_ONCE: Final = 8
 """Records that a listing asks a node for at the same time."""

@@ -9,10 +9,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from mesh.chain.errors import InvalidName, NoContracts, Reverted, UnknownName
+from schemas import keccak256
 from schemas.address import ZERO_ADDRESS, is_ens_name, parse_address
 from schemas.cid import format_cid, parse_cid
 from schemas.errors import InvalidAddress, InvalidCid
-from schemas.keccak import keccak256
 
 if TYPE_CHECKING:
     from mesh.chain.node import Node

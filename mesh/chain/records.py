@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from schemas.address import ZERO_ADDRESS, parse_address
 from schemas.cid import format_cid
-from schemas.liability import Liability
+from schemas.records import Liability
 
 if TYPE_CHECKING:
     from mesh.chain.node import Node

@@ -15,8 +15,8 @@ from eth_abi.exceptions import DecodingError
 from mesh.chain.artifacts import NAMES, load_artifact, signature_of
 from mesh.chain.errors import Reverted
 from mesh.devchain.jsonrpc import REVERTED
+from schemas import keccak256
 from schemas.address import parse_address
-from schemas.keccak import keccak256
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from mesh.watching import How
-    from schemas.status import ContentMetrics, Market, Way, Work
+    from schemas.status import ContentMetrics, DirectionStatus, MarketStatus, Work
 
 PHASES: Final = ("incoming", "ready", "running", "complete")
 """Of jobs that are not at their end."""
@@ -71,7 +71,7 @@ def _work(work: Work) -> dict[str, str]:
     }
 
 
-def _market(market: Market) -> dict[str, str]:
+def _market(market: MarketStatus) -> dict[str, str]:
     return {
         "open orders": f"{market.open_orders:,}",
         "contracts": f"{market.created:,} made, {market.finalized:,} finalized",
@@ -105,7 +105,7 @@ def _content(figures: ContentMetrics) -> str:
     return f"{brought}, {taken}, {plural(figures.answered, 'block')} given, {figures.lies:,} false ones refused"
 
 
-def _way(way: Way) -> str:
+def _way(way: DirectionStatus) -> str:
     refused = f", {_counts(way.invalid)} refused" if way.invalid else ""
     return (
         f"{way.carried:,} carried ({way.per_second:.1f}/s), {way.waiting:,} waiting, "

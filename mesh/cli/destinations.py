@@ -10,7 +10,7 @@ from msgspec import Struct
 
 from mesh.cli.opening import own_address
 from mesh.errors import ConfigurationError, InputError
-from schemas.chunks import topic_chunks
+from schemas.key_chunks import topic_chunks
 from schemas.keys import DeviceTopicKey, LiabilityTopicKey, ObjectiveTopicKey
 
 if TYPE_CHECKING:

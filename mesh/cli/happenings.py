@@ -11,7 +11,7 @@ from mesh.cli.liability.words import short
 from mesh.cli.printing import visible
 from mesh.watching import JobEvent, Reading
 from schemas import Demand, Empty, Result, String, Verified
-from schemas.rejection import Rejection
+from schemas.signing import Rejection
 
 if TYPE_CHECKING:
     from mesh.watching import Seen

@@ -16,7 +16,9 @@ from mesh.errors import InputError
 from mesh.running import run_to_end
 from mesh.settings import NetworkSettings, options_of
 from schemas import Record, parse_address
-from schemas.rpc import GUARDED, SERVICES, Balance, Done, LiabilityRead, LogsRead, Status
+from schemas.logs import LogsRead
+from schemas.rpc import GUARDED, SERVICES, Balance, Done, LiabilityRead
+from schemas.status import Status
 
 if TYPE_CHECKING:
     from mesh.settings import Settings

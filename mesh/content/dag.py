@@ -14,7 +14,7 @@ from schemas.errors import InputError
 from schemas.unixfs import parse_block
 
 if TYPE_CHECKING:
-    from schemas.unixfs import Node
+    from schemas.unixfs import UnixfsNode
 
 MAX_DEPTH: Final = 12
 """Levels of the deepest tree taken. Ours are 3 deep at 7 GiB."""
@@ -42,7 +42,7 @@ def most_blocks(size: int) -> int:
     return min(MAX_BLOCKS, _SPARE_BLOCKS + size // _SMALLEST_CHUNK)
 
 
-def node_at(place: BlockRef, block: bytes) -> Node:
+def node_at(place: BlockRef, block: bytes) -> UnixfsNode:
     """What the block at `place` says, checked against the link that led to it. Raises `ContentCorrupt`."""
     try:
         node = parse_block(block)
@@ -59,7 +59,7 @@ def node_at(place: BlockRef, block: bytes) -> Node:
     return node
 
 
-def children_of(place: BlockRef, node: Node) -> list[BlockRef]:
+def children_of(place: BlockRef, node: UnixfsNode) -> list[BlockRef]:
     """The places of the blocks that the one at `place` links to, in the order of the file."""
     offset = place.offset + len(node.data)
     places = []

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.content.index import BlockSpan
-    from schemas.unixfs import Node
+    from schemas.unixfs import UnixfsNode
 
     SpanOf = Callable[[bytes], BlockSpan | None]
     """Where the block of a digest is in the file that is read, and what is around it."""
@@ -35,7 +35,7 @@ class CheckedFile(io.RawIOBase):
         self._span_of = span_of
         self._damaged = damaged
         self._position = 0
-        self._path: list[tuple[BlockRef, Node]] = []
+        self._path: list[tuple[BlockRef, UnixfsNode]] = []
         """The nodes from the root to the one that was read last."""
         try:
             self._size = self._node(BlockRef(cid), 0).file_size
@@ -88,7 +88,7 @@ class CheckedFile(io.RawIOBase):
             below = [child for child in children_of(place, node) if child.offset <= position]
             place, depth = below[-1], depth + 1
 
-    def _node(self, place: BlockRef, depth: int) -> Node:
+    def _node(self, place: BlockRef, depth: int) -> UnixfsNode:
         if depth < len(self._path) and self._path[depth][0] == place:
             return self._path[depth][1]
         try:

@@ -21,7 +21,7 @@ from mesh.devchain.jsonrpc import (
 )
 from mesh.devchain.log_filter import LogFilter
 from mesh.devchain.node_filters import NodeFilters
-from schemas.keccak import keccak256
+from schemas import keccak256
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -19,7 +19,7 @@ from mesh.identity.admission import NotAdmittedYet
 from mesh.identity.routers import is_loopback
 from mesh.network import Endpoints, Network
 from mesh.network.endpoints import SECURE
-from schemas.chunks import address_chunk, lighthouse_chunk, name_chunk
+from schemas.key_chunks import address_chunk, lighthouse_chunk, name_chunk
 
 if TYPE_CHECKING:
     from contextlib import AsyncExitStack

@@ -26,7 +26,7 @@ from mesh.errors import InvalidAddress, InvalidKey
 from mesh.identity.errors import RosterError
 from mesh.identity.roles import ROLES, Role
 from schemas.address import parse_address
-from schemas.chunks import lighthouse_chunk, name_chunk
+from schemas.key_chunks import lighthouse_chunk, name_chunk
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -28,7 +28,7 @@ from mesh.role import Role
 from mesh.telemetry.context import LogSource, liability_context, log_event, source_context
 from mesh.telemetry.log_service import LogService
 from schemas import ZERO_ADDRESS, Demand, Offer, RejectKey, Result, Verified
-from schemas.rejection import Rejection
+from schemas.signing import Rejection
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping

@@ -6,7 +6,7 @@ import time
 from typing import TYPE_CHECKING
 
 import mesh
-from schemas.status import ALIVE, Market, Status
+from schemas.status import ALIVE, MarketStatus, Status
 
 if TYPE_CHECKING:
     import zenoh
@@ -57,7 +57,7 @@ class StatusService:
             chain_id=self._chain.chain_id,
             xrt=self._chain.xrt,
             uptime=round(time.monotonic() - self._began, 3),
-            market=Market(
+            market=MarketStatus(
                 open_orders=len(self._book),
                 created=earned.created,
                 finalized=earned.finalized,

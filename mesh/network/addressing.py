@@ -9,7 +9,7 @@ from schemas import Demand, Offer, Result, SignedMessage, Verified, message_hash
 if TYPE_CHECKING:
     from schemas.keys import MarketKind
 
-KINDS: Final[dict[type[Any], MarketKind]] = {Demand: "demand", Offer: "offer", Result: "result"}
+KINDS: Final[dict[type[Any], MarketKind]] = {kind: kind.kind for kind in (Demand, Offer, Result)}
 """What each message is called in keys."""
 
 
@@ -25,5 +25,4 @@ def verified_key(lighthouse: str, verified: Verified[Any]) -> str:
 
 def key_of(lighthouse: str, message: SignedMessage, digest: bytes) -> str:
     """As `message_key`, given the message's hash. Its fields were checked when it was made, so they are not again."""
-    chunk = message.liability.lower() if isinstance(message, Result) else message.model
-    return f"aira/{lighthouse}/{KINDS[type(message)]}/{chunk}/{digest.hex()}"
+    return f"aira/{lighthouse}/{message.kind}/{message.key_chunk}/{digest.hex()}"

@@ -24,10 +24,9 @@ import msgspec
 from mesh.errors import InputError, InvalidKey
 from mesh.recording.mcap_file import MAX_TIME
 from mesh.recording.objective import Played
-from schemas.chunks import topic_chunks
 from schemas.errors import InvalidPayload
-from schemas.payloads import EMPTY, JSON, STRING, Empty, PayloadType, String, payload_type
-from schemas.values import encode_value
+from schemas.key_chunks import topic_chunks
+from schemas.payloads import EMPTY, JSON, STRING, Empty, PayloadType, String, encode_value, payload_type
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

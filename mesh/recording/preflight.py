@@ -9,9 +9,9 @@ from mesh.errors import InvalidKey
 from mesh.recording.errors import RecordingError
 from mesh.recording.limits import Limits
 from mesh.recording.objective import Objective, open_source
-from schemas.chunks import topic_chunks
 from schemas.errors import InvalidPayload
-from schemas.values import decode_value
+from schemas.key_chunks import topic_chunks
+from schemas.payloads import decode_value
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection

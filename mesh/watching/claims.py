@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Generic, NamedTuple, TypeAlias, TypeVar
 from mesh.errors import AiraError, InputError
 from mesh.network import Statistics
 from schemas import EventKey, Liability, RejectKey, parse_address, parse_cid, parse_key
-from schemas.rejection import Rejection
+from schemas.signing import Rejection
 
 if TYPE_CHECKING:
     from collections.abc import Callable

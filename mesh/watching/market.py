@@ -23,7 +23,7 @@ from schemas import (
     parse_key,
     presence_selector,
 )
-from schemas.rejection import Rejection
+from schemas.signing import Rejection
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

@@ -18,7 +18,7 @@ from mesh.recording import Limits, open_objective
 from mesh.watching.claims import JobEvent
 from mesh.watching.market import Remembered
 from schemas import Result, Verified
-from schemas.values import decode_value
+from schemas.payloads import decode_value
 
 if TYPE_CHECKING:
     from collections.abc import Callable

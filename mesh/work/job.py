@@ -16,8 +16,7 @@ import zenoh
 from mesh.errors import AiraError, ClosedError
 from mesh.recording import Recorder, Unrecordable, json_type, play
 from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey, parse_key, topic_selector
-from schemas.payloads import JSON, STRING, PayloadType, String, payload_type
-from schemas.values import encode_value
+from schemas.payloads import JSON, STRING, PayloadType, String, encode_value, payload_type
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -105,7 +104,7 @@ class Job:
     def publish(self, topic: str, message: object) -> None:
         """Say `message` on a topic of the job, as the device does; it becomes part of the recording.
 
-        `message` is bytes, or what `schemas.values.encode_value` takes: `Empty`, `String`, a str, a msgspec
+        `message` is bytes, or what `schemas.payloads.encode_value` takes: `Empty`, `String`, a str, a msgspec
         Struct or plain JSON data.
         """
         if self._subscriber is None:

@@ -13,8 +13,7 @@ from eth_abi.abi import encode
 from eth_typing import Address
 
 from mesh.chain.reverts import explain
-from schemas import address_bytes, checksum_address
-from schemas.keccak import keccak256
+from schemas import address_bytes, checksum_address, keccak256
 
 if TYPE_CHECKING:
     from tests.contracts.chains import Chain

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from itertools import count
 from typing import TYPE_CHECKING, Any, Final
 
-from schemas import Demand, Offer, Result, address_bytes, checksum_address, order_abi, parse_cid
-from schemas.keccak import keccak256
+from schemas import Demand, Offer, Result, address_bytes, checksum_address, keccak256, order_abi, parse_cid
 from tests.contracts.books import UNLIMITED, Books, Terms
 from tests.contracts.chains import py_evm
 from tests.contracts.evm import Answer, Evm

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from web3.logs import DISCARD
 
-from schemas import Signer
-from schemas.keccak import keccak256
+from schemas import Signer, keccak256
 
 if TYPE_CHECKING:
     from web3.contract import Contract

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from web3.logs import DISCARD
 
-from schemas import address_bytes
-from schemas.keccak import keccak256
+from schemas import address_bytes, keccak256
 from tests.contracts.suite import REFUND_DELAY, XRT
 
 if TYPE_CHECKING:

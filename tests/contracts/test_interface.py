@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from schemas.keccak import keccak256
+from schemas import keccak256
 from tests.contracts.suite import artifact
 
 LEGACY = [

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 from web3.logs import DISCARD
 
-from schemas.keccak import keccak256
+from schemas import keccak256
 from tests.contracts.suite import XRT, namehash
 
 if TYPE_CHECKING:

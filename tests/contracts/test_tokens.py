@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from schemas.keccak import keccak256
+from schemas import keccak256
 from tests.contracts.suite import REFUND_DELAY
 
 if TYPE_CHECKING:

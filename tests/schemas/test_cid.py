@@ -6,10 +6,11 @@ from contextlib import suppress
 from hashlib import sha256
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
-from schemas import InvalidCid, base58, cid_of_digest, format_cid, parse_cid
+from schemas import InputError, InvalidCid, cid_of_digest, format_cid, parse_cid
+from schemas.cid import decode_base58, encode_base58
 
 EMPTY_FILE = "QmbFMke1KXqnYyBBWxB74N4c5SBnJMVAiMNRcGu6x1AwQH"
 
@@ -36,9 +37,9 @@ def test_every_digest_has_a_name_of_46_characters(digest: bytes) -> None:
         EMPTY_FILE.replace("F", "0"),
         EMPTY_FILE[:-1] + "é",
         " " + EMPTY_FILE[1:],
-        base58.encode(b"\x12\x20" + bytes(31)),
-        base58.encode(b"\x11\x14" + bytes(20)),
-        base58.encode(b"\x16\x20" + sha256().digest()),
+        encode_base58(b"\x12\x20" + bytes(31)),
+        encode_base58(b"\x11\x14" + bytes(20)),
+        encode_base58(b"\x16\x20" + sha256().digest()),
         "bafkreihdwdcefgh4dqkjv67uzcmw7ojee6xedzdetojuzjevtenxquvyku",
     ],
 )
@@ -63,3 +64,37 @@ def test_no_text_raises_anything_but_invalid_cid(text: str) -> None:
 def test_other_multihashes_have_no_name(multihash: bytes) -> None:
     with pytest.raises(InvalidCid):
         format_cid(multihash)
+
+
+# Known pairs, from the tests of Bitcoin.
+PAIRS = (
+    ("", ""),
+    ("61", "2g"),
+    ("626262", "a3gV"),
+    ("73696d706c792061206c6f6e6720737472696e67", "2cFupjhnEsSn59qHXstmK2ffpLv2"),
+    ("00eb15231dfceb60925886b67d065299925915aeb172c06647", "1NS17iag9jJgTHD1VXjvLCEnZuQ3rJDE9L"),
+    ("516b6fcd0f", "ABnLTmg"),
+    ("bf4f89001e670274dd", "3SEo3LWLoPntC"),
+    ("572e4794", "3EFU7m"),
+    ("10c8511e", "Rt5zm"),
+    ("00000000000000000000", "1111111111"),
+)
+
+
+@pytest.mark.parametrize(("raw", "text"), PAIRS)
+def test_known_pairs(raw: str, text: str) -> None:
+    assert encode_base58(bytes.fromhex(raw)) == text
+    assert decode_base58(text) == bytes.fromhex(raw)
+
+
+@given(st.binary(max_size=120))
+@example(bytes(range(256)))
+@example(bytes(40) + bytes(range(256)))
+def test_what_was_encoded_is_decoded(data: bytes) -> None:
+    assert decode_base58(encode_base58(data)) == data
+
+
+@pytest.mark.parametrize("text", ["0", "O", "I", "l", "a b", "a\n", "+", "é", "\ud800", "\uff11"])
+def test_what_is_not_in_the_alphabet_is_refused(text: str) -> None:
+    with pytest.raises(InputError):
+        decode_base58(text)

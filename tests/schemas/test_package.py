@@ -24,7 +24,7 @@ def test_importing_it_loads_nothing_heavy() -> None:
 
 
 def test_keys_and_payloads_are_had_without_signatures() -> None:
-    keys = "from schemas import DeviceTopicKey, Empty, String; import schemas.keys, schemas.payloads, schemas.values"
+    keys = "from schemas import DeviceTopicKey, Empty, String; import schemas.keys, schemas.payloads"
     assert loaded_by(keys, ("coincurve", "schemas.signing", "schemas.messages")) == "[]"
 
 

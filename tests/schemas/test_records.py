@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas import MAX_UINT256, ZERO_ADDRESS, InvalidRecord, Liability, Record
+from schemas.message_requests import SignDemand
 from schemas.rpc import (
     SERVICES,
     Accounts,
@@ -23,10 +24,9 @@ from schemas.rpc import (
     FinishLiability,
     LiabilityRead,
     Nothing,
-    SignDemand,
     StartLiability,
     TransferEvent,
-    TransferFrom,
+    TransferFromRequest,
 )
 from tests.schemas.samples import LIGHTHOUSE, MODEL, OBJECTIVE, SENDER, TOKEN
 from tests.schemas.strategies import amounts
@@ -128,7 +128,7 @@ def test_amount_beyond_256_bits_is_refused_on_the_wire() -> None:
         (Accounts((SENDER,)), {"accounts": [SENDER]}),
         (BlockNumber(7), {"number": 7}),
         (AccountToAddressAllowance(SENDER, TOKEN), {"account": SENDER, "to": TOKEN}),
-        (TransferFrom(SENDER, TOKEN, 5), {"owner": SENDER, "to": TOKEN, "value": "5"}),
+        (TransferFromRequest(SENDER, TOKEN, 5), {"owner": SENDER, "to": TOKEN, "value": "5"}),
         (TransferEvent(SENDER, TOKEN, 5), {"args_from": SENDER, "args_to": TOKEN, "args_value": "5"}),
         (ApprovalEvent(SENDER, TOKEN, 5), {"args_owner": SENDER, "args_spender": TOKEN, "args_value": "5"}),
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 from contextlib import suppress
 
@@ -10,6 +11,7 @@ import pytest
 from coincurve import PrivateKey
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from schemas import (
     AiraError,
@@ -26,13 +28,16 @@ from schemas import (
     verify_hashed,
     verify_message,
 )
+from schemas.signing import Rejection
 from tests.schemas.samples import (
     DEMAND,
     DEMAND_5,
     FEEDBACK_JSON,
     LIGHTHOUSE_NAME,
+    NONCE,
     OFFER,
     RESULT,
+    SENDER,
     TRANSACTION_JSON,
     payload,
 )
@@ -198,3 +203,30 @@ def test_signatures_agree_with_the_curve_library() -> None:
 def test_errors_are_those_of_the_project() -> None:
     with pytest.raises(AiraError):
         verify(b"{}")
+
+
+def test_rejection_is_read_as_written() -> None:
+    rejection = Rejection(order=NONCE, reason="deadline", detail="block 7 has passed", provider=SENDER)
+    assert Rejection.decode(rejection.encode()) == rejection
+    assert json.loads(rejection.encode()).keys() == {"order", "reason", "detail", "provider", "signature"}
+
+
+def test_a_signed_rejection_is_the_providers_word() -> None:
+    signer = Signer(b"\x07" * 32)
+    rejection = Rejection(order=NONCE, reason="full", detail="later", provider=signer.address).signed_by(signer)
+    assert rejection.is_signed
+    assert Rejection.decode(rejection.encode()).is_signed
+
+
+@pytest.mark.parametrize("field", ["order", "reason", "detail", "provider", "signature"])
+def test_a_changed_rejection_is_nobodys_word(field: str) -> None:
+    signer = Signer(b"\x07" * 32)
+    rejection = Rejection(order=NONCE, reason="full", detail="later", provider=signer.address).signed_by(signer)
+    for other in ("", "0", SENDER, "ab" * 65):
+        assert not replace(rejection, **{field: other}).is_signed
+
+
+def test_nobody_signs_for_another() -> None:
+    rejection = Rejection(order=NONCE, reason="full", detail="", provider=SENDER)
+    assert not rejection.is_signed
+    assert not rejection.signed_by(Signer(b"\x07" * 32)).is_signed

@@ -25,7 +25,7 @@ from schemas import (
     parse_block,
     unixfs,
 )
-from schemas.protobuf import read_fields, write_bytes, write_number
+from schemas.unixfs import read_fields, write_bytes, write_number
 
 if TYPE_CHECKING:
     from pathlib import Path

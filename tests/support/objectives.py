@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from mcap.writer import Writer
 
-from schemas.values import encode_value
+from schemas.payloads import encode_value
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -18,7 +18,7 @@ STEP = 20 * MILLISECOND
 
 
 def objective(*messages: tuple[str, object], step_ns: int = STEP) -> bytes:
-    """An MCAP file with these messages, a topic and a value each (see `schemas.values`), `step_ns` apart."""
+    """An MCAP file with these messages, a topic and a value each (see `schemas.payloads`), `step_ns` apart."""
     return timed((topic, value, number * step_ns) for number, (topic, value) in enumerate(messages))
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from mesh.chain import Chain
     from mesh.settings import Settings
-    from schemas.liability import Liability
+    from schemas.records import Liability
 
 HEAD = ("LIABILITY", "STATE", "COST", "PROMISEE", "PROMISOR")
 

@@ -15,7 +15,7 @@ from mesh.running import run_to_end
 if TYPE_CHECKING:
     from mesh.chain import Chain, RefundState
     from mesh.settings import Settings
-    from schemas.liability import Liability
+    from schemas.records import Liability
 
 
 @click.command("show")

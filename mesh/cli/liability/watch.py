@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from mesh.cli.amounts import Unit
     from mesh.errors import AiraError
     from mesh.settings import Settings
-    from schemas.liability import Liability
+    from schemas.records import Liability
 
 log = logging.getLogger(__name__)
 

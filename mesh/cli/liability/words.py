@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from mesh.chain import Chain
-    from schemas.liability import Liability
+    from schemas.records import Liability
 
 OUTCOMES: Final[Mapping[str, str]] = {
     "open": "open, the money is held",

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from schemas.status import BridgeStatus, Way
+from schemas.status import BridgeStatus, DirectionStatus
 
 NONE: dict[str, Any] = dict.fromkeys(
     ("received", "known", "accepted", "carried", "left", "waiting", "left_waiting", "unheard"), 0
 )
 
 
-def way(**figures: Any) -> Way:
+def way(**figures: Any) -> DirectionStatus:
     """One direction."""
-    return Way(**(NONE | {"invalid": {}, "dropped": {}, "per_second": 0.5} | figures))
+    return DirectionStatus(**(NONE | {"invalid": {}, "dropped": {}, "per_second": 0.5} | figures))
 
 
 def status(**figures: Any) -> BridgeStatus:

@@ -11,7 +11,7 @@ from mesh.agent import Agent
 from mesh.chain import Account, Chain
 from mesh.recording import open_objective
 from schemas import Empty, String, cid_of_bytes
-from schemas.values import decode_value
+from schemas.payloads import decode_value
 from tests.support.bags import Bag, BagMessage, string
 from tests.support.boards import COUNTER, ROSSERIAL_ECHO, board, edge
 from tests.support.market import QUICK, founded, obliging, place

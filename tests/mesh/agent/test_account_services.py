@@ -10,7 +10,7 @@ import pytest
 from mesh.agent import Agent
 from mesh.chain import Account, Chain, new_private_key
 from schemas import ZERO_ADDRESS, cid_of_bytes
-from schemas.posting import SendResult
+from schemas.message_requests import SendResult, SignDemand, SignOffer, SignResult
 from schemas.rpc import (
     GUARDED,
     AccountBalance,
@@ -21,12 +21,9 @@ from schemas.rpc import (
     Balance,
     BlockNumber,
     FinishLiability,
-    SignDemand,
-    SignOffer,
-    SignResult,
     StartLiability,
-    Transfer,
-    TransferFrom,
+    TransferFromRequest,
+    TransferRequest,
 )
 from tests.mesh.agent.conftest import Asker, asking, other_token
 from tests.support.market import QUICK, obliging
@@ -88,15 +85,15 @@ async def test_the_token_is_that_of_the_settings(place: Place) -> None:
     robot = place.agent("robot", erc20_token=token, open_services=True)
     async with asking(place, robot) as asker:
         assert await asker.ask("eth/xrt_balance") == Balance(1000)
-        await asker.ask("eth/transfer", Transfer(person, 300))
+        await asker.ask("eth/transfer", TransferRequest(person, 300))
         assert await asker.ask("eth/account_xrt_balance", AccountBalance(person)) == Balance(300)
         await asker.ask("eth/approve", Approve(place.chains["robot"].factory, 5))
         assert await asker.ask("eth/xrt_allowance") == Allowance(5)
 
 
 REQUESTS: dict[str, Record] = {
-    "eth/transfer": Transfer(ZERO_ADDRESS, 1),
-    "eth/transfer_from": TransferFrom(ZERO_ADDRESS, ZERO_ADDRESS, 1),
+    "eth/transfer": TransferRequest(ZERO_ADDRESS, 1),
+    "eth/transfer_from": TransferFromRequest(ZERO_ADDRESS, ZERO_ADDRESS, 1),
     "eth/approve": Approve(ZERO_ADDRESS, 1),
     "sign/demand": SignDemand(**TERMS, validator_fee=0),
     "sign/offer": SignOffer(**TERMS, lighthouse_fee=0),
@@ -118,7 +115,7 @@ def test_all_that_is_guarded_is_tried() -> None:
 
 async def test_tokens_are_sent_for_who_may_ask_for_it(place: Place, opened: Asker) -> None:
     before = await place.balance("robot"), await place.balance("person")
-    done = await opened.ask("eth/transfer", Transfer(place.address("person"), 250))
+    done = await opened.ask("eth/transfer", TransferRequest(place.address("person"), 250))
     assert (await place.balance("robot"), await place.balance("person")) == (before[0] - 250, before[1] + 250)
     receipt = await place.chains["person"].node.web3.eth.get_transaction_receipt(done.txhash)
     assert receipt["status"] == 1
@@ -126,7 +123,7 @@ async def test_tokens_are_sent_for_who_may_ask_for_it(place: Place, opened: Aske
 
 async def test_who_asks_for_many_transfers_at_once_gets_each_of_them(place: Place, opened: Asker) -> None:
     before = await place.balance("person")
-    request = Transfer(place.address("person"), 3)
+    request = TransferRequest(place.address("person"), 3)
     done = await asyncio.gather(*(opened.ask("eth/transfer", request) for _ in range(10)))
     assert len({one.txhash for one in done}) == 10
     assert await place.balance("person") == before + 30
@@ -135,7 +132,7 @@ async def test_who_asks_for_many_transfers_at_once_gets_each_of_them(place: Plac
 async def test_tokens_that_were_approved_for_the_agent_are_sent(place: Place, opened: Asker) -> None:
     before = await place.balance("person"), await place.balance("provider")
     await place.chains["person"].tokens.approve(place.address("robot"), 40)
-    request = TransferFrom(place.address("person"), place.address("provider"), 40)
+    request = TransferFromRequest(place.address("person"), place.address("provider"), 40)
     assert len((await opened.ask("eth/transfer_from", request)).txhash) == 66
     assert (await place.balance("person"), await place.balance("provider")) == (before[0] - 40, before[1] + 40)
 
@@ -149,14 +146,14 @@ async def test_an_allowance_is_given(place: Place, opened: Asker) -> None:
 @pytest.mark.parametrize(
     ("request_", "said"),
     [
-        (Transfer("the kitchen", 1), "'the kitchen' is not an address"),
-        (Transfer("nobody.eth", 1), "the ENS name 'nobody.eth' is not known"),
-        (Transfer("kitchen.sink", 1), "'kitchen.sink' is not an ENS name"),
-        (Transfer(ZERO_ADDRESS, 1), "the contract refused: ERC20InvalidReceiver"),
-        (Transfer("0x" + "12" * 20, 10**30), "the contract refused: ERC20InsufficientBalance"),
+        (TransferRequest("the kitchen", 1), "'the kitchen' is not an address"),
+        (TransferRequest("nobody.eth", 1), "the ENS name 'nobody.eth' is not known"),
+        (TransferRequest("kitchen.sink", 1), "'kitchen.sink' is not an ENS name"),
+        (TransferRequest(ZERO_ADDRESS, 1), "the contract refused: ERC20InvalidReceiver"),
+        (TransferRequest("0x" + "12" * 20, 10**30), "the contract refused: ERC20InsufficientBalance"),
     ],
 )
-async def test_why_nothing_was_sent_is_told_in_a_line(opened: Asker, request_: Transfer, said: str) -> None:
+async def test_why_nothing_was_sent_is_told_in_a_line(opened: Asker, request_: TransferRequest, said: str) -> None:
     assert (await opened.refused("eth/transfer", request_)).startswith(said)
 
 

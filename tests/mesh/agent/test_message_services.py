@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from schemas import ZERO_ADDRESS, Demand, Offer, Result, Verified, cid_of_bytes, message_hash
-from schemas.posting import Published, SendDemand, SendOffer, SendResult, SignDemand, SignOffer, SignResult
+from schemas.message_requests import Published, SendDemand, SendOffer, SendResult, SignDemand, SignOffer, SignResult
 from schemas.rpc import Approve
 from tests.mesh.agent.conftest import Asker, asking
 from tests.support.market import MODEL, obliging

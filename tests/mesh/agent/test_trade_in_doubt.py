@@ -13,7 +13,7 @@ from mesh.chain import Chain, Timing
 from mesh.network import Endpoints, Network
 from mesh.work import outbox as outbox_module
 from schemas import Demand, Offer, RejectKey, cid_of_bytes, cid_of_file, decode, message_hash
-from schemas.rejection import Rejection
+from schemas.signing import Rejection
 from tests.mesh.agent.trades import OBJECTIVE, all_posted, job, known, posted, waiting, working
 from tests.support.market import MODEL, Place
 from tests.support.waiting import until, until_found

@@ -15,9 +15,9 @@ import pytest_asyncio
 from mesh.chain import XRT, Account, Chain, Deployment, DeploymentPlan, Node, Timing, deploy
 from mesh.devchain import EmbeddedChain
 from mesh.devchain.embedded import EmbeddedProvider
+from schemas import keccak256
 from schemas.address import ZERO_ADDRESS
 from schemas.cid import cid_of_digest
-from schemas.keccak import keccak256
 from schemas.messages import Demand, Offer, Result
 from tests.support.nodes import Anvil
 

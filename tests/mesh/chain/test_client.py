@@ -21,7 +21,7 @@ from mesh.chain import (
 )
 from mesh.errors import ClosedError, InvalidAddress
 from schemas.address import ZERO_ADDRESS
-from schemas.packing import message_hash
+from schemas.wire import message_hash
 
 if TYPE_CHECKING:
     from tests.mesh.chain.conftest import Market

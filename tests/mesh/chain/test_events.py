@@ -6,8 +6,8 @@ import pytest
 
 from mesh.chain import NewLighthouse
 from mesh.chain.events import decode_log
+from schemas import keccak256
 from schemas.address import address_bytes
-from schemas.keccak import keccak256
 
 LIGHTHOUSE = "0x5FbDB2315678afecb367f032d93F642f64180aa3"
 FACTORY = "0x" + "12" * 20

@@ -9,7 +9,7 @@ from eth_abi.abi import encode
 
 from mesh.chain.refusals import HINTS
 from mesh.chain.reverts import custom_errors, decode_revert, explain
-from schemas.keccak import keccak256
+from schemas import keccak256
 
 ADDRESS = "0x00000000219ab540356cBB839Cbe05303d7705Fa"
 NOT_A_PROVIDER = keccak256(b"NotAProvider(address)")[:4] + encode(["address"], [ADDRESS])

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from web3 import AsyncWeb3, WebSocketProvider
 
 from mesh.chain import XRT, Account, Chain, Deployment, Node, TransactionSender, deploy
-from schemas.keccak import keccak256
+from schemas import keccak256
 from tests.mesh.chain.conftest import QUICK
 from tests.mesh.chain.pushing import connected, node, server
 

@@ -13,16 +13,8 @@ from mesh.cli.arguments import request_of
 from mesh.cli.rpc import _call
 from mesh.errors import InputError
 from mesh.network import ServiceFailed
-from schemas.rpc import (
-    GUARDED,
-    SERVICES,
-    FinishLiability,
-    Nothing,
-    ReadLiability,
-    SendDemand,
-    StartLiability,
-    Transfer,
-)
+from schemas.message_requests import SendDemand
+from schemas.rpc import GUARDED, SERVICES, FinishLiability, Nothing, ReadLiability, StartLiability, TransferRequest
 from tests.mesh.cli.chains import columns
 from tests.support.market import obliging
 from tests.support.objectives import objective
@@ -39,14 +31,14 @@ def test_arguments_are_given_by_name() -> None:
     assert request_of("start", [f"address={LIGHTHOUSE}"]) == StartLiability(LIGHTHOUSE)
     assert request_of("finish", [f"address={LIGHTHOUSE}", "success=yes"]) == FinishLiability(LIGHTHOUSE, True)
     assert request_of("finish", ["success=FALSE", "address=a=b"]) == FinishLiability("a=b", False)
-    assert request_of("eth/transfer", ["to=x", f"value={MOST}"]) == Transfer("x", MOST)
+    assert request_of("eth/transfer", ["to=x", f"value={MOST}"]) == TransferRequest("x", MOST)
     assert request_of("eth/accounts", []) == Nothing()
 
 
 def test_arguments_are_given_as_one_json_object() -> None:
     assert request_of("read", [json.dumps({"address": LIGHTHOUSE})]) == ReadLiability(LIGHTHOUSE)
     for value in (5, "5"):
-        assert request_of("eth/transfer", [json.dumps({"to": "x", "value": value})]) == Transfer("x", 5)
+        assert request_of("eth/transfer", [json.dumps({"to": "x", "value": value})]) == TransferRequest("x", 5)
     assert request_of("eth/accounts", ["{}"]) == Nothing()
 
 

@@ -16,7 +16,7 @@ from mesh.cli.status import _everybody, _one
 from mesh.devchain import JsonRpcServer
 from mesh.errors import InvalidAddress, RemoteError
 from mesh.settings import Settings
-from schemas.status import ContentMetrics, Market, Status, StoreUse, Work
+from schemas.status import ContentMetrics, MarketStatus, Status, StoreUse, Work
 from tests.mesh.cli.chains import columns
 from tests.mesh.market.floor import QUICK
 from tests.mesh.watching.test_presence import WAY, bridge_status, status
@@ -34,7 +34,7 @@ WORK = Work(
     outbox=1,
     store=StoreUse(files=3, bytes=2048, quota=10 * 1024**3),
 )
-MARKET_FACTS = Market(
+MARKET_FACTS = MarketStatus(
     open_orders=7,
     created=3,
     finalized=2,

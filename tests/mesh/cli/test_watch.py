@@ -19,7 +19,7 @@ from mesh.network import Channel, Endpoints, Network, message_key
 from mesh.settings import Settings
 from mesh.watching import JobEvent, Reading, Readings, Tally
 from schemas import Empty, RejectKey, Result, String, encode, message_hash, verify_message
-from schemas.rejection import Rejection
+from schemas.signing import Rejection
 from tests.mesh.watching.test_market import EVENT, JOB
 from tests.support.commands import AIRA, aira, environment
 from tests.support.market import MODEL, obliging

@@ -12,7 +12,7 @@ from schemas.unixfs import CHUNK_SIZE, blocks_of_stream
 from tests.mesh.content.trees import leaf, named, parent
 
 if TYPE_CHECKING:
-    from schemas.unixfs import Block
+    from schemas.unixfs import UnixfsBlock
 
 
 def put_all(assembly: Assembly, blocks: dict[str, bytes], *, at_most: int = 10_000) -> int:
@@ -33,7 +33,7 @@ def blocks_of(data: bytes) -> tuple[str, dict[str, bytes]]:
     return list(blocks)[-1], blocks
 
 
-def refused(store: Store, blocks: list[Block]) -> ContentCorrupt:
+def refused(store: Store, blocks: list[UnixfsBlock]) -> ContentCorrupt:
     """The error of assembling a tree, the root last."""
     with store.assemble(blocks[-1].cid) as assembly, pytest.raises(ContentCorrupt) as caught:
         put_all(assembly, {block.cid: block.data for block in blocks})

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
     import zenoh
 
-    from schemas.unixfs import Block
+    from schemas.unixfs import UnixfsBlock
 
 
-def put_tree(store: Store, blocks: list[Block]) -> str:
+def put_tree(store: Store, blocks: list[UnixfsBlock]) -> str:
     """Have a store hold the file of a tree, the root last."""
     by_cid = {block.cid: block.data for block in blocks}
     with store.assemble(blocks[-1].cid) as assembly:

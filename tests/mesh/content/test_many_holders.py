@@ -14,8 +14,7 @@ import pytest
 import zenoh
 
 from mesh.content import ContentCorrupt, ContentUnavailable, Exchange, QuotaReached, Store
-from schemas.protobuf import write_bytes, write_number
-from schemas.unixfs import CHUNK_SIZE, blocks_of_stream
+from schemas.unixfs import CHUNK_SIZE, blocks_of_stream, write_bytes, write_number
 from tests.mesh.content.holders import answering, given_by, some
 from tests.mesh.content.test_store import ROOT, leftovers
 from tests.mesh.content.trees import digest, leaf, named, parent
@@ -25,7 +24,7 @@ from tests.support.waiting import until
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from schemas.unixfs import Block
+    from schemas.unixfs import UnixfsBlock
 
 FETCHER = """
 import asyncio, sys, zenoh
@@ -179,7 +178,9 @@ async def test_what_nobody_has_leaves_nothing_behind(store: Store, session: zeno
     assert leftovers(store.directory) == []
 
 
-async def refused(store: Store, session: zenoh.Session, other: zenoh.Session, blocks: list[Block]) -> tuple[str, int]:
+async def refused(
+    store: Store, session: zenoh.Session, other: zenoh.Session, blocks: list[UnixfsBlock]
+) -> tuple[str, int]:
     """Why a tree, the root last, is not fetched, and how often its holder was asked."""
     by_cid, count = {block.cid: block.data for block in blocks}, 0
 

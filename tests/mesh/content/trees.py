@@ -6,24 +6,25 @@ from hashlib import sha256
 from typing import TYPE_CHECKING
 
 from schemas.cid import cid_of_digest
-from schemas.protobuf import write_bytes, write_number
-from schemas.unixfs import Block
+from schemas.unixfs import UnixfsBlock, write_bytes, write_number
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
-def named(data: bytes) -> Block:
+def named(data: bytes) -> UnixfsBlock:
     """A block under its true name."""
-    return Block(cid_of_digest(sha256(data).digest()), data)
+    return UnixfsBlock(cid_of_digest(sha256(data).digest()), data)
 
 
-def leaf(data: bytes) -> Block:
+def leaf(data: bytes) -> UnixfsBlock:
     """A leaf as old versions of IPFS wrote it: of UnixFS type `raw`, and without the size of the file."""
     return named(write_bytes(1, write_number(1, 0) + write_bytes(2, data)))
 
 
-def parent(children: Sequence[tuple[Block, int]], *, data: bytes = b"", sizes: Sequence[int] | None = None) -> Block:
+def parent(
+    children: Sequence[tuple[UnixfsBlock, int]], *, data: bytes = b"", sizes: Sequence[int] | None = None
+) -> UnixfsBlock:
     """A node over these blocks, each with its bytes of the file; `sizes` are those it claims instead."""
     links = b"".join(write_bytes(2, write_bytes(1, b"\x12\x20" + digest(block))) for block, _ in children)
     claimed = [size for _, size in children] if sizes is None else list(sizes)
@@ -32,13 +33,13 @@ def parent(children: Sequence[tuple[Block, int]], *, data: bytes = b"", sizes: S
     return named(links + write_bytes(1, unixfs))
 
 
-def chunked(data: bytes, size: int) -> list[Block]:
+def chunked(data: bytes, size: int) -> list[UnixfsBlock]:
     """The blocks of a file in chunks of `size` bytes under one root, the root last."""
     pieces = [data[start : start + size] for start in range(0, len(data), size)]
     leaves = [leaf(piece) for piece in pieces]
     return [*leaves, parent([(block, len(piece)) for block, piece in zip(leaves, pieces, strict=True)])]
 
 
-def digest(block: Block) -> bytes:
+def digest(block: UnixfsBlock) -> bytes:
     """The sha2-256 digest of a block."""
     return sha256(block.data).digest()

@@ -14,7 +14,7 @@ from mesh.chain.events import NewLiability
 from mesh.market.provider import Provider
 from mesh.network import Channel, Endpoints, Network
 from schemas import Demand, Offer, RejectKey, Result, market_selector, message_hash, parse_key
-from schemas.rejection import Rejection
+from schemas.signing import Rejection
 from tests.support.orders import RECORDING, terms
 from tests.support.waiting import until, until_found, until_heard
 

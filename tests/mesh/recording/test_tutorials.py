@@ -9,7 +9,7 @@ import pytest
 
 from mesh.recording import bag_to_mcap, open_objective, preflight
 from schemas import Empty, String, cid_of_file
-from schemas.values import decode_value
+from schemas.payloads import decode_value
 from tests.support.bags import MAGIC, fields, record, string
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import pytest
 from mesh.network import Channel, Endpoints, Network, message_key
 from mesh.watching import JobEvent, MarketWatch
 from schemas import EventKey, RejectKey, Verified, encode, message_hash
-from schemas.rejection import Rejection
+from schemas.signing import Rejection
 from tests.support.orders import (
     CONTRACT,
     LIGHTHOUSE,

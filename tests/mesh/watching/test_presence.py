@@ -11,7 +11,7 @@ import pytest
 from mesh.network import Channel, Endpoints, Network, Services
 from mesh.watching import Peer, present, status_of, statuses
 from schemas import RpcKey
-from schemas.status import ALIVE, BridgeStatus, Status, Way, bridge_status_key
+from schemas.status import ALIVE, BridgeStatus, DirectionStatus, Status, bridge_status_key
 from tests.support.orders import MARKET, PERSON, ROBOT, STRANGER
 from tests.support.waiting import until_answered, until_found
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from tests.support.routers import EmbeddedRouter
 
 QUICK = 0.5
-WAY = Way(
+WAY = DirectionStatus(
     received=0,
     invalid={},
     known=0,

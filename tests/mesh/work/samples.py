@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from mesh.work import Outgoing
-from schemas import ZERO_ADDRESS, Liability, checksum_address, cid_of_bytes
-from schemas.keccak import keccak256
+from schemas import ZERO_ADDRESS, Liability, checksum_address, cid_of_bytes, keccak256
 
 
 def liability(name: str = "one", *, promisor: str = ZERO_ADDRESS, objective: str | None = None) -> Liability:

@@ -1,7 +1,7 @@
-"""Messages in services: to be signed by the agent that is asked, or signed already and to be published by it.
+"""Requests for market messages: the agent that is asked signs and publishes one, or publishes one already signed.
 
-The fields bear the names that messages have on the wire; amounts are decimal strings, as in all records. Addresses may
-be ENS names, a model the name of one.
+The fields have the names that messages have on the wire; amounts are decimal strings, as in all records. Addresses may
+be ENS names, and a model may be given by its name.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from schemas.errors import InvalidMessage
 from schemas.messages import MAX_UINT256, Demand, Offer, Result
 from schemas.records import Record, UInt256
 
-_LONGEST_NUMBER: Final = len(str(MAX_UINT256))
+_MAX_DIGITS: Final = len(str(MAX_UINT256))
 
 
-class _Terms(Record, frozen=True, kw_only=True, rename="camel"):
-    """What the requests for a Demand and for an Offer have in common."""
+class _OrderFields(Record, frozen=True, kw_only=True, rename="camel"):
+    """The fields that the requests for a Demand and for an Offer have in common."""
 
     model: str
     objective: str
@@ -29,7 +29,7 @@ class _Terms(Record, frozen=True, kw_only=True, rename="camel"):
     deadline: UInt256
 
 
-class SignDemand(_Terms, frozen=True, kw_only=True, rename="camel"):
+class SignDemand(_OrderFields, frozen=True, kw_only=True, rename="camel"):
     """Sign and publish a Demand; the agent adds nonce, sender (generation 5) and signature."""
 
     validator_fee: UInt256
@@ -39,7 +39,7 @@ class SignDemand(_Terms, frozen=True, kw_only=True, rename="camel"):
         return Demand(**_fields(self), nonce=nonce, sender=sender)
 
 
-class SignOffer(_Terms, frozen=True, kw_only=True, rename="camel"):
+class SignOffer(_OrderFields, frozen=True, kw_only=True, rename="camel"):
     """Sign and publish an Offer; the agent adds nonce, sender (generation 5) and signature."""
 
     lighthouse_fee: UInt256
@@ -61,7 +61,7 @@ class SignResult(Record, frozen=True, kw_only=True):
         return Result(**_fields(self))
 
 
-class SendDemand(_Terms, frozen=True, kw_only=True, rename="camel", omit_defaults=True):
+class SendDemand(_OrderFields, frozen=True, kw_only=True, rename="camel", omit_defaults=True):
     """Publish a signed Demand. `nonce` is 64 hexadecimal digits, or decimal ones where `sender` is there."""
 
     validator_fee: UInt256
@@ -79,7 +79,7 @@ class SendDemand(_Terms, frozen=True, kw_only=True, rename="camel", omit_default
         return Demand(**_signed_fields(self, self.nonce, self.sender))
 
 
-class SendOffer(_Terms, frozen=True, kw_only=True, rename="camel", omit_defaults=True):
+class SendOffer(_OrderFields, frozen=True, kw_only=True, rename="camel", omit_defaults=True):
     """Publish a signed Offer. `nonce` is 64 hexadecimal digits, or decimal ones where `sender` is there."""
 
     lighthouse_fee: UInt256
@@ -132,7 +132,7 @@ def _signed_fields(request: Record, nonce: str, sender: str | None) -> dict[str,
 
 
 def _count(nonce: str) -> int:
-    if not (nonce.isascii() and nonce.isdigit() and len(nonce) <= _LONGEST_NUMBER):
+    if not (nonce.isascii() and nonce.isdigit() and len(nonce) <= _MAX_DIGITS):
         raise InvalidMessage("nonce", "the nonce of a generation-5 order is a number in decimal digits")
     return int(nonce)
 

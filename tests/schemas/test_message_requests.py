@@ -10,7 +10,7 @@ from hypothesis import given
 from msgspec.structs import asdict, replace
 
 from schemas import Demand, InvalidMessage, InvalidRecord, Offer, Order, Result
-from schemas.posting import SendDemand, SendOffer, SendResult, SignDemand, SignOffer, SignResult
+from schemas.message_requests import SendDemand, SendOffer, SendResult, SignDemand, SignOffer, SignResult
 from schemas.rpc import GUARDED, SERVICES, SPENDING
 from tests.schemas.samples import DEMAND, DEMAND_5, OFFER, RESULT
 from tests.schemas.strategies import addresses, orders, results
