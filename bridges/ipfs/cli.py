@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from mesh.cli.announcing import announce
 from mesh.cli.options import with_settings
+from mesh.cli.output import announce
 from mesh.errors import ConfigurationError, NetworkUnavailable
 from mesh.running import run_until_stopped
 from mesh.settings import ChainSettings, NetworkSettings, TelemetrySettings, options_of
@@ -67,7 +67,7 @@ def command(settings: Settings, api: str | None, lighthouses: tuple[str, ...]) -
 
 def _address(settings: Settings) -> str | None:
     """As whom the bridge shows itself: the holder of its certificate, or of the keyfile, or nobody in particular."""
-    from mesh.cli.opening import own_address
+    from mesh.cli.chain_client import own_address
 
     if not settings.tls_certificate:
         return own_address(settings)
@@ -111,7 +111,7 @@ async def _introduce(bridge: IpfsBridge, network: Network, stack: AsyncExitStack
     introduce(LogSource("bridge", parse_address(bridge.channels[0].address)))
     for channel in bridge.channels:
         words = f"bridge {channel.address} carries {channel.lighthouse} to and from {bridge.daemon.api}"
-        announce(log, words, bridge=channel.address)
+        announce(log, "bridge-started", words, bridge=channel.address)
     # Of one process: each address answers for all of it.
     for address in {channel.address for channel in bridge.channels}:
         services = await stack.enter_async_context(Services(network.session, address))

@@ -15,7 +15,7 @@ from bridges.serial.device_id import PRESENT
 from bridges.serial.edge import Edge
 from bridges.serial.ports import PortName
 from bridges.serial.telling import tell_log
-from mesh.cli.announcing import announce
+from mesh.cli.output import announce
 from mesh.network.opening import Opening
 from mesh.running import INTERRUPTED
 from mesh.starting import AGAIN, lacking
@@ -106,6 +106,6 @@ def serve(device: DeviceId, wiring: Wiring, *, endpoints: Endpoints, told: Told)
         words = f"edge of {device.agent}: {device.name} on {name}, {wiring.protocol}, Zenoh id {session.zid()}"
         told(edge, session)
         introduce(LogSource("edge", parse_address(device.agent)))
-        announce(log, words, device=device.name)
+        announce(log, "edge-started", words, device=device.name)
         with tell_log(session, device):
             edge.run()

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from mesh.cli.amounts import AMOUNT, XRT
-from mesh.cli.options import with_settings
-from mesh.cli.printing import print_json, say, with_json
+from mesh.cli.options import with_json, with_settings
+from mesh.cli.output import print_json, print_line
 from mesh.errors import AiraError, ConfigurationError, InputError, RemoteError
 from mesh.running import run_to_end
 from mesh.settings import ChainSettings, NetworkSettings, options_of
@@ -99,17 +99,17 @@ async def _contract(
     agent: Agent, source: str | Path, *, cost: str, validator_fee: int, quiet: bool, **terms: Any
 ) -> Contract:
     """The contract that comes of the demand; what may be said is said."""
-    from mesh.cli.tokens import check_enough, unit_of
+    from mesh.cli.chain_client import check_balance, unit_of
 
     chain, token = agent.parts.chain, agent.settings.erc20_token
     unit = await unit_of(chain, token)
     amount = unit.parse(cost)
     if not quiet:
-        say(f"demand by {agent.address} for {agent.model}")
-    await check_enough(chain, unit, amount, token=token)
+        print_line(f"demand by {agent.address} for {agent.model}")
+    await check_balance(chain, unit, amount, token=token)
     contract = await agent.demand(source, cost=amount, validator_fee=validator_fee, **terms)
     if not quiet:
-        say(f"contract {contract.address} with {contract.liability.promisor}")
+        print_line(f"contract {contract.address} with {contract.liability.promisor}")
     return contract
 
 
@@ -118,7 +118,7 @@ async def _ending(contract: Contract, out: Path | None, *, as_json: bool) -> Non
     outcome = await contract.outcome()
     facts: dict[str, Any] = {"liability": contract.address, "success": outcome.success, "result": outcome.result}
     if not as_json:
-        say(f"{'paid' if outcome.success else 'refunded'}, result {outcome.result or 'none'}")
+        print_line(f"{'paid' if outcome.success else 'refunded'}, result {outcome.result or 'none'}")
     failure: AiraError | None = None
     if not outcome.success:
         failure = RemoteError("the job was not done, and its cost came back", hint=_why(contract, outcome.result))
@@ -134,7 +134,7 @@ async def _ending(contract: Contract, out: Path | None, *, as_json: bool) -> Non
     if as_json:
         print_json(facts)
     elif facts.get("recording"):
-        say(f"recording {out}")
+        print_line(f"recording {out}")
     if failure is not None:
         raise failure
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Final, get_args
 
 import click
 
-from mesh.cli.options import with_settings
-from mesh.cli.printing import plural, print_json, say, visible, with_json
+from mesh.cli.options import with_json, with_settings
+from mesh.cli.output import plural, print_json, print_line, printable
 from mesh.doctor.case import Case, Line, Role, examined_as
 from mesh.doctor.findings import Verdict
 from mesh.errors import AiraError, InputError
@@ -124,18 +124,18 @@ def _say_line(case: Case, checked: Checked, width: int) -> None:
     assert checked.finding is not None
     verdict, found, do = checked.finding
     mark = click.style(f"{verdict.value:<{MARK}}", fg=COLOURS[verdict], bold=verdict is Verdict.FAIL)
-    say(f"{mark}{checked.name:<{width}}  {visible(case.without_secrets(found))}")
+    print_line(f"{mark}{checked.name:<{width}}  {printable(case.without_secrets(found))}")
     if do:
-        say(f"{'':<{MARK + width}}  -> {visible(case.without_secrets(do))}")
+        print_line(f"{'':<{MARK + width}}  -> {printable(case.without_secrets(do))}")
 
 
 def _sum_up(case: Case, count: int, verdicts: dict[Verdict, list[str]], left_out: list[str]) -> None:
     failed, warned = verdicts[Verdict.FAIL], verdicts[Verdict.WARN]
-    say()
+    print_line()
     if left_out:
-        say(f"not tried, because of a failure before: {', '.join(left_out)}")
+        print_line(f"not tried, because of a failure before: {', '.join(left_out)}")
     if failed:
-        say(f"{plural(len(failed), 'check')} of {count} failed for the role {case.role}: {', '.join(failed)}")
+        print_line(f"{plural(len(failed), 'check')} of {count} failed for the role {case.role}: {', '.join(failed)}")
     else:
         warnings = f"; with a warning: {', '.join(warned)}" if warned else ""
-        say(f"all {count} checks are in order for the role {case.role}{warnings}")
+        print_line(f"all {count} checks are in order for the role {case.role}{warnings}")

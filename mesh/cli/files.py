@@ -1,30 +1,26 @@
-"""Files that commands write and tell of."""
+"""Files that commands read and write: by name, in the store, or fetched from the mesh by CID."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, TypeVar
+import asyncio
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
-from mesh.errors import AiraError, ConfigurationError, InputError
-from mesh.running import fail
+from mesh.cli.chain_client import own_address
+from mesh.cli.output import progress
+from mesh.content import Exchange, Store
+from mesh.errors import ConfigurationError, InputError
+from mesh.settings import NetworkSettings, options_of
+from schemas import InvalidCid, parse_cid
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
+    from collections.abc import AsyncIterator
 
-T = TypeVar("T")
-
-_UNITS: Final = ("bytes", "KiB", "MiB", "GiB", "TiB")
+    from mesh.settings import Settings
 
 
-def at_once(work: Callable[[], T]) -> T:
-    """Do what needs no event loop, so that Ctrl-C ends it at any moment. Errors are told as by `run_to_end`."""
-    try:
-        return work()
-    except AiraError as error:
-        fail(error)
-
-
-def free(path: Path) -> Path:
+def require_new_file(path: Path) -> Path:
     """The same path, if nothing is there and its folder is. Raises `InputError`: no file is written over."""
     if path.exists():
         raise InputError(f"{path} is there already", hint="choose another name, or move it away")
@@ -33,24 +29,80 @@ def free(path: Path) -> Path:
     return path
 
 
-def unwritable(path: Path, error: OSError) -> ConfigurationError:
+def write_error(path: Path, error: OSError) -> ConfigurationError:
     """What to raise when the disk refuses a file."""
     return ConfigurationError(f"can't write {path}: {error.strerror}")
 
 
-def size_words(size: int) -> str:
-    """A number of bytes as people read it."""
-    scaled, unit = float(size), 0
-    while scaled >= 1024 and unit < len(_UNITS) - 1:
-        scaled, unit = scaled / 1024, unit + 1
-    return f"{size:,} bytes" if not unit else f"{scaled:.1f} {_UNITS[unit]}"
+STORE: Final = ("data_dir", "keyfile")
+"""The settings that say which store."""
 
 
-def duration_words(nanoseconds: int) -> str:
-    """A length of time as people read it."""
-    seconds = nanoseconds / 1e9
-    if seconds < 120:
-        return f"{seconds:.3f}".rstrip("0").rstrip(".") + " s"
-    minutes, rest = divmod(int(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}"
+MESH: Final = (*options_of(NetworkSettings), "fetch_timeout", *STORE)
+"""Those that say also where a file comes from that is not there."""
+
+
+LARGEST: Final = 8 << 30
+"""Bytes of the largest file that commands take."""
+
+
+def open_store(settings: Settings) -> Store:
+    """The store of the agent whose keyfile is in the settings, or else one for whoever has no account.
+
+    Opening and what is done with it block on the disk; use threads. Raises `ConfigurationError`.
+    """
+    address = own_address(settings)
+    folder = settings.state_directory / address if address else settings.state_directory
+    return Store(folder / "content", limit=LARGEST, quota=settings.content_limit)
+
+
+@asynccontextmanager
+async def opened_store(settings: Settings) -> AsyncIterator[Store]:
+    """The same, to be closed in the end."""
+    store = await asyncio.to_thread(open_store, settings)
+    try:
+        yield store
+    finally:
+        store.close()
+
+
+async def fetch(settings: Settings, store: Store, cid: str) -> Path:
+    """Where the file of that CID is in the store; it is fetched from the mesh if it is not there yet.
+
+    Raises `InvalidCid`, `NetworkUnavailable`, `ContentUnavailable` and other branches of `ContentError`.
+    """
+    from mesh.composition import endpoints_of
+    from mesh.network import Network
+
+    parse_cid(cid)
+    held = await asyncio.to_thread(store.checked, cid)
+    if held is not None:
+        return held
+    async with Network(endpoints_of(settings)) as network, Exchange(network.session, store) as exchange:
+        with progress(f"fetching {cid[:8]}…") as tell:
+            return await exchange.fetch(cid, timeout=settings.fetch_timeout, progress=tell)
+
+
+def file_or_cid(text: str) -> Path | str:
+    """A file where there is one of that name, else a CID. Raises `InputError` if it is neither."""
+    path = Path(text)
+    if path.exists():
+        return path
+    try:
+        parse_cid(text)
+    except InvalidCid:
+        raise InputError(
+            f"{text!r} is neither a file nor a CID", hint="name a file that is there, or a CID of 46 characters (Qm…)"
+        ) from None
+    return text
+
+
+def require_readable(path: Path) -> Path:
+    """The same path, if a file that can be read is there. Raises `InputError`."""
+    try:
+        if path.is_dir():
+            raise InputError(f"can't read {path}: it is a folder")
+        with path.open("rb"):
+            return path
+    except OSError as error:
+        raise InputError(f"can't read {path}: {error.strerror}") from None

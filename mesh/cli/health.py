@@ -8,8 +8,8 @@ from urllib.parse import urlsplit
 
 import click
 
-from mesh.cli.options import with_settings
-from mesh.cli.printing import print_facts, print_json, visible, with_json
+from mesh.cli.options import with_json, with_settings
+from mesh.cli.output import print_facts, print_json, printable
 from mesh.errors import AiraError, ConfigurationError, RemoteError
 from mesh.running import fail
 
@@ -44,7 +44,7 @@ def command(settings: Settings, url: str | None, timeout: float, as_json: bool) 
     if as_json:
         print_json(health)
     else:
-        print_facts({visible(part): visible(state) for part, state in health.parts.items()})
+        print_facts({printable(part): printable(state) for part, state in health.parts.items()})
     sys.exit(0 if health.ok else 1)
 
 

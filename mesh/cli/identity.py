@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mesh.cli.options import with_settings
-from mesh.cli.printing import print_facts, print_json, visible, with_json
+from mesh.cli.options import with_json, with_settings
+from mesh.cli.output import print_facts, print_json, printable
 from mesh.errors import AiraError, ConfigurationError, InputError
 from mesh.identity.roles import ROLES
 from mesh.running import fail, run_to_end, tell
@@ -125,7 +125,7 @@ def renew(
         if is_due or as_json:
             _print(facts, as_json)
         else:
-            click.echo(f"{visible(facts.holder.name)} is valid for {facts.left.days} more days")
+            click.echo(f"{printable(facts.holder.name)} is valid for {facts.left.days} more days")
     if failed is not None:
         fail(failed)
 
@@ -208,11 +208,11 @@ def _address(about: dict[str, Any]) -> str:
     import secrets
 
     if about["keyfile"] is not None:
-        from mesh.cli.opening import claimed_address
+        from mesh.cli.chain_client import address_in_keyfile
 
         if about["address"] is not None:
             raise InputError("both --address and --keyfile are given", hint="give one of them")
-        return claimed_address(about["keyfile"])
+        return address_in_keyfile(about["keyfile"])
     if about["address"] is not None:
         return str(about["address"])
     if set(about["roles"]) == {"router"}:
@@ -254,10 +254,10 @@ def _print(facts: Facts, as_json: bool, standing: str | None = None) -> None:
         return
     print_facts(
         {
-            "name": visible(facts.holder.name),
+            "name": printable(facts.holder.name),
             "address": facts.holder.address,
-            "roles": visible(", ".join(facts.holder.roles)),
-            "hosts": visible(", ".join(facts.holder.hosts)) or None,
+            "roles": printable(", ".join(facts.holder.roles)),
+            "hosts": printable(", ".join(facts.holder.hosts)) or None,
             "valid from": facts.since.isoformat(" "),
             "valid until": f"{facts.until.isoformat(' ')} ({'expired' if expired else f'{left.days} days left'})",
             "fingerprint": facts.fingerprint,

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from mesh.cli.options import with_settings
-from mesh.cli.pipes import until_unread
-from mesh.cli.printing import plural, say, visible, with_json
+from mesh.cli.options import with_json, with_settings
+from mesh.cli.output import plural, print_line, printable, wait_for_broken_pipe
 from mesh.errors import RemoteError
 from mesh.running import run_to_end
 from mesh.settings import NetworkSettings, options_of
@@ -86,7 +85,7 @@ async def _show(
     from mesh.watching.logs import LogReader
 
     async with Network(endpoints_of(settings)) as network, Background() as tasks:
-        tasks.start(until_unread(), "readers of stdout")
+        tasks.start(wait_for_broken_pipe(), "readers of stdout")
         reader = LogReader(network.session, key, **wanted)
         look = await reader.look(timeout=timeout)
         if not look.answered:
@@ -114,7 +113,7 @@ async def _follow(reader: LogReader, line: Callable[[LogEvent], str], *, timeout
             look = await reader.look(timeout=timeout)
             met = "" if look.answered else "nobody answers now; waiting"
         except ServiceFailed as error:
-            look, met = Look([]), visible(str(error))
+            look, met = Look([]), printable(str(error))
         if met != trouble:
             _note(met or "it answers again")
             trouble = met
@@ -123,11 +122,11 @@ async def _follow(reader: LogReader, line: Callable[[LogEvent], str], *, timeout
 
 def _tell(look: Look, line: Callable[[LogEvent], str]) -> None:
     for began in look.began:
-        _note(f"it has begun anew at {visible(began)}")
+        _note(f"it has begun anew at {printable(began)}")
     if look.missed:
         _note(f"missed {plural(look.missed, 'event')}, which came faster than they could be read")
     for event in look.events:
-        say(line(event))
+        print_line(line(event))
 
 
 def _note(words: str) -> None:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from mesh.background import Background
-from mesh.cli.announcing import announce
 from mesh.cli.options import with_settings
+from mesh.cli.output import announce
 from mesh.running import run_until_stopped
 from mesh.settings import ChainSettings, NetworkSettings, TelemetrySettings, options_of
 from mesh.telemetry.context import LogSource
@@ -65,7 +65,7 @@ async def _serve(settings: Settings) -> None:
         make = partial(_opened, settings, account, telemetry)
         network, provider = await entered(stack, settings, make, role="provider", waits=telemetry.starting)
         words = f"provider {provider.address} serves {lighthouse}, Zenoh id {network.id}"
-        announce(log, words, provider=provider.address, zenoh=network.id)
+        announce(log, "provider-started", words, provider=provider.address, zenoh=network.id)
         tasks = await stack.enter_async_context(Background())
         tasks.start(_report(provider.earnings), "earnings")
         await provider.run()

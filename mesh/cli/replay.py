@@ -1,34 +1,34 @@
-"""`aira replay`: a recording said once more."""
+"""`aira replay`: publishes the messages of a recording again."""
 
 from __future__ import annotations
 
 import asyncio
+import re
 import time
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import click
 import zenoh
 from msgspec import Struct
 
-from mesh.cli.destinations import ADDRESS, JobTopics, destination_of
-from mesh.cli.files import duration_words
-from mesh.cli.holdings import MESH, fetch, file_or_cid, opened_store, readable
-from mesh.cli.opening import reading
-from mesh.cli.options import with_settings
-from mesh.cli.printing import plural, print_json, with_json
-from mesh.cli.progress import progress
-from mesh.errors import InputError
+from mesh.cli.chain_client import open_chain, own_address
+from mesh.cli.files import MESH, fetch, file_or_cid, opened_store, require_readable
+from mesh.cli.options import with_json, with_settings
+from mesh.cli.output import format_duration, plural, print_json, progress
+from mesh.errors import ConfigurationError, InputError
 from mesh.recording import GENEROUS, AtOnce, RecordedTimes, open_objective, play
 from mesh.running import run_to_end
 from mesh.settings import ChainSettings, options_of
+from schemas.key_chunks import topic_chunks
+from schemas.keys import DeviceTopicKey, LiabilityTopicKey, ObjectiveTopicKey
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.cli.destinations import Destination
     from mesh.content import Store
     from mesh.recording import Objective, Pace, Played
     from mesh.settings import Settings
+
 
 ROLES: Final = ("objective", "device", "agent")
 
@@ -101,15 +101,15 @@ async def _replay(settings: Settings, asked: Replay) -> None:
     if asked.as_json:
         print_json({"messages": played, "seconds": round(seconds, 3), "file": str(path)})
     else:
-        click.echo(f"{plural(played, 'message')} in {duration_words(int(seconds * 1e9))}")
+        click.echo(f"{plural(played, 'message')} in {format_duration(int(seconds * 1e9))}")
 
 
 async def _source(settings: Settings, store: Store, asked: Replay) -> tuple[Path, Destination | None]:
     """The file to play, and where it is played unless something else is asked for."""
     if not ADDRESS.fullmatch(asked.source):
         named = file_or_cid(asked.source)
-        return (await fetch(settings, store, named) if isinstance(named, str) else readable(named)), None
-    async with reading(settings) as chain:
+        return (await fetch(settings, store, named) if isinstance(named, str) else require_readable(named)), None
+    async with open_chain(settings) as chain:
         liability = await chain.liabilities.get(asked.source)
     cid = liability.objective if asked.of_objective else liability.result
     if not cid:
@@ -156,3 +156,74 @@ async def _play(session: zenoh.Session, recording: Objective, destination: Desti
                 played += 1
             tell(step.index + 1, recording.count)
     return played
+
+
+ADDRESS: Final = re.compile(r"0x[0-9a-fA-F]{40}")
+
+
+class Destination(Protocol):
+    """Where messages go."""
+
+    def key(self, topic: str, role: str) -> str:
+        """The key for a topic, and the role that a message has there. Raises `InvalidKey` for what no key may hold."""
+
+
+class DeviceTopics(Struct, frozen=True):
+    """The topics of a device, outside any job."""
+
+    agent: str
+    device: str
+
+    def key(self, topic: str, role: str) -> str:
+        """Its topic."""
+        return str(DeviceTopicKey(self.agent, self.device, topic))
+
+
+class JobTopics(Struct, frozen=True):
+    """The topics of a job that has ended."""
+
+    agent: str
+    liability: str
+
+    def key(self, topic: str, role: str) -> str:
+        """Where it was when it was recorded."""
+        family = ObjectiveTopicKey if role == "objective" else LiabilityTopicKey
+        return str(family(self.agent, self.liability, topic))
+
+
+class KeyPrefix(Struct, frozen=True):
+    """Keys that begin with `prefix`."""
+
+    prefix: str
+
+    def key(self, topic: str, role: str) -> str:
+        """Its topic."""
+        return self.prefix + topic_chunks(topic)
+
+
+def destination_of(settings: Settings, to: str) -> Destination:
+    """Where `--to` says. Raises `InputError`, `ConfigurationError`."""
+    first, slash, rest = to.partition("/")
+    if not slash:
+        own = own_address(settings)
+        if own is None:
+            raise ConfigurationError(
+                f"whose device {to!r} is can't be told without an account",
+                hint="give --keyfile, or --to ADDRESS/DEVICE",
+            )
+        return _checked(DeviceTopics(own, to))
+    if ADDRESS.fullmatch(first) and "/" not in rest:
+        return _checked(DeviceTopics(first, rest))
+    try:
+        prefix = str(zenoh.KeyExpr(to))
+    except zenoh.ZError as error:
+        raise InputError(f"{to!r} is not the beginning of a key: {error}") from None
+    if "*" in prefix or "$" in prefix:
+        raise InputError(f"{to!r} has a wildcard, and would reach everybody", hint="name one key")
+    return KeyPrefix(prefix)
+
+
+def _checked(device: DeviceTopics) -> DeviceTopics:
+    """The same, if keys can be made with it. Raises `InvalidKey`."""
+    device.key("/any", "")
+    return device

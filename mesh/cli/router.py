@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from mesh.cli.announcing import announce
-from mesh.cli.options import with_settings
-from mesh.cli.printing import print_json, print_table, visible, with_json
+from mesh.cli.options import with_json, with_settings
+from mesh.cli.output import announce, print_json, print_table, printable
 from mesh.errors import AiraError, ConfigurationError
 from mesh.outage_log import OutageLog
 from mesh.running import fail, run_until_stopped
@@ -71,7 +70,7 @@ def acl(settings: Settings, check: bool, roster: Path | None, as_json: bool) -> 
         print_json(_access(found))
     else:
         rows = [
-            (visible(one["name"]), one["address"], ", ".join(one["roles"]), right, key)
+            (printable(one["name"]), one["address"], ", ".join(one["roles"]), right, key)
             for one in _access(found)
             for right, keys in (one["may"] or {"nothing": ["(revoked)"]}).items()
             for key in keys
@@ -112,8 +111,13 @@ async def _serve(settings: Settings) -> None:
         while True:
             certificate = _contents(endpoints)
             async with Network(endpoints) as network:
-                announce(log, f"router {network.id} listens at {', '.join(settings.listen)}", zenoh=network.id)
-                announce(log, _who_is_let_in(endpoints))
+                announce(
+                    log,
+                    "router-started",
+                    f"router {network.id} listens at {', '.join(settings.listen)}",
+                    zenoh=network.id,
+                )
+                announce(log, "access-loaded", _who_is_let_in(endpoints))
                 with _shown(telemetry, network):
                     endpoints = await _changed(settings, endpoints, certificate)
             log.info("the roster or the certificate has changed: the router begins anew")

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from mesh.cli.files import at_once, size_words
-from mesh.cli.options import with_settings
-from mesh.cli.printing import plural, print_facts, print_json, print_table, visible, with_json
+from mesh.cli.options import with_json, with_settings
+from mesh.cli.output import format_size, plural, print_facts, print_json, print_table, printable, run_sync
 from mesh.running import run_to_end
 
 if TYPE_CHECKING:
@@ -37,7 +36,7 @@ def show(settings: Settings, file: Path | None, as_json: bool) -> None:
     if file is None:
         run_to_end(lambda: _show(settings.state_directory, as_json=as_json))
     else:
-        at_once(lambda: _show_archive(file, as_json=as_json))
+        run_sync(lambda: _show_archive(file, as_json=as_json))
 
 
 @command.command("backup", short_help="write it to a file, while agents run")
@@ -107,8 +106,8 @@ def _print_inventory(found: Inventory) -> None:
         print_table(("ACCOUNT", "CHAIN", "BLOCK", "JOBS", "TO SEND", "RECORDING"), rows)
     print_facts(
         {
-            account.address: f"{plural(account.files, 'file')}, {size_words(account.bytes)}"
-            f" ({size_words(account.pinned_bytes)} pinned){', in use' if account.in_use else ''}"
+            account.address: f"{plural(account.files, 'file')}, {format_size(account.bytes)}"
+            f" ({format_size(account.pinned_bytes)} pinned){', in use' if account.in_use else ''}"
             for account in found.accounts
         }
     )
@@ -128,12 +127,12 @@ def _show_archive(file: Path, *, as_json: bool) -> None:
 def _print_archive(found: ArchiveContents) -> None:
     print_facts(
         {
-            "made": visible(found.made),
-            "by": visible(found.software),
+            "made": printable(found.made),
+            "by": printable(found.software),
             "parts": ", ".join(found.parts),
             "files": ", ".join(f"{count} {kind}" for kind, count in found.files.items()),
-            "content": visible(found.content),
-            "unpacked": size_words(found.bytes),
+            "content": printable(found.content),
+            "unpacked": format_size(found.bytes),
             "checksums": "as they should be",
         }
     )
@@ -149,7 +148,7 @@ async def _back_up(folder: Path, file: Path, content: str, *, as_json: bool) -> 
     print_facts(
         {
             "backup": file,
-            "size": size_words(done.size),
+            "size": format_size(done.size),
             "accounts": ", ".join(done.accounts) or None,
             "jobs under way": done.jobs,
             "content": plural(done.files, "file"),
@@ -171,7 +170,7 @@ async def _restore(folder: Path, file: Path, existing: str, *, as_json: bool) ->
     print_facts(
         {
             "restored to": folder,
-            "as it was at": visible(done.made),
+            "as it was at": printable(done.made),
             "before that": done.aside,
             "jobs under way": len(jobs),
         }

@@ -1,22 +1,36 @@
-"""`aira status`: how agents, providers and bridges are."""
+"""`aira status` and `aira peers`: who is on a lighthouse's channel, and how each of them is."""
 
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from mesh.cli.options import with_settings
-from mesh.cli.printing import print_facts, print_json, print_table, say, with_json
+from mesh.cli.amounts import ETH, XRT
+from mesh.cli.options import with_json, with_settings
+from mesh.cli.output import (
+    format_duration,
+    format_size,
+    plural,
+    print_facts,
+    print_json,
+    print_line,
+    print_table,
+    printable,
+)
 from mesh.errors import RemoteError
 from mesh.running import run_to_end
 from mesh.settings import NetworkSettings, options_of
 from schemas import parse_address
+from schemas.status import ALIVE, OFF, BridgeStatus, Status
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from mesh.settings import Settings
-    from mesh.watching import How
+    from mesh.watching import How, Peer
+    from schemas.status import ContentMetrics, DirectionStatus, MarketStatus, Work
 
 
 @click.command("status")
@@ -26,7 +40,7 @@ if TYPE_CHECKING:
 )
 @with_json
 @with_settings(*options_of(NetworkSettings), "lighthouse_contract")
-def command(settings: Settings, address: str | None, timeout: float, as_json: bool) -> None:
+def status(settings: Settings, address: str | None, timeout: float, as_json: bool) -> None:
     """Show how whoever has ADDRESS is: an agent, a provider, a bridge. Whether its parts are alive, how far it has
     read the chain, its jobs or its market.
 
@@ -40,7 +54,6 @@ def command(settings: Settings, address: str | None, timeout: float, as_json: bo
 
 async def _one(settings: Settings, named: str, *, timeout: float, as_json: bool) -> None:
     from mesh.agent.components import watching
-    from mesh.cli.conditions import spoken
     from mesh.watching import status_of
 
     address = parse_address(named)
@@ -52,32 +65,190 @@ async def _one(settings: Settings, named: str, *, timeout: float, as_json: bool)
             hint="is it running, and on the same router? `aira peers` shows who is; a bridge needs its --lighthouse",
         )
     if as_json:
-        print_json([_facts(how) for how in told])
+        print_json([_status_json(how) for how in told])
         return
     for place, how in enumerate(told):
         if place:
-            say()
+            print_line()
         print_facts(spoken(how))
 
 
 async def _everybody(settings: Settings, *, timeout: float, as_json: bool) -> None:
     from mesh.agent.components import watching
-    from mesh.cli.conditions import in_short
     from mesh.watching import present, statuses
 
     async with watching(settings) as (network, channel):
         peers = await present(channel)
         told = await statuses(network.session, channel, peers, timeout=timeout)
     if as_json:
-        people = [{"role": peer.role, "address": peer.address, "status": _facts(told[peer])} for peer in peers]
+        people = [{"role": peer.role, "address": peer.address, "status": _status_json(told[peer])} for peer in peers]
         print_json({"lighthouse": channel.lighthouse, "peers": people})
     elif peers:
         rows = [(peer.role, peer.address, in_short(told[peer])) for peer in peers]
         print_table(("role", "address", "how it is"), rows)
     else:
-        say(f"nobody on {channel.lighthouse}")
+        print_line(f"nobody on {channel.lighthouse}")
 
 
-def _facts(how: How | None) -> dict[str, Any] | None:
+def _status_json(how: How | None) -> dict[str, Any] | None:
     """What somebody says of itself, as it travels."""
     return None if how is None else json.loads(how.encode())
+
+
+@click.command("peers")
+@with_json
+@with_settings(*options_of(NetworkSettings), "lighthouse_contract")
+def peers(settings: Settings, as_json: bool) -> None:
+    """Show who is on the lighthouse's channel, by role and address, and how many nodes listen on the IPFS side.
+
+    Who only watches does not show itself. `aira status` asks each of them how it is.
+    """
+    run_to_end(lambda: _peers(settings, as_json=as_json))
+
+
+async def _peers(settings: Settings, *, as_json: bool) -> None:
+    from mesh.agent.components import watching
+    from mesh.watching import present, statuses
+    from schemas.status import BridgeStatus
+
+    async with watching(settings) as (network, channel):
+        peers = await present(channel)
+        bridges = [peer for peer in peers if peer.role == "bridge"]
+        told = await statuses(network.session, channel, bridges)
+    states = {peer: how for peer, how in told.items() if isinstance(how, BridgeStatus)}
+    if as_json:
+        print_json(_peers_json(channel.lighthouse, peers, states))
+        return
+    if peers:
+        print_table(("role", "address"), [(peer.role, peer.address) for peer in peers])
+    print_line(f"{len(peers) or 'nobody'} on {channel.lighthouse}; on the IPFS side {_ipfs_side(bridges, states)}")
+
+
+def _peers_json(lighthouse: str, peers: list[Peer], states: dict[Peer, BridgeStatus]) -> dict[str, Any]:
+    best = _best(states)
+    return {
+        "lighthouse": lighthouse,
+        "peers": [{"role": peer.role, "address": peer.address} for peer in peers],
+        "ipfsPeers": None if best is None else list(best.ipfs_peers),
+    }
+
+
+def _ipfs_side(bridges: list[Peer], states: dict[Peer, BridgeStatus]) -> str:
+    """How many nodes of the legacy network are on the channel, as a bridge says."""
+    best = _best(states)
+    if best is None:
+        return "nobody knows: no bridge answers" if bridges else "nobody knows: there is no bridge"
+    nodes = plural(len(best.ipfs_peers), "node")
+    return nodes if best.state in ("connected", "alone") else f"{nodes}; the bridge says: {printable(best.state)}"
+
+
+def _best(states: dict[Peer, BridgeStatus]) -> BridgeStatus | None:
+    """The bridge to believe: the one that carries, or the one that sees most nodes."""
+    return max(states.values(), key=lambda how: (how.carries, len(how.ipfs_peers)), default=None)
+
+
+PHASES: Final = ("incoming", "ready", "running", "complete")
+"""Of jobs that are not at their end."""
+
+
+def spoken(how: How) -> dict[str, str]:
+    """All that somebody says of itself, by what it is about."""
+    told = _bridge(how) if isinstance(how, BridgeStatus) else _participant(how)
+    return {printable(name): printable(fact) for name, fact in told.items()}
+
+
+def in_short(how: How | None) -> str:
+    """The same in a line; None is somebody who does not say it."""
+    if how is None:
+        return "does not answer"
+    if isinstance(how, BridgeStatus):
+        carries = "carries" if how.carries else "stands by"
+        words = [how.state, carries, f"{plural(len(how.ipfs_peers), 'node')} on the IPFS side"]
+    else:
+        troubles = [f"{part} {state}" for part, state in how.parts.items() if state not in (ALIVE, OFF)]
+        words = [*(troubles or [ALIVE]), f"block {how.head:,}"]
+        if how.work is not None:
+            words.append(plural(_open_jobs(how.work), "open job"))
+        if how.market is not None:
+            words += [plural(how.market.open_orders, "open order"), plural(how.market.created, "contract")]
+    return printable(", ".join(words))
+
+
+def _participant(how: Status) -> dict[str, str]:
+    facts: dict[str, str] = {
+        how.role: how.address,
+        "lighthouse": how.lighthouse,
+        **how.parts,
+        "block": f"{how.head:,} of chain {how.chain_id}",
+    }
+    facts |= {} if how.work is None else _work(how.work)
+    facts |= {} if how.market is None else _market(how.market)
+    return facts | {
+        "runs for": format_duration(int(how.uptime) * 10**9),
+        "version": how.version,
+        "Zenoh id": how.zenoh_id,
+    }
+
+
+def _work(work: Work) -> dict[str, str]:
+    open_jobs = ", ".join(f"{work.jobs[phase]:,} {phase}" for phase in PHASES if work.jobs.get(phase))
+    store, quota = work.store, work.store.quota
+    room = "" if quota is None else f" of {format_size(quota)}"
+    return {
+        "open jobs": open_jobs or "none",
+        "done": f"{work.jobs.get('finalized', 0):,}",
+        "to be sent": plural(work.outbox, "message"),
+        "store": f"{plural(store.files, 'file')}, {format_size(store.bytes)}{room}",
+    }
+
+
+def _market(market: MarketStatus) -> dict[str, str]:
+    return {
+        "open orders": f"{market.open_orders:,}",
+        "contracts": f"{market.created:,} made, {market.finalized:,} finalized",
+        "rejected": _counts(market.rejected),
+        "earned": f"{XRT.show(market.fees + market.minted)}, {XRT.show(market.fees)} of it fees",
+        "spent": f"{ETH.show(market.spent)} on {market.gas_used:,} gas",
+    }
+
+
+def _bridge(how: BridgeStatus) -> dict[str, str]:
+    return {
+        "bridge": parse_address(how.bridge),
+        "lighthouse": how.lighthouse,
+        "state": how.state,
+        "carries": "yes" if how.carries else "no, it stands by",
+        "daemon": f"{how.daemon or 'not reached yet'} at {how.api}" + (f", {how.dialect}" if how.dialect else ""),
+        "IPFS side": plural(len(how.ipfs_peers), "node"),
+        "mesh side": plural(len(how.mesh_peers), "peer"),
+        "to IPFS": _way(how.to_ipfs),
+        "to mesh": _way(how.to_mesh),
+        **({} if how.content is None else {"content": _content(how.content)}),
+        "losses": f"{how.losses:,} of the daemon",
+        "last error": how.last_error or "none",
+        "runs for": format_duration(int(how.uptime) * 10**9),
+    }
+
+
+def _content(figures: ContentMetrics) -> str:
+    brought = f"{plural(figures.fetched, 'file')} fetched ({format_size(figures.fetched_bytes)})"
+    taken = f"{figures.added:,} added ({format_size(figures.added_bytes)})"
+    return f"{brought}, {taken}, {plural(figures.answered, 'block')} given, {figures.lies:,} false ones refused"
+
+
+def _way(way: DirectionStatus) -> str:
+    refused = f", {_counts(way.invalid)} refused" if way.invalid else ""
+    return (
+        f"{way.carried:,} carried ({way.per_second:.1f}/s), {way.waiting:,} waiting, "
+        f"{_counts(way.dropped)} dropped{refused}"
+    )
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    """How many in all, and of which kind."""
+    kinds = ", ".join(f"{count:,} {kind}" for kind, count in sorted(counts.items()))
+    return f"{sum(counts.values()):,}" + (f" ({kinds})" if kinds else "")
+
+
+def _open_jobs(work: Work) -> int:
+    return sum(work.jobs.get(phase, 0) for phase in PHASES)

@@ -1,23 +1,58 @@
-"""`aira up`: all that an agent needs around it, in one process."""
+"""`aira up` and `aira chain up`: a market, or a chain alone, for development."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 from contextlib import AsyncExitStack
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from mesh.cli.announcing import announce
-from mesh.cli.engine import chosen, with_engine
-from mesh.cli.options import BLOCK_TIME, PORT, with_settings
+from mesh.cli.options import BLOCK_TIME, PORT, with_json, with_settings
+from mesh.cli.output import announce, print_json
+from mesh.errors import ConfigurationError
 from mesh.running import run_until_stopped
 from mesh.settings import Settings, TelemetrySettings, options_of
 from mesh.telemetry.serving import Telemetry
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import Callable
+
+
+def with_engine(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command the options `engine`, `anvil` and `state`, which `chosen` understands."""
+    engine = click.option(
+        "--engine",
+        type=click.Choice(["auto", "anvil", "embedded"]),
+        default="auto",
+        show_default=True,
+        help="what runs the chain; auto takes anvil where it is found",
+    )
+    anvil = click.option("--anvil", type=click.Path(path_type=Path), help="the program anvil [the one on the path]")
+    kept = click.Path(dir_okay=False, path_type=Path)
+    state = click.option("--state", type=kept, help="file that anvil keeps the chain in")
+    return engine(anvil(state(function)))
+
+
+def find_engine(*, engine: str, anvil: Path | None, state: Path | None) -> Path | None:
+    """The program anvil, or None for the embedded chain. Raises `ConfigurationError`."""
+    from mesh.devchain.anvil import find_anvil
+
+    program = None if engine == "embedded" else find_anvil(anvil)
+    if engine == "anvil" and program is None:
+        raise ConfigurationError(
+            "anvil is not on the path", hint="name it with --anvil FILE, or take --engine embedded, which needs nothing"
+        )
+    if state is not None and program is None:
+        raise ConfigurationError(
+            "only anvil can keep the chain in a file, and the embedded chain was "
+            + ("asked for" if engine == "embedded" else "taken, as anvil is not on the path"),
+            hint="name anvil with --anvil FILE, or leave --state out",
+        )
+    return program
+
 
 log = logging.getLogger(__name__)
 
@@ -37,10 +72,10 @@ def command(settings: Settings, port: int, block_time: float, **engine: Any) -> 
     The chain is gone then, unless --state keeps it. The keyfiles of a robot and a person with money are written to the
     data folder; what to do with them is printed.
     """
-    run_until_stopped(lambda: _serve(settings, port, block_time, **engine), settings=settings, role="up")
+    run_until_stopped(lambda: _serve_market(settings, port, block_time, **engine), settings=settings, role="up")
 
 
-async def _serve(
+async def _serve_market(
     settings: Settings,
     port: int,
     block_time: float,
@@ -56,7 +91,7 @@ async def _serve(
     from mesh.network import Endpoints, Network
 
     check_loopback(settings.listen)
-    program = chosen(engine=engine, anvil=anvil, state=state)
+    program = find_engine(engine=engine, anvil=anvil, state=state)
     async with AsyncExitStack() as stack:
         telemetry = await stack.enter_async_context(Telemetry(settings.metrics_listen))
         network = await stack.enter_async_context(Network(Endpoints(listen=settings.listen, mode="router")))
@@ -73,4 +108,55 @@ async def _serve(
         for market, provider in zip(markets, providers, strict=True):
             tasks.create_task(provider.run(), name=f"provider of {market}")
         words = f"router      {', '.join(settings.listen)}\n{served.describe()}\nprovider    {providers[0].address}"
-        announce(log, words, **served.facts(), provider=providers[0].address)
+        announce(log, "market-started", words, **served.facts(), provider=providers[0].address)
+
+
+log = logging.getLogger(__name__)
+
+
+@click.command("up")
+@click.option("--host", default="127.0.0.1", show_default=True, help="address to listen at")
+@click.option("--port", type=PORT, default=8545, show_default=True, help="port to listen at; 0 takes a free one")
+@click.option("--block-time", type=BLOCK_TIME, help="also mine an empty block every so many seconds")
+@with_engine
+@with_json
+@with_settings("data_dir", *options_of(TelemetrySettings))
+def chain_up(settings: Settings, host: str, port: int, block_time: float | None, as_json: bool, **engine: Any) -> None:
+    """Serve a chain with the contracts on it, as JSON-RPC over HTTP and WebSocket.
+
+    It is gone when this ends (Ctrl-C), unless --state keeps it.
+
+    The keyfiles of three accounts with money (provider, robot, person) are written to the data folder. Their keys are
+    known to all the world: they are for development alone.
+    """
+
+    async def serve() -> None:
+        from mesh.devchain.development import serve_chain
+
+        program = find_engine(**engine)
+        async with (
+            Telemetry(settings.metrics_listen) as telemetry,
+            serve_chain(
+                settings, host=host, port=port, block_time=block_time, anvil=program, state=engine["state"]
+            ) as served,
+        ):
+            if as_json:
+                print_json(served.facts())
+            else:
+                announce(log, "chain-started", served.describe(), **served.facts())
+            await _show_health(served.url, telemetry)
+
+    run_until_stopped(serve, settings=settings, role="chain")
+
+
+async def _show_health(url: str, telemetry: Telemetry) -> None:
+    """Tell how the chain at `url` is, if anybody is to be told, until cancelled."""
+    from mesh.chain import Node
+    from mesh.demo.looking import Look
+
+    if not telemetry.url:
+        await asyncio.Event().wait()
+    async with Node(url) as node:
+        look = Look(node)
+        with telemetry.showing(measure=look.measure, health=look.health):
+            await look.run()

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Final
 import click
 import msgspec
 
-from mesh.cli.holdings import MESH, fetch, opened_store, readable
-from mesh.cli.opening import reading
-from mesh.cli.options import with_settings
-from mesh.cli.printing import plural, print_facts, print_json, print_table, visible, with_json
-from mesh.cli.progress import progress
+from mesh.cli.chain_client import open_chain
+from mesh.cli.files import MESH, fetch, opened_store, require_readable
+from mesh.cli.options import with_json, with_settings
+from mesh.cli.output import plural, print_facts, print_json, print_table, printable, progress
 from mesh.errors import AiraError, InputError
 from mesh.evidence import Claim, Verdict, check_end, verify
 from mesh.running import run_to_end
@@ -78,7 +77,7 @@ class Files(msgspec.Struct, frozen=True, kw_only=True):
 async def _verify(settings: Settings, liability: str | None, files: Files, *, offline: bool, as_json: bool) -> bool:
     if (liability is None or offline) and None in (files.objective, files.result):
         raise InputError("without a contract there is nothing to fetch", hint="give --objective and --result")
-    message = None if files.message is None else await asyncio.to_thread(readable(files.message).read_bytes)
+    message = None if files.message is None else await asyncio.to_thread(require_readable(files.message).read_bytes)
     claim = await _claim(settings, liability, offline=offline)
     verdict = await _verdict(settings, claim, files, message)
     if as_json:
@@ -93,7 +92,7 @@ async def _claim(settings: Settings, liability: str | None, *, offline: bool) ->
         return Claim()
     if offline:
         return Claim(liability=parse_address(liability))
-    async with reading(settings) as chain:
+    async with open_chain(settings) as chain:
         return Claim.of_contract(await chain.liabilities.get(liability))
 
 
@@ -101,8 +100,10 @@ async def _verdict(settings: Settings, claim: Claim, files: Files, message: byte
     if files.result is None and not claim.result:
         return Verdict((check_end(claim),))
     async with opened_store(settings) as store:
-        objective = readable(files.objective) if files.objective else await fetch(settings, store, claim.objective)
-        result = readable(files.result) if files.result else await fetch(settings, store, claim.result)
+        objective = (
+            require_readable(files.objective) if files.objective else await fetch(settings, store, claim.objective)
+        )
+        result = require_readable(files.result) if files.result else await fetch(settings, store, claim.result)
         with progress("verifying") as tell:
             return await asyncio.to_thread(
                 verify,
@@ -125,7 +126,7 @@ def _print(claim: Claim, verdict: Verdict) -> None:
             "result": claim.result or None,
         }
     )
-    rows = [(MARKS[finding.holds], finding.name, visible(finding.detail)) for finding in verdict.findings]
+    rows = [(MARKS[finding.holds], finding.name, printable(finding.detail)) for finding in verdict.findings]
     print_table(("", "what", "found"), rows)
     failed = sum(finding.holds is False for finding in verdict.findings)
     untold = sum(finding.holds is None for finding in verdict.findings)

@@ -1,4 +1,4 @@
-"""`aira watch`: a market as it happens."""
+"""`aira watch`: prints what happens on a market."""
 
 from __future__ import annotations
 
@@ -7,28 +7,31 @@ import signal
 from contextlib import AsyncExitStack, asynccontextmanager
 from datetime import UTC, datetime
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
 import click
+import msgspec
 
 from mesh.background import Background
-from mesh.cli.options import with_settings
-from mesh.cli.pipes import until_unread
-from mesh.cli.printing import plural, print_json, say, with_json
+from mesh.cli.amounts import XRT, Unit
+from mesh.cli.options import with_json, with_settings
+from mesh.cli.output import plural, print_json, print_line, printable, short_address, wait_for_broken_pipe
 from mesh.running import run_until_stopped
 from mesh.settings import NetworkSettings, options_of
 from mesh.telemetry.logs import start_log
-from schemas import InvalidAddress, parse_address, parse_cid
+from mesh.watching import JobEvent, Reading
+from schemas import Demand, Empty, InvalidAddress, Result, String, Verified, parse_address, parse_cid
+from schemas.signing import Rejection
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     import zenoh
 
-    from mesh.cli.happenings import Words
     from mesh.network import Channel, Network
     from mesh.settings import Settings
-    from mesh.watching import MarketWatch, Reading, Seen, Tally
+    from mesh.watching import MarketWatch, Seen, Tally
+    from schemas import Liability, Offer
 
 
 @click.command("watch")
@@ -55,7 +58,6 @@ async def _watch(
     settings: Settings, model: str | None, *, with_open: bool, as_json: bool, readings: bool = False
 ) -> None:
     from mesh.agent.components import watching
-    from mesh.cli.happenings import Words
     from mesh.watching import MarketWatch, Readings
 
     if model is not None:
@@ -79,13 +81,12 @@ async def _watch(
 
 def _tell(words: Words | None, something: Seen | Reading) -> None:
     """Print what happened: in `words` for people, as JSON where there are none."""
-    from mesh.cli.happenings import facts
 
     now = datetime.now(UTC)
     if words is None:
-        print_json(facts(something, time=now.isoformat(timespec="milliseconds").replace("+00:00", "Z")))
+        print_json(event_json(something, time=now.isoformat(timespec="milliseconds").replace("+00:00", "Z")))
     else:
-        say(f"{now.astimezone():%H:%M:%S}  {words.line(something)}")
+        print_line(f"{now.astimezone():%H:%M:%S}  {words.line(something)}")
 
 
 @asynccontextmanager
@@ -94,13 +95,13 @@ async def _beside(network: Network, seen: MarketWatch) -> AsyncIterator[Backgrou
     loop = asyncio.get_running_loop()
 
     def tell() -> None:
-        click.echo(told(seen.tally()), err=True)
+        click.echo(format_counters(seen.tally()), err=True)
 
     loop.add_signal_handler(signal.SIGUSR1, tell)
     try:
         async with Background() as tasks:
             tasks.start(_say_losses(network), "network losses")
-            tasks.start(until_unread(), "readers of stdout")
+            tasks.start(wait_for_broken_pipe(), "readers of stdout")
             yield tasks
     except asyncio.CancelledError:  # by Ctrl-C; who has closed the pipe wants to hear no more
         tell()
@@ -109,7 +110,7 @@ async def _beside(network: Network, seen: MarketWatch) -> AsyncIterator[Backgrou
         loop.remove_signal_handler(signal.SIGUSR1)
 
 
-def told(tally: Tally) -> str:
+def format_counters(tally: Tally) -> str:
     """What came by, in a line for people."""
     reasons = ", ".join(f"{count:,} {reason}" for reason, count in sorted(tally.refused.items()))
     refused = f"{sum(tally.refused.values()):,} refused" + (f" ({reasons})" if reasons else "")
@@ -138,3 +139,125 @@ async def _xrt(settings: Settings, session: zenoh.Session, channel: Channel) -> 
         told = await statuses(session, channel, providers)
     named = {how.xrt for how in told.values() if isinstance(how, Status) and how.xrt}
     return named.pop() if len(named) == 1 else None
+
+
+LONGEST: Final = 200
+"""Letters of what somebody says that are shown."""
+
+
+DIGITS: Final = 8
+"""Of an order's hash in a line; with --json there are all 64."""
+
+
+KIND: Final = 9
+"""Letters of the longest word for what happened."""
+
+
+def event_json(seen: Seen | Reading, *, time: str) -> dict[str, Any]:
+    """Something that happened at `time` (ISO 8601), for programs. Amounts are text, in the smallest unit."""
+    match seen:
+        case Verified():
+            message = seen.message
+            about: dict[str, Any] = {"event": type(message).__name__.lower(), "hash": seen.hash.hex()}
+            about["signer"] = seen.signer
+            if isinstance(message, Result):
+                about |= {"liability": message.liability, "result": message.result, "success": message.success}
+            else:
+                about |= _order_facts(message)
+        case Rejection():
+            about = {"event": "rejected", "order": seen.order, "provider": seen.provider}
+            about |= {"reason": seen.reason, "detail": seen.detail}
+        case Reading():
+            about = {"event": "reading", "signer": seen.signer, "result": seen.result, "topic": seen.topic}
+            about["value"] = _value(seen)
+        case JobEvent(agent, event, liability):
+            about = {"event": event, "agent": agent, "liability": msgspec.json.decode(liability.encode())}
+    return {"time": time} | about
+
+
+def _order_facts(order: Demand | Offer) -> dict[str, Any]:
+    if isinstance(order, Demand):
+        fee = {"validatorFee": str(order.validator_fee)}
+    else:
+        fee = {"lighthouseFee": str(order.lighthouse_fee)}
+    return {
+        "model": order.model,
+        "objective": order.objective,
+        "token": order.token,
+        "cost": str(order.cost),
+        "lighthouse": order.lighthouse,
+        "validator": order.validator,
+        **fee,
+        "deadline": order.deadline,
+        "generation": order.generation,
+    }
+
+
+class Words:
+    """What happened, in a line for people. `xrt` is the address of XRT, as far as it is known."""
+
+    def __init__(self, xrt: str | None) -> None:
+        self._xrt = xrt
+
+    def line(self, seen: Seen | Reading) -> str:
+        """The line, without the time."""
+        match seen:
+            case Verified():
+                message, kind = seen.message, type(seen.message).__name__.lower()
+                words = self._result(message, seen.signer) if isinstance(message, Result) else self._order(seen)
+            case Rejection():
+                why = printable(seen.detail[:LONGEST] or seen.reason[:LONGEST])
+                kind, words = "rejected", f"{seen.order[:DIGITS]} by {short_address(seen.provider)}: {why}"
+            case Reading():
+                kind, words = "reading", f"{printable(seen.topic)}  {_shown(seen)}, from {short_address(seen.signer)}"
+            case JobEvent(_, kind, liability):
+                words = self._work(liability)
+        return f"{kind:<{KIND}}  {words}"
+
+    def cost(self, amount: int, token: str) -> str:
+        """An amount of a token."""
+        return (XRT if token == self._xrt else Unit(f"units of {short_address(token)}", 0)).show(amount)
+
+    def _order(self, seen: Verified[Any]) -> str:
+        order: Demand | Offer = seen.message
+        if isinstance(order, Demand):
+            does, fee = "pays", ""
+        else:
+            does = "works for"
+            fee = f" and {XRT.show(order.lighthouse_fee)} to the provider" if order.lighthouse_fee else ""
+        terms = f"{self.cost(order.cost, order.token)}{fee}, model {_short_cid(order.model)}"
+        more = f"objective {_short_cid(order.objective)}, until block {order.deadline:,}"
+        return f"{seen.hash.hex()[:DIGITS]}  {seen.signer} {does} {terms}, {more}"
+
+    def _result(self, result: Result, signer: str) -> str:
+        return f"{result.result}  {_ended(result.success)}, for {result.liability}, signed by {short_address(signer)}"
+
+    def _work(self, job: Liability) -> str:
+        parties = f"{short_address(job.promisor)} for {short_address(job.promisee)}, {self.cost(job.cost, job.token)}"
+        return f"{job.address}  {parties}" + (f", {_ended(job.is_success)}: {job.result}" if job.result else "")
+
+
+def _value(reading: Reading) -> Any:
+    """What was read as JSON has it; bytes become base64."""
+    match reading.value:
+        case Empty():
+            return None
+        case String(data):
+            return data
+        case value:
+            return value
+
+
+def _shown(reading: Reading) -> str:
+    value = _value(reading)
+    text = value if isinstance(value, str) else msgspec.json.encode(value).decode()
+    return printable(text[:LONGEST] + ("…" if len(text) > LONGEST else ""))
+
+
+def _short_cid(cid: str) -> str:
+    """A CID in a line in which something else is the one to copy."""
+    return f"{cid[:6]}…{cid[-4:]}"
+
+
+def _ended(success: bool) -> str:
+    return "done" if success else "not done"

@@ -6,9 +6,18 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mesh.cli.opening import for_reading, for_signing, patience, reading, signing
-from mesh.cli.printing import print_facts, print_json, say, with_json
-from mesh.cli.tokens import FACTORY, account_of, check_enough, spender_of, unit_of
+from mesh.cli.chain_client import (
+    FACTORY,
+    account_of,
+    check_balance,
+    notice_when_slow,
+    open_chain,
+    open_signing_chain,
+    spender_of,
+    unit_of,
+)
+from mesh.cli.options import with_chain_settings, with_json, with_signing_settings
+from mesh.cli.output import print_facts, print_json, print_line
 from mesh.running import run_to_end
 
 if TYPE_CHECKING:
@@ -32,21 +41,21 @@ def command() -> None:
 @click.argument("account", required=False)
 @with_token
 @with_json
-@for_reading()
+@with_chain_settings()
 def balance(settings: Settings, **what: Any) -> None:
     """Show what ACCOUNT (an address or ENS name; by default the settings' account) holds."""
     run_to_end(lambda: _balance(settings, **what))
 
 
 async def _balance(settings: Settings, *, account: str | None, token: str | None, as_json: bool) -> None:
-    async with reading(settings) as chain:
+    async with open_chain(settings) as chain:
         owner = await account_of(chain, settings, account)
         unit = await unit_of(chain, token)
         amount = await chain.tokens.balance(owner, token=token)
         if as_json:
             print_json({"account": owner, **await _about(chain, token, unit), "balance": str(amount)})
         else:
-            say(unit.show(amount))
+            print_line(unit.show(amount))
 
 
 @command.command("allowance", short_help="show what somebody may take from an account")
@@ -54,14 +63,14 @@ async def _balance(settings: Settings, *, account: str | None, token: str | None
 @click.option("--owner", help="address or ENS name of who allows it [the settings' account]")
 @with_token
 @with_json
-@for_reading()
+@with_chain_settings()
 def allowance(settings: Settings, **what: Any) -> None:
     """Show what SPENDER may take from the account: `factory` (the default), a lighthouse's name, or an address."""
     run_to_end(lambda: _allowance(settings, **what))
 
 
 async def _allowance(settings: Settings, *, spender: str, owner: str | None, token: str | None, as_json: bool) -> None:
-    async with reading(settings) as chain:
+    async with open_chain(settings) as chain:
         whose, by = await account_of(chain, settings, owner), await spender_of(chain, spender)
         unit = await unit_of(chain, token)
         amount = await chain.tokens.allowance(whose, by, token=token)
@@ -69,7 +78,7 @@ async def _allowance(settings: Settings, *, spender: str, owner: str | None, tok
             about = await _about(chain, token, unit)
             print_json({"owner": whose, "spender": by, **about, "allowance": str(amount)})
         else:
-            say(unit.show(amount))
+            print_line(unit.show(amount))
 
 
 @command.command("approve", short_help="let somebody take up to an amount")
@@ -77,7 +86,7 @@ async def _allowance(settings: Settings, *, spender: str, owner: str | None, tok
 @click.argument("amount")
 @with_token
 @with_json
-@for_signing()
+@with_signing_settings()
 def approve(settings: Settings, **what: Any) -> None:
     """Let SPENDER take up to AMOUNT from the account, instead of what it might take before; 0 takes it back.
 
@@ -87,10 +96,10 @@ def approve(settings: Settings, **what: Any) -> None:
 
 
 async def _approve(settings: Settings, *, spender: str, amount: str, token: str | None, as_json: bool) -> None:
-    async with signing(settings) as chain:
+    async with open_signing_chain(settings) as chain:
         unit = await unit_of(chain, token)
         value, by = unit.parse(amount), await spender_of(chain, spender)
-        with patience():
+        with notice_when_slow():
             tx = await chain.tokens.approve(by, value, token=token)
         if as_json:
             print_json({"spender": by, **await _about(chain, token, unit), "allowance": str(value), "tx": tx})
@@ -103,18 +112,18 @@ async def _approve(settings: Settings, *, spender: str, amount: str, token: str 
 @click.argument("amount")
 @with_token
 @with_json
-@for_signing()
+@with_signing_settings()
 def transfer(settings: Settings, **what: Any) -> None:
     """Send AMOUNT from the account to TO, an address or ENS name."""
     run_to_end(lambda: _transfer(settings, **what))
 
 
 async def _transfer(settings: Settings, *, to: str, amount: str, token: str | None, as_json: bool) -> None:
-    async with signing(settings) as chain:
+    async with open_signing_chain(settings) as chain:
         unit = await unit_of(chain, token)
         value, recipient = unit.parse(amount), await chain.names.address(to)
-        await check_enough(chain, unit, value, token=token)
-        with patience():
+        await check_balance(chain, unit, value, token=token)
+        with notice_when_slow():
             tx = await chain.tokens.transfer(recipient, value, token=token)
         left = await chain.tokens.balance(token=token)
         if as_json:

@@ -11,12 +11,12 @@ from tests.support.commands import run
 
 PROGRAM = """
 import logging
-from mesh.cli.announcing import announce
+from mesh.cli.output import announce
 from mesh.telemetry.logs import own_log, start_log
 from schemas.logs import ReadLogs
 start_log(form={form!r}, role="up")
 words = "router      tcp/here 100%\\nchain       http://there"
-announce(logging.getLogger("a.server"), words, chain="http://there", count=1)
+announce(logging.getLogger("a.server"), "server-started", words, chain="http://there", count=1)
 print(own_log().ring.read(ReadLogs()).entries[0].message)
 """
 LINE = "router tcp/here 100%; chain http://there"
@@ -33,5 +33,5 @@ def test_the_event_is_one_line_and_people_see_all_of_them(form: str) -> None:
         assert (said, done.stderr) == (["router      tcp/here 100%", "chain       http://there"], "")
     else:
         event = json.loads(done.stderr)
-        assert (said, event["message"], event["chain"]) == ([], LINE, "http://there")
+        assert (said, event["event"], event["message"], event["chain"]) == ([], "server-started", LINE, "http://there")
         assert "count" not in event

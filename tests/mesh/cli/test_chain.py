@@ -11,7 +11,7 @@ import pytest
 from mesh.chain import XRT, Account, Chain, TransactionSender, new_private_key
 from mesh.chain.artifacts import load_artifact
 from mesh.chain.recognition import is_code_of
-from mesh.cli.chain.deploy import DEPLOYMENT_GAS
+from mesh.cli.chain import DEPLOYMENT_GAS
 from tests.mesh.cli.chains import Town, columns, refused, write_quick_keyfile
 from tests.support.commands import aira
 from tests.support.nodes import Anvil

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from mesh.cli.peers import _peers
+from mesh.cli.status import _peers
 from mesh.network import Channel, Endpoints, Network
 from mesh.settings import Settings
 from mesh.watching import present

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from mesh.cli.printing import plural, print_facts, print_json, print_table, visible
+from mesh.cli.output import plural, print_facts, print_json, print_table, printable
 
 
 def test_facts_are_in_two_columns_and_the_unknown_ones_left_out(capsys: pytest.CaptureFixture[str]) -> None:
@@ -33,7 +33,7 @@ def test_numbers_that_doubles_can_not_hold_are_text_in_json(capsys: pytest.Captu
 
 
 def test_a_strangers_text_does_not_steer_the_terminal() -> None:
-    assert visible("anvil\x1b[2J\u202e") == "anvil\N{REPLACEMENT CHARACTER}[2J\N{REPLACEMENT CHARACTER}"
+    assert printable("anvil\x1b[2J\u202e") == "anvil\N{REPLACEMENT CHARACTER}[2J\N{REPLACEMENT CHARACTER}"
 
 
 @pytest.mark.parametrize(("count", "words"), [(0, "0 blocks"), (1, "1 block"), (2_000, "2,000 blocks")])
@@ -42,7 +42,7 @@ def test_one_is_one_and_all_else_are_many(count: int, words: str) -> None:
 
 
 def test_a_disk_that_is_full_is_one_clear_line() -> None:
-    program = "from mesh.cli.printing import print_json, say\nsay('a line')\nprint_json({'an': 'object'})\n"
+    program = "from mesh.cli.output import print_json, print_line\nprint_line('a line')\nprint_json({'an': 'object'})\n"
     with open("/dev/full", "w") as full:
         done = subprocess.run([sys.executable, "-c", program], stdout=full, stderr=subprocess.PIPE, text=True)
     assert (done.returncode, done.stderr) == (1, "aira: can't write to stdout: No space left on device\n")

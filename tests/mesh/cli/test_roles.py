@@ -13,7 +13,7 @@ from mesh.agent import Agent
 from mesh.cli.demand import _demand
 from mesh.cli.provider import _serve as serve_provider
 from mesh.cli.router import _serve as serve_router
-from mesh.cli.up import _serve as serve_up
+from mesh.cli.up import _serve_market as serve_up
 from mesh.composition import load_account
 from mesh.errors import AiraError, ConfigurationError, NetworkUnavailable
 from mesh.settings import Settings

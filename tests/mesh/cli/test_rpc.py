@@ -9,8 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from mesh.cli import main
-from mesh.cli.arguments import request_of
-from mesh.cli.rpc import _call
+from mesh.cli.rpc import _call, request_of
 from mesh.errors import InputError
 from mesh.network import ServiceFailed
 from schemas.message_requests import SendDemand

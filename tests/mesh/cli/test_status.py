@@ -11,8 +11,7 @@ import pytest
 import mesh
 from mesh.agent import Agent
 from mesh.chain import Chain
-from mesh.cli.conditions import in_short, spoken
-from mesh.cli.status import _everybody, _one
+from mesh.cli.status import _everybody, _one, in_short, spoken
 from mesh.devchain import JsonRpcServer
 from mesh.errors import InvalidAddress, RemoteError
 from mesh.settings import Settings

@@ -15,7 +15,7 @@ from mesh.agent import Agent
 from mesh.cli import main
 from mesh.cli.demand import _demand
 from mesh.cli.replay import Replay, _replay
-from mesh.cli.up import _serve as serve_up
+from mesh.cli.up import _serve_market as serve_up
 from mesh.cli.verify import Files, _verify
 from mesh.composition import load_account
 from mesh.errors import AiraError

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
-from mesh.cli.happenings import Words, facts
-from mesh.cli.watch import _watch, told
+from mesh.cli.watch import Words, _watch
+from mesh.cli.watch import event_json as facts
+from mesh.cli.watch import format_counters as told
 from mesh.errors import InvalidCid
 from mesh.network import Channel, Endpoints, Network, message_key
 from mesh.settings import Settings

@@ -1,4 +1,4 @@
-"""`aira liability cancel`: the end of a liability without a result."""
+"""`aira liability cancel`: ends a liability without a result."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mesh.cli.liability.show import refund_words
-from mesh.cli.liability.words import OUTCOMES, facts_of, state_of, units_of
-from mesh.cli.opening import for_signing, patience, signing
-from mesh.cli.printing import print_facts, print_json, say, with_json
+from mesh.cli.chain_client import notice_when_slow, open_signing_chain, units_of
+from mesh.cli.liability import OUTCOMES, facts_of, refund_words, state_of
+from mesh.cli.options import with_json, with_signing_settings
+from mesh.cli.output import print_facts, print_json, print_line
 from mesh.errors import ChainError, InputError, InvalidMessage
 from mesh.running import run_to_end
 
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 )
 @click.option("--refund", is_flag=True, help="have the promisee paid back by the delay alone, without signatures")
 @with_json
-@for_signing()
-def command(settings: Settings, address: str, signatures: tuple[str, ...], refund: bool, as_json: bool) -> None:
+@with_signing_settings()
+def cancel(settings: Settings, address: str, signatures: tuple[str, ...], refund: bool, as_json: bool) -> None:
     """Call off the work of the liability at ADDRESS: the promisee has its money back, nobody is paid.
 
     Both parties have to agree. The first runs this without --signature: nothing is sent, its signature is printed. It
@@ -48,7 +48,7 @@ def command(settings: Settings, address: str, signatures: tuple[str, ...], refun
 
 
 async def _refund(settings: Settings, address: str, as_json: bool) -> None:
-    async with signing(settings) as chain:
+    async with open_signing_chain(settings) as chain:
         liability = await _open_liability(chain, address)
         state = await chain.liabilities.refund_state(liability.address)
         if not state.is_refundable:
@@ -56,18 +56,18 @@ async def _refund(settings: Settings, address: str, as_json: bool) -> None:
                 f"the money of {liability.address} can't be had back yet: {refund_words(state)}",
                 hint="before that, both parties can call the work off: `aira liability cancel` without --refund",
             )
-        with patience():
+        with notice_when_slow():
             settled = await chain.liabilities.refund(liability.address)
         await _print_end(chain, liability.address, settled, as_json)
 
 
 async def _cancel(settings: Settings, address: str, signatures: Sequence[str], as_json: bool) -> None:
-    async with signing(settings) as chain:
+    async with open_signing_chain(settings) as chain:
         liability = await _open_liability(chain, address)
         signed = _signed(chain, liability, signatures)
         missing = [party for party in ("promisee", "promisor") if party not in signed]
         if not missing:
-            with patience():
+            with notice_when_slow():
                 settled = await chain.liabilities.cancel(
                     liability.address, promisee_signature=signed["promisee"], promisor_signature=signed["promisor"]
                 )
@@ -126,9 +126,9 @@ def _print_signature(chain: Chain, liability: Liability, signed: dict[str, str],
         facts = {"liability": liability.address, "signer": chain.account.address, "party": party}
         print_json(facts | {"signature": signature, "needed": whose})
         return
-    say(f"as the {party}, you agree to call off {liability.address} by this signature:\n\n{signature}\n")
-    say(f"nothing was sent. The {other}, {whose}, ends it with\n")
-    say(f"aira liability cancel {liability.address} --signature {signature}")
+    print_line(f"as the {party}, you agree to call off {liability.address} by this signature:\n\n{signature}\n")
+    print_line(f"nothing was sent. The {other}, {whose}, ends it with\n")
+    print_line(f"aira liability cancel {liability.address} --signature {signature}")
 
 
 async def _print_end(chain: Chain, address: str, settled: Settled, as_json: bool) -> None:

@@ -1,4 +1,4 @@
-"""`aira objective show`."""
+"""`aira objective show`: what is in an objective or a recording."""
 
 from __future__ import annotations
 
@@ -7,11 +7,20 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from mesh.cli.files import at_once, duration_words, size_words
-from mesh.cli.holdings import MESH, fetch, file_or_cid, opened_store, readable
-from mesh.cli.options import with_settings
-from mesh.cli.printing import plural, print_facts, print_json, print_table, visible, with_json
-from mesh.cli.progress import progress
+from mesh.cli.files import MESH, fetch, file_or_cid, opened_store, require_readable, write_error
+from mesh.cli.options import with_json, with_settings
+from mesh.cli.output import (
+    format_duration,
+    format_size,
+    plural,
+    print_facts,
+    print_json,
+    print_table,
+    printable,
+    progress,
+    run_sync,
+)
+from mesh.errors import ConfigurationError
 from mesh.recording import GENEROUS, Objective, TopicRates, open_objective, rates_of
 from mesh.running import run_to_end
 from schemas import cid_of_file
@@ -22,9 +31,14 @@ if TYPE_CHECKING:
     from mesh.settings import Settings
     from schemas.payloads import PayloadType
 
+
 SPANS: Final = 48
 """Columns of the plot in the terminal."""
+
+
 PNG_SPANS: Final = 200
+
+
 BARS: Final = " ▁▂▃▄▅▆▇█"
 
 
@@ -34,13 +48,13 @@ BARS: Final = " ▁▂▃▄▅▆▇█"
 @click.option("--png", type=click.Path(path_type=Path), help="draw the messages a second to this file")
 @with_json
 @with_settings(*MESH)
-def command(settings: Settings, objective: str, schemas: bool, png: Path | None, as_json: bool) -> None:
+def show(settings: Settings, objective: str, schemas: bool, png: Path | None, as_json: bool) -> None:
     """Show what is in OBJECTIVE, a file or a CID: how long, which topics of which types, whose recording it says it is,
     and how many messages come when."""
-    path = at_once(lambda: file_or_cid(objective))
+    path = run_sync(lambda: file_or_cid(objective))
     if isinstance(path, str):
         path = _fetched(settings, path)
-    at_once(lambda: _show(path, schemas=schemas, png=png, as_json=as_json))
+    run_sync(lambda: _show(path, schemas=schemas, png=png, as_json=as_json))
 
 
 def _fetched(settings: Settings, cid: str) -> Path:
@@ -55,15 +69,13 @@ def _fetched(settings: Settings, cid: str) -> Path:
 
 
 def _show(path: Path, *, schemas: bool, png: Path | None, as_json: bool) -> None:
-    readable(path)
+    require_readable(path)
     with progress(f"reading {path.name}") as tell:
         objective = open_objective(path, GENEROUS, progress=tell)
     if png is not None:
-        from mesh.cli.objective.plot import draw
-
         draw(_rates(objective, PNG_SPANS), png, title=path.name)
     if as_json:
-        print_json(_facts(objective))
+        print_json(_objective_json(objective))
         return
     _print_summary(objective)
     _print_topics(objective)
@@ -76,7 +88,7 @@ def _rates(objective: Objective, spans: int) -> TopicRates:
     return rates_of(objective.messages(), start_ns=start, duration_ns=duration, spans=spans)
 
 
-def _facts(objective: Objective) -> dict[str, Any]:
+def _objective_json(objective: Objective) -> dict[str, Any]:
     rates = _rates(objective, SPANS)
     return {
         "cid": cid_of_file(objective.path),
@@ -113,20 +125,20 @@ def _described(kind: PayloadType) -> dict[str, str]:
 
 
 def _print_summary(objective: Objective) -> None:
-    attached = ", ".join(f"{visible(one.name)} ({size_words(one.size)})" for one in objective.attachments)
+    attached = ", ".join(f"{printable(one.name)} ({format_size(one.size)})" for one in objective.attachments)
     print_facts(
         {
             "cid": cid_of_file(objective.path),
             "format": {"mcap": "MCAP", "bag": "ROS 1 bag"}[objective.format],
-            "size": size_words(objective.size),
+            "size": format_size(objective.size),
             "messages": f"{objective.count:,}",
-            "duration": duration_words(objective.duration_ns),
+            "duration": format_duration(objective.duration_ns),
             "attached": attached or None,
         }
     )
     for name, values in objective.metadata.items():
-        click.echo(f"\n{visible(name)}")
-        print_facts({f"  {visible(key)}": visible(value) for key, value in values.items()})
+        click.echo(f"\n{printable(name)}")
+        print_facts({f"  {printable(key)}": printable(value) for key, value in values.items()})
 
 
 def _print_topics(objective: Objective) -> None:
@@ -135,12 +147,12 @@ def _print_topics(objective: Objective) -> None:
     for name, kinds in _kinds(objective).items():
         counts = rates.counts.get(name, [])
         rate = f"{sum(counts) * 1e9 / objective.duration_ns:.3g}/s" if objective.duration_ns else ""
-        types = ", ".join(visible(kind.schema_name or kind.encoding or "bytes") for kind in kinds)
-        rows.append((visible(name), types, f"{sum(counts):,}", rate, _bars(counts)))
+        types = ", ".join(printable(kind.schema_name or kind.encoding or "bytes") for kind in kinds)
+        rows.append((printable(name), types, f"{sum(counts):,}", rate, _bars(counts)))
     click.echo()
     print_table(("topic", "type", "messages", "rate", "when"), rows, numbers=("messages", "rate"))
     if objective.duration_ns:
-        click.echo(f"each column of `when` is {duration_words(rates.span_ns)} long")
+        click.echo(f"each column of `when` is {format_duration(rates.span_ns)} long")
 
 
 def _bars(counts: Sequence[int]) -> str:
@@ -151,6 +163,39 @@ def _bars(counts: Sequence[int]) -> str:
 
 def _print_schemas(objective: Objective) -> None:
     for kind in dict.fromkeys(topic.type for topic in objective.topics):
-        click.echo(f"\n{visible(kind.zenoh_encoding)} ({plural(len(kind.schema_data), 'byte')} of schema)")
+        click.echo(f"\n{printable(kind.zenoh_encoding)} ({plural(len(kind.schema_data), 'byte')} of schema)")
         for line in kind.schema_data.decode(errors="replace").splitlines():
-            click.echo(f"  {visible(line.expandtabs())}")
+            click.echo(f"  {printable(line.expandtabs())}")
+
+
+def draw(rates: TopicRates, path: Path, *, title: str) -> None:
+    """Draw the messages a second of each topic over time, to a PNG at `path`.
+
+    Raises `ConfigurationError` where matplotlib is missing or the file can't be written.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise ConfigurationError(
+            "drawing needs matplotlib, which is not installed", hint="pip install 'aira-mesh[plot]'"
+        ) from None
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    axes = figure.add_subplot()
+    spans = len(next(iter(rates.counts.values()), []))
+    edges = [number * rates.span_ns / 1e9 for number in range(spans + 1)]
+    for topic in sorted(rates.counts):
+        axes.stairs(rates.per_second(topic), edges, label=_plain_text(topic))
+    axes.set(title=_plain_text(title), xlabel="seconds from the first message", ylabel="messages a second")
+    axes.set_ylim(bottom=0)
+    if rates.counts:
+        axes.legend(loc="upper right", fontsize="small")
+    try:
+        figure.savefig(path, format="png", dpi=100)
+    except OSError as error:
+        raise write_error(path, error) from None
+
+
+def _plain_text(text: str) -> str:
+    """A stranger's text as text: a dollar begins a formula, a leading underscore hides a label."""
+    shown = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
+    return shown.replace("$", r"\$").lstrip("_")

@@ -1,0 +1,238 @@
+"""`aira account`: keyfiles."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from mesh.cli.amounts import ETH, XRT
+from mesh.cli.chain_client import address_in_keyfile, open_chain, required_address
+from mesh.cli.options import with_chain_settings, with_json
+from mesh.cli.output import print_facts, print_json, print_line
+from mesh.errors import AiraError, ConfigurationError, InputError
+from mesh.running import fail, run_to_end
+
+if TYPE_CHECKING:
+    from mesh.settings import Settings
+
+
+FILE = click.Path(dir_okay=False, path_type=Path)
+
+
+@click.group("account")
+def command() -> None:
+    """Make, import and look at accounts: keyfiles in the Web3 secret storage format."""
+
+
+@command.command("new", short_help="make an account")
+@click.argument("keyfile", type=FILE)
+@click.option(
+    "--password-file",
+    required=True,
+    type=FILE,
+    help="file with the password; made with a random one when it does not exist",
+)
+@with_json
+def new(keyfile: Path, password_file: Path, as_json: bool) -> None:
+    """Make an account and write its key, encrypted, to KEYFILE. Prints the address. Nothing is overwritten."""
+    from mesh.chain import new_private_key, write_keyfile
+
+    try:
+        address = write_keyfile(free_path(keyfile), new_private_key(), password_in(password_file))
+    except AiraError as error:
+        fail(error)
+    print_account(address, keyfile, as_json)
+
+
+@command.command("import", short_help="write an existing key to a keyfile")
+@click.argument("keyfile", type=FILE)
+@click.option(
+    "--password-file",
+    required=True,
+    type=FILE,
+    help="file with the password of the new KEYFILE; made with a random one when it does not exist",
+)
+@click.option("--private-key-file", type=FILE, help="file with the private key, 64 hexadecimal digits")
+@click.option("--from-keyfile", type=FILE, help="another keyfile, whose key is to be taken")
+@click.option("--from-password-file", type=FILE, help="file with the password of that one [it is asked for]")
+@with_json
+def import_account(keyfile: Path, password_file: Path, as_json: bool, **source: Any) -> None:
+    """Write a key that there is already, encrypted, to KEYFILE. Prints the address. Nothing is overwritten.
+
+    The key comes from --private-key-file, or from another keyfile. With neither, it is read from the standard input, or
+    asked for on a terminal without being shown. It is never an argument: those are seen by everybody on the machine.
+    """
+    try:
+        _check_no_key(keyfile)
+        address = _import(free_path(keyfile), password_file, **source)
+    except AiraError as error:
+        fail(error)
+    print_account(address, keyfile, as_json)
+
+
+def _import(
+    keyfile: Path,
+    password_file: Path,
+    *,
+    private_key_file: Path | None,
+    from_keyfile: Path | None,
+    from_password_file: Path | None,
+) -> str:
+    """Write the keyfile from one of the sources of a key; its address. Raises `InputError`, `ConfigurationError`."""
+    from mesh.chain import copy_keyfile, write_keyfile
+
+    if private_key_file is not None and from_keyfile is not None:
+        raise InputError("a key comes from --private-key-file or from --from-keyfile, not from both")
+    if from_keyfile is None:
+        if from_password_file is not None:
+            raise InputError("--from-password-file goes with --from-keyfile")
+        key = private_key_in(private_key_file)
+        return write_keyfile(keyfile, key, password_in(password_file))
+    opened_by, where = password_of(from_keyfile, from_password_file)
+    password = password_in(password_file)
+    return copy_keyfile(from_keyfile, keyfile, opened_by=opened_by, password=password, password_from=where)
+
+
+def _check_no_key(keyfile: Path) -> None:
+    """Raise `InputError` for a private key in the place of a file's name."""
+    digits = keyfile.name.removeprefix("0x")
+    if len(digits) == 64 and not digits.strip("0123456789abcdefABCDEF"):
+        raise InputError(
+            "that looks like a private key, and is no name for a keyfile",
+            hint="give it on the standard input; it is in your shell's history now, so better take a new one",
+        )
+
+
+@command.command("show", short_help="print the address, and what the account holds")
+@click.argument("file", metavar="[KEYFILE]", required=False, type=FILE)
+@click.option("--balance", is_flag=True, help="ask the chain for its ETH, XRT and the nonce of its next order")
+@with_json
+@with_chain_settings()
+def show(settings: Settings, file: Path | None, balance: bool, as_json: bool) -> None:
+    """Print the address of the account in KEYFILE (by default the settings'); needs no password."""
+    try:
+        address = required_address(settings) if file is None else address_in_keyfile(file)
+    except AiraError as error:
+        fail(error)
+    if balance:
+        run_to_end(lambda: _show_balance(settings, address, as_json))
+    else:
+        print_account(address, file or Path(settings.keyfile), as_json)
+
+
+async def _show_balance(settings: Settings, address: str, as_json: bool) -> None:
+    from mesh.chain import NotOffered
+
+    async with open_chain(settings) as chain:
+        wei, wn = await chain.tokens.eth_balance(address), await chain.tokens.balance(address)
+        try:
+            nonce = await chain.liabilities.next_nonce(address)
+        except NotOffered:
+            nonce = None
+    if as_json:
+        print_json({"address": address, "wei": str(wei), "wn": str(wn), "nonce": nonce})
+    else:
+        facts: dict[str, Any] = {
+            "address": address,
+            "ETH": ETH.number(wei),
+            "XRT": XRT.number(wn),
+            "order nonce": nonce,
+        }
+        print_facts(facts)
+
+
+def print_account(address: str, keyfile: Path, as_json: bool) -> None:
+    """Print an account's address; for programs also where its key is."""
+    if as_json:
+        print_json({"address": address, "keyfile": str(keyfile)})
+    else:
+        print_line(address)
+
+
+KEY_DIGITS = 64
+
+
+def free_path(keyfile: Path) -> Path:
+    """The same path, its folder made. Raises `ConfigurationError` for a name that is taken."""
+    if keyfile.exists():
+        raise ConfigurationError(f"{keyfile} exists already", hint="no keyfile is overwritten; choose another name")
+    try:
+        keyfile.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigurationError(f"can't make the folder of {keyfile}: {error.strerror}") from None
+    return keyfile
+
+
+def password_in(path: Path) -> str:
+    """The password in a file, its first line; the file is made, readable by its owner only, when it is missing."""
+    import secrets
+
+    try:
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+                file.write(secrets.token_urlsafe(24) + "\n")
+    except OSError as error:
+        raise ConfigurationError(f"can't use the password file {path}: {error.strerror}") from None
+    password = _first_line(path, what="password file")
+    if not password:
+        raise ConfigurationError(f"the password file {path} is empty", hint="write one line with the password into it")
+    return password
+
+
+def private_key_in(path: Path | None) -> bytes:
+    """The private key in a file; without one, that on the standard input, or typed unseen on a terminal.
+
+    Raises `InputError` for what is no private key, `ConfigurationError` for a file that can't be read.
+    """
+    if path is None:
+        text, where = _asked("private key: "), "what was given"
+    else:
+        text, where = _first_line(path, what="private key"), f"the first line of {path}"
+    digits = text.strip().removeprefix("0x")
+    try:
+        key = bytes.fromhex(digits)
+    except ValueError:  # whose own text shows where in the key it went wrong
+        key = b""
+    if len(digits) != KEY_DIGITS or len(key) != KEY_DIGITS // 2:
+        raise InputError(
+            f"{where} is not a private key", hint="a private key is 64 hexadecimal digits, 0x before them or not"
+        )
+    return key
+
+
+def password_of(keyfile: Path, path: Path | None) -> tuple[str, str]:
+    """The password that opens a keyfile, and where it is from: a file, the standard input or a terminal."""
+    if path is not None:
+        return _first_line(path, what="password file"), str(path)
+    return _asked(f"password of {keyfile}: "), "the answer"
+
+
+def _asked(question: str) -> str:
+    """A line of the standard input; from a terminal it is asked for, and not shown."""
+    import getpass
+
+    try:
+        line = getpass.getpass(question) if sys.stdin.isatty() else sys.stdin.readline()
+    except (EOFError, UnicodeDecodeError):
+        line = ""
+    line = line.rstrip("\r\n")
+    if not line:
+        raise InputError(
+            f"nothing was given for the {question.removesuffix(': ')}", hint="give one line on the standard input"
+        )
+    return line
+
+
+def _first_line(path: Path, *, what: str) -> str:
+    """The first line of a file. Raises `ConfigurationError`, which shows nothing of it."""
+    try:
+        return path.read_text(encoding="utf-8").split("\n", 1)[0].rstrip("\r")
+    except OSError as error:
+        raise ConfigurationError(f"can't use the {what} {path}: {error.strerror}") from None
+    except UnicodeDecodeError:  # whose own text shows a part of the secret
+        raise ConfigurationError(f"can't use the {what} {path}: it is not UTF-8 text") from None

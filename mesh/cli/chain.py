@@ -1,0 +1,257 @@
+"""`aira chain`: the network's contracts on a chain, and a chain for development."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from mesh.cli.amounts import ETH, XRT, Unit
+from mesh.cli.chain_client import open_chain, own_address
+from mesh.cli.lazy import LazyGroup
+from mesh.cli.lighthouse import check_lighthouse
+from mesh.cli.options import with_chain_settings, with_json, with_lighthouse_options, with_signing_settings
+from mesh.cli.output import print_facts, print_json, print_line, printable
+from mesh.errors import ChainError, ConfigurationError
+from mesh.running import run_to_end
+
+if TYPE_CHECKING:
+    from mesh.chain import Account, Chain, Deployment, Node
+    from mesh.settings import Settings
+
+
+DEPLOYMENT_GAS: Final = 9_500_000
+"""A little more than what a deployment takes in all; an account that can't pay for it is told so before it begins."""
+
+
+command = LazyGroup(
+    "chain",
+    help="A chain to develop on, and the network's contracts on any chain.",
+    lazy={"up": ("mesh.cli.up:chain_up", "serve a chain with the contracts, for development")},
+)
+
+
+@command.command("deploy", short_help="put the contracts on a chain")
+@click.option("--lighthouse", default="airalab", show_default=True, help="name of the first lighthouse, one label")
+@with_lighthouse_options
+@click.option(
+    "--refund-delay",
+    type=click.IntRange(1, 2**32 - 1),
+    default=50_400,
+    show_default=True,
+    help="blocks until an unfinished job's money can be had back; it can't be changed later",
+)
+@click.option("--again", is_flag=True, help="deploy though the chain has contracts; the old ones stay as they are")
+@with_json
+@with_signing_settings()
+def deploy_contracts(settings: Settings, **options: Any) -> None:
+    """Put the contracts on the chain: ENS registry and names, XRT, factory, and a first lighthouse.
+
+    The settings' account pays the gas, owns the names and gets the first million XRT. About twenty transactions are
+    sent, one after another. What to put into the settings of those who use them is printed.
+    """
+    run_to_end(lambda: _deploy(settings, **options))
+
+
+async def _deploy(
+    settings: Settings,
+    *,
+    lighthouse: str,
+    minimal_stake: str,
+    timeout_blocks: int,
+    refund_delay: int,
+    again: bool,
+    as_json: bool,
+) -> None:
+    from mesh.chain import DeploymentPlan, deploy
+    from mesh.composition import chain_of, load_account
+
+    plan = DeploymentPlan(
+        lighthouse=lighthouse,
+        minimal_stake=XRT.parse(minimal_stake),
+        timeout_blocks=timeout_blocks,
+        refund_delay=refund_delay,
+    )
+    check_lighthouse(plan.lighthouse, minimal_stake=plan.minimal_stake)  # which comes last, and would be refused then
+    account = await asyncio.to_thread(load_account, settings)
+    node = chain_of(settings, account).node
+    async with node:
+        if not again:
+            await _check_not_deployed(settings, node)
+        await _check_affordable(node, account)
+        if not as_json:
+            click.echo(f"deploying to the chain {node.chain_id} at {node.endpoint} with {account.address}:", err=True)
+            click.echo("about twenty transactions, one after another", err=True)
+        deployment = await deploy(node, account, plan=plan)
+        _print_deployment(settings, deployment, chain_id=node.chain_id, as_json=as_json)
+
+
+async def _check_not_deployed(settings: Settings, node: Node) -> None:
+    from mesh.chain import NoContracts
+    from mesh.composition import chain_of
+
+    try:
+        async with chain_of(settings, None) as chain:
+            raise ConfigurationError(
+                f"the chain {node.chain_id} has the contracts already (factory {chain.factory})",
+                hint="use those, or deploy a second set with --again; the lighthouse of another name: "
+                "`aira lighthouse create`",
+            )
+    except NoContracts:
+        return
+
+
+async def _check_affordable(node: Node, account: Account) -> None:
+    from mesh.chain import InsufficientFunds
+
+    balance = await node.eth_balance(account.address)
+    needed = DEPLOYMENT_GAS * int(await node.web3.eth.gas_price)
+    if balance < needed:
+        raise InsufficientFunds(account.address, balance=balance, needed=needed)
+
+
+def _print_deployment(settings: Settings, deployment: Deployment, *, chain_id: int, as_json: bool) -> None:
+    options = {
+        "web3_http_provider": settings.web3_http_provider,
+        "ens_contract": deployment.ens,
+        "lighthouse_contract": deployment.lighthouse_name,
+    }
+    if as_json:
+        print_json(
+            {
+                "chainId": chain_id,
+                "ens": deployment.ens,
+                "resolver": deployment.resolver,
+                "xrt": deployment.xrt,
+                "factory": deployment.factory,
+                "lighthouse": deployment.lighthouse,
+                "lighthouseName": deployment.lighthouse_name,
+                "blockNumber": deployment.block_number,
+                "gasUsed": deployment.gas_used,
+                "settings": options,
+            }
+        )
+        return
+    print_facts(
+        {
+            "ENS registry": deployment.ens,
+            "resolver": deployment.resolver,
+            "XRT": deployment.xrt,
+            "factory": deployment.factory,
+            "lighthouse": f"{deployment.lighthouse}  {deployment.lighthouse_name}",
+            "block": f"{deployment.block_number:,}",
+            "gas used": f"{deployment.gas_used:,}",
+        }
+    )
+    print_line("\nsettings of those who use it:\n")
+    for name, value in options.items():
+        print_line(f'{name} = "{value}"')
+
+
+GWEI: Final = Unit("gwei", 9, "wei")
+
+
+CONTRACT_FACTS: Final = ("ens", "factory", "xrt", "isOurCode", "lighthouse", "lighthouseName", "wn")
+"""What is null, for programs, as long as there are no contracts."""
+
+
+@command.command("status", short_help="show the node, the contracts and the account's money")
+@with_json
+@with_chain_settings("lighthouse_contract")
+def status(settings: Settings, as_json: bool) -> None:
+    """Show what there is: the node and its chain, the contracts and whose they are, the account's money.
+
+    What could be learned is shown in any case; the exit code is 1 when the chain has no contracts.
+    """
+    run_to_end(lambda: _status(settings, as_json))
+
+
+async def _status(settings: Settings, as_json: bool) -> None:
+    from mesh.composition import chain_of
+
+    account = await asyncio.to_thread(own_address, settings)
+    trouble: ChainError | None = None
+    async with chain_of(settings, None).node as node:
+        facts = dict.fromkeys(CONTRACT_FACTS) | await _node_facts(node, account)
+        try:
+            async with open_chain(settings) as chain:
+                facts |= await _contract_facts(chain, settings.lighthouse_contract, account)
+        except ChainError as error:
+            trouble = error
+    if as_json:
+        print_json(facts)
+    else:
+        print_facts(_readable_status(facts))
+    if trouble is not None:
+        raise trouble
+
+
+async def _node_facts(node: Node, account: str | None) -> dict[str, Any]:
+    block = await node.web3.eth.get_block("latest")
+    base_fee = block.get("baseFeePerGas")
+    return {
+        "node": node.endpoint,
+        "client": printable(str(await node.web3.client_version)),
+        "chainId": node.chain_id,
+        "blockNumber": int(block["number"]),
+        "blockTime": int(block["timestamp"]),
+        "baseFee": None if base_fee is None else str(int(base_fee)),
+        "account": account,
+        "wei": None if account is None else str(await node.eth_balance(account)),
+    }
+
+
+async def _contract_facts(chain: Chain, lighthouse: str, account: str | None) -> dict[str, Any]:
+    from mesh.chain import UnknownName
+    from mesh.chain.recognition import is_ours
+
+    try:
+        address: str | None = await chain.names.lighthouse(lighthouse)
+    except UnknownName:
+        address = None
+    return {
+        "ens": chain.ens,
+        "factory": chain.factory,
+        "xrt": chain.xrt,
+        "isOurCode": await is_ours(chain),
+        "lighthouse": address,
+        "lighthouseName": lighthouse,
+        "wn": None if account is None else str(await chain.tokens.balance(account)),
+    }
+
+
+def _readable_status(facts: dict[str, Any]) -> dict[str, str | None]:
+    """The same as people read it."""
+    spoken: dict[str, str | None] = {
+        "node": f"{facts['node']}  {facts['client']}",
+        "chain id": str(facts["chainId"]),
+        "block": f"{facts['blockNumber']:,}, {_ago(facts['blockTime'])}",
+        "base fee": None if facts["baseFee"] is None else GWEI.show(int(facts["baseFee"])),
+    }
+    if facts["factory"] is not None:
+        whose = "this project's, by their code" if facts["isOurCode"] else "not this project's code"
+        there = facts["lighthouse"] or "none of that name"
+        spoken |= {
+            "contracts": whose,
+            "ENS registry": facts["ens"],
+            "factory": facts["factory"],
+            "XRT": facts["xrt"],
+            "lighthouse": f"{there}  {facts['lighthouseName']}",
+        }
+    if facts["account"] is not None:
+        amounts = [ETH.show(int(facts["wei"]))]
+        if facts["wn"] is not None:
+            amounts.append(XRT.show(int(facts["wn"])))
+        spoken["account"] = f"{facts['account']}  {', '.join(amounts)}"
+    return spoken
+
+
+def _ago(timestamp: int) -> str:
+    """How long ago a block was made, in the unit that says it best."""
+    seconds = max(0, int(time.time()) - timestamp)
+    for name, length in (("day", 86_400), ("hour", 3_600), ("minute", 60)):
+        if seconds >= 2 * length:
+            return f"{seconds // length:,} {name}s ago"
+    return f"{seconds} s ago"

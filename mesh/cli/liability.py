@@ -1,0 +1,327 @@
+"""`aira liability`: lists, shows and follows liabilities."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from contextlib import aclosing
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from mesh.cli.amounts import XRT, Unit
+from mesh.cli.chain_client import account_of, open_chain, own_address, units_of
+from mesh.cli.lazy import LazyGroup
+from mesh.cli.options import with_chain_settings, with_json
+from mesh.cli.output import plural, print_facts, print_json, print_line, print_table, short_address
+from mesh.outage_log import OutageLog
+from mesh.running import run_to_end
+from schemas.address import ZERO_ADDRESS
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Mapping, Sequence
+
+    from mesh.chain import BlockEvents, Chain, RefundState
+    from mesh.errors import AiraError
+    from mesh.settings import Settings
+    from schemas.records import Liability
+
+
+HEAD = ("LIABILITY", "STATE", "COST", "PROMISEE", "PROMISOR")
+
+
+log = logging.getLogger(__name__)
+
+command = LazyGroup(
+    "liability",
+    help="""Liabilities, the contracts that hold the money of a job until it is done.
+
+    The promisee asks for the work and pays, the promisor does it.""",
+    lazy={
+        "cancel": ("mesh.cli.liability_cancel:cancel", "call the work off together, or get a refund after the delay")
+    },
+)
+
+
+@command.command("list", short_help="list those of an account, or all")
+@click.option("--account", help="address or ENS name of a promisee or promisor [the settings' account]")
+@click.option("--all", "everybody", is_flag=True, help="those of everybody")
+@click.option(
+    "--state",
+    type=click.Choice(["any", "open", "finalized"]),
+    default="any",
+    show_default=True,
+    help="only those that are open, or that have ended",
+)
+@click.option(
+    "--from-block", type=click.IntRange(min=0), default=0, show_default=True, help="only those made since this block"
+)
+@with_json
+@with_chain_settings()
+def list_liabilities(settings: Settings, **what: Any) -> None:
+    """List the liabilities of an account, first those that it pays for, then those that it works for; or all.
+
+    Each kind is in the order in which they were made. Without an account in the settings, all are listed. A long chain
+    takes its time to be read: --from-block shortens that.
+    """
+    run_to_end(lambda: _list(settings, **what))
+
+
+async def _list(
+    settings: Settings, *, account: str | None, everybody: bool, state: str, from_block: int, as_json: bool
+) -> None:
+    own = await asyncio.to_thread(own_address, settings)
+    async with open_chain(settings) as chain:
+        whose = None if everybody or (account is None and own is None) else await account_of(chain, settings, account)
+        found = await _liabilities_of(chain, whose, from_block)
+        if state != "any":
+            found = [liability for liability in found if liability.is_finalized == (state == "finalized")]
+        if as_json:
+            print_json([facts_of(liability) for liability in found])
+            return
+        units = await units_of(chain, found)
+    if not found:
+        print_line(f"no {'' if state == 'any' else state + ' '}liabilities" + (f" of {whose}" if whose else ""))
+        return
+    rows = [
+        (
+            liability.address,
+            state_of(liability),
+            units[liability.token].show(liability.cost),
+            short_address(liability.promisee, own=own),
+            short_address(liability.promisor, own=own),
+        )
+        for liability in found
+    ]
+    print_table(HEAD, rows, numbers=("COST",))
+
+
+async def _liabilities_of(chain: Chain, whose: str | None, from_block: int) -> Sequence[Liability]:
+    """All liabilities, or those of an account in either part; one with itself once."""
+    if whose is None:
+        return await chain.liabilities.list(from_block=from_block)
+    paid = await chain.liabilities.list(from_block=from_block, promisee=whose)
+    worked = await chain.liabilities.list(from_block=from_block, promisor=whose)
+    return list({liability.address: liability for liability in (*paid, *worked)}.values())
+
+
+@command.command("show", short_help="show one: parties, terms, cost and state")
+@click.argument("address")
+@with_json
+@with_chain_settings()
+def show(settings: Settings, address: str, as_json: bool) -> None:
+    """Show the liability at ADDRESS: who does what for whom, for how much, how it stands, and from when on the money
+    can be had back."""
+    run_to_end(lambda: _show(settings, address, as_json))
+
+
+async def _show(settings: Settings, address: str, as_json: bool) -> None:
+    own = await asyncio.to_thread(own_address, settings)
+    async with open_chain(settings) as chain:
+        await print_liability(chain, await chain.liabilities.get(address), own=own, as_json=as_json)
+
+
+async def print_liability(chain: Chain, liability: Liability, *, own: str | None, as_json: bool) -> None:
+    """Print all that there is to say of a liability."""
+    refund = await refund_state(chain, liability)
+    if as_json:
+        print_json(facts_of(liability) | {"refundableFrom": None if refund is None else refund.refundable_from})
+        return
+    units = await units_of(chain, [liability])
+    words = None if refund is None else refund_words(refund)
+    print_facts(spoken(liability, units[liability.token], own=own, refundable=words))
+
+
+async def refund_state(chain: Chain, liability: Liability) -> RefundState | None:
+    """From when on an open liability's money can be had back; None for one that has ended, or where it never can."""
+    from mesh.chain import NotOffered
+
+    try:
+        return None if liability.is_finalized else await chain.liabilities.refund_state(liability.address)
+    except NotOffered:
+        return None
+
+
+def refund_words(refund: RefundState) -> str:
+    """When the promisee can have the money back, in words."""
+    if refund.is_refundable:
+        return "possible now, by `aira liability cancel --refund`"
+    blocks = refund.refundable_from - refund.block_number
+    return f"possible from block {refund.refundable_from:,} on, in {plural(blocks, 'block')}"
+
+
+@command.command("watch", short_help="follow one until it has ended, or all of them")
+@click.argument("address", required=False)
+@click.option("--from-block", type=click.IntRange(min=0), help="without ADDRESS: begin at this block [the next]")
+@with_json
+@with_chain_settings("confirmations", "poll_interval")
+def watch(settings: Settings, address: str | None, from_block: int | None, as_json: bool) -> None:
+    """Follow the liability at ADDRESS until it has ended, and show it then. A node that is lost is waited for.
+
+    Without ADDRESS, tell of each liability that is made, and of each that ends, until Ctrl-C; with --json an object a
+    line.
+    """
+    if address is None:
+        run_to_end(lambda: _watch_all(settings, from_block, as_json))
+    else:
+        run_to_end(lambda: _watch(settings, address, as_json))
+
+
+async def _watch(settings: Settings, address: str, as_json: bool) -> None:
+    own = await asyncio.to_thread(own_address, settings)
+    async with open_chain(settings) as chain:
+        liability = await chain.liabilities.get(address)
+        if not liability.is_finalized and not as_json:
+            print_line(f"{liability.address} is {OUTCOMES['open']}; waiting for its end (Ctrl-C leaves it as it is)")
+        await print_liability(chain, await chain.liabilities.watch(address), own=own, as_json=as_json)
+
+
+async def _watch_all(settings: Settings, from_block: int | None, as_json: bool) -> None:
+    own = await asyncio.to_thread(own_address, settings)
+    async with open_chain(settings) as chain:
+        cursor = await chain.block_number() + 1 if from_block is None else from_block
+        if not as_json:
+            click.echo(f"watching from block {cursor:,} on; Ctrl-C ends it", err=True)
+        async for happening in _follow(chain, cursor):
+            if as_json:
+                print_json(happening.facts())
+            else:
+                print_line(happening.words(own=own))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Happening:
+    """A liability was made, or ended; `liability` is its record by now, `unit` that of its token."""
+
+    event: str
+    block_number: int
+    tx: str
+    liability: Liability
+    unit: Unit
+
+    def facts(self) -> dict[str, Any]:
+        """It, for programs."""
+        about = {"event": self.event, "blockNumber": self.block_number, "tx": self.tx}
+        return about | {"liability": facts_of(self.liability)}
+
+    def words(self, *, own: str | None) -> str:
+        """It, for people."""
+        promisor, promisee = (
+            short_address(address, own=own) for address in (self.liability.promisor, self.liability.promisee)
+        )
+        word = "made" if self.event == "made" else state_of(self.liability)
+        cost = self.unit.show(self.liability.cost)
+        return f"block {self.block_number:,}  {self.liability.address}  {word:<10}  {promisor} for {promisee}, {cost}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TakenBack:
+    """The chain was reorganised: the making or the end of a liability did not happen after all."""
+
+    what: str
+    liability: str
+    tx: str
+
+    def facts(self) -> dict[str, Any]:
+        """It, for programs."""
+        return {"event": "taken-back", "what": self.what, "liability": self.liability, "tx": self.tx}
+
+    def words(self, *, own: str | None) -> str:
+        """It, for people."""
+        return f"the chain was reorganised: {self.liability} was not {self.what} after all"
+
+
+class _PrintedOutages(OutageLog):
+    """Prints to stderr that the node is lost, once in an outage."""
+
+    def __init__(self) -> None:
+        super().__init__(log, "chain")
+        self._has_failed = False
+
+    def failed(self, error: AiraError, consequence: str) -> None:
+        """Print `error`, unless the outage is known."""
+        if not self._has_failed:
+            click.echo(f"aira: {error}; waiting for it", err=True)
+        self._has_failed = True
+
+    def recovered(self, message: str) -> None:
+        """The next failure is another outage."""
+        self._has_failed = False
+
+
+async def _follow(chain: Chain, cursor: int) -> AsyncIterator[Happening | TakenBack]:
+    """What happens to liabilities from a block on. Waits while the node is lost, and prints that once."""
+    outages = _PrintedOutages()
+    async with aclosing(chain.follow(cursor, outages=outages)) as blocks:
+        async for block in blocks:
+            for happening in await chain.retrying(partial(_happenings, chain, block), outages=outages):
+                yield happening
+
+
+async def _happenings(chain: Chain, block: BlockEvents) -> list[Happening | TakenBack]:
+    """What a block, or its going, means for liabilities, in order."""
+    from mesh.chain import Finalized, NewLiability, NoContracts, Reorganisation
+
+    words = {NewLiability: "made", Finalized: "ended"}
+    found: list[Happening | TakenBack] = []
+    for event in block.reverted_events if isinstance(block, Reorganisation) else ():
+        if isinstance(event, NewLiability | Finalized):
+            found.append(TakenBack(what=words[type(event)], liability=event.liability, tx=event.tx))
+    for event in block.events:
+        if not isinstance(event, NewLiability | Finalized):
+            continue
+        try:
+            liability = await chain.liabilities.get(event.liability)
+        except NoContracts:  # the chain was reorganised meanwhile, which is told next
+            continue
+        unit = (await units_of(chain, [liability]))[liability.token]
+        number, word = block.block_number, words[type(event)]
+        found.append(Happening(event=word, block_number=number, tx=event.tx, liability=liability, unit=unit))
+    return found
+
+
+OUTCOMES: Final[Mapping[str, str]] = {
+    "open": "open, the money is held",
+    "paid": "paid: done, and the promisor has the money",
+    "failed": "failed: not done, and the promisee has the money back",
+    "called-off": "called off without a result, and the promisee has the money back",
+}
+"""Every state that a liability can be in, and what it means."""
+
+
+def state_of(liability: Liability) -> str:
+    """One of `OUTCOMES`."""
+    if not liability.is_finalized:
+        return "open"
+    if liability.is_success:
+        return "paid"
+    return "failed" if liability.result else "called-off"
+
+
+def facts_of(liability: Liability) -> dict[str, Any]:
+    """A liability for programs: its record as it is on the wire, and its state in a word."""
+    record: dict[str, Any] = json.loads(liability.encode())
+    return record | {"state": state_of(liability)}
+
+
+def spoken(liability: Liability, unit: Unit, *, own: str | None, refundable: str | None) -> dict[str, str | None]:
+    """A liability as people read it, `own` being the address of who reads it."""
+    is_judged = liability.validator != ZERO_ADDRESS
+    fee = XRT.show(liability.validator_fee)
+    return {
+        "liability": liability.address,
+        "state": OUTCOMES[state_of(liability)],
+        "promisee": f"{liability.promisee}{'  (you)' if liability.promisee == own else ''}",
+        "promisor": f"{liability.promisor}{'  (you)' if liability.promisor == own else ''}",
+        "cost": unit.show(liability.cost),
+        "token": liability.token,
+        "model": liability.model,
+        "objective": liability.objective,
+        "result": liability.result or None,
+        "lighthouse": f"{liability.lighthouse}  for {XRT.show(liability.lighthouse_fee)}",
+        "validator": f"{liability.validator}  for {fee}" if is_judged else "none",
+        "refund": refundable,
+    }

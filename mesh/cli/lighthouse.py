@@ -1,0 +1,222 @@
+"""`aira lighthouse`: lists, shows and creates lighthouses."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from mesh.cli.amounts import XRT
+from mesh.cli.chain_client import notice_when_slow, open_chain, open_signing_chain
+from mesh.cli.lazy import LazyGroup
+from mesh.cli.options import with_chain_settings, with_json, with_lighthouse_options, with_signing_settings
+from mesh.cli.output import plural, print_facts, print_json, print_line, print_table, printable
+from mesh.errors import ChainError, InputError
+from mesh.running import run_to_end
+
+if TYPE_CHECKING:
+    from mesh.chain import Chain, LighthouseState
+    from mesh.settings import Settings
+
+
+command = LazyGroup(
+    "lighthouse",
+    help="""Lighthouses, the markets: make one, look at them, become a provider of one.
+
+    Stakes are in XRT (1.5), or with the ending wn in its smallest unit (1500000000wn). A lighthouse is named by its
+    label (airalab), its ENS name or its address.""",
+    lazy={
+        "join": ("mesh.cli.lighthouse_stake:join", "stake, and be a provider"),
+        "leave": ("mesh.cli.lighthouse_stake:leave", "take the stake back, or a part of it"),
+    },
+)
+
+
+@command.command("list", short_help="list all lighthouses")
+@click.option(
+    "--from-block", type=click.IntRange(min=0), default=0, show_default=True, help="only those made since this block"
+)
+@with_json
+@with_chain_settings()
+def list_lighthouses(settings: Settings, from_block: int, as_json: bool) -> None:
+    """List all lighthouses of the factory, in the order in which they were made."""
+    run_to_end(lambda: _list(settings, from_block, as_json))
+
+
+async def _list(settings: Settings, from_block: int, as_json: bool) -> None:
+    async with open_chain(settings) as chain:
+        found = [
+            (made.name, await chain.lighthouses.get(made.lighthouse))
+            for made in await chain.lighthouses.list(from_block=from_block)
+        ]
+    if as_json:
+        print_json([facts_of(name, state) for name, state in found])
+        return
+    rows = [
+        (
+            printable(name),
+            state.address,
+            XRT.show(state.minimal_stake),
+            plural(state.timeout_blocks, "block"),
+            len(state.stakes),
+            XRT.show(sum(state.stakes.values())),
+        )
+        for name, state in found
+    ]
+    if rows:
+        head = ("NAME", "ADDRESS", "MINIMAL STAKE", "TIMEOUT", "PROVIDERS", "STAKED")
+        print_table(head, rows, numbers=head[2:])
+    else:
+        print_line("no lighthouse was made here" + (f" since block {from_block:,}" if from_block else ""))
+
+
+@command.command("info", short_help="show one: its terms, its providers, whose turn it is")
+@click.argument("name", required=False)
+@with_json
+@with_chain_settings("lighthouse_contract")
+def info(settings: Settings, name: str | None, as_json: bool) -> None:
+    """Show a lighthouse (by default the settings'): its terms, its providers, and whose turn it is."""
+    run_to_end(lambda: _info(settings, name or settings.lighthouse_contract, as_json))
+
+
+async def _info(settings: Settings, name: str, as_json: bool) -> None:
+    async with open_chain(settings) as chain:
+        state = await chain.lighthouses.get(await find_lighthouse(chain, name))
+        block = await chain.block_number()
+        may_send = {provider: await chain.lighthouses.is_turn(state.address, provider) for provider in state.stakes}
+    if as_json:
+        facts = facts_of(name, state) | {"blockNumber": block}
+        for provider in facts["providers"]:
+            provider["maySend"] = may_send[provider["provider"]]
+        print_json(facts)
+    else:
+        _say_info(name, state, block, may_send)
+
+
+def _say_info(name: str, state: LighthouseState, block: int, may_send: dict[str, bool]) -> None:
+    alive = state.keep_alive_block
+    print_facts(
+        {
+            "lighthouse": state.address,
+            "name": None if name == state.address else name,
+            "minimal stake": XRT.show(state.minimal_stake),
+            "timeout": plural(state.timeout_blocks, "block"),
+            "turn": _turn(state),
+            "last sign of life": f"block {alive:,}, {plural(block - alive, 'block')} ago" if alive else "none yet",
+            "providers": None if state.stakes else "none; `aira lighthouse join` makes one",
+        }
+    )
+    if state.stakes:
+        print_line()
+        rows = [
+            (
+                number,
+                provider,
+                XRT.show(stake),
+                plural(stake // state.minimal_stake, "transaction"),
+                "yes" if may_send[provider] else "no",
+            )
+            for number, (provider, stake) in enumerate(state.stakes.items(), 1)
+        ]
+        head = ("", "PROVIDER", "STAKE", "A TURN", "MAY SEND NOW")
+        print_table(head, rows, numbers=("", "STAKE", "A TURN"))
+
+
+def _turn(state: LighthouseState) -> str | None:
+    """Whose turn it is, by address and place; None where nobody staked."""
+    if not state.stakes:
+        return None
+    providers = list(state.stakes)
+    place = f"{providers.index(state.current) + 1} of {len(providers)}" if state.current in providers else "left"
+    return f"{state.current}  ({place}), {plural(state.quota, 'transaction')} left"
+
+
+@command.command("create", short_help="make a lighthouse")
+@click.argument("name")
+@with_lighthouse_options
+@with_json
+@with_signing_settings()
+def create(settings: Settings, **plan: Any) -> None:
+    """Make a lighthouse called NAME: 1 to 32 letters a to z, digits and -. Whoever stakes there is its provider."""
+    run_to_end(lambda: _create(settings, **plan))
+
+
+async def _create(settings: Settings, *, name: str, minimal_stake: str, timeout_blocks: int, as_json: bool) -> None:
+    stake = XRT.parse(minimal_stake)
+    check_lighthouse(name, minimal_stake=stake)
+    async with open_signing_chain(settings) as chain:
+        full_name = f"{name}.lighthouse.{chain.generation}.robonomics.eth"
+        await _check_free(chain, full_name)
+        with notice_when_slow():
+            made = await chain.lighthouses.create(minimal_stake=stake, timeout_blocks=timeout_blocks, name=name)
+    if as_json:
+        facts = {"lighthouse": made.lighthouse, "name": full_name, "minimalStake": str(stake)}
+        print_json(facts | {"timeoutBlocks": timeout_blocks, "tx": made.tx})
+        return
+    print_facts(
+        {
+            "lighthouse": made.lighthouse,
+            "name": full_name,
+            "minimal stake": XRT.show(stake),
+            "timeout": plural(timeout_blocks, "block"),
+            "transaction": made.tx,
+        }
+    )
+
+
+async def _check_free(chain: Chain, name: str) -> None:
+    from mesh.chain import UnknownName
+
+    try:
+        taken = await chain.names.address(name)
+    except UnknownName:
+        return
+    raise ChainError(f"the name {name} is taken, by {taken}", hint="choose another name")
+
+
+LABEL: Final = re.compile(r"[a-z0-9-]{1,32}", re.ASCII)
+
+
+LARGEST_STAKE: Final = 2**128 - 1
+
+
+def check_lighthouse(name: str, *, minimal_stake: int) -> None:
+    """Raise `InputError` for a name or a minimal stake (wn) that the factory would refuse."""
+    if not LABEL.fullmatch(name):
+        raise InputError(
+            f"{name[:40]!r} can't be the name of a lighthouse",
+            hint="1 to 32 letters a to z, digits and -, such as `airalab`",
+        )
+    if not 1 <= minimal_stake <= LARGEST_STAKE:
+        raise InputError(f"a minimal stake of {XRT.show(minimal_stake)} can't be", hint="it is 1 wn at least")
+
+
+async def find_lighthouse(chain: Chain, name: str) -> str:
+    """The address of a lighthouse, by its label, ENS name or address.
+
+    Raises `ChainError` for what is no lighthouse of the factory, `UnknownName`, `InvalidName`, `InvalidAddress`.
+    """
+    address = await chain.names.lighthouse(name)
+    if not await chain.lighthouses.exists(address):
+        raise ChainError(f"{address} is not a lighthouse of this factory", hint="`aira lighthouse list` shows those")
+    return address
+
+
+def facts_of(name: str, state: LighthouseState) -> dict[str, Any]:
+    """A lighthouse, for programs: stakes in wn."""
+    providers = list(state.stakes)
+    return {
+        "lighthouse": state.address,
+        "name": name,
+        "minimalStake": str(state.minimal_stake),
+        "timeoutBlocks": state.timeout_blocks,
+        "keepAliveBlock": state.keep_alive_block,
+        "current": state.current if providers else None,
+        "marker": providers.index(state.current) + 1 if state.current in providers else 0,
+        "quota": state.quota,
+        "providers": [
+            {"provider": provider, "stake": str(stake), "quota": stake // state.minimal_stake}
+            for provider, stake in state.stakes.items()
+        ],
+    }

@@ -1,0 +1,127 @@
+"""`aira lighthouse join` and `leave`: the stake that makes an account a provider."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import click
+
+from mesh.cli.amounts import AMOUNT, XRT
+from mesh.cli.chain_client import check_balance, notice_when_slow, open_signing_chain
+from mesh.cli.lighthouse import find_lighthouse
+from mesh.cli.options import with_json, with_signing_settings
+from mesh.cli.output import plural, print_facts, print_json
+from mesh.errors import ChainError, InputError
+from mesh.running import run_to_end
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from mesh.chain import LighthouseState
+    from mesh.settings import Settings
+
+
+@click.command("join")
+@click.argument("words", nargs=-1, required=True, metavar="[LIGHTHOUSE] VALUE")
+@with_json
+@with_signing_settings("lighthouse_contract")
+def join(settings: Settings, words: tuple[str, ...], as_json: bool) -> None:
+    """Stake VALUE at LIGHTHOUSE (by default the settings'), on top of what is staked already, and be its provider.
+
+    What the lighthouse is not yet allowed to take is approved first. Each minimal stake is one transaction a turn.
+    """
+    run_to_end(lambda: _join(settings, words, as_json))
+
+
+async def _join(settings: Settings, words: Sequence[str], as_json: bool) -> None:
+    name, value = lighthouse_and_value(words, settings)
+    if value is None:
+        raise InputError("a VALUE is missing, what is to be staked", hint=f"say so: `aira lighthouse join {name} 20`")
+    async with open_signing_chain(settings) as chain:
+        assert chain.account is not None
+        state = await chain.lighthouses.get(await find_lighthouse(chain, name))
+        staked = state.stakes.get(chain.account.address, 0)
+        _check_stake(state, staked=staked, added=value)
+        await check_balance(chain, XRT, value)
+        with notice_when_slow():
+            state = await chain.lighthouses.become_provider(state.address, staked + value)
+    print_stake(name, chain.account.address, state, as_json=as_json)
+
+
+def _check_stake(state: LighthouseState, *, staked: int, added: int) -> None:
+    """Raise `InputError` for a stake that the lighthouse would refuse."""
+    hint = f"stake {XRT.show(max(1, state.minimal_stake - staked))} or more"
+    if not added:
+        raise InputError("a stake of nothing can't be added", hint=hint)
+    if staked + added < state.minimal_stake:
+        minimum = XRT.show(state.minimal_stake)
+        raise InputError(f"a stake of {XRT.show(staked + added)} is below the minimum of {minimum}", hint=hint)
+
+
+@click.command("leave")
+@click.argument("words", nargs=-1, metavar="[LIGHTHOUSE] [VALUE]")
+@with_json
+@with_signing_settings("lighthouse_contract")
+def leave(settings: Settings, words: tuple[str, ...], as_json: bool) -> None:
+    """Take VALUE off the stake at LIGHTHOUSE (by default the settings').
+
+    Without VALUE, or when less than the minimum would remain, all of it is taken. Who has no stake is no provider any
+    more.
+    """
+    run_to_end(lambda: _leave(settings, words, as_json))
+
+
+async def _leave(settings: Settings, words: Sequence[str], as_json: bool) -> None:
+    name, value = lighthouse_and_value(words, settings)
+    async with open_signing_chain(settings) as chain:
+        assert chain.account is not None
+        me = chain.account.address
+        state = await chain.lighthouses.get(await find_lighthouse(chain, name))
+        staked = state.stakes.get(me)
+        if staked is None:
+            raise ChainError(f"{me} has no stake at {name}", hint=f"see `aira lighthouse info {name}`")
+        if value is not None and not 0 < value <= staked:
+            raise InputError(
+                f"{XRT.show(value)} can't be taken off a stake of {XRT.show(staked)}", hint="without VALUE all is taken"
+            )
+        with notice_when_slow():
+            await chain.lighthouses.withdraw(state.address, staked if value is None else value)
+        state = await chain.lighthouses.get(state.address)
+    print_stake(name, me, state, as_json=as_json)
+
+
+def lighthouse_and_value(words: Sequence[str], settings: Settings) -> tuple[str, int | None]:
+    """What `[LIGHTHOUSE] [VALUE]` means: a name, by default the settings', and an amount in wn, if there is one.
+
+    One word alone is a VALUE if it looks like one. Raises `InputError`.
+    """
+    match words:
+        case ():
+            return settings.lighthouse_contract, None
+        case (word,) if AMOUNT.fullmatch(word):
+            return settings.lighthouse_contract, XRT.parse(word)
+        case (name,):
+            return name, None
+        case (value, name) if AMOUNT.fullmatch(value) and not AMOUNT.fullmatch(name):
+            raise InputError(f"{name!r} is not an amount", hint=f"the lighthouse comes first: {name} {value}")
+        case (name, value):
+            return name, XRT.parse(value)
+    raise InputError("there are too many words", hint="give a LIGHTHOUSE and a VALUE")
+
+
+def print_stake(name: str, address: str, state: LighthouseState, *, as_json: bool) -> None:
+    """Print what an account has at the lighthouse that goes by `name`, after all."""
+    stake = state.stakes.get(address, 0)
+    quota = stake // state.minimal_stake
+    if as_json:
+        facts = {"lighthouse": state.address, "name": name, "provider": address}
+        print_json(facts | {"stake": str(stake), "quota": quota, "isProvider": address in state.stakes})
+        return
+    print_facts(
+        {
+            "lighthouse": f"{state.address}  {name}",
+            "provider": f"{address}{'' if stake else '  (no more)'}",
+            "stake": XRT.show(stake),
+            "a turn": plural(quota, "transaction") if stake else None,
+        }
+    )

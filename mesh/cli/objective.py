@@ -1,0 +1,224 @@
+"""`aira objective`: adds, fetches, checks and converts objectives and recordings."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from mesh.cli.files import (
+    MESH,
+    STORE,
+    fetch,
+    file_or_cid,
+    open_store,
+    opened_store,
+    require_new_file,
+    require_readable,
+    write_error,
+)
+from mesh.cli.lazy import LazyGroup
+from mesh.cli.options import with_json, with_settings
+from mesh.cli.output import format_duration, format_size, plural, print_json, printable, progress, run_sync
+from mesh.recording import GENEROUS, Limits, NotARecording, bag_to_mcap, open_objective, preflight, recover
+from mesh.running import run_to_end
+from schemas import cid_of_file
+
+if TYPE_CHECKING:
+    from mesh.content import Store
+    from mesh.settings import Settings
+
+
+PIN = "user"
+"""The label under which files that a person added are kept until that person removes them."""
+
+
+command = LazyGroup(
+    "objective",
+    help="Objectives and recordings: MCAP files (or ROS 1 bags) with messages for a robot, or from one.",
+    lazy={
+        "pack": ("mesh.cli.objective_pack:pack_objective", "make one from JSON lines, a bag, or live messages"),
+        "show": ("mesh.cli.objective_show:show", "summary, topics, schemas, and when the messages come"),
+    },
+)
+
+
+@command.command("add", short_help="put files into the store, where robots can fetch them")
+@click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
+@with_json
+@with_settings(*STORE)
+def add(settings: Settings, files: tuple[Path, ...], as_json: bool) -> None:
+    """Put FILES into the store and print their CIDs. Whoever asks the mesh for such a CID gets the file while an agent
+    with this store runs: with --keyfile, that of the account.
+
+    A file that robots would refuse is put there all the same, with a word of warning.
+    """
+    run_sync(lambda: _add(settings, files, as_json=as_json))
+
+
+def _add(settings: Settings, files: tuple[Path, ...], *, as_json: bool) -> None:
+    for path in files:
+        require_readable(path)
+    added = []
+    with open_store(settings) as store:
+        for path in files:
+            with progress(f"adding {path.name}") as tell:
+                cid = store.put_file(path, pin=PIN, progress=tell)
+            with progress(f"examining {path.name}") as tell:
+                outcome = preflight(path, progress=tell)
+            if not outcome.ok:
+                click.echo(f"aira: robots would refuse it ({outcome.reason}): {printable(outcome.detail)}", err=True)
+            added.append({"cid": cid, "file": str(path), "reason": outcome.reason})
+            if not as_json:
+                click.echo(cid if len(files) == 1 else f"{cid}  {path}")
+    if as_json:
+        print_json(added)
+
+
+@command.command("get", short_help="fetch a file by its CID")
+@click.argument("cid")
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="file to write it to")
+@with_json
+@with_settings(*MESH)
+def get(settings: Settings, cid: str, out: Path, as_json: bool) -> None:
+    """Fetch the file of CID, from the store or from whoever in the mesh holds it, every block checked."""
+    run_to_end(lambda: _get(settings, cid, out, as_json=as_json))
+
+
+async def _get(settings: Settings, cid: str, out: Path, *, as_json: bool) -> None:
+    require_new_file(out)
+    async with opened_store(settings) as store:
+        await fetch(settings, store, cid)
+        try:
+            with progress(f"writing {out.name}") as tell:
+                size = (await asyncio.to_thread(store.copy, cid, out, progress=tell)).stat().st_size
+        except OSError as error:
+            raise write_error(out, error) from None
+    if as_json:
+        print_json({"cid": cid, "file": str(out), "size": size})
+    else:
+        click.echo(f"{out}  {format_size(size)}")
+
+
+CHECK_SETTINGS = (*STORE, "objective_size_limit", "objective_expanded_limit")
+
+
+@command.command("check", short_help="whether a robot would take it; or the whole store")
+@click.argument("objective", required=False)
+@click.option("--topics", help="topics that the robot takes, separated by commas [any]")
+@with_json
+@with_settings(*CHECK_SETTINGS)
+def check(settings: Settings, objective: str | None, topics: str | None, as_json: bool) -> None:
+    """Look at OBJECTIVE, a file or a CID in the store, as a robot does before it takes a job: what it is, its size and
+    what it expands to, every checksum, its schemas, its topics.
+
+    Without an OBJECTIVE the whole store is checked: every file against its CID. Exit code 1: something is wrong, and
+    the reason is a word for programs.
+    """
+
+    def work() -> bool:
+        with open_store(settings) as store:
+            if objective is None:
+                return _check_store(store, as_json=as_json)
+            return _check(settings, store, objective, topics=topics, as_json=as_json)
+
+    if not run_sync(work):
+        raise SystemExit(1)
+
+
+def _check(settings: Settings, store: Store, objective: str, *, topics: str | None, as_json: bool) -> bool:
+    path, cid = _find_file(store, objective)
+    limits = Limits(size=settings.objective_size_limit, expanded=settings.objective_expanded_limit)
+    taken = None if topics is None else frozenset(name.strip() for name in topics.split(",") if name.strip())
+    with progress(f"reading {path.name}") as tell:
+        outcome = preflight(path, limits, topics=taken, progress=tell)
+    if as_json:
+        print_json(
+            {"cid": cid, "file": str(path), "ok": outcome.ok, "reason": outcome.reason, "detail": outcome.detail}
+        )
+    elif outcome.ok and outcome.objective is not None:
+        length = format_duration(outcome.objective.duration_ns)
+        click.echo(f"{cid}  fit to be played: {plural(outcome.objective.count, 'message')}, {length}")
+    else:
+        click.echo(f"{cid}  {outcome.reason}: {printable(outcome.detail)}")
+    return outcome.ok
+
+
+def _find_file(store: Store, objective: str) -> tuple[Path, str]:
+    """The file that is meant, and its CID. One of the store is compared with its CID."""
+    named = file_or_cid(objective)
+    if isinstance(named, str):
+        with progress(f"hashing {named[:8]}…") as tell:
+            return store.verify(named, progress=tell), named
+    return require_readable(named), cid_of_file(named)
+
+
+def _check_store(store: Store, *, as_json: bool) -> bool:
+    with progress("checking the store") as tell:
+        check = store.check(progress=tell)
+    if as_json:
+        print_json({"files": check.files, "bytes": check.bytes, "damaged": list(check.damaged)})
+    else:
+        click.echo(f"{plural(check.files, 'file')}, {format_size(check.bytes)}, {len(check.damaged)} damaged")
+        for cid in check.damaged:
+            click.echo(f"{cid}  damaged, and set aside; fetch it again")
+    return not check.damaged
+
+
+@command.command("convert", short_help="convert a ROS 1 bag to MCAP without loss")
+@click.argument("bag", type=click.Path(path_type=Path))
+@click.argument("out", type=click.Path(path_type=Path), required=False)
+@with_json
+def convert(bag: Path, out: Path | None, as_json: bool) -> None:
+    """Make the MCAP file OUT [BAG with the ending .mcap] of a ROS 1 bag: payloads, types, times, topics and what the
+    connections say stay as they are, and the bag's CID is noted. Prints the new file's CID."""
+    run_sync(lambda: _convert(bag, out or bag.with_suffix(".mcap"), as_json=as_json))
+
+
+def _convert(bag: Path, out: Path, *, as_json: bool) -> None:
+    require_readable(bag)
+    require_new_file(out)
+    with progress(f"reading {bag.name}") as tell:
+        if open_objective(bag, GENEROUS, progress=tell).format != "bag":
+            raise NotARecording(bag, "it is no ROS 1 bag")
+    source = cid_of_file(bag)
+    try:
+        with progress(f"converting {bag.name}") as tell:
+            bag_to_mcap(bag, out, cid=source, limits=GENEROUS, progress=tell)
+    except OSError as error:
+        raise write_error(out, error) from None
+    made, cid = open_objective(out, GENEROUS), cid_of_file(out)
+    if as_json:
+        facts = {"cid": cid, "file": str(out), "source": source, "messages": made.count, "durationNs": made.duration_ns}
+        print_json(facts)
+    else:
+        click.echo(f"{cid}  {out}  {plural(made.count, 'message')}, {format_duration(made.duration_ns)}")
+
+
+@command.command("recover", short_help="save what is readable of a file that was cut")
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), help="file to write [NAME.recovered.mcap]")
+@with_json
+def recover_file(file: Path, out: Path | None, as_json: bool) -> None:
+    """Write what is readable of FILE, an MCAP file that was cut or has rotted, to a new, whole one, which says so."""
+    run_sync(lambda: _recover(file, out, as_json=as_json))
+
+
+def _recover(file: Path, out: Path | None, *, as_json: bool) -> None:
+    require_readable(file)
+    if out is not None:
+        require_new_file(out)
+    try:
+        recovered = recover(file, out)
+    except OSError as error:
+        raise write_error(out or file.parent, error) from None
+    cid = cid_of_file(recovered.path)
+    if as_json:
+        print_json(
+            {"cid": cid, "file": str(recovered.path), "messages": recovered.messages, "why": recovered.why},
+        )
+        return
+    click.echo(f"{cid}  {recovered.path}  {plural(recovered.messages, 'message')}")
+    click.echo(f"what is missing: {printable(recovered.why) or 'nothing'}")

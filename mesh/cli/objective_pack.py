@@ -1,0 +1,241 @@
+"""`aira objective pack`: makes an objective from JSON lines, a bag, or messages recorded now."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import click
+import zenoh
+
+import mesh
+from mesh.cli.files import require_new_file, require_readable, write_error
+from mesh.cli.options import with_json, with_settings
+from mesh.cli.output import format_duration, format_size, plural, print_json, progress, run_sync
+from mesh.errors import InputError, InvalidKey, RemoteError
+from mesh.recording import GENEROUS, Recorder, RecordingAbout, bag_to_mcap, messages_in, open_objective, pack
+from mesh.running import run_until_stopped
+from mesh.settings import NetworkSettings, options_of
+from schemas import cid_of_file
+from schemas.keys import DeviceTopicKey, LiabilityTopicKey, ObjectiveTopicKey, parse_key
+from schemas.payloads import payload_type
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from mesh.recording import RecordingSummary
+    from mesh.settings import Settings
+
+
+_BAG = b"#ROSBAG V"
+
+
+@click.command("pack")
+@click.argument("source", required=False, type=click.Path(path_type=Path, allow_dash=True))
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="MCAP file to write")
+@click.option("--hear", "keys", multiple=True, metavar="KEY", help="record what is said on KEY (may be repeated)")
+@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="how long to hear [until Ctrl-C]")
+@with_json
+@with_settings(*options_of(NetworkSettings))
+def pack_objective(
+    settings: Settings, source: Path | None, out: Path, keys: tuple[str, ...], seconds: float | None, as_json: bool
+) -> None:
+    """Make an objective, an MCAP file, and print its CID.
+
+    From SOURCE (`-`: the standard input): a ROS 1 bag, or JSON lines like
+
+    \b
+      {"topic": "/blink", "time": 0}
+      {"topic": "/blink", "time": 0.5, "data": "blue"}
+      {"topic": "/move", "time": 2, "data": {"x": 1.5}}
+
+    `topic`; `time`, seconds from the beginning (left out: that of the line before); `data`: nothing is a
+    std_msgs/Empty, a text a std_msgs/String, anything else JSON; `type`, where that is not meant: std_msgs/Empty,
+    std_msgs/String, json, json;NAME, or any other encoding (`ros1;my_msgs/Move`), whose payload is then `data` in
+    base64.
+
+    Or from what is said in the mesh now, by --hear: `aira/agent/ADDRESS/device/lamp/**` is what a device says.
+    """
+    if (source is None) == (not keys):
+        run_sync(_refuse)
+    if source is not None:
+        run_sync(lambda: _from_file(source, out, as_json=as_json))
+    else:
+        run_until_stopped(lambda: _record(settings, keys, out, seconds=seconds, as_json=as_json))
+
+
+def _refuse() -> None:
+    raise InputError("an objective is made of a SOURCE or of what is heard", hint="name a file, or a key with --hear")
+
+
+def _from_file(source: Path, out: Path, *, as_json: bool) -> None:
+    require_new_file(out)
+    try:
+        with _opened(source) as stream, progress(f"packing {source.name}") as tell:
+            if _is_bag(source):
+                bag_to_mcap(source, out, cid=cid_of_file(source), limits=GENEROUS, progress=tell)
+            else:
+                total = source.stat().st_size if source.is_file() else None
+                pack(messages_in(_lines_with_progress(stream, tell, total)), out)
+    except OSError as error:
+        raise write_error(out, error) from None
+    _print_made(out, as_json=as_json)
+
+
+def _is_bag(source: Path) -> bool:
+    """Whether a file begins as a ROS 1 bag does; what comes from the standard input are lines."""
+    if not source.is_file():
+        return False
+    with source.open("rb") as stream:
+        return stream.read(len(_BAG)) == _BAG
+
+
+@contextmanager
+def _opened(source: Path) -> Iterator[BinaryIO]:
+    if str(source) == "-":
+        yield sys.stdin.buffer
+        return
+    with require_readable(source).open("rb") as stream:
+        yield stream
+
+
+def _lines_with_progress(
+    stream: BinaryIO, tell: Callable[[int, int | None], None], total: int | None
+) -> Iterator[bytes]:
+    """The lines of a stream, of `total` bytes; `tell` is told how far it was read."""
+    done = 0
+    for line in stream:
+        done += len(line)
+        tell(done, total)
+        yield line
+
+
+async def _record(settings: Settings, keys: Sequence[str], out: Path, *, seconds: float | None, as_json: bool) -> None:
+    from mesh.composition import endpoints_of
+    from mesh.network import Network
+
+    expressions = [key_expression(key) for key in keys]
+    require_new_file(out)
+    async with Network(endpoints_of(settings)) as network:
+        click.echo(f"hearing {', '.join(expressions)}; Ctrl-C ends it", err=True)
+        try:
+            with progress("hearing") as tell:
+                total = None if seconds is None else int(seconds * 10)
+                await record_keys(
+                    network.session, expressions, out, seconds=seconds, tell=lambda done: tell(int(done * 10), total)
+                )
+        finally:
+            await asyncio.to_thread(_print_if_made, out, as_json=as_json)
+
+
+def _print_if_made(out: Path, *, as_json: bool) -> None:
+    """What Ctrl-C has ended is a whole file, too."""
+    if out.exists():
+        _print_made(out, as_json=as_json)
+
+
+def _print_made(out: Path, *, as_json: bool) -> None:
+    made, cid = open_objective(out, GENEROUS), cid_of_file(out)
+    if as_json:
+        print_json(
+            {
+                "cid": cid,
+                "file": str(out),
+                "size": made.size,
+                "messages": made.count,
+                "topics": sorted({topic.name for topic in made.topics}),
+                "durationNs": made.duration_ns,
+            }
+        )
+        return
+    length = format_duration(made.duration_ns)
+    click.echo(f"{cid}  {out}  {plural(made.count, 'message')}, {length}, {format_size(made.size)}")
+
+
+log = logging.getLogger(__name__)
+
+
+PROGRESS_INTERVAL = 0.1
+"""Seconds between two looks at how much was heard."""
+
+
+class NothingHeard(RemoteError):
+    """Nobody said anything on the keys."""
+
+    code = "nothing-heard"
+
+    def __init__(self, keys: Sequence[str]) -> None:
+        super().__init__(
+            f"nobody said anything on {', '.join(keys)}", hint="`aira/agent/ADDRESS/device/**` are an agent's devices"
+        )
+        self.keys = tuple(keys)
+
+
+def key_expression(text: str) -> str:
+    """The same text, if it is a key expression. Raises `InputError`."""
+    try:
+        return str(zenoh.KeyExpr(text))
+    except zenoh.ZError as error:
+        raise InputError(f"{text!r} is no key expression: {error}", hint="`*` is any chunk, `**` any chunks") from None
+
+
+def topic_of(key: str) -> str:
+    """The topic that a key of a device or a job has; of any other key, the whole key."""
+    try:
+        parsed = parse_key(key)
+    except InvalidKey:
+        return f"/{key}"
+    if isinstance(parsed, DeviceTopicKey | LiabilityTopicKey | ObjectiveTopicKey):
+        return parsed.topic
+    return f"/{key}"
+
+
+async def record_keys(
+    session: zenoh.Session,
+    keys: Sequence[str],
+    target: Path,
+    *,
+    seconds: float | None = None,
+    tell: Callable[[float], None] = lambda done: None,
+) -> RecordingSummary:
+    """Record what is said on `keys` to a new file for so many `seconds`, or until cancelled: then, too, it is finished.
+
+    `tell` is told the seconds so far. Raises `NothingHeard`, and then leaves no file, `RecordingFailed`, and
+    `asyncio.CancelledError` never before the file is whole.
+    """
+    about = RecordingAbout(software=f"aira-mesh {mesh.__version__}")
+    recorder = await asyncio.to_thread(Recorder, target, about)
+
+    def heard(sample: zenoh.Sample) -> None:
+        try:
+            kind = payload_type(str(sample.encoding))
+            recorder.record(topic_of(str(sample.key_expr)), sample.payload.to_bytes(), kind)
+        except Exception as error:  # nobody stands behind a callback
+            log.warning("not recorded from %s: %s", sample.key_expr, error)
+
+    subscribers: list[Any] = []
+    try:
+        subscribers.extend(session.declare_subscriber(key, heard) for key in keys)
+        await _pass_time(seconds, tell)
+    finally:
+        for subscriber in subscribers:
+            subscriber.undeclare()
+        summary = await asyncio.to_thread(recorder.close)
+        if not summary.messages:
+            await asyncio.to_thread(target.unlink)
+    if not summary.messages:
+        raise NothingHeard(keys)
+    return summary
+
+
+async def _pass_time(seconds: float | None, tell: Callable[[float], None]) -> None:
+    loop = asyncio.get_running_loop()
+    begin = loop.time()
+    while seconds is None or loop.time() - begin < seconds:
+        left = PROGRESS_INTERVAL if seconds is None else min(PROGRESS_INTERVAL, seconds - (loop.time() - begin))
+        await asyncio.sleep(max(0, left))
+        tell(loop.time() - begin)

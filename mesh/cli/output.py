@@ -1,0 +1,185 @@
+"""What commands print: lines, facts, tables, JSON, progress bars, and the announcement of a server."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+import click
+import msgspec
+
+from mesh.errors import AiraError
+from mesh.running import fail
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from logging import Logger
+
+T = TypeVar("T")
+
+COLUMN_GAP: Final = "  "
+LARGEST_NUMBER: Final = 2**53
+"""Integers from here on lose digits in programs that read JSON numbers as doubles, so they are printed as text."""
+SIZE_UNITS: Final = ("bytes", "KiB", "MiB", "GiB", "TiB")
+BAR_INTERVAL: Final = 0.1
+"""Seconds between two updates of a progress bar."""
+PIPE_INTERVAL: Final = 0.5
+"""Seconds between two checks whether stdout is still read."""
+
+
+def run_sync(work: Callable[[], T]) -> T:
+    """Call `work`, which needs no event loop. Prints an `AiraError` and exits, as `run_to_end` does."""
+    try:
+        return work()
+    except AiraError as error:
+        fail(error)
+
+
+def print_line(text: str = "") -> None:
+    """Print a line to stdout. If that fails, print the reason to stderr and exit with 1."""
+    try:
+        click.echo(text)
+    except BrokenPipeError:  # the reader has left: click ends the program quietly
+        raise
+    except OSError as error:
+        with open(os.devnull, "w") as nowhere:  # flushing the rest of the buffer at exit would fail again
+            os.dup2(nowhere.fileno(), sys.stdout.fileno())
+        fail(AiraError(f"can't write to stdout: {error.strerror}"))
+
+
+def print_json(value: Any) -> None:
+    """Print one JSON value on a line. Structs have the field names that they have on the wire."""
+    print_line(msgspec.json.encode(_exact(msgspec.to_builtins(value))).decode())
+
+
+def print_facts(facts: Mapping[str, object]) -> None:
+    """Print a name and its value on each line, in two columns. Values that are None are left out."""
+    known = {name: str(fact) for name, fact in facts.items() if fact is not None}
+    width = max(map(len, known), default=0)
+    for name, fact in known.items():
+        print_line(f"{name:<{width}}{COLUMN_GAP}{fact}".rstrip())
+
+
+def print_table(head: Sequence[str], rows: Sequence[Sequence[object]], *, numbers: Sequence[str] = ()) -> None:
+    """Print rows below their heads, in columns as wide as needed. The columns in `numbers` are aligned to the right."""
+    cells = [list(head), *([str(cell) for cell in row] for row in rows)]
+    widths = [max(len(row[place]) for row in cells) for place in range(len(head))]
+    for row in cells:
+        columns = zip(head, row, widths, strict=True)
+        aligned = (cell.rjust(width) if name in numbers else cell.ljust(width) for name, cell, width in columns)
+        print_line(COLUMN_GAP.join(aligned).rstrip())
+
+
+def printable(text: str) -> str:
+    """Text from others without control characters, which could steer the terminal."""
+    return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
+
+
+def plural(count: int, one: str) -> str:
+    """A count with its noun: `1 block`, `2 blocks`."""
+    return f"{count:,} {one}" if count == 1 else f"{count:,} {one}s"
+
+
+def short_address(address: str, *, own: str | None = None) -> str:
+    """The ends of an address, for a line in which another one is to be copied; `you` for the reader's own."""
+    return "you" if address == own else f"{address[:6]}…{address[-4:]}"
+
+
+def format_size(size: int) -> str:
+    """A number of bytes for people: `512 bytes`, `2.0 KiB`."""
+    scaled, unit = float(size), 0
+    while scaled >= 1024 and unit < len(SIZE_UNITS) - 1:
+        scaled, unit = scaled / 1024, unit + 1
+    return f"{size:,} bytes" if not unit else f"{scaled:.1f} {SIZE_UNITS[unit]}"
+
+
+def format_duration(nanoseconds: int) -> str:
+    """A duration for people: `1.5 s`, or `1:02:03` from two minutes on."""
+    seconds = nanoseconds / 1e9
+    if seconds < 120:
+        return f"{seconds:.3f}".rstrip("0").rstrip(".") + " s"
+    minutes, rest = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}"
+
+
+def announce(log: Logger, event: str, text: str, **fields: object) -> None:
+    """Print that a server has started, or how, and log it as `event` at every log level.
+
+    People get `text` as it is, unless the program logs in JSON; the log gets it on one line. The event has those of
+    `fields` that are text.
+    """
+    import logging
+
+    from mesh.telemetry.context import log_event
+    from mesh.telemetry.logs import own_log
+
+    own = own_log()
+    if own is None or not own.writes_json:
+        print_line(text)
+    if own is not None:
+        texts = {name: value for name, value in fields.items() if isinstance(value, str)}
+        line = "; ".join(" ".join(part.split()) for part in text.splitlines())
+        extra = log_event(event, **texts)
+        record = log.makeRecord(log.name, logging.INFO, __file__, 0, "%s", (line,), None, extra=extra)
+        record.is_said = True
+        log.handle(record)
+
+
+@contextmanager
+def progress(label: str) -> Iterator[Callable[[int, int | None], None]]:
+    """Show a progress bar on stderr, if that is a terminal.
+
+    Gives a function to call with how much is done, and of how much (None: unknown), from any one thread.
+    """
+    if not sys.stderr.isatty():
+        yield lambda done, total: None
+        return
+    with click.progressbar(length=1, label=label, file=sys.stderr, show_pos=False) as bar:
+        seen, shown = 0, 0.0
+
+        def report(done: int, total: int | None) -> None:
+            nonlocal seen, shown
+            if total and (done >= total or time.monotonic() >= shown + BAR_INTERVAL):
+                bar.length = total
+                bar.update(max(0, done - seen))
+                seen, shown = max(seen, done), time.monotonic()
+
+        yield report
+
+
+async def wait_for_broken_pipe() -> None:
+    """Raise `BrokenPipeError`, which ends the program quietly, when stdout is a pipe that nobody reads any more.
+
+    A command that waits for news runs this beside its work: it would notice otherwise only when it prints. Returns at
+    once where stdout is not a file of the system.
+    """
+    import asyncio
+    import errno
+    import io
+    import select
+
+    try:
+        number = sys.stdout.fileno()
+    except (io.UnsupportedOperation, AttributeError, ValueError):
+        return
+    poll = select.poll()
+    poll.register(number, 0)
+    while True:
+        if any(event & select.POLLERR for _, event in poll.poll(0)):
+            raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
+        await asyncio.sleep(PIPE_INTERVAL)
+
+
+def _exact(value: Any) -> Any:
+    match value:
+        case dict():
+            return {name: _exact(member) for name, member in value.items()}
+        case list() | tuple():
+            return [_exact(member) for member in value]
+        case int() if abs(value) >= LARGEST_NUMBER:
+            return str(value)
+    return value
