@@ -37,12 +37,12 @@ def run_until_stopped(
 
     It logs as the `settings` say, and is called `role` there.
     """
-    from mesh.telemetry.logs import start_log, start_log_of
+    from mesh.telemetry.logs import configure_logging, configure_logging_from
 
     if settings is None:
-        start_log(role=role)
+        configure_logging(role=role)
     else:
-        start_log_of(settings, role)
+        configure_logging_from(settings, role)
     _run(main)
 
 
@@ -59,9 +59,9 @@ def tell(error: AiraError) -> None:
     """
     from mesh.telemetry.context import log_event  # here, as few commands come to this
     from mesh.telemetry.events import without_secrets
-    from mesh.telemetry.logs import writes_json
+    from mesh.telemetry.logs import logs_json
 
-    if writes_json():
+    if logs_json():
         log.error("%s", error, extra=log_event("failed", code=error.code, hint=error.hint))
         return
     print(f"aira: {without_secrets(str(error))} [{error.code}]", file=sys.stderr)

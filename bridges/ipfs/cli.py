@@ -17,8 +17,7 @@ from mesh.errors import ConfigurationError, NetworkUnavailable
 from mesh.running import run_until_stopped
 from mesh.settings import ChainSettings, NetworkSettings, TelemetrySettings, options_of
 from mesh.telemetry.context import LogSource
-from mesh.telemetry.log_service import LogService
-from mesh.telemetry.logs import introduce
+from mesh.telemetry.logs import LogService, set_process_source
 from schemas import parse_address
 
 if TYPE_CHECKING:
@@ -108,7 +107,7 @@ async def _introduce(bridge: IpfsBridge, network: Network, stack: AsyncExitStack
     """Say what the bridge is, and answer who asks for its log."""
     from mesh.network import Services
 
-    introduce(LogSource("bridge", parse_address(bridge.channels[0].address)))
+    set_process_source(LogSource("bridge", parse_address(bridge.channels[0].address)))
     for channel in bridge.channels:
         words = f"bridge {channel.address} carries {channel.lighthouse} to and from {bridge.daemon.api}"
         announce(log, "bridge-started", words, bridge=channel.address)

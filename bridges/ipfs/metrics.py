@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from mesh.telemetry.families import Family, by_label, counter, gauge, labelled
+from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge, labelled
 from schemas.status import ALIVE
 
 if TYPE_CHECKING:
@@ -21,14 +21,14 @@ class Standing(NamedTuple):
     subscribed: bool
 
 
-def bridge_families(bridges: Iterable[Standing]) -> tuple[Family, ...]:
+def bridge_families(bridges: Iterable[Standing]) -> tuple[MetricFamily, ...]:
     """The figures of each of these bridges, with its lighthouse as a label."""
     return tuple(
         family for bridge in bridges for family in labelled(_bridge(bridge), lighthouse=bridge.status.lighthouse)
     )
 
 
-def content_families(content: ContentMetrics) -> tuple[Family, ...]:
+def content_families(content: ContentMetrics) -> tuple[MetricFamily, ...]:
     """What was done with content, for all lighthouses together."""
     return (
         counter("aira_bridge_content_fetched_total", "Files fetched from IPFS and kept", content.fetched),
@@ -56,7 +56,7 @@ def parts_of(bridges: Iterable[Standing]) -> Mapping[str, str]:
     return parts
 
 
-def _bridge(bridge: Standing) -> Iterator[Family]:
+def _bridge(bridge: Standing) -> Iterator[MetricFamily]:
     status = bridge.status
     for direction, way in (("to-ipfs", status.to_ipfs), ("to-mesh", status.to_mesh)):
         yield from labelled(_way(way), direction=direction)
@@ -68,7 +68,7 @@ def _bridge(bridge: Standing) -> Iterator[Family]:
     yield gauge("aira_bridge_mesh_peers", "Who is on the lighthouse's channel in the mesh", len(status.mesh_peers))
 
 
-def _way(way: DirectionStatus) -> tuple[Family, ...]:
+def _way(way: DirectionStatus) -> tuple[MetricFamily, ...]:
     return (
         counter("aira_bridge_received_total", "Messages that came in on the other side", way.received),
         by_label("aira_bridge_accepted_total", "counter", "Messages let through, by kind", "kind", way.kinds),

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from mesh.chain import Chain
     from mesh.network import Network
     from mesh.settings import Settings
-    from mesh.telemetry.families import Family
+    from mesh.telemetry.metrics import MetricFamily
 
 
 class IpfsBridge(Role):
@@ -73,7 +73,7 @@ class IpfsBridge(Role):
             if self._markets is not None:
                 tasks.create_task(self._markets.run(), name="bridge: the chain")
 
-    async def measure(self) -> Iterable[Family]:
+    async def measure(self) -> Iterable[MetricFamily]:
         """Its figures: of each channel, of the content, and of its session."""
         return (
             *bridge_families(channel.standing() for channel in self.channels),

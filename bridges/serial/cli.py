@@ -10,7 +10,7 @@ from mesh.cli.options import with_settings
 from mesh.errors import AiraError
 from mesh.running import fail
 from mesh.settings import NetworkSettings, TelemetrySettings, options_of
-from mesh.telemetry.logs import start_log_of
+from mesh.telemetry.logs import configure_logging_from
 
 if TYPE_CHECKING:
     from bridges.serial.serving import Protocol
@@ -108,7 +108,7 @@ def command(
     from bridges.serial.serving import Wiring, serve, telling, wait_for_files
     from mesh.network.endpoints import Endpoints
 
-    start_log_of(settings, "edge")
+    configure_logging_from(settings, "edge")
     device = DeviceId(agent=agent, name=name)
     endpoints = Endpoints.from_settings(settings)
     try:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mesh.telemetry.families import Family, by_label, counter, gauge
-from mesh.telemetry.health import STARTING, Health, up
+from mesh.telemetry.health import STARTING, Health, health_metrics
+from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge
 from schemas.status import ALIVE
 
 if TYPE_CHECKING:
@@ -27,10 +27,10 @@ class EdgeMetrics:
         """These are what is told of from now on."""
         self._begun = edge, session
 
-    def families(self) -> Iterable[Family]:
+    def families(self) -> Iterable[MetricFamily]:
         """The figures now."""
         figures = () if self._begun is None else families_of(self._begun[0].tally.statistics())
-        return (*figures, up(self._parts()))
+        return (*figures, health_metrics(self._parts()))
 
     def health(self) -> Health:
         """The state of its parts now."""
@@ -49,7 +49,7 @@ class EdgeMetrics:
         }
 
 
-def families_of(now: EdgeStatistics) -> tuple[Family, ...]:
+def families_of(now: EdgeStatistics) -> tuple[MetricFamily, ...]:
     """The figures of one edge agent."""
     line = now.line
     directions = {"in": line.received, "out": line.sent}

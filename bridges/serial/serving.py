@@ -20,7 +20,7 @@ from mesh.network.opening import Opening
 from mesh.running import INTERRUPTED
 from mesh.starting import AGAIN, lacking
 from mesh.telemetry.context import LogSource
-from mesh.telemetry.logs import introduce
+from mesh.telemetry.logs import set_process_source
 from schemas.address import parse_address
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ def telling(listen: str) -> Iterator[Told]:
         yield lambda edge, session: None
         return
     from bridges.serial.metrics import EdgeMetrics
-    from mesh.telemetry.opening import open_server
+    from mesh.telemetry.serving import open_server
 
     figures = EdgeMetrics()
     with open_server(listen, figures.families, figures.health):
@@ -105,7 +105,7 @@ def serve(device: DeviceId, wiring: Wiring, *, endpoints: Endpoints, told: Told)
             signal.signal(number, lambda number, frame: edge.stop())
         words = f"edge of {device.agent}: {device.name} on {name}, {wiring.protocol}, Zenoh id {session.zid()}"
         told(edge, session)
-        introduce(LogSource("edge", parse_address(device.agent)))
+        set_process_source(LogSource("edge", parse_address(device.agent)))
         announce(log, "edge-started", words, device=device.name)
         with tell_log(session, device):
             edge.run()

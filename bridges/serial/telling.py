@@ -9,7 +9,7 @@ import msgspec
 
 from bridges.serial.device_id import LOG
 from mesh.errors import AiraError
-from mesh.telemetry.log_service import LogService
+from mesh.telemetry.logs import LogService
 from schemas.logs import ReadLogs
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from mesh.errors import ClosedError, ConfigurationError
 from mesh.settings import load
 from mesh.starting import entered, files
 from mesh.telemetry.context import LogSource, source_context
-from mesh.telemetry.logs import introduce
+from mesh.telemetry.logs import set_process_source
 from mesh.telemetry.serving import Telemetry
 from schemas import Demand, Offer, Result, Verified
 
@@ -235,7 +235,7 @@ class Agent:
         if account is None and self.settings.keyfile:
             account = await asyncio.to_thread(load_account, self.settings)
         who = LogSource("agent", "" if account is None else account.address, self.settings.lighthouse_contract.lower())
-        introduce(who)
+        set_process_source(who)
         with source_context(who):
             await self._open_as(stack, account)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from mesh.chain.metrics import ChainMetrics, reading_families
 from mesh.network.metrics import message_families, network_families
-from mesh.telemetry.families import Family, by_label, counter, gauge, labelled
+from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge, labelled
 from mesh.work.lifecycle import UNFINISHED, Phase
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ class AgentMetrics:
         self._workshop = workshop
         self._chain = ChainMetrics(parts.chain)
 
-    async def measure(self, subscriptions: Sequence[Subscription[Any]]) -> tuple[Family, ...]:
+    async def measure(self, subscriptions: Sequence[Subscription[Any]]) -> tuple[MetricFamily, ...]:
         """The figures now; `subscriptions` are what its handlers hear."""
         families = (
             *message_families(subscriptions),
@@ -40,7 +40,7 @@ class AgentMetrics:
         own = labelled(families, lighthouse=self._parts.channel.lighthouse)
         return (*own, *network_families(self._parts.network), *await self._chain.measure())
 
-    async def _jobs(self) -> tuple[Family, ...]:
+    async def _jobs(self) -> tuple[MetricFamily, ...]:
         now, standing = time.time(), await self._parts.ledger.standing()
         counts = {phase.value: 0.0 for phase in Phase} | {phase: float(count) for phase, count, _ in standing}
         ages = {phase.value: 0.0 for phase in UNFINISHED}
@@ -51,12 +51,12 @@ class AgentMetrics:
             by_label("aira_job_standing_seconds", "gauge", meaning, "phase", ages),
         )
 
-    async def _waiting(self) -> tuple[Family, ...]:
+    async def _waiting(self) -> tuple[MetricFamily, ...]:
         kinds = {"demand": 0, "offer": 0, "result": 0} | await self._parts.ledger.waiting_by_kind()
         meaning = "Messages that are sent until their effect is on the chain"
         return (by_label("aira_outbox_messages", "gauge", meaning, "kind", kinds),)
 
-    def _recording(self) -> tuple[Family, ...]:
+    def _recording(self) -> tuple[MetricFamily, ...]:
         done = self._workshop.recorders.statistics()
         return (
             counter("aira_recorded_messages_total", "Messages written into recordings", done.recorded),
@@ -64,7 +64,7 @@ class AgentMetrics:
             gauge("aira_recording_lag_seconds", "For how long a message has waited to be written", done.lag),
         )
 
-    async def _content(self) -> tuple[Family, ...]:
+    async def _content(self) -> tuple[MetricFamily, ...]:
         usage = await asyncio.to_thread(self._parts.store.usage)
         known = self._parts.exchange.statistics()
         quota = () if usage.quota is None else (gauge("aira_content_quota_bytes", "Most of that", usage.quota),)

@@ -14,7 +14,7 @@ from mesh.agent.status_service import StatusService
 from mesh.agent.token_events import TokenEvents
 from mesh.agent.trade import Trader
 from mesh.telemetry.context import with_liability_context
-from mesh.telemetry.log_service import LogService
+from mesh.telemetry.logs import LogService
 from mesh.work.executor import Executor
 from mesh.work.liability_events import LiabilityEvents
 from mesh.work.lifecycle import Phase
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from mesh.agent.hooks import Handler
     from mesh.chain import Approval, Transfer
     from mesh.network import Subscription
-    from mesh.telemetry.families import Family
+    from mesh.telemetry.metrics import MetricFamily
     from mesh.work.job import TopicHandler
     from schemas import Liability
 
@@ -81,7 +81,7 @@ class AgentRuntime:
         await settle_ended(self.parts.chain, self.parts.ledger, self)
         await self.executor.run()
 
-    async def measure(self, subscriptions: Sequence[Subscription[Any]]) -> tuple[Family, ...]:
+    async def measure(self, subscriptions: Sequence[Subscription[Any]]) -> tuple[MetricFamily, ...]:
         """The figures of its work, and of what it hears over `subscriptions`."""
         return await self._figures.measure(subscriptions)
 

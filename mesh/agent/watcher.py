@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from mesh.network.metrics import link_state, message_families, network_families
-from mesh.telemetry.families import labelled
+from mesh.telemetry.metrics import labelled
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from mesh.network import Channel, Network, Subscription
-    from mesh.telemetry.families import Family
+    from mesh.telemetry.metrics import MetricFamily
 
 
 class Watcher:
@@ -21,7 +21,7 @@ class Watcher:
         self._network = network
         self._channel = channel
 
-    async def measure(self, subscriptions: Sequence[Subscription[Any]]) -> tuple[Family, ...]:
+    async def measure(self, subscriptions: Sequence[Subscription[Any]]) -> tuple[MetricFamily, ...]:
         """The figures of what it hears over `subscriptions`."""
         heard = labelled(message_families(subscriptions), lighthouse=self._channel.lighthouse)
         return (*heard, *network_families(self._network))

@@ -8,7 +8,7 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from mesh.errors import AiraError
-from mesh.telemetry.families import Family, by_label, counter, gauge
+from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
@@ -26,12 +26,12 @@ PATIENCE: Final = 1.0
 class Asked:
     """Figures that have to be asked of the node: now and then, and left out where it does not answer soon."""
 
-    def __init__(self, ask: Callable[[], Awaitable[Iterable[Family]]]) -> None:
+    def __init__(self, ask: Callable[[], Awaitable[Iterable[MetricFamily]]]) -> None:
         self._ask = ask
-        self._families: tuple[Family, ...] = ()
+        self._families: tuple[MetricFamily, ...] = ()
         self._asked_at = float("-inf")
 
-    async def measure(self) -> tuple[Family, ...]:
+    async def measure(self) -> tuple[MetricFamily, ...]:
         """The figures, not older than `FRESH`."""
         if time.monotonic() - self._asked_at >= FRESH:
             self._asked_at = time.monotonic()
@@ -51,7 +51,7 @@ class ChainMetrics:
         self._chain = chain
         self._balances = Asked(self._ask_balances)
 
-    async def measure(self) -> tuple[Family, ...]:
+    async def measure(self) -> tuple[MetricFamily, ...]:
         """The figures now."""
         counted = self._chain.node.tally.statistics()
         fates = {fate.value: float(count) for fate, count in counted.transactions.items()}
@@ -70,7 +70,7 @@ class ChainMetrics:
             *await self._balances.measure(),
         )
 
-    async def _ask_balances(self) -> Iterable[Family]:
+    async def _ask_balances(self) -> Iterable[MetricFamily]:
         if self._chain.account is None:
             return ()
         eth, xrt = await asyncio.gather(
@@ -82,7 +82,7 @@ class ChainMetrics:
         )
 
 
-def reading_families(*, head: int, read_at: float) -> tuple[Family, ...]:
+def reading_families(*, head: int, read_at: float) -> tuple[MetricFamily, ...]:
     """How far the chain was read: up to the block `head`, at `read_at` of the monotonic clock."""
     return (
         gauge("aira_chain_head_block", "The last block that was read", head),

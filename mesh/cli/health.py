@@ -50,7 +50,7 @@ def command(settings: Settings, url: str | None, timeout: float, as_json: bool) 
 
 def _place(url: str | None, settings: Settings) -> tuple[str, int]:
     """Host and port of whom to ask. Raises `ConfigurationError`."""
-    from mesh.telemetry.opening import place
+    from mesh.telemetry.health import listen_address
 
     if url is not None:
         return _place_of(url)
@@ -59,7 +59,7 @@ def _place(url: str | None, settings: Settings) -> tuple[str, int]:
             "nothing says where the server tells its health",
             hint="give --url http://HOST:PORT, or the metrics_listen that the server was given",
         )
-    host, port = place(settings.metrics_listen)
+    host, port = listen_address(settings.metrics_listen)
     return ANYWHERE.get(host, host), port
 
 

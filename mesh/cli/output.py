@@ -115,9 +115,9 @@ def announce(log: Logger, event: str, text: str, **fields: object) -> None:
     import logging
 
     from mesh.telemetry.context import log_event
-    from mesh.telemetry.logs import own_log
+    from mesh.telemetry.logs import process_log
 
-    own = own_log()
+    own = process_log()
     if own is None or not own.writes_json:
         print_line(text)
     if own is not None:

@@ -16,7 +16,7 @@ from mesh.cli.output import announce
 from mesh.running import run_until_stopped
 from mesh.settings import ChainSettings, NetworkSettings, TelemetrySettings, options_of
 from mesh.telemetry.context import LogSource
-from mesh.telemetry.logs import introduce
+from mesh.telemetry.logs import set_process_source
 from mesh.telemetry.serving import Telemetry
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ async def _serve(settings: Settings) -> None:
         telemetry = await stack.enter_async_context(Telemetry(settings.metrics_listen))
         await files(settings)
         account = await asyncio.to_thread(load_account, settings)
-        introduce(LogSource("provider", account.address, lighthouse.lower()))
+        set_process_source(LogSource("provider", account.address, lighthouse.lower()))
         make = partial(_opened, settings, account, telemetry)
         network, provider = await entered(stack, settings, make, role="provider", waits=telemetry.starting)
         words = f"provider {provider.address} serves {lighthouse}, Zenoh id {network.id}"

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from mesh.identity import Roster
     from mesh.network import Endpoints, Network
     from mesh.settings import Settings
-    from mesh.telemetry.families import Family
+    from mesh.telemetry.metrics import MetricFamily
 
 log = logging.getLogger(__name__)
 
@@ -127,7 +127,7 @@ def _shown(telemetry: Telemetry, network: Network) -> AbstractContextManager[Non
     """A router's figures and health: that it listens, and who is linked to it."""
     from mesh.network.metrics import link_state, network_families
 
-    async def measure() -> Iterable[Family]:
+    async def measure() -> Iterable[MetricFamily]:
         return network_families(network)
 
     return telemetry.showing(measure=measure, health=lambda: {"router": link_state(network)})

@@ -18,7 +18,7 @@ from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import plural, print_json, print_line, printable, short_address, wait_for_broken_pipe
 from mesh.running import run_until_stopped
 from mesh.settings import NetworkSettings, options_of
-from mesh.telemetry.logs import start_log
+from mesh.telemetry.logs import configure_logging
 from mesh.watching import JobEvent, Reading
 from schemas import Demand, Empty, InvalidAddress, Result, String, Verified, parse_address, parse_cid
 from schemas.signing import Rejection
@@ -50,7 +50,7 @@ def command(settings: Settings, model: str | None, with_open: bool, readings: bo
 
     That a contract was made is what agents say; `aira liability watch` asks the chain.
     """
-    start_log(level="warning")
+    configure_logging(level="warning")
     run_until_stopped(lambda: _watch(settings, model, with_open=with_open, readings=readings, as_json=as_json))
 
 

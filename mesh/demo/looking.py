@@ -6,7 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING, Final
 
 from mesh.chain import NodeUnreachable, RequestRefused
-from mesh.telemetry.families import Family, gauge
+from mesh.telemetry.metrics import MetricFamily, gauge
 from schemas.status import ALIVE
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ class Look:
                 self._head = None
             await asyncio.sleep(LOOK)
 
-    async def measure(self) -> tuple[Family, ...]:
+    async def measure(self) -> tuple[MetricFamily, ...]:
         """How high the chain is, if that is known."""
         return (
             () if self._head is None else (gauge("aira_chain_head_block", "The last block that was read", self._head),)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from mesh.chain.metrics import Asked, reading_families
 from mesh.network.metrics import message_families
-from mesh.telemetry.families import Family, by_label, counter, gauge, labelled
+from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge, labelled
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -42,7 +42,7 @@ class MarketMetrics:
         self._watching = watching
         self._stake = Asked(self._ask_stake)
 
-    async def measure(self) -> tuple[Family, ...]:
+    async def measure(self) -> tuple[MetricFamily, ...]:
         """The figures now."""
         families = (
             *message_families(self._subscriptions),
@@ -53,7 +53,7 @@ class MarketMetrics:
         )
         return labelled(families, lighthouse=self._channel.lighthouse)
 
-    def _market(self) -> Iterable[Family]:
+    def _market(self) -> Iterable[MetricFamily]:
         seen, rejected = self._books.turnover(), self._books.earnings().rejected
         undone = {"created": seen.taken_back.created, "finalized": seen.taken_back.finalized}
         return (
@@ -70,7 +70,7 @@ class MarketMetrics:
             gauge("aira_transactions_waiting", "Contracts to make or to finalize that wait", self._sending.waiting),
         )
 
-    def _money(self) -> Iterable[Family]:
+    def _money(self) -> Iterable[MetricFamily]:
         seen = self._books.turnover()
         undone = {"fees": seen.taken_back.fees, "minted": seen.taken_back.minted}
         return (
@@ -85,7 +85,7 @@ class MarketMetrics:
             ),
         )
 
-    async def _ask_stake(self) -> Iterable[Family]:
+    async def _ask_stake(self) -> Iterable[MetricFamily]:
         assert self._chain.account is not None
         assert self._channel.address is not None
         state = await self._chain.lighthouses.get(self._channel.address)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from mesh.chain import Chain
     from mesh.market.provider import Provider
     from mesh.network import Network
-    from mesh.telemetry.families import Family
+    from mesh.telemetry.metrics import MetricFamily
 
 
 class ProviderProcess:
@@ -24,7 +24,7 @@ class ProviderProcess:
         self._chain = ChainMetrics(chain)
         self._providers = providers
 
-    async def measure(self) -> tuple[Family, ...]:
+    async def measure(self) -> tuple[MetricFamily, ...]:
         """The figures of session, chain and account, and those of each provider with its lighthouse."""
         families = [*network_families(self._network), *await self._chain.measure()]
         for provider in self._providers:

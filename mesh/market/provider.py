@@ -26,7 +26,7 @@ from mesh.network.channel import Channel
 from mesh.network.services import Services
 from mesh.role import Role
 from mesh.telemetry.context import LogSource, liability_context, log_event, source_context
-from mesh.telemetry.log_service import LogService
+from mesh.telemetry.logs import LogService
 from schemas import ZERO_ADDRESS, Demand, Offer, RejectKey, Result, Verified
 from schemas.signing import Rejection
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from mesh.chain import Chain
     from mesh.market.book import Order
     from mesh.network import Subscription
-    from mesh.telemetry.families import Family
+    from mesh.telemetry.metrics import MetricFamily
     from schemas import Liability
 
 log = logging.getLogger(__name__)
@@ -152,7 +152,7 @@ class Provider(Role):
         """What was done, earned and spent so far."""
         return self._books.earnings()
 
-    async def measure(self) -> Iterable[Family]:
+    async def measure(self) -> Iterable[MetricFamily]:
         """Its figures, with its lighthouse as a label; those of its chain and its session are not among them."""
         return await self._figures.measure()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from mesh.telemetry.families import Family, Sample, counter, gauge
+from mesh.telemetry.metrics import MetricFamily, MetricSample, counter, gauge
 from schemas.status import ALIVE
 
 if TYPE_CHECKING:
@@ -15,30 +15,30 @@ if TYPE_CHECKING:
     from mesh.network.validation import Statistics
 
 
-def message_families(subscriptions: Iterable[Subscription[Any]]) -> tuple[Family, ...]:
+def message_families(subscriptions: Iterable[Subscription[Any]]) -> tuple[MetricFamily, ...]:
     """What came in over these subscriptions: by kind and verdict, and what was lost before it had one."""
     told = [(subscription.kind, subscription.statistics()) for subscription in subscriptions]
     return (
-        Family(
+        MetricFamily(
             "aira_messages_total",
             "counter",
             "Messages that came in, by kind and verdict: accepted, duplicate, or the reason why they are not let in",
             tuple(
-                Sample(count, {"kind": kind, "verdict": verdict})
+                MetricSample(count, {"kind": kind, "verdict": verdict})
                 for kind, statistics in told
                 for verdict, count in _verdicts(statistics)
             ),
         ),
-        Family(
+        MetricFamily(
             "aira_messages_dropped_total",
             "counter",
             "Messages that fell out of the queue unseen, the oldest first, as they came faster than they were taken",
-            tuple(Sample(statistics.dropped, {"kind": kind}) for kind, statistics in told),
+            tuple(MetricSample(statistics.dropped, {"kind": kind}) for kind, statistics in told),
         ),
     )
 
 
-def network_families(network: Network) -> tuple[Family, ...]:
+def network_families(network: Network) -> tuple[MetricFamily, ...]:
     """How well a session holds."""
     return (
         gauge(

@@ -1,1 +1,1 @@
-"""What an operator sees of a running role: its figures, its health, its log."""
+"""What an operator sees of a running role: its metrics, its health, its log."""

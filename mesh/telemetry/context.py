@@ -1,4 +1,4 @@
-"""What an event of the log is about: who speaks, and the contract that it concerns. Tasks and threads inherit it."""
+"""The context of log events: which role logs, and which liability it is about. Tasks and threads inherit it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ P = ParamSpec("P")
 
 
 class LogSource(NamedTuple):
-    """Whose event it is."""
+    """The role that logs an event."""
 
     role: str = ""
     address: str = ""
@@ -31,36 +31,36 @@ class LogSource(NamedTuple):
     """The ENS name of its market."""
 
 
-NOBODY: Final = LogSource()
+UNKNOWN_SOURCE: Final = LogSource()
 
-_speaker: ContextVar[LogSource] = ContextVar("speaker", default=NOBODY)
+_source: ContextVar[LogSource] = ContextVar("source", default=UNKNOWN_SOURCE)
 _liability: ContextVar[str] = ContextVar("liability", default="")
 
 
-def speaker() -> LogSource:
-    """Who speaks here; `NOBODY` where that is not said."""
-    return _speaker.get()
+def current_source() -> LogSource:
+    """The role that logs here; `UNKNOWN_SOURCE` outside of any `source_context`."""
+    return _source.get()
 
 
-def liability() -> str:
-    """The address of the contract that is dealt with here; empty if there is none."""
+def current_liability() -> str:
+    """The address of the liability that the code here works on; empty outside of any `liability_context`."""
     return _liability.get()
 
 
 @contextmanager
-def source_context(who: LogSource) -> Iterator[None]:
-    """What is logged within is said by `who`."""
-    token = _speaker.set(who)
+def source_context(source: LogSource) -> Iterator[None]:
+    """Attribute events logged in this context to `source`."""
+    token = _source.set(source)
     try:
         yield
     finally:
-        _speaker.reset(token)
+        _source.reset(token)
 
 
 @contextmanager
 def liability_context(liability: str) -> Iterator[None]:
-    """What is logged within concerns the contract at the address `liability`."""
-    token = _liability.set(_canonical(liability))
+    """Attach the liability at this address to events logged in this context."""
+    token = _liability.set(_checksummed(liability))
     try:
         yield
     finally:
@@ -70,18 +70,18 @@ def liability_context(liability: str) -> Iterator[None]:
 def with_liability_context(
     method: Callable[Concatenate[S, L, P], Coroutine[Any, Any, T]],
 ) -> Callable[Concatenate[S, L, P], Coroutine[Any, Any, T]]:
-    """Decorate a method whose first argument is a liability, or the address of one: its events concern that."""
+    """Decorate a method whose first argument is a liability or its address: it runs in that `liability_context`."""
 
     @wraps(method)
-    async def concerned(self: S, which: L, /, *arguments: P.args, **options: P.kwargs) -> T:
-        with liability_context(which if isinstance(which, str) else which.address):
-            return await method(self, which, *arguments, **options)
+    async def wrapped(self: S, liability: L, /, *arguments: P.args, **options: P.kwargs) -> T:
+        with liability_context(liability if isinstance(liability, str) else liability.address):
+            return await method(self, liability, *arguments, **options)
 
-    return concerned
+    return wrapped
 
 
-def _canonical(address: str) -> str:
-    """The address as EIP-55 writes it: keys have it in small letters."""
+def _checksummed(address: str) -> str:
+    """The address as EIP-55 writes it; keys have it in lower case."""
     try:
         return parse_address(address)
     except InvalidAddress:

@@ -1,83 +1,225 @@
-"""The log of a process: every event a line on stderr, and the last ones kept for whoever asks."""
+"""The log of a process: a line on stderr for each event, and the last events in memory for the service `logs`."""
 
 from __future__ import annotations
 
 import logging
+import secrets
 import sys
 import threading
-from typing import TYPE_CHECKING, Final
+import time
+from collections import deque
+from itertools import islice
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-from mesh.telemetry import context
-from mesh.telemetry.events import event_of, human_line, json_line
-from mesh.telemetry.ring import Ring
+from msgspec.structs import replace
+
+from mesh.errors import AiraError, InputError
+from mesh.telemetry.context import UNKNOWN_SOURCE, LogSource, log_event
+from mesh.telemetry.events import event_of, human_line, json_line, timestamp
+from schemas.logs import LEVELS, LogsRead
+from schemas.records import MAX_RECORD_SIZE
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
     from types import TracebackType
-    from typing import Any
 
-    from mesh.settings import Settings
-    from mesh.telemetry.context import LogSource
-    from schemas.logs import LogEvent
+    from mesh.settings import TelemetrySettings
+    from schemas.logs import LogEvent, ReadLogs
 
 log = logging.getLogger(__name__)
 
-OTHERS: Final = ("aiohttp", "asyncio", "eth", "eth_tester", "urllib3", "web3", "websockets", "zenoh")
-"""Loggers of libraries, which tell more than an operator wants to know, and what is none of his."""
+LIBRARIES: Final = ("aiohttp", "asyncio", "eth", "eth_tester", "urllib3", "web3", "websockets", "zenoh")
+"""Loggers of libraries; below level debug only their warnings are shown."""
+MAX_EVENTS: Final = 2_000
+"""Events that a process keeps."""
+MAX_BYTES: Final = 2 * 1024 * 1024
+"""Bytes of encoded events that a process keeps."""
+MAX_REPLY: Final = MAX_RECORD_SIZE - 4_096
+"""Bytes of events in a reply; the rest of the record is for its other fields."""
 
 
-class Log(logging.Handler):
-    """Keeps events in `ring`, and writes them to stderr with `line` (None: does not write)."""
+class NoLog(AiraError):
+    """The process keeps no log: a program embeds the role and logs in its own way."""
 
-    def __init__(self, line: Any = None, *, speaker: LogSource = context.NOBODY) -> None:
+    code = "log-not-kept"
+
+
+class _BufferedEvent(NamedTuple):
+    event: LogEvent
+    size: int
+    """Bytes of the encoded event."""
+
+
+class LogBuffer:
+    """Keeps the last events of a process, numbered from 1. Every method may be called from any thread."""
+
+    def __init__(self, *, max_events: int = MAX_EVENTS, max_bytes: int = MAX_BYTES) -> None:
+        self.instance: Final = secrets.token_hex(8)
+        """Identifies this run of the process."""
+        self.began: Final = timestamp(time.time())
+        self._max_events = max_events
+        self._max_bytes = max_bytes
+        self._lock = threading.Lock()
+        self._events: deque[_BufferedEvent] = deque()
+        self._bytes = 0
+        self._last = 0
+
+    def __len__(self) -> int:
+        return len(self._events)
+
+    @property
+    def size(self) -> int:
+        """Bytes of all kept events, encoded."""
+        return self._bytes
+
+    def add(self, event: LogEvent) -> None:
+        """Keep an event and drop the oldest ones beyond the limits."""
+        with self._lock:
+            self._last += 1
+            event = replace(event, sequence=self._last)
+            size = len(event.encode())
+            self._events.append(_BufferedEvent(event, size))
+            self._bytes += size
+            while len(self._events) > self._max_events or self._bytes > self._max_bytes:
+                self._bytes -= self._events.popleft().size
+
+    def read(self, request: ReadLogs, *, address: str = "", role: str = "") -> LogsRead:
+        """The requested events, as many as fit into a reply.
+
+        With `address`, events of other accounts in the same process are left out. Raises `InputError` for an unknown
+        level.
+        """
+        wanted = _filter(request, address)
+        with self._lock:
+            events, last = list(self._events), self._last
+        first = last - len(events) + 1
+        if (after := request.after.get(self.instance)) is None:
+            newest = [one for one in events if wanted(one.event)][-request.lines :] if request.lines > 0 else []
+            missed, found = 0, newest
+        else:
+            missed = max(0, first - after - 1)
+            found = [one for one in islice(events, max(0, after + 1 - first), None) if wanted(one.event)]
+        entries = tuple(_that_fit(found))
+        more = len(entries) < len(found)
+        return LogsRead(
+            instance=self.instance,
+            began=self.began,
+            role=role,
+            entries=entries,
+            last=entries[-1].sequence if more else last,
+            more=more,
+            missed=missed,
+        )
+
+
+def _filter(request: ReadLogs, address: str) -> Callable[[LogEvent], bool]:
+    """Whether an event is one of those requested. Raises `InputError`."""
+    if request.level not in LEVELS:
+        raise InputError(f"there is no log level {request.level[:20]!r}", hint=f"one of {', '.join(LEVELS)}")
+    least, liability = LEVELS.index(request.level), request.liability.lower()
+    return lambda event: (
+        LEVELS.index(event.level) >= least
+        and (not address or event.address in ("", address))
+        and (not liability or event.liability.lower() == liability)
+    )
+
+
+def _that_fit(found: list[_BufferedEvent]) -> Iterator[LogEvent]:
+    """The first events that fit into one reply. A single event always does."""
+    left = MAX_REPLY
+    for event, size in found:
+        left -= size + 1
+        if left < 0:
+            return
+        yield event
+
+
+class LogHandler(logging.Handler):
+    """Keeps events in `buffer` and writes each to stderr with `format_line` (None: does not write)."""
+
+    def __init__(
+        self,
+        format_line: Callable[[LogEvent], str] | None = None,
+        *,
+        source: LogSource = UNKNOWN_SOURCE,
+        buffer: LogBuffer | None = None,
+    ) -> None:
         super().__init__()
-        self.ring: Final = Ring()
-        self.speaker = speaker
-        """Who speaks where nobody is said to: in the threads of libraries."""
-        self._line = line
+        self.buffer: Final = LogBuffer() if buffer is None else buffer
+        self.source = source
+        """The source of events without a `source_context`, as in the threads of libraries."""
+        self._format_line = format_line
 
     @property
     def writes_json(self) -> bool:
-        """Whether every line is to be a JSON object."""
-        return self._line is json_line
+        """Whether every line is a JSON object."""
+        return self._format_line is json_line
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep and write an event. What can't be put into words is told as such."""
+        """Keep and write an event. A record that can't be formatted becomes an error event that says so."""
         try:
-            event = event_of(record, default=self.speaker)
-        except Exception:  # wrong arguments of a log call, or something of a stranger whose `str` fails
-            words = f"what {record.pathname}:{record.lineno} logs can't be put into words: {record.msg!r}"
+            event = event_of(record, default=self.source)
+        except Exception:  # wrong arguments of the log call, or an argument whose `str` fails
+            message = f"{record.pathname}:{record.lineno} logs what can't be formatted: {record.msg!r}"
             record = logging.LogRecord(
-                record.name, logging.ERROR, record.pathname, record.lineno, "%s", (words,), sys.exc_info()
+                record.name, logging.ERROR, record.pathname, record.lineno, "%s", (message,), sys.exc_info()
             )
-            event = event_of(record, default=self.speaker)
-        self.ring.add(event)
+            vars(record).update(log_event("record-malformed"))
+            event = event_of(record, default=self.source)
+        self.buffer.add(event)
         if not (getattr(record, "is_said", False) and not self.writes_json):
             self._write(event)
 
     def _write(self, event: LogEvent) -> None:
-        if self._line is None:
+        if self._format_line is None:
             return
         try:
-            sys.stderr.write(f"{self._line(event)}\n")
+            sys.stderr.write(f"{self._format_line(event)}\n")
             sys.stderr.flush()
         except (OSError, ValueError):
-            pass  # nobody reads stderr any more, or it is closed: there is no place left to say so but the ring
+            pass  # stderr is closed; the event is in the buffer
 
 
-def start_log(*, level: str = "info", form: str = "human", role: str = "") -> None:
-    """Write the log to stderr, a line an event, from `level` on, in the format `form` (`human` or `json`).
+class LogService:
+    """The service `logs` of a role: its last events, for everyone whom the router lets ask.
 
-    `role` is what this process is. Does nothing where logging is set up already.
+    It changes nothing and is as open as `status`: on a router without a roster to everyone on the machine, on a closed
+    site to operators. No event holds a key or a password. In a process with several roles, each serves its own events.
+    """
+
+    def __init__(self, role: str, address: str) -> None:
+        self._role = role
+        self._address = address
+
+    async def logs(self, request: ReadLogs) -> LogsRead:
+        """The requested events. Raises `NoLog`, `InputError`."""
+        return self.read(request)
+
+    def read(self, request: ReadLogs) -> LogsRead:
+        """The same for callers without an event loop."""
+        handler = process_log()
+        if handler is None:
+            raise NoLog(
+                f"this {self._role} is part of a program that keeps no log",
+                hint="the program may call mesh.telemetry.logs.keep_log()",
+            )
+        return handler.buffer.read(request, address=self._address, role=self._role)
+
+
+def configure_logging(*, level: str = "info", form: str = "human", role: str = "") -> None:
+    """Write events from `level` on to stderr, one per line, as `form` says (`human` or `json`).
+
+    `role` names this process. Does nothing if the program has set up logging already.
     """
     root = logging.getLogger()
     if root.handlers:
         return
-    handler = Log(json_line if form == "json" else human_line, speaker=context.LogSource(role))
+    handler = LogHandler(json_line if form == "json" else human_line, source=LogSource(role))
     root.addHandler(handler)
     least = getattr(logging, level.upper())
     root.setLevel(least)
     if least > logging.DEBUG:
-        for name in OTHERS:
+        for name in LIBRARIES:
             logging.getLogger(name).setLevel(max(least, logging.WARNING))
     logging.captureWarnings(True)
     if handler.writes_json:
@@ -90,53 +232,55 @@ def start_log(*, level: str = "info", form: str = "human", role: str = "") -> No
         zenoh.init_log_from_env_or("info")
 
 
-def start_log_of(settings: Settings, role: str) -> None:
-    """Write the log as the settings say; `role` is what this process is."""
-    start_log(level=settings.log_level, form=settings.log_format, role=role)
+def configure_logging_from(settings: TelemetrySettings, role: str) -> None:
+    """Configure logging as the settings say; `role` names this process."""
+    configure_logging(level=settings.log_level, form=settings.log_format, role=role)
 
 
-def keep_log() -> None:
-    """Keep the last events of a program that writes its log in its own way, for the service `logs` of its agents.
+def keep_log(*, max_events: int = MAX_EVENTS) -> None:
+    """Keep the last events of a program that logs in its own way, for the service `logs` of its agents.
 
-    Call it after the program has set up its logging. What that holds back is not kept either.
+    Call it after the program has set up its logging. Events that its level holds back are not kept.
     """
-    if own_log() is None:
-        logging.getLogger().addHandler(Log())
+    if process_log() is None:
+        logging.getLogger().addHandler(LogHandler(buffer=LogBuffer(max_events=max_events)))
 
 
-def own_log() -> Log | None:
-    """The log of this process; None where a program logs in its own way, and keeps nothing."""
-    return next((handler for handler in logging.getLogger().handlers if isinstance(handler, Log)), None)
+def process_log() -> LogHandler | None:
+    """The log handler of this process; None if the program logs in its own way and keeps nothing."""
+    return next((handler for handler in logging.getLogger().handlers if isinstance(handler, LogHandler)), None)
 
 
-def writes_json() -> bool:
-    """Whether everything that this process says is to be a JSON object a line."""
-    own = own_log()
-    return own is not None and own.writes_json
+def logs_json() -> bool:
+    """Whether everything that this process writes has to be one JSON object per line."""
+    handler = process_log()
+    return handler is not None and handler.writes_json
 
 
-def introduce(who: LogSource) -> None:
-    """Say as whom this process speaks, where it is known by its role only so far."""
-    own = own_log()
-    if own is not None and own.speaker == context.LogSource(who.role):
-        own.speaker = who
+def set_process_source(source: LogSource) -> None:
+    """Set the source of this process's events, if only its role is known so far."""
+    handler = process_log()
+    if handler is not None and handler.source == LogSource(source.role):
+        handler.source = source
 
 
 def _uncaught(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
     if not isinstance(error, KeyboardInterrupt):
-        log.critical("the program failed", exc_info=(kind, error, trace))
+        log.critical("the program failed", exc_info=(kind, error, trace), extra=log_event("program-failed"))
 
 
 def _unraisable(found: sys.UnraisableHookArgs) -> None:
-    """What nobody can catch, as it is raised in a finalizer or a callback of C."""
+    """Log an error raised where nothing can catch it, as in a finalizer or a callback from C."""
     error = found.exc_value
     if error is not None:
-        words = found.err_msg or "raised where nobody can catch it"
-        log.error("%s: %r", words, found.object, exc_info=(type(error), error, error.__traceback__))
+        message = found.err_msg or "raised where nothing can catch it"
+        info = (type(error), error, error.__traceback__)
+        log.error("%s: %r", message, found.object, exc_info=info, extra=log_event("finalizer-failed"))
 
 
 def _uncaught_in_thread(arguments: threading.ExceptHookArgs) -> None:
     error = arguments.exc_value
     if error is not None:
         name = arguments.thread.name if arguments.thread is not None else "that is gone"
-        log.critical("the thread %s failed", name, exc_info=(type(error), error, error.__traceback__))
+        info = (type(error), error, error.__traceback__)
+        log.critical("the thread %s failed", name, exc_info=info, extra=log_event("thread-failed", thread=name))

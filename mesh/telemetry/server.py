@@ -1,4 +1,7 @@
-"""The HTTP side of metrics and health: two pages, read only, on threads of their own. Loaded where they are served."""
+"""The HTTP server of /metrics and /health, on threads of its own.
+
+The only module that needs prometheus_client; it is imported when the settings say where to serve.
+"""
 
 from __future__ import annotations
 
@@ -10,64 +13,128 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
+from prometheus_client import PlatformCollector, ProcessCollector
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
+from prometheus_client.exposition import choose_encoder
+from prometheus_client.registry import Collector, CollectorRegistry
+
+import mesh
 from mesh.errors import AiraError, ConfigurationError
+from mesh.telemetry.context import log_event
+from mesh.telemetry.metrics import merged
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
     from types import TracebackType
 
+    from prometheus_client.core import Metric
+
     from mesh.telemetry.health import Health
+    from mesh.telemetry.metrics import MetricFamily
 
 log = logging.getLogger(__name__)
 
-PATIENCE: Final = 10.0
-"""Seconds that a connection may last, whatever comes over it."""
-CONNECTIONS: Final = 32
-"""Connections at once; more are closed unanswered."""
-LOOK: Final = 0.2
-"""Seconds between two looks at whether the server is to end, and at which connections last too long."""
+POLL: Final = 0.2
+"""Seconds after which the server notices that it is closed, or that a connection lasts too long."""
 TEXT: Final = "text/plain; charset=utf-8"
+PROMETHEUS_TYPES: Final = {"counter": CounterMetricFamily, "gauge": GaugeMetricFamily}
 
 
-class Answer(NamedTuple):
-    """What a page says."""
+class ServerLimits(NamedTuple):
+    """What clients may use of the server."""
+
+    seconds: float = 10.0
+    """How long a connection may last, whatever is sent over it."""
+    connections: int = 32
+    """Connections at once; more are closed without an response."""
+
+
+class HttpResponse(NamedTuple):
+    """What a page answers."""
 
     body: bytes
     content_type: str = TEXT
     status: HTTPStatus = HTTPStatus.OK
 
 
-class Server:
-    """Serves `metrics` at /metrics and `health` at /health of `host` and `port` (0 takes a free one), with `with`.
+class PrometheusCollector(Collector):
+    """The metrics of the process (memory, CPU, open files, start time, version), and these families."""
 
-    Both are called on threads of the server, several at once; `metrics` with the header `Accept` of who asks. Entering
-    raises `ConfigurationError` when nothing can be served there.
+    def __init__(self, families: Iterable[MetricFamily]) -> None:
+        self._families = merged(families)
+        self._process = (ProcessCollector(registry=None), PlatformCollector(registry=None))
+
+    def collect(self) -> Iterator[Metric]:
+        """Each family once. Raises `ValueError` for a name or a label that Prometheus does not accept."""
+        for collector in self._process:
+            yield from collector.collect()
+        version = InfoMetricFamily("aira", "The version of aira-mesh")
+        version.add_metric([], {"version": mesh.__version__})
+        yield version
+        for family in self._families:
+            labels = sorted({label for sample in family.samples for label in sample.labels})
+            metric = PROMETHEUS_TYPES[family.kind](family.name, family.meaning, labels=labels)
+            for sample in family.samples:
+                metric.add_metric([sample.labels.get(label, "") for label in labels], sample.value)
+            yield metric
+
+
+def render_metrics(families: Iterable[MetricFamily], *, accept: str = "") -> HttpResponse:
+    """The families and the metrics of the process, in the format that a scrape's header `Accept` asks for."""
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(PrometheusCollector(families))
+    encoder, content_type = choose_encoder(accept)
+    return HttpResponse(encoder(registry), content_type)
+
+
+class TelemetryServer:
+    """Serves `families` at /metrics and `health` at /health of `host` and `port` (0 takes a free one), with `with`.
+
+    Both are called on threads of the server, several at once. Entering raises `ConfigurationError` if the address can't
+    be served.
     """
 
-    def __init__(self, host: str, port: int, *, metrics: Callable[[str], Answer], health: Callable[[], Health]) -> None:
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        *,
+        families: Callable[[], Iterable[MetricFamily]],
+        health: Callable[[], Health],
+        limits: ServerLimits = ServerLimits(),  # noqa: B008
+    ) -> None:
         self._address = host, port
-        self._pages: Mapping[str, Callable[[str], Answer]] = {"/metrics": metrics, "/health": lambda _: told(health())}
-        self._http: _Http | None = None
+        self._pages: Mapping[str, Callable[[str], HttpResponse]] = {
+            "/metrics": lambda accept: render_metrics(families(), accept=accept),
+            "/health": lambda _: health_response(health()),
+        }
+        self._limits = limits
+        self._http: _HttpServer | None = None
 
     @property
     def url(self) -> str:
-        """Where the pages are, without a path."""
+        """The address of the pages, without a path."""
         assert self._http is not None, "the server is not open"
         host, port = self._http.server_name, self._http.server_port
         return f"http://{f'[{host}]' if ':' in host else host}:{port}"
 
     def __enter__(self) -> Self:
         try:
-            self._http = _Http(self._address, self._pages)
+            self._http = _HttpServer(self._address, self._pages, self._limits)
         except (OSError, OverflowError, UnicodeError) as error:
             where = f"{self._address[0]}:{self._address[1]}"
             why = getattr(error, "strerror", None) or error
             raise ConfigurationError(
-                f"can't tell metrics and health at {where}: {why}",
-                hint="is the port taken? each server of a machine needs one of its own: --metrics-listen HOST:PORT",
+                f"can't serve metrics and health at {where}: {why}",
+                hint="is the port taken? each server on a machine needs its own: --metrics-listen HOST:PORT",
             ) from None
-        threading.Thread(target=self._http.serve_forever, args=(LOOK,), name="aira-metrics", daemon=True).start()
-        log.info("metrics at %s/metrics, health at %s/health", self.url, self.url)
+        threading.Thread(target=self._http.serve_forever, args=(POLL,), name="aira-metrics", daemon=True).start()
+        log.info(
+            "metrics at %s/metrics, health at %s/health",
+            self.url,
+            self.url,
+            extra=log_event("metrics-served", url=self.url),
+        )
         return self
 
     def __exit__(
@@ -79,31 +146,34 @@ class Server:
             self._http = None
 
 
-class _Http(ThreadingHTTPServer):
-    """A server that bears any number of clients, and slow ones."""
+class _HttpServer(ThreadingHTTPServer):
+    """Limits how many connections there are and how long each lasts."""
 
     daemon_threads = True
-    block_on_close = False  # who is still being answered must not hold up the end
-    request_queue_size = CONNECTIONS
+    block_on_close = False  # closing does not wait for open connections
 
-    def __init__(self, address: tuple[str, int], pages: Mapping[str, Callable[[str], Answer]]) -> None:
+    def __init__(
+        self, address: tuple[str, int], pages: Mapping[str, Callable[[str], HttpResponse]], limits: ServerLimits
+    ) -> None:
         self.pages = pages
+        self.limits = limits
+        self.request_queue_size = limits.connections
         self._lock = threading.Lock()
         self._open: dict[socket.socket, float] = {}
         self.address_family = socket.getaddrinfo(*address, type=socket.SOCK_STREAM)[0][0]
         super().__init__(address, _Handler)
 
     def server_bind(self) -> None:
-        """Without a look at the name service for the host's name, which may take its time."""
+        """Bind without looking up the host's name, which can take long."""
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self.socket.bind(self.server_address)
         self.server_address = self.socket.getsockname()
         self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer on a thread, unless too many are being answered."""
+        """Answer on a thread, or close the connection if there are too many."""
         with self._lock:
-            admitted = len(self._open) < CONNECTIONS
+            admitted = len(self._open) < self.limits.connections
             if admitted:
                 self._open[request] = time.monotonic()
         if admitted:
@@ -112,77 +182,85 @@ class _Http(ThreadingHTTPServer):
             self.shutdown_request(request)
 
     def shutdown_request(self, request: Any) -> None:
-        """The end of a connection."""
+        """Close a connection."""
         with self._lock:
             self._open.pop(request, None)
         super().shutdown_request(request)
 
     def service_actions(self) -> None:
-        """Break off connections that last too long: each byte of a slow one would grant it another timeout."""
+        """Close connections that last too long: the socket's own timeout begins again with each byte."""
         with self._lock:
-            late = [connection for connection, since in self._open.items() if time.monotonic() - since > PATIENCE]
+            now, most = time.monotonic(), self.limits.seconds
+            late = [connection for connection, since in self._open.items() if now - since > most]
         for connection in late:
             try:
                 connection.shutdown(socket.SHUT_RDWR)
-            except OSError as error:  # it has ended meanwhile
-                log.debug("a connection had ended: %s", error)
+            except OSError as error:  # closed meanwhile
+                log.debug("the connection was closed already: %s", error)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """What happens to a connection concerns nobody but who asked."""
-        log.debug("a question for metrics or health broke off", exc_info=True)
+        """A broken connection is no concern of the operator."""
+        log.debug("a request for metrics or health broke off", exc_info=True)
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """One question. Nothing of it comes back in the answer."""
+    """One request. No part of it is repeated in the response."""
 
-    server: _Http
-    timeout = PATIENCE
+    server: _HttpServer
+
+    def setup(self) -> None:
+        """Set the socket's timeout."""
+        self.request.settimeout(self.server.limits.seconds)
+        super().setup()
 
     def do_GET(self) -> None:
-        """Answer with the page, or that there is none."""
+        """Answer with the page, or 404."""
         page = self.server.pages.get(self.path.partition("?")[0])
         if page is None:
-            self._reply(_plain(HTTPStatus.NOT_FOUND, "there is /metrics, and /health"))
+            self._reply(_plain(HTTPStatus.NOT_FOUND, "not found; the pages are /metrics and /health"))
             return
         try:
-            answer = page(self.headers.get("Accept", ""))
+            response = page(self.headers.get("Accept", ""))
         except (AiraError, TimeoutError) as error:
-            log.warning("metrics or health can't be told now: %s", error)
-            answer = _plain(HTTPStatus.SERVICE_UNAVAILABLE, "this can't be told now; the server's log says why")
+            code = getattr(error, "code", "timeout")
+            log.warning(
+                "metrics or health are unavailable: %s", error, extra=log_event("metrics-unavailable", code=code)
+            )
+            response = _plain(HTTPStatus.SERVICE_UNAVAILABLE, "unavailable; the server's log says why")
         except Exception:
-            log.exception("a question for metrics or health can't be answered")
-            answer = _plain(HTTPStatus.INTERNAL_SERVER_ERROR, "this failed; the server's log says why")
-        self._reply(answer)
+            log.exception("a request for metrics or health failed", extra=log_event("metrics-failed"))
+            response = _plain(HTTPStatus.INTERNAL_SERVER_ERROR, "failed; the server's log says why")
+        self._reply(response)
 
     do_HEAD = do_GET  # noqa: N815
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """What is no question that can be answered: another method, a request that is none."""
+        """Answer another method, or a malformed request."""
         self.close_connection = True
         self._reply(_plain(HTTPStatus(code), HTTPStatus(code).phrase))
 
     def version_string(self) -> str:
-        """What the server calls itself."""
+        """The header `Server`."""
         return "aira"
 
     def log_message(self, format: str, *args: Any) -> None:
-        """A scrape every few seconds is no event."""
+        """Requests are not logged: a scrape comes every few seconds."""
 
-    def _reply(self, answer: Answer) -> None:
-        self.send_response(answer.status)
-        self.send_header("Content-Type", answer.content_type)
-        self.send_header("Content-Length", str(len(answer.body)))
+    def _reply(self, response: HttpResponse) -> None:
+        self.send_response(response.status)
+        self.send_header("Content-Type", response.content_type)
+        self.send_header("Content-Length", str(len(response.body)))
         self.send_header("Cache-Control", "no-store")
         self.end_headers()
         if self.command != "HEAD":
-            self.wfile.write(answer.body)
+            self.wfile.write(response.body)
 
 
-def told(health: Health) -> Answer:
-    """The page of a role's health: 503 where a part is not well."""
+def health_response(health: Health) -> HttpResponse:
+    """The page /health: 503 if a part does not work."""
     status = HTTPStatus.OK if health.ok else HTTPStatus.SERVICE_UNAVAILABLE
-    return Answer(health.encode() + b"\n", "application/json", status)
+    return HttpResponse(health.encode() + b"\n", "application/json", status)
 
 
-def _plain(status: HTTPStatus, words: str) -> Answer:
-    return Answer(f"{words}\n".encode(), TEXT, status)
+def _plain(status: HTTPStatus, text: str) -> HttpResponse:
+    return HttpResponse(f"{text}\n".encode(), TEXT, status)

@@ -1,4 +1,4 @@
-"""Metrics and health of a role in an event loop: `async with Telemetry(settings.metrics_listen) as telemetry`."""
+"""Metrics and health of the roles of a process: `async with Telemetry(settings.metrics_listen) as telemetry`."""
 
 from __future__ import annotations
 
@@ -7,62 +7,77 @@ import concurrent.futures
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Final, NamedTuple, Self, TypeVar
 
-from mesh.errors import ClosedError
-from mesh.telemetry.health import STARTING, Health, up
+from mesh.errors import ClosedError, ConfigurationError
+from mesh.telemetry.health import STARTING, Health, health_metrics, listen_address
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator, Mapping
     from types import TracebackType
     from typing import Any
 
-    from mesh.telemetry.families import Family
-    from mesh.telemetry.server import Server
+    from mesh.telemetry.metrics import MetricFamily
+    from mesh.telemetry.server import TelemetryServer
 
-    Measure = Callable[[], Awaitable[Iterable[Family]]]
-    AgentComponents = Callable[[], Mapping[str, str]]
+    Measure = Callable[[], Awaitable[Iterable[MetricFamily]]]
+    HealthCheck = Callable[[], Mapping[str, str]]
 
 T = TypeVar("T")
 
-ANSWERED_WITHIN: Final = 5.0
+ANSWER_TIMEOUT: Final = 5.0
 """Seconds that the event loop may take to answer."""
-SILENT: Final = Health.of({"event loop": f"has not answered within {ANSWERED_WITHIN:g} s"})
 
 
-async def no_figures() -> tuple[Family, ...]:
-    """The figures of a role that has none yet."""
+def open_server(
+    listen: str, families: Callable[[], Iterable[MetricFamily]], health: Callable[[], Health]
+) -> TelemetryServer:
+    """A server at `listen` (HOST:PORT), to be used with `with`; it calls both functions on threads of its own.
+
+    Raises `ConfigurationError` if `listen` is not HOST:PORT or prometheus_client is missing; entering it does so if the
+    address can't be served. For processes without an event loop; others use `Telemetry`.
+    """
+    host, port = listen_address(listen)
+    try:
+        from mesh.telemetry.server import TelemetryServer
+    except ModuleNotFoundError as error:
+        raise ConfigurationError(
+            f"metrics need {error.name}, which is not installed",
+            hint="pip install 'aira-mesh[metrics]', or leave metrics_listen empty",
+        ) from None
+    return TelemetryServer(host, port, families=families, health=health)
+
+
+async def no_metrics() -> tuple[MetricFamily, ...]:
+    """The metrics of a role that has none."""
     return ()
 
 
-class _Shown(NamedTuple):
-    """What one role of the process shows."""
-
+class _RoleTelemetry(NamedTuple):
     measure: Measure
-    health: AgentComponents
+    health: HealthCheck
 
 
 class Telemetry:
     """Serves /metrics and /health at `listen` (HOST:PORT) while it is open; with an empty `listen` it does nothing.
 
-    What is served is `showing`, asked for anew each time. Entering raises `ConfigurationError` for a text that is no
-    HOST:PORT, a port that is taken, a missing prometheus_client.
+    Each request calls the functions given to `showing`. Entering raises `ConfigurationError` if `listen` is not
+    HOST:PORT, the port is taken, or prometheus_client is missing.
     """
 
-    def __init__(self, listen: str) -> None:
+    def __init__(self, listen: str, *, answer_timeout: float = ANSWER_TIMEOUT) -> None:
         self._listen = listen
-        self._shown: list[_Shown] = []
+        self._answer_timeout = answer_timeout
+        self._roles: list[_RoleTelemetry] = []
         self._starting = STARTING
-        self._server: Server | None = None
+        self._server: TelemetryServer | None = None
         self._stack = ExitStack()
 
     @property
     def url(self) -> str:
-        """Where the pages are, without a path; empty where nothing is served."""
+        """The address of the pages, without a path; empty if nothing is served."""
         return "" if self._server is None else self._server.url
 
     async def __aenter__(self) -> Self:
         if self._listen:
-            from mesh.telemetry.opening import open_server
-
             self._loop = asyncio.get_running_loop()
             server = await asyncio.to_thread(open_server, self._listen, self._families, self._health)
             self._server = self._stack.enter_context(server)
@@ -76,66 +91,66 @@ class Telemetry:
             await asyncio.to_thread(self._stack.close)
 
     def starting(self, why: str) -> None:
-        """Say what a start waits for that has not come to its end."""
+        """Report what a role that has not started yet waits for."""
         self._starting = f"waits: {why}"
 
     @contextmanager
-    def showing(self, *, health: AgentComponents, measure: Measure = no_figures) -> Iterator[None]:
-        """Show these figures and parts, beside those that are shown already, until the `with` ends.
+    def showing(self, *, health: HealthCheck, measure: Measure = no_metrics) -> Iterator[None]:
+        """Serve these metrics and this health, beside those of other roles, until the `with` ends.
 
-        `measure` (figures now) and `health` (part → `ALIVE`, `OFF`, or what it waits for) are called in the event loop.
-        Several roles of one process have the same figures with other labels, and parts of other names. What `measure`
-        raises becomes the answer 500, and an event of the log.
+        `measure` (metrics now) and `health` (part → `ALIVE`, `OFF`, or what it waits for) are called in the event loop.
+        Several roles of one process share metric names and differ in labels and in the names of their parts. An error
+        in `measure` is answered with 500 and logged.
         """
-        shown = _Shown(measure, health)
-        self._shown.append(shown)
+        role = _RoleTelemetry(measure, health)
+        self._roles.append(role)
         try:
             yield
         finally:
-            self._shown.remove(shown)
+            self._roles.remove(role)
 
     def parts(self) -> Mapping[str, str]:
-        """The parts of all that is shown; of who shows nothing yet, that it starts."""
-        if not self._shown:
+        """The parts of all roles; before the first has started, the part `start`."""
+        if not self._roles:
             return {"start": self._starting}
-        return {part: state for shown in self._shown for part, state in shown.health().items()}
+        return {part: state for role in self._roles for part, state in role.health().items()}
 
-    async def measure(self) -> Iterable[Family]:
-        """The figures of all that is shown, and whether its parts are well."""
-        families: list[Family] = []
-        for shown in tuple(self._shown):
+    async def measure(self) -> Iterable[MetricFamily]:
+        """The metrics of all roles, and whether their parts work."""
+        families: list[MetricFamily] = []
+        for role in tuple(self._roles):
             try:
-                families += await shown.measure()
+                families += await role.measure()
             except Exception:
-                if shown in self._shown:
+                if role in self._roles:
                     raise
-                continue  # it was being closed
-        return [*families, up(self.parts())]
+                continue  # the role was closed meanwhile
+        return [*families, health_metrics(self.parts())]
 
-    def _families(self) -> Iterable[Family]:
-        """The figures, on a thread of the server's. Raises `TimeoutError`, `ClosedError`."""
+    def _families(self) -> Iterable[MetricFamily]:
+        """The metrics, asked on a thread of the server. Raises `TimeoutError`, `ClosedError`."""
         return self._in_loop(self.measure())
 
     def _health(self) -> Health:
-        """How it is, on a thread of the server's. Raises `ClosedError`."""
+        """The health, asked on a thread of the server. Raises `ClosedError`."""
         try:
             return Health.of(self._in_loop(self._parts()))
-        except TimeoutError:
-            return SILENT
+        except TimeoutError as error:
+            return Health.of({"event loop": str(error)})
 
     async def _parts(self) -> Mapping[str, str]:
         return self.parts()
 
     def _in_loop(self, work: Coroutine[Any, Any, T]) -> T:
         try:
-            asked = asyncio.run_coroutine_threadsafe(work, self._loop)
+            future = asyncio.run_coroutine_threadsafe(work, self._loop)
         except RuntimeError:  # the loop is closed
             work.close()
-            raise ClosedError("the program has come to its end") from None
+            raise ClosedError("the program has ended") from None
         try:
-            return asked.result(ANSWERED_WITHIN)
+            return future.result(self._answer_timeout)
         except concurrent.futures.CancelledError:
-            raise ClosedError("the program comes to its end") from None
+            raise ClosedError("the program is ending") from None
         except concurrent.futures.TimeoutError:
-            asked.cancel()
-            raise TimeoutError(f"the event loop has not answered within {ANSWERED_WITHIN:g} s") from None
+            future.cancel()
+            raise TimeoutError(f"the event loop has not answered within {self._answer_timeout:g} s") from None

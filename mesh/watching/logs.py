@@ -49,6 +49,11 @@ class LogReader:
         self._wanted = ReadLogs(lines=lines, level=level, liability=liability)
         self._after: dict[str, int] = {}
 
+    @property
+    def instances(self) -> frozenset[str]:
+        """The processes whose logs are followed."""
+        return frozenset(self._after)
+
     async def look(self, *, timeout: float = TIMEOUT) -> Look:
         """What has come since the last look. Raises `ServiceFailed` when all who answer do so with an error."""
         first = not self._after

@@ -28,7 +28,7 @@ class Page(NamedTuple):
     headers: Mapping[str, str]
 
 
-class Figures:
+class Scrape:
     """A scrape: `figures("aira_jobs", phase="ready")` is a sample's value."""
 
     def __init__(self, text: str) -> None:
@@ -49,7 +49,7 @@ class Figures:
         assert len(found) <= 1, f"{len(found)} samples of {name} with {labels}"
         return found[0] if found else 0.0
 
-    def changes(self, before: Figures) -> dict[str, float]:
+    def changes(self, before: Scrape) -> dict[str, float]:
         """What has changed since, as `name{label,…}`: counters of the mesh only, without their lighthouse."""
         counters = {name for name in self.names() if name.endswith("_total")}
         found: dict[str, float] = {}
@@ -82,11 +82,11 @@ def get(url: str, path: str, *, method: str = "GET", headers: Mapping[str, str] 
         connection.close()
 
 
-async def scraped(url: str) -> Figures:
+async def scraped(url: str) -> Scrape:
     """The metrics now, beside the event loop, which has to answer."""
     page = await asyncio.to_thread(get, url, "/metrics")
     assert page.status == 200, page.text
-    return Figures(page.text)
+    return Scrape(page.text)
 
 
 async def health(url: str) -> tuple[int, dict[str, str]]:

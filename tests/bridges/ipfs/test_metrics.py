@@ -6,7 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING
 
 from bridges.ipfs.metrics import Standing, bridge_families, content_families, parts_of
-from mesh.telemetry.families import merged
+from mesh.telemetry.metrics import merged
 from schemas.status import ALIVE, ContentMetrics
 from tests.bridges.ipfs.pages import health, metrics
 from tests.bridges.ipfs.replays import OldDaemon
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
-    from mesh.telemetry.families import Family
+    from mesh.telemetry.metrics import MetricFamily
     from tests.support.routers import EmbeddedRouter
 
 SECONDS = 60.0
 MARKET = "airalab.lighthouse.3.robonomics.eth"
 
 
-def figures(families: Iterable[Family]) -> dict[tuple[str, frozenset[str]], float]:
+def figures(families: Iterable[MetricFamily]) -> dict[tuple[str, frozenset[str]], float]:
     """Each figure by its name and the values of its labels."""
     return {
         (family.name, frozenset(sample.labels.values())): sample.value

@@ -12,12 +12,12 @@ from tests.support.commands import run
 PROGRAM = """
 import logging
 from mesh.cli.output import announce
-from mesh.telemetry.logs import own_log, start_log
+from mesh.telemetry.logs import process_log, configure_logging
 from schemas.logs import ReadLogs
-start_log(form={form!r}, role="up")
+configure_logging(form={form!r}, role="up")
 words = "router      tcp/here 100%\\nchain       http://there"
 announce(logging.getLogger("a.server"), "server-started", words, chain="http://there", count=1)
-print(own_log().ring.read(ReadLogs()).entries[0].message)
+print(process_log().buffer.read(ReadLogs()).entries[0].message)
 """
 LINE = "router tcp/here 100%; chain http://there"
 

@@ -16,18 +16,18 @@ from bridges.serial.tally import EdgeStatistics
 from mesh.market.process import ProviderProcess
 from mesh.market.provider import Provider
 from mesh.network import Endpoints, Network
-from mesh.telemetry.exposition import Exposition
-from mesh.telemetry.families import labelled
-from mesh.telemetry.health import up
+from mesh.telemetry.health import health_metrics
+from mesh.telemetry.metrics import labelled
+from mesh.telemetry.server import render_metrics
 from schemas.status import ContentMetrics
 from tests.bridges.ipfs.statuses import status, way
-from tests.support.scraping import Figures
+from tests.support.scraping import Scrape
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from mesh.agent import Agent
-    from mesh.telemetry.families import Family
+    from mesh.telemetry.metrics import MetricFamily
     from tests.support.market import Place
 
 ROOT: Final = Path(__file__).parents[3]
@@ -52,7 +52,7 @@ class Known(NamedTuple):
     labels: set[str]
 
 
-def edge_families() -> tuple[Family, ...]:
+def edge_families() -> tuple[MetricFamily, ...]:
     return families_of(
         EdgeStatistics(
             line=Counters(),
@@ -65,12 +65,12 @@ def edge_families() -> tuple[Family, ...]:
     )
 
 
-def bridge() -> tuple[Family, ...]:
+def bridge() -> tuple[MetricFamily, ...]:
     ways = way(invalid={"hash": 1}, dropped={"no-room": 1}, kinds={"demand": 1})
     return (*bridge_families([Standing(status(to_ipfs=ways, to_mesh=ways), True, True)]), *content_families(CONTENT))
 
 
-async def role_families(place: Place) -> list[Family]:
+async def role_families(place: Place) -> list[MetricFamily]:
     """Of a provider that has rejected and taken back something, and of an agent."""
     robot: Agent = place.agent("robot")
 
@@ -86,7 +86,7 @@ async def role_families(place: Place) -> list[Family]:
         provider._books.rejected("DeadlineReached")
         process = ProviderProcess(network, place.chains["provider"], [provider])
         # They tell nothing over HTTP here, and measure the same.
-        of_provider = [*await process.measure(), up(process.health())]
+        of_provider = [*await process.measure(), health_metrics(process.health())]
         return [*labelled(of_provider, role="provider"), *labelled(await robot.telemetry.measure(), role="agent")]
 
 
@@ -94,7 +94,7 @@ async def role_families(place: Place) -> list[Family]:
 async def served(place: Place) -> Mapping[str, Known]:
     """All that any role serves, by name."""
     families = [*await role_families(place), *edge_families(), *bridge()]
-    figures = Figures(Exposition().render(families)[0].decode())
+    figures = Scrape(render_metrics(families).body.decode())
     known = {}
     for family in figures.families.values():
         name = family.name + ("_total" if family.type == "counter" else "")

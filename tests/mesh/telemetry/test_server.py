@@ -13,29 +13,30 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.errors import ConfigurationError
-from mesh.telemetry import server
-from mesh.telemetry.families import counter
-from mesh.telemetry.health import Health
-from mesh.telemetry.opening import open_server, place
+from mesh.telemetry.health import Health, listen_address
+from mesh.telemetry.metrics import counter
+from mesh.telemetry.server import ServerLimits, TelemetryServer
+from mesh.telemetry.serving import open_server
 from tests.support.ports import free_port
-from tests.support.scraping import Figures, get
+from tests.support.scraping import Scrape, get
 from tests.support.waiting import SECONDS, at_most
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from mesh.telemetry.families import Family
-    from mesh.telemetry.server import Server
+    from mesh.telemetry.metrics import MetricFamily
 
 WELL = Health.of({"channel": "alive"})
-SECRET = "x-not-to-be-told-again"
+SECRET = "x-not-to-be-repeated"
 
 
-def some() -> Iterable[Family]:
+def some() -> Iterable[MetricFamily]:
     return [counter("aira_some_total", "Some", 7)]
 
 
-def serving(*, families: Callable[[], Iterable[Family]] = some, health: Callable[[], Health] = lambda: WELL) -> Server:
+def serving(
+    *, families: Callable[[], Iterable[MetricFamily]] = some, health: Callable[[], Health] = lambda: WELL
+) -> TelemetryServer:
     return open_server("127.0.0.1:0", families, health)
 
 
@@ -69,14 +70,14 @@ def trickle(line: socket.socket) -> None:
         time.sleep(0.01)
 
 
-def test_metrics_and_health_are_told(url: str) -> None:
-    assert Figures(get(url, "/metrics").text)("aira_some_total") == 7
+def test_metrics_and_health_are_served(url: str) -> None:
+    assert Scrape(get(url, "/metrics").text)("aira_some_total") == 7
     assert get(url, "/health")[:2] == (200, '{"ok":true,"parts":{"channel":"alive"}}\n')
     assert get(url, "/health?x=1").status == 200
     assert get(url, "/health").headers["Content-Type"] == "application/json"
 
 
-def test_who_is_not_well_says_so_with_503_and_its_parts() -> None:
+def test_an_unhealthy_role_answers_503_with_its_parts() -> None:
     with serving(health=lambda: Health.of({"channel": "waits for a router"})) as running:
         assert get(running.url, "/health")[:2] == (
             503,
@@ -93,14 +94,14 @@ def test_a_head_has_the_length_and_no_body(url: str) -> None:
 @pytest.mark.parametrize(
     "path", ["/", "/metrics/", "/metric", "/../metrics", "/health/../../etc/passwd", f"/{SECRET}", "*"]
 )
-def test_any_other_path_is_404_and_never_told_again(url: str, path: str) -> None:
+def test_any_other_path_is_404_and_not_repeated(url: str, path: str) -> None:
     page = get(url, path)
 
-    assert (page.status, page.text) == (404, "there is /metrics, and /health\n")
+    assert (page.status, page.text) == (404, "not found; the pages are /metrics and /health\n")
 
 
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "TRACE", "CONNECT", "PROPFIND"])
-def test_nothing_can_be_done_but_reading(url: str, method: str) -> None:
+def test_other_methods_are_refused(url: str, method: str) -> None:
     page = get(url, "/health", method=method)
 
     assert page.status == 501
@@ -121,7 +122,7 @@ def test_nothing_can_be_done_but_reading(url: str, method: str) -> None:
         f"GET /<b>{SECRET}</b> HTTP/1.1\r\nHost: {SECRET}\r\n\r\n".encode(),
     ],
 )
-def test_what_is_no_question_is_refused_and_the_next_one_answered(url: str, request_: bytes) -> None:
+def test_a_malformed_request_is_refused_and_the_next_one_answered(url: str, request_: bytes) -> None:
     answer = said(url, request_)
 
     assert not answer.startswith((b"HTTP/1.0 2", b"HTTP/1.1 2"))
@@ -129,62 +130,67 @@ def test_what_is_no_question_is_refused_and_the_next_one_answered(url: str, requ
     assert get(url, "/health").status == 200
 
 
-def test_who_sends_byte_by_byte_is_cut_off_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, "PATIENCE", 0.5)
-    with serving() as running, at_most(20), connected(running.url) as slow, pytest.raises(OSError, match=r"\w"):
+def test_a_client_that_sends_byte_by_byte_is_disconnected() -> None:
+    limits = ServerLimits(seconds=0.5)
+    with (
+        TelemetryServer("127.0.0.1", 0, families=some, health=lambda: WELL, limits=limits) as running,
+        at_most(20),
+        connected(running.url) as slow,
+        pytest.raises(OSError, match=r"\w"),
+    ):
         trickle(slow)
 
 
-def test_so_many_connections_are_held_and_more_are_closed_unanswered(url: str) -> None:
+def test_connections_beyond_the_limit_are_closed_without_an_answer(url: str) -> None:
     with ExitStack() as stack:
-        for _ in range(server.CONNECTIONS):
+        for _ in range(ServerLimits().connections):
             stack.enter_context(closing(connected(url)))
         with connected(url) as one_more:
             assert one_more.recv(1) == b""
     answer, deadline = b"", time.monotonic() + SECONDS
-    while not answer and time.monotonic() < deadline:  # those that have left make room, once that is noticed
+    while not answer and time.monotonic() < deadline:  # until the server notices that the others have left
         answer = said(url, b"GET /health HTTP/1.0\r\n\r\n")
     assert answer.startswith(b"HTTP/1.0 200")
 
 
-def test_a_failure_is_an_answer_that_tells_nothing_of_it(caplog: pytest.LogCaptureFixture) -> None:
-    def fail() -> Iterable[Family]:
+def test_a_failure_is_answered_without_its_details(caplog: pytest.LogCaptureFixture) -> None:
+    def fail() -> Iterable[MetricFamily]:
         raise ZeroDivisionError(SECRET)
 
     with serving(families=fail) as running:
         page = get(running.url, "/metrics")
-        assert (page.status, page.text) == (500, "this failed; the server's log says why\n")
+        assert (page.status, page.text) == (500, "failed; the server's log says why\n")
         assert get(running.url, "/health").status == 200
     assert SECRET in caplog.text
 
 
-def test_a_port_that_is_taken_is_one_clear_line(url: str) -> None:
+def test_a_taken_port_is_a_configuration_error(url: str) -> None:
     taken = url.removeprefix("http://")
 
-    with pytest.raises(ConfigurationError, match=f"can't tell metrics and health at {taken}: ") as raised:
+    with pytest.raises(ConfigurationError, match=f"can't serve metrics and health at {taken}: ") as raised:
         open_server(taken, some, lambda: WELL).__enter__()
 
     assert "--metrics-listen" in raised.value.hint
 
 
 @pytest.mark.parametrize("host", ["192.0.2.1", "no..host", "a" * 70])
-def test_a_host_that_is_none_is_one_clear_line(host: str) -> None:
-    with pytest.raises(ConfigurationError, match=f"can't tell metrics and health at {re.escape(host)}:\\d+: "):
+def test_an_unusable_host_is_a_configuration_error(host: str) -> None:
+    with pytest.raises(ConfigurationError, match=f"can't serve metrics and health at {re.escape(host)}:\\d+: "):
         open_server(f"{host}:{free_port()}", some, lambda: WELL).__enter__()
 
 
 @pytest.mark.parametrize("listen", ["9464", ":9464", "host:", "host:x", "host:65536", "host:-1", "::1:9464", "[]:1"])
-def test_what_is_no_host_and_port_is_one_clear_line(listen: str) -> None:
-    with pytest.raises(ConfigurationError, match="is no HOST:PORT to tell metrics at"):
-        place(listen)
+def test_a_malformed_listen_address_is_a_configuration_error(listen: str) -> None:
+    with pytest.raises(ConfigurationError, match="not HOST:PORT"):
+        listen_address(listen)
 
 
 @pytest.mark.parametrize(
     ("listen", "found"),
     [("0.0.0.0:9464", ("0.0.0.0", 9464)), ("[::1]:0", ("::1", 0)), ("localhost:80", ("localhost", 80))],
 )
-def test_a_host_and_a_port_are_found(listen: str, found: tuple[str, int]) -> None:
-    assert place(listen) == found
+def test_a_listen_address_is_parsed(listen: str, found: tuple[str, int]) -> None:
+    assert listen_address(listen) == found
 
 
 def test_ipv6_is_served() -> None:
@@ -193,7 +199,7 @@ def test_ipv6_is_served() -> None:
         assert get(running.url, "/health").status == 200
 
 
-def test_the_port_is_free_again_at_the_end() -> None:
+def test_the_port_is_free_after_closing() -> None:
     with serving() as running:
         listen = running.url.removeprefix("http://")
         get(running.url, "/health")
@@ -201,12 +207,12 @@ def test_the_port_is_free_again_at_the_end() -> None:
         assert get(again.url, "/health").status == 200
 
 
-def test_without_prometheus_client_it_is_one_clear_line() -> None:
+def test_without_prometheus_client_it_is_a_configuration_error() -> None:
     program = """
 import sys
 sys.modules["prometheus_client"] = None
 from mesh.errors import ConfigurationError
-from mesh.telemetry.opening import open_server
+from mesh.telemetry.serving import open_server
 try:
     open_server("127.0.0.1:0", list, None)
 except ConfigurationError as error:

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.errors import ChainError, ClosedError, ConfigurationError
-from mesh.telemetry import serving
-from mesh.telemetry.families import Family, counter, gauge, labelled
+from mesh.telemetry.metrics import MetricFamily, counter, gauge, labelled
 from mesh.telemetry.serving import Telemetry
 from schemas.status import ALIVE
 from tests.support.scraping import SECONDS, get, health, scraped
@@ -21,23 +20,23 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
 
 HERE = "127.0.0.1:0"
-"""A port that nobody has."""
+"""A free port."""
 
 
-def telling(name: str, value: float, **labels: str) -> Callable[[], Awaitable[Iterable[Family]]]:
-    async def measure() -> Iterable[Family]:
+def measuring(name: str, value: float, **labels: str) -> Callable[[], Awaitable[Iterable[MetricFamily]]]:
+    async def measure() -> Iterable[MetricFamily]:
         return labelled([gauge(name, "Of the test", value)], **labels)
 
     return measure
 
 
-async def test_without_a_place_nothing_is_served() -> None:
+async def test_without_an_address_nothing_is_served() -> None:
     async with Telemetry("") as telemetry:
-        with telemetry.showing(measure=telling("aira_a", 1), health=lambda: {"part": ALIVE}):
+        with telemetry.showing(measure=measuring("aira_a", 1), health=lambda: {"part": ALIVE}):
             assert telemetry.url == ""
 
 
-async def test_what_has_not_begun_is_not_well_and_says_what_it_waits_for() -> None:
+async def test_a_role_that_has_not_started_is_unhealthy_and_says_what_it_waits_for() -> None:
     async with Telemetry(HERE) as telemetry:
         assert await health(telemetry.url) == (503, {"start": "still waits"})
         telemetry.starting("no router answers")
@@ -49,11 +48,11 @@ async def test_what_has_not_begun_is_not_well_and_says_what_it_waits_for() -> No
         assert (await health(telemetry.url))[0] == 503
 
 
-async def test_several_roles_of_one_process_are_told_together() -> None:
+async def test_several_roles_of_one_process_are_served_together() -> None:
     async with Telemetry(HERE) as telemetry:
         with (
-            telemetry.showing(measure=telling("aira_a", 1, lighthouse="north"), health=lambda: {"north": ALIVE}),
-            telemetry.showing(measure=telling("aira_a", 2, lighthouse="south"), health=lambda: {"south": "waits"}),
+            telemetry.showing(measure=measuring("aira_a", 1, lighthouse="north"), health=lambda: {"north": ALIVE}),
+            telemetry.showing(measure=measuring("aira_a", 2, lighthouse="south"), health=lambda: {"south": "waits"}),
         ):
             figures = await scraped(telemetry.url)
             assert (figures("aira_a", lighthouse="north"), figures("aira_a", lighthouse="south")) == (1, 2)
@@ -61,10 +60,10 @@ async def test_several_roles_of_one_process_are_told_together() -> None:
             assert await health(telemetry.url) == (503, {"north": ALIVE, "south": "waits"})
 
 
-async def test_each_scrape_measures_anew() -> None:
+async def test_each_scrape_measures_again() -> None:
     count = 0
 
-    async def measure() -> Iterable[Family]:
+    async def measure() -> Iterable[MetricFamily]:
         nonlocal count
         count += 1
         return [counter("aira_scrapes_total", "Scrapes", count)]
@@ -75,35 +74,34 @@ async def test_each_scrape_measures_anew() -> None:
                 assert (await scraped(telemetry.url))("aira_scrapes_total") == expected
 
 
-async def test_a_loop_that_stands_still_is_not_well_and_nobody_waits_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(serving, "ANSWERED_WITHIN", 0.2)
-    async with Telemetry(HERE) as telemetry:
-        with telemetry.showing(measure=telling("aira_a", 1), health=lambda: {"channel": ALIVE}), Threads() as threads:
+async def test_a_blocked_event_loop_is_unhealthy_and_requests_do_not_wait_for_it() -> None:
+    async with Telemetry(HERE, answer_timeout=0.2) as telemetry:
+        with telemetry.showing(measure=measuring("aira_a", 1), health=lambda: {"channel": ALIVE}), Threads() as threads:
             asked = [threads.submit(get, telemetry.url, path) for path in ("/health", "/metrics")]
-            # Waited for here, as by a handler that does not give way.
+            # Wait in the event loop itself, like a handler that blocks it.
             of_health, of_metrics = [asking.result(SECONDS) for asking in asked]
             assert (of_health.status, of_metrics.status) == (503, 503)
             assert "event loop" in of_health.text
             assert await health(telemetry.url) == (200, {"channel": ALIVE})
 
 
-async def test_what_can_not_be_measured_now_is_no_failure_of_the_server(caplog: pytest.LogCaptureFixture) -> None:
-    async def measure() -> Iterable[Family]:
+async def test_an_expected_error_of_a_measurement_is_503(caplog: pytest.LogCaptureFixture) -> None:
+    async def measure() -> Iterable[MetricFamily]:
         raise ChainError("the ledger is full")
 
     async with Telemetry(HERE) as telemetry:
         with telemetry.showing(measure=measure, health=lambda: {"channel": ALIVE}):
             page = await asyncio.to_thread(get, telemetry.url, "/metrics")
-            assert (page.status, page.text) == (503, "this can't be told now; the server's log says why\n")
+            assert (page.status, page.text) == (503, "unavailable; the server's log says why\n")
     assert "the ledger is full" in caplog.text
 
 
-async def test_who_is_closed_while_it_is_measured_has_no_figures_and_no_failure(
+async def test_a_role_closed_during_a_scrape_has_no_metrics_and_is_no_failure(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     began, closed = asyncio.Event(), asyncio.Event()
 
-    async def measure() -> Iterable[Family]:
+    async def measure() -> Iterable[MetricFamily]:
         began.set()
         await closed.wait()
         raise ClosedError("the store is closed")
@@ -118,8 +116,8 @@ async def test_who_is_closed_while_it_is_measured_has_no_figures_and_no_failure(
     assert caplog.records == []
 
 
-async def test_a_question_that_the_end_of_the_program_cancels_is_no_failure(caplog: pytest.LogCaptureFixture) -> None:
-    async def measure() -> Iterable[Family]:
+async def test_a_request_cancelled_by_the_end_of_the_program_is_no_failure(caplog: pytest.LogCaptureFixture) -> None:
+    async def measure() -> Iterable[MetricFamily]:
         task = asyncio.current_task()
         assert task is not None
         task.cancel()
@@ -133,7 +131,7 @@ async def test_a_question_that_the_end_of_the_program_cancels_is_no_failure(capl
     assert [record.exc_info for record in caplog.records] == [None]
 
 
-def test_a_question_after_the_end_of_the_loop_is_no_failure(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_request_after_the_end_of_the_loop_is_no_failure(caplog: pytest.LogCaptureFixture) -> None:
     telemetry = Telemetry(HERE)
     asyncio.run(telemetry.__aenter__())
     page = get(telemetry.url, "/health")
@@ -142,9 +140,9 @@ def test_a_question_after_the_end_of_the_loop_is_no_failure(caplog: pytest.LogCa
     assert [record.exc_info for record in caplog.records] == [None]
 
 
-async def test_two_servers_can_not_have_one_port() -> None:
+async def test_two_servers_can_not_share_a_port() -> None:
     async with Telemetry(HERE) as telemetry:
-        with pytest.raises(ConfigurationError, match="can't tell metrics and health"):
+        with pytest.raises(ConfigurationError, match="can't serve metrics and health"):
             await Telemetry(telemetry.url.removeprefix("http://")).__aenter__()
 
 
@@ -169,7 +167,7 @@ print(sorted(name for name in names if name in sys.modules))
         ),
     ],
 )
-def test_who_serves_no_metrics_does_not_load_what_serves_them(what: str, more: str) -> None:
+def test_without_metrics_the_server_is_not_loaded(what: str, more: str) -> None:
     program = LOADED.format(what=what, more=more)
 
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)

@@ -35,13 +35,13 @@ def told(body: str, *, code: int = 0, **variables: str) -> list[dict[str, Any]]:
     return [json.loads(line) for line in said(body, code=code, AIRA_LOG_FORMAT="json", **variables)]
 
 
-def test_a_users_own_words_are_events() -> None:
+def test_messages_of_the_users_program_are_events() -> None:
     (event,) = told('log.info("the lamp %s", "is on")')
     assert (event["level"], event["logger"], event["message"]) == ("info", "my.robot", "the lamp is on")
     assert event["role"] == "robot"
 
 
-def test_the_human_format_is_time_level_words() -> None:
+def test_the_human_format_is_time_level_message() -> None:
     (line,) = said('log.warning("the lamp is dim")')
     assert line[8:] == " WARNING the lamp is dim"
 
@@ -50,37 +50,43 @@ def test_the_human_format_is_time_level_words() -> None:
     ("level", "words"),
     [("debug", "dbiwe"), ("info", "biwe"), ("warning", "we"), ("error", "e")],
 )
-def test_the_level_decides_what_is_said(level: str, words: str) -> None:
+def test_the_level_decides_what_is_logged(level: str, words: str) -> None:
     body = 'log.debug("d"); log.info("b"); log.info("i"); log.warning("w"); log.error("e")'
     events = told(body, AIRA_LOG_LEVEL=level)
     assert "".join(event["message"] for event in events if event["logger"] == "my.robot") == words
 
 
-def test_libraries_speak_only_of_trouble_unless_all_is_to_be_said() -> None:
+def test_libraries_log_only_warnings_unless_the_level_is_debug() -> None:
     body = 'web3 = logging.getLogger("web3.providers"); web3.info("chatter"); web3.warning("trouble")'
     assert [event["message"] for event in told(body)] == ["trouble"]
     assert "chatter" in [event["message"] for event in told(body, AIRA_LOG_LEVEL="debug")]
 
 
-def test_an_error_that_ends_a_server_is_an_event_with_what_to_do() -> None:
+def test_an_error_that_ends_a_server_is_an_event_with_its_hint() -> None:
     (event,) = told('raise RemoteError("the node is gone", hint="start it")', code=1)
     assert (event["level"], event["message"], event["hint"]) == ("error", "the node is gone", "start it")
+    assert (event["event"], event["code"]) == ("failed", "remote-error")
     assert said('raise RemoteError("the node is gone", hint="start it")', code=1) == [
-        "aira: the node is gone",
+        "aira: the node is gone [remote-error]",
         "      start it",
     ]
 
 
-def test_a_defect_that_ends_a_server_is_one_line_with_its_traceback() -> None:
+def test_an_unexpected_error_that_ends_a_server_is_one_line_with_its_traceback() -> None:
     event = told('raise ZeroDivisionError("so\\nwhat")', code=1)[-1]
-    assert (event["level"], event["error"]) == ("critical", "ZeroDivisionError: so\nwhat")
+    assert (event["event"], event["level"]) == ("program-failed", "critical")
+    assert event["error"] == "ZeroDivisionError: so\nwhat"
     assert "in main\n" in event["trace"]
 
 
 def test_a_thread_that_fails_is_one_line() -> None:
     body = 'thread = threading.Thread(target=lambda: 1 / 0, name="pump"); thread.start(); thread.join()'
     (event,) = told(body)
-    assert (event["message"], event["error"]) == ("the thread pump failed", "ZeroDivisionError: division by zero")
+    assert (event["event"], event["thread"], event["error"]) == (
+        "thread-failed",
+        "pump",
+        "ZeroDivisionError: division by zero",
+    )
 
 
 def test_a_task_that_fails_unheard_is_one_line() -> None:
@@ -96,7 +102,7 @@ del task
     assert "ZeroDivisionError" in event["error"]
 
 
-def test_what_nobody_can_catch_is_one_line() -> None:
+def test_an_error_in_a_finalizer_is_one_line() -> None:
     body = """
 class Fragile:
     def __del__(self):
@@ -104,7 +110,8 @@ class Fragile:
 Fragile()
 """
     (event,) = told(body)
-    assert (event["level"], event["error"]) == ("error", "ZeroDivisionError: in the end")
+    assert (event["event"], event["level"]) == ("finalizer-failed", "error")
+    assert event["error"] == "ZeroDivisionError: in the end"
     assert "Fragile" in event["message"]
 
 
@@ -114,14 +121,14 @@ def test_a_warning_is_one_line() -> None:
     assert "old fashioned" in event["message"]
 
 
-def test_a_wrong_call_of_the_log_is_told_and_stops_nothing() -> None:
+def test_a_wrong_log_call_is_logged_and_stops_nothing() -> None:
     first, second = told('log.info("%d messages", "many"); log.info("it goes on")')
-    assert (first["level"], "'%d messages'" in first["message"]) == ("error", True)
+    assert (first["event"], first["level"], "'%d messages'" in first["message"]) == ("record-malformed", "error", True)
     assert first["error"].startswith("TypeError")
     assert second["message"] == "it goes on"
 
 
-def test_a_program_that_logs_in_its_own_way_goes_on_to() -> None:
+def test_a_program_that_logs_in_its_own_way_keeps_doing_so() -> None:
     body = 'logging.basicConfig(format="mine %(message)s", force=True); log.warning("hello")'
     assert said(body, AIRA_LOG_FORMAT="json") == ["mine hello"]
     own = "import logging; logging.basicConfig(format='mine %(message)s', level=20)\n" + START

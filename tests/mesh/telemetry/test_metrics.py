@@ -1,20 +1,20 @@
-"""Figures as a role has them: put together, labelled, rendered for Prometheus, and read again."""
+"""Scrape as a role has them: put together, labelled, rendered for Prometheus, and read again."""
 
 from __future__ import annotations
 
 import pytest
 from prometheus_client.openmetrics.parser import text_string_to_metric_families as open_metrics
 
-from mesh.telemetry.exposition import Exposition
-from mesh.telemetry.families import Family, Sample, by_label, counter, gauge, labelled, merged
-from mesh.telemetry.health import Health, up
-from tests.support.scraping import Figures
+from mesh.telemetry.health import Health, health_metrics
+from mesh.telemetry.metrics import MetricFamily, MetricSample, by_label, counter, gauge, labelled, merged
+from mesh.telemetry.server import render_metrics
+from tests.support.scraping import Scrape
 
 
-def rendered(*families: Family) -> Figures:
-    text, content_type = Exposition().render(families)
+def rendered(*families: MetricFamily) -> Scrape:
+    text, content_type, _ = render_metrics(families)
     assert content_type.startswith("text/plain")
-    return Figures(text.decode())
+    return Scrape(text.decode())
 
 
 def test_a_counter_and_a_gauge_are_told_with_their_kind_and_meaning() -> None:
@@ -39,7 +39,7 @@ def test_labels_are_told_whatever_they_hold() -> None:
 def test_a_scraper_that_asks_for_openmetrics_gets_it() -> None:
     families = [counter("aira_jobs_done_total", "Jobs done", 3)]
 
-    text, content_type = Exposition().render(families, accept="application/openmetrics-text; version=1.0.0")
+    text, content_type, _ = render_metrics(families, accept="application/openmetrics-text; version=1.0.0")
 
     assert content_type.startswith("application/openmetrics-text")
     found = {family.name: family for family in open_metrics(text.decode())}  # type: ignore[no-untyped-call]
@@ -59,8 +59,8 @@ def test_labels_are_added_to_all_samples_and_do_not_hide_their_own() -> None:
 
     first, second = labelled(families, lighthouse="north")
 
-    assert first.samples == (Sample(1, {"lighthouse": "north"}),)
-    assert second.samples == (Sample(2, {"lighthouse": "north", "kind": "demand"}),)
+    assert first.samples == (MetricSample(1, {"lighthouse": "north"}),)
+    assert second.samples == (MetricSample(2, {"lighthouse": "north", "kind": "demand"}),)
 
 
 def test_the_same_figure_of_two_lighthouses_is_one_family() -> None:
@@ -89,7 +89,7 @@ def test_who_has_a_part_that_waits_is_not_well(parts: dict[str, str], ok: bool) 
 
     assert health.ok is ok
     assert Health.decode(health.encode()) == health
-    assert sum(sample.value for sample in up(parts).samples) == (2 if ok else 1)
+    assert sum(sample.value for sample in health_metrics(parts).samples) == (2 if ok else 1)
 
 
 def test_health_keeps_what_opens_doors_to_itself() -> None:

@@ -20,7 +20,7 @@ from schemas.status import ALIVE
 from tests.support.market import MODEL, obliging
 from tests.support.objectives import objective
 from tests.support.orders import demand
-from tests.support.scraping import Figures, health, scraped
+from tests.support.scraping import Scrape, health, scraped
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def blinking(place: Place) -> Agent:
     return robot
 
 
-async def settled(url: str, **expected: float) -> Figures:
+async def settled(url: str, **expected: float) -> Scrape:
     """The figures, when those named (without labels) have come to their values."""
 
     async def as_expected() -> bool:
@@ -189,16 +189,16 @@ async def test_what_is_refused_is_counted_under_its_reason(place: Place) -> None
         assert sum(changes.values()) == 3
 
 
-async def _changed(url: str, before: Figures, count: float) -> bool:
+async def _changed(url: str, before: Scrape, count: float) -> bool:
     return sum((await scraped(url)).changes(before).values()) >= count
 
 
-async def test_a_router_that_goes_is_told_and_so_is_its_return(place: Place, router: EmbeddedRouter) -> None:
+async def test_the_loss_and_return_of_a_router_are_reported(place: Place, router: EmbeddedRouter) -> None:
     robot = blinking(place)
     async with provider_at(place) as url, robot:
         own = url_of(robot)
-        assert await health(url) == (200, WELL)
-        assert await health(own) == (200, AGENT_WELL)
+        for where, well in ((url, WELL), (own, AGENT_WELL)):
+            await until_found(partial(_is, where, (200, well)), what="the start", seconds=LONG)
         await asyncio.to_thread(router.stop)
         for where, well in ((url, WELL), (own, AGENT_WELL)):
             lost = (503, {**well, "channel": "waits for a router"})
@@ -266,7 +266,7 @@ async def test_a_balance_that_the_node_does_not_tell_is_left_out(place: Place, m
 
     async with provider_at(place), blinking(place) as robot:
         assert "aira_account_eth_wei" in (await scraped(url_of(robot))).names()
-        monkeypatch.setattr(chain, "eth_balance", unreachable)
+        monkeypatch.setattr(chain.node, "eth_balance", unreachable)
         figures = await scraped(url_of(robot))
         assert "aira_account_eth_wei" not in figures.names()
         assert figures.of_label("aira_jobs", "phase")

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from mesh.telemetry.context import LogSource, liability_context, log_event, source_context, with_liability_context
-from mesh.telemetry.events import LARGEST, LONGEST_MESSAGE, event_of, human_line, json_line, without_secrets
+from mesh.telemetry.events import MAX_EVENT, MAX_MESSAGE, event_of, human_line, json_line, without_secrets
 from schemas.logs import LogEvent
 from tests.support.orders import ROBOT, STRANGER
 
@@ -34,7 +34,7 @@ def failed(words: str) -> ZeroDivisionError:
         return error
 
 
-def test_an_event_says_who_speaks_and_which_contract_it_concerns() -> None:
+def test_an_event_has_its_source_and_its_liability() -> None:
     with source_context(ARM), liability_context(LIABILITY.lower()):
         event = event_of(record("ready, %d messages to play", 3))
     told = json.loads(json_line(event))
@@ -56,14 +56,14 @@ def test_the_time_is_utc_with_milliseconds() -> None:
     assert event_of(event).time == "2023-11-14T22:13:20.001Z"
 
 
-def test_the_contract_is_at_the_front_of_the_human_line() -> None:
+def test_a_human_line_begins_with_the_liability() -> None:
     with liability_context(LIABILITY):
         line = human_line(event_of(record("finalized, paid", level=logging.WARNING)))
     assert line[8:] == f" WARNING {LIABILITY}: finalized, paid"
     assert human_line(event_of(record("started")))[8:] == " INFO    started"
 
 
-def test_who_speaks_in_threads_of_libraries_is_the_process() -> None:
+def test_events_without_a_context_have_the_default_source() -> None:
     assert event_of(record("x"), default=ARM).address == ROBOT.address
     with source_context(LogSource("provider", STRANGER.address)):
         assert event_of(record("x"), default=ARM).role == "provider"
@@ -71,9 +71,9 @@ def test_who_speaks_in_threads_of_libraries_is_the_process() -> None:
 
 def test_facts_are_members_of_the_json_object_and_never_replace_a_field() -> None:
     event = record("rejected")
-    vars(event).update(log_event("unnamed", order="ab" * 32, gas=7, level="none", message="forged"))
+    vars(event).update(log_event("order-rejected", order="ab" * 32, gas=7, level="none", message="forged"))
     told = json.loads(json_line(event_of(event)))
-    assert (told["order"], told["gas"]) == ("ab" * 32, "7")
+    assert (told["event"], told["order"], told["gas"]) == ("order-rejected", "ab" * 32, "7")
     assert (told["level"], told["message"]) == ("info", "rejected")
 
 
@@ -84,7 +84,7 @@ def test_what_a_stranger_says_stays_on_one_line_and_steers_no_terminal(write: An
     assert len(line.splitlines()) == 1
 
 
-def test_programs_get_what_a_stranger_said_unchanged() -> None:
+def test_json_lines_keep_untrusted_text_unchanged() -> None:
     assert json.loads(json_line(event_of(record("%s", HOSTILE))))["message"] == HOSTILE
 
 
@@ -97,7 +97,7 @@ def test_an_exception_is_a_part_of_the_one_json_line() -> None:
     assert "in failed\n" in told["trace"]
 
 
-def test_no_line_of_a_traceback_looks_like_an_event() -> None:
+def test_a_line_of_a_traceback_can_not_pass_for_an_event() -> None:
     _, *rest = human_line(event_of(record("failed", error=failed(HOSTILE)))).split("\n")
     assert len(rest) > 3
     for line in rest:
@@ -109,11 +109,11 @@ def test_an_event_fits_into_a_reply_however_long_its_words_are() -> None:
     event = event_of(record("x" * 100_000, error=failed("\x00" * 100_000)))
     assert event.message.startswith("x" * 1_000)
     assert event.message.endswith("characters more)")
-    assert len(event.encode()) <= LARGEST
-    assert event_of(record("x" * 5_000)).message == "x" * LONGEST_MESSAGE + "… (1,000 characters more)"
+    assert len(event.encode()) <= MAX_EVENT
+    assert event_of(record("x" * 5_000)).message == "x" * MAX_MESSAGE + "… (1,000 characters more)"
 
 
-def test_names_of_files_that_are_no_text_can_be_told() -> None:
+def test_undecodable_file_names_can_be_logged() -> None:
     event = event_of(record("can't read %s", b"\xff.mcap".decode("utf-8", "surrogateescape")))
     assert event.message == "can't read \\udcff.mcap"
     assert LogEvent.decode(event.encode()) == event
@@ -129,21 +129,31 @@ def test_names_of_files_that_are_no_text_can_be_told() -> None:
         (f"http://gateway/ipfs/Qm{'a' * 44}", f"http://gateway/ipfs/Qm{'a' * 44}"),
     ],
 )
-def test_what_opens_doors_in_a_url_is_left_out(said: str, told: str) -> None:
+def test_secrets_in_urls_are_removed(said: str, told: str) -> None:
     assert without_secrets(said).replace(")", "") == told
     event = event_of(record("%s", said, error=failed(said)))
     for secret in ("pass@", "0123456789abcdef", "apikey"):
         assert secret not in event.message + event.error + event.trace.replace(repr(said), "")
 
 
-def test_levels_have_names_and_those_in_between_count_as_the_lower() -> None:
+def test_a_level_between_two_counts_as_the_lower() -> None:
     named = {level: event_of(record("x", level=level)).level for level in (0, 5, 10, 20, 25, 30, 40, 50, 99)}
     assert list(named.values()) == [
         "debug", "debug", "debug", "info", "info", "warning", "error", "critical", "critical",
     ]  # fmt: skip
 
 
-async def test_tasks_and_threads_inherit_the_contract_and_leave_others_alone() -> None:
+def test_the_name_of_an_event_is_in_json_lines_and_not_in_human_lines() -> None:
+    named = record("created, gas 7")
+    vars(named).update(log_event("contract-created", gas=7))
+    event = event_of(named)
+    assert event.event == "contract-created"
+    assert json.loads(json_line(event))["event"] == "contract-created"
+    assert human_line(event)[8:] == " INFO    created, gas 7"
+    assert "event" not in json.loads(json_line(event_of(record("a library's message"))))
+
+
+async def test_tasks_and_threads_inherit_the_liability() -> None:
     seen: dict[str, str] = {}
 
     class Work:
@@ -165,6 +175,6 @@ async def test_tasks_and_threads_inherit_the_contract_and_leave_others_alone() -
     assert event_of(record("x")).liability == ""
 
 
-def test_a_clock_that_is_none_is_shown_as_such() -> None:
+def test_a_malformed_time_is_shown_as_dashes() -> None:
     event = LogEvent(time="\x1b[31m", level="info", logger="x", message="hello")
     assert human_line(event) == "--:--:-- INFO    hello"
