@@ -6,22 +6,26 @@ from typing import TYPE_CHECKING
 import pytest
 from eth_keyfile.keyfile import decode_keyfile_json
 
-from tests.support.deployment import COMPOSE, Deployment, Images
+from tests.support.deployment import ComposeDeployment, Images
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+pytestmark = pytest.mark.compose
 
 SERVICES = ("setup", "chain", "router", "provider", "agent", "person")
 
 
 @pytest.fixture(scope="module")
-def demo(images: Images, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Deployment]:
-    with Deployment(images, tmp_path_factory.mktemp("demo")) as market:
+def demo(images: Images, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ComposeDeployment]:
+    with ComposeDeployment(images, tmp_path_factory.mktemp("demo")) as market:
         market.up()
         yield market
 
 
-async def test_a_market_comes_up_from_nothing_and_does_a_job_whose_story_is_in_the_logs(demo: Deployment) -> None:
+async def test_a_market_comes_up_from_nothing_and_does_a_job_whose_story_is_in_the_logs(
+    demo: ComposeDeployment,
+) -> None:
     await demo.ready()
     assert "made" in demo.log("setup")
     story = demo.log("person")
@@ -33,7 +37,7 @@ async def test_a_market_comes_up_from_nothing_and_does_a_job_whose_story_is_in_t
     assert liability in demo.log("agent")
 
 
-async def test_nobody_has_more_rights_than_needed(demo: Deployment) -> None:
+async def test_nobody_has_more_rights_than_needed(demo: ComposeDeployment) -> None:
     await demo.ready()
     for service in SERVICES:
         facts = demo.facts(service)
@@ -49,7 +53,7 @@ async def test_nobody_has_more_rights_than_needed(demo: Deployment) -> None:
         )
 
 
-async def test_no_key_and_no_password_is_in_an_environment_a_command_line_or_a_log(demo: Deployment) -> None:
+async def test_no_key_and_no_password_is_in_an_environment_a_command_line_or_a_log(demo: ComposeDeployment) -> None:
     await demo.ready()
     hidden = secrets_of(demo)
     assert len(hidden) == 10
@@ -62,7 +66,7 @@ async def test_no_key_and_no_password_is_in_an_environment_a_command_line_or_a_l
             assert not found, f"{service} shows {found}"
 
 
-async def test_each_service_sees_its_own_secrets_and_nobody_elses(demo: Deployment) -> None:
+async def test_each_service_sees_its_own_secrets_and_nobody_elses(demo: ComposeDeployment) -> None:
     await demo.ready()
     keys = set()
     for service in ("router", "provider", "agent"):
@@ -73,7 +77,7 @@ async def test_each_service_sees_its_own_secrets_and_nobody_elses(demo: Deployme
     assert len(keys) == 3
 
 
-async def test_taking_it_down_with_its_volumes_leaves_nothing(images: Images, demo: Deployment) -> None:
+async def test_taking_it_down_with_its_volumes_leaves_nothing(images: Images, demo: ComposeDeployment) -> None:
     await demo.ready()
     assert {left.split()[0] for left in demo.leftovers()} == {"container", "pod", "volume", "network"}
     demo.down()
@@ -87,15 +91,7 @@ def test_an_edge_device_gets_no_client_of_a_chain(images: Images) -> None:
     assert "Usage: aira edge" in images.engine(*run, "aira", "edge", "--help")
 
 
-def test_the_environments_file_says_all_that_can_be_told() -> None:
-    text = COMPOSE.read_text()
-    told = (COMPOSE.parent / ".env.example").read_text()
-    names = {part.split(":-")[0] for part in text.split("${")[1:]}
-    assert len(names) > 20
-    assert [name for name in sorted(names) if f"#{name}=" not in told] == []
-
-
-def secrets_of(market: Deployment) -> dict[str, str]:
+def secrets_of(market: ComposeDeployment) -> dict[str, str]:
     """What nobody may see, by where it is: passwords, accounts' private keys, and a line of each certificate's key."""
     found = {}
     for service in ("router", "provider", "agent"):

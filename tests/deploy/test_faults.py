@@ -10,23 +10,25 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.support.deployment import CUT_SECONDS, Deployment, Images, passed
+from tests.support.deployment import CUT_SECONDS, ComposeDeployment, Images, passed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+pytestmark = pytest.mark.compose
 
 PLAYED_SECONDS = 8
 
 
 @pytest.fixture(scope="module")
-def market(images: Images, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Deployment]:
-    with Deployment(images, tmp_path_factory.mktemp("faults")) as running:
+def market(images: Images, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ComposeDeployment]:
+    with ComposeDeployment(images, tmp_path_factory.mktemp("faults")) as running:
         running.up()
         yield running
 
 
 @pytest.mark.parametrize("service", ["router", "provider", "agent"])
-async def test_a_job_is_paid_though_a_service_is_killed_and_comes_back(market: Deployment, service: str) -> None:
+async def test_a_job_is_paid_though_a_service_is_killed_and_comes_back(market: ComposeDeployment, service: str) -> None:
     await market.ready()
     job = market.ask(PLAYED_SECONDS)
     await job.is_played()
@@ -36,7 +38,9 @@ async def test_a_job_is_paid_though_a_service_is_killed_and_comes_back(market: D
     assert (await job.settled())["success"]
 
 
-async def test_a_job_is_paid_though_the_chain_is_killed_and_comes_back_with_its_state(market: Deployment) -> None:
+async def test_a_job_is_paid_though_the_chain_is_killed_and_comes_back_with_its_state(
+    market: ComposeDeployment,
+) -> None:
     await market.ready()
     job = market.ask(PLAYED_SECONDS)
     await job.is_played()
@@ -47,7 +51,7 @@ async def test_a_job_is_paid_though_the_chain_is_killed_and_comes_back_with_its_
     assert (await job.settled())["success"]
 
 
-async def test_a_job_is_paid_though_its_robot_is_cut_off_for_half_a_minute(market: Deployment) -> None:
+async def test_a_job_is_paid_though_its_robot_is_cut_off_for_half_a_minute(market: ComposeDeployment) -> None:
     await market.ready()
     job = market.ask(PLAYED_SECONDS)
     await job.is_played()
@@ -59,7 +63,7 @@ async def test_a_job_is_paid_though_its_robot_is_cut_off_for_half_a_minute(marke
     assert (await job.settled())["success"]
 
 
-async def test_a_job_is_paid_though_its_robot_stands_still_for_a_while(market: Deployment) -> None:
+async def test_a_job_is_paid_though_its_robot_stands_still_for_a_while(market: ComposeDeployment) -> None:
     await market.ready()
     job = market.ask(PLAYED_SECONDS)
     await job.is_played()
@@ -71,6 +75,6 @@ async def test_a_job_is_paid_though_its_robot_stands_still_for_a_while(market: D
     assert (await job.settled())["success"]
 
 
-def saved(market: Deployment) -> float:
+def saved(market: ComposeDeployment) -> float:
     """When the chain's state was last written, seconds of this machine's clock."""
     return float(market.execute("chain", "stat", "--format=%Y", "/var/lib/aira/chain.json"))

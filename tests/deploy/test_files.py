@@ -138,6 +138,13 @@ def test_the_example_of_env_says_of_every_variable_what_is_in_force_without_it()
     assert told == used
 
 
+def test_every_variable_of_the_compose_file_is_in_the_example_of_env() -> None:
+    example = (ROOT / ".env.example").read_text()
+    names = {part.split(":-")[0] for part in ONE_SITE.read_text().split("${")[1:]}
+    assert len(names) > 20
+    assert [name for name in sorted(names) if f"#{name}=" not in example] == []
+
+
 def test_a_default_is_the_same_wherever_a_variable_is_used() -> None:
     found: dict[str, str] = {}
     for variable, default in VARIABLE.findall(ONE_SITE.read_text()):

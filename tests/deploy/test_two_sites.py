@@ -6,22 +6,24 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.support.deployment import CUT_SECONDS, TWO_SITES, Deployment, Images, passed
+from tests.support.deployment import CUT_SECONDS, TWO_SITES, ComposeDeployment, Images, passed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+pytestmark = pytest.mark.compose
 
 PLAYED_SECONDS = 5
 
 
 @pytest.fixture(scope="module")
-def sites(images: Images, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Deployment]:
-    with Deployment(images, tmp_path_factory.mktemp("sites"), file=TWO_SITES) as running:
+def sites(images: Images, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ComposeDeployment]:
+    with ComposeDeployment(images, tmp_path_factory.mktemp("sites"), file=TWO_SITES) as running:
         running.up()
         yield running
 
 
-async def test_a_person_at_one_site_gets_a_job_done_by_a_robot_at_the_other(sites: Deployment) -> None:
+async def test_a_person_at_one_site_gets_a_job_done_by_a_robot_at_the_other(sites: ComposeDeployment) -> None:
     await sites.ready()
     assert "paid, result Qm" in sites.log("person")
     assert sites.networks("person").isdisjoint(sites.networks("agent") - {"wan"})
@@ -29,7 +31,7 @@ async def test_a_person_at_one_site_gets_a_job_done_by_a_robot_at_the_other(site
     assert "router-south" in sites.variable("person", "AIRA_CONNECT").split(",")[0]
 
 
-async def test_a_job_is_paid_though_a_site_is_cut_off_for_half_a_minute(sites: Deployment) -> None:
+async def test_a_job_is_paid_though_a_site_is_cut_off_for_half_a_minute(sites: ComposeDeployment) -> None:
     await sites.ready()
     job = sites.ask(PLAYED_SECONDS)
     await job.is_played()
@@ -44,7 +46,7 @@ async def test_a_job_is_paid_though_a_site_is_cut_off_for_half_a_minute(sites: D
     assert (await job.settled())["success"]
 
 
-async def test_who_has_two_endpoints_goes_on_without_the_router_that_died(sites: Deployment) -> None:
+async def test_who_has_two_endpoints_goes_on_without_the_router_that_died(sites: ComposeDeployment) -> None:
     await sites.ready()
     job = sites.ask(PLAYED_SECONDS)
     await job.is_played()

@@ -72,7 +72,7 @@ class Images:
             self.engine("untag", self.name(target))
 
 
-class Deployment(Project):
+class ComposeDeployment(Project):
     """The services of a compose file, all of the profile `demo`."""
 
     def __init__(self, images: Images, folder: Path, *, file: Path = COMPOSE) -> None:
@@ -140,7 +140,7 @@ async def passed(seconds: float) -> None:
 class Job:
     """A person's container that waits for the end of a job. `before` and `lamps`: how things stood before it."""
 
-    market: Deployment
+    market: ComposeDeployment
     container: str
     seconds: int
     before: Sequence[Finalized]

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 __all__ = ["engine"]
 
+pytestmark = pytest.mark.compose
+
 COMPOSE = f"""
 services:
   web:

@@ -36,12 +36,14 @@ def test_podman_compose_is_the_pinned_version() -> None:
     assert "podman-compose version 1.6.0" in said(require("podman-compose"), "version")
 
 
+@pytest.mark.compose
 def test_the_base_image_has_python_and_trusts_whom_this_machine_trusts(engine: Engine) -> None:
     look = "import hashlib, os, venv; print(hashlib.sha256(open(os.environ['PIP_CERT'], 'rb').read()).hexdigest())"
     trusted = hashlib.sha256(CERTIFICATES.read_bytes()).hexdigest()
     assert engine("run", "--rm", "--network", "none", BASE_IMAGE, "python3", "-c", look) == f"{trusted}\n"
 
 
+@pytest.mark.compose
 @pytest.mark.parametrize(("required", "outcome"), [("0", pytest.skip.Exception), ("1", pytest.fail.Exception)])
 def test_where_no_container_runs_the_reason_is_told(
     engine: Engine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, required: str, outcome: type[Exception]
