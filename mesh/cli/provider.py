@@ -77,14 +77,12 @@ async def _opened(
 ) -> AsyncIterator[tuple[Network, Provider]]:
     """The provider with all that it needs: a node, contracts, a stake, a router; and with its figures to be seen."""
     from mesh.composition import chain_of, endpoints_of
-    from mesh.market.preflight import check_standing
-    from mesh.market.process import ProviderProcess
-    from mesh.market.provider import Provider
+    from mesh.market.provider import Provider, ProviderProcess, check_account
     from mesh.network import Network
 
     lighthouse = settings.lighthouse_contract
     async with chain_of(settings, account) as chain:
-        await check_standing(chain, lighthouse)
+        await check_account(chain, lighthouse)
         async with (
             Network(endpoints_of(settings)) as network,
             Provider(network.session, chain, lighthouse, limit=settings.open_orders_limit) as provider,

@@ -86,8 +86,7 @@ async def _serve_market(
 ) -> None:
     from mesh.devchain.development import serve_chain
     from mesh.identity.routers import check_loopback
-    from mesh.market.process import ProviderProcess
-    from mesh.market.provider import Provider
+    from mesh.market.provider import Provider, ProviderProcess
     from mesh.network import Endpoints, Network
 
     check_loopback(settings.listen)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from mesh.chain import Account
 from mesh.doctor.checks import aside
 from mesh.doctor.findings import Finding, broken, doubtful, sound
-from mesh.market.preflight import GAS_OF_ONE
+from mesh.market.transaction_queue import LEAST_GAS
 
 if TYPE_CHECKING:
     from mesh.doctor.case import Case
@@ -61,7 +61,7 @@ class Purse:
         node = self._ledgers.node
         balance = await node.eth_balance(self.address)
         await node.fees.fees(node)
-        one = GAS_OF_ONE * int(await node.web3.eth.gas_price)
+        one = LEAST_GAS * int(await node.web3.eth.gas_price)
         count = balance // one if one else AMPLE
         shown = f"{self.address} has {_amount(balance, ETH)}"
         if count >= AMPLE:
@@ -91,7 +91,7 @@ class Purse:
             return sound(f"the factory may take {_amount(allowed, coin)}")
         node = chain.node
         approve = "`aira xrt approve factory AMOUNT`"
-        if await node.eth_balance(self.address) < GAS_OF_ONE * int(await node.web3.eth.gas_price):
+        if await node.eth_balance(self.address) < LEAST_GAS * int(await node.web3.eth.gas_price):
             return broken(
                 f"the factory may take no {coin.symbol} from {self.address}, which has no ETH to allow it",
                 do=f"send it ETH for gas; `aira demand` then allows what a job costs, or {approve} does",
@@ -103,7 +103,7 @@ class Purse:
 
     async def check_stake(self) -> Finding:
         """That the account may send transactions to its lighthouse. Raises `NoStake`."""
-        from mesh.market.turns import NoStake
+        from mesh.market.transaction_queue import NoStake
 
         chain, name = self._ledgers.chain, self._case.settings.lighthouse_contract
         state = await chain.lighthouses.get(name)

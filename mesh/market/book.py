@@ -1,23 +1,24 @@
 """The order book: open demands and offers of one lighthouse, matched first come, first served. Pure: no I/O.
 
-A demand and an offer agree when model, objective, token, cost, lighthouse, validator and generation are equal; the
-book is of one lighthouse. Orders wait in a queue for each set of the other terms. Adding, matching and removing cost
-the same at a thousand open orders and at a million, and an order costs little more than its text. What is due at a
-block is a list of keys; an order that leaves earlier stays listed, by its key only, until then or until the lists are
-made anew because most of what they hold has left.
+A demand and an offer match when model, objective, token, cost, lighthouse, validator and generation are equal. A book
+serves one lighthouse, and has a queue of orders for each set of the other terms. Adding, matching and removing take
+the same time at a thousand open orders and at a million; an order takes little more memory than its text.
+
+For each deadline there is a list of the keys of orders that expire then. An order that leaves earlier stays in its
+list, by its key only, until the deadline, or until the lists are rebuilt because most of their orders have left.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from mesh.market.queues import Link, Queues
+from mesh.market.queues import QueueNode, Queues
 from schemas import Demand, address_bytes
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
 
     from schemas import Offer, Verified
 
@@ -26,26 +27,32 @@ if TYPE_CHECKING:
 
 HASH_SIZE: Final = 32
 STALE: Final = 4096
-"""Keys of orders that have left which may stay listed, beside as many as are open."""
+"""Keys of orders that left the book which may stay in the lists, in addition to as many as are open."""
 LIMIT: Final = 1_000_000
-"""Open orders that a book holds unless told otherwise."""
+"""Open orders that a book holds by default."""
+
+
+ORDER_USED: Final = "OrderUsed"
+"""The contracts' error for an order that became a liability before."""
+UNNAMED_ERROR: Final = "Reverted"
+"""The reason of a rejection when the contract's error has no name."""
 
 
 class Refusal(StrEnum):
-    """Why an order can't be taken, as published to its sender."""
+    """Why the book refuses an order, as published to its sender."""
 
     EXPIRED = "expired"
-    """Its deadline is not ahead."""
+    """Its deadline has passed."""
     DUPLICATE = "duplicate"
-    """It is open already."""
+    """It is in the book already."""
     LIGHTHOUSE = "lighthouse"
-    """It is made for another lighthouse."""
+    """It names another lighthouse."""
     FULL = "full"
-    """The book holds as many orders as it may; try again later."""
+    """The book is full; try again later."""
 
 
 class Match(NamedTuple):
-    """A demand and an offer that agree. Neither is open any more."""
+    """A demand and an offer with equal terms, which have left the book."""
 
     demand: Verified[Demand]
     offer: Verified[Offer]
@@ -53,45 +60,45 @@ class Match(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Added:
-    """The order is open and waits for its counterpart."""
+    """The order is in the book and waits for its counterpart."""
 
     order: Verified[Order]
 
 
 def order_id(order: Verified[Order]) -> bytes:
-    """What names an order in a book: hash and signer, since in generation 3 two people may sign equal terms."""
+    """The identity of an order in a book: hash and signer, as in generation 3 two people may sign equal terms."""
     return order.hash + address_bytes(order.signer)
 
 
 class OrderBook:
     """The open orders of the lighthouse at `lighthouse` (EIP-55 address), `limit` of them at most.
 
-    Not thread-safe. Every method is O(1) in the number of open orders, but for those that say otherwise.
+    Not thread-safe. Every method is O(1) in the number of open orders, unless it says otherwise.
     """
 
     def __init__(self, lighthouse: str, *, limit: int = LIMIT) -> None:
         self._lighthouse = lighthouse
         self._limit = limit
         self._head = 0
-        self._links: dict[bytes, Link[Verified[Order]]] = {}
+        self._nodes: dict[bytes, QueueNode[Verified[Order]]] = {}
         self._demands: Queues[Terms, Verified[Order]] = Queues()
         self._offers: Queues[Terms, Verified[Order]] = Queues()
         self._due: dict[int, list[bytes]] = {}
         self._listed = 0
 
     def __len__(self) -> int:
-        return len(self._links)
+        return len(self._nodes)
 
     def __contains__(self, identity: bytes) -> bool:
-        return self._key(identity) in self._links
+        return self._key(identity) in self._nodes
 
     @property
     def head(self) -> int:
-        """The latest block that the book was told of."""
+        """The latest block that `expire` was called with."""
         return self._head
 
     def add(self, order: Verified[Order]) -> Match | Added | Refusal:
-        """Take a verified order: a `Match` with the longest waiting counterpart, or `Added`, or why it is refused."""
+        """Add a verified order. Returns a `Match` with the oldest counterpart, `Added`, or the reason of a refusal."""
         message = order.message
         if message.lighthouse != self._lighthouse:
             return Refusal.LIGHTHOUSE
@@ -104,24 +111,24 @@ class OrderBook:
         if counterpart is not None:
             self.remove(order_id(counterpart.item))
             return _match(order, counterpart.item)
-        if len(self._links) >= self._limit:
+        if len(self._nodes) >= self._limit:
             return Refusal.FULL
         self._enter(order)
         return Added(order)
 
     def remove(self, identity: bytes) -> Verified[Order] | None:
-        """Take the order named `identity` out; None when it is not open."""
-        link = self._links.pop(self._key(identity), None)
-        if link is None:
+        """Remove and return the order with this identity; None if it is not in the book."""
+        node = self._nodes.pop(self._key(identity), None)
+        if node is None:
             return None
-        message = link.item.message
-        self._side(message).remove(_terms(message), link)
-        return link.item
+        message = node.item.message
+        self._side(message).remove(_terms(message), node)
+        return node.item
 
     def expire(self, head: int) -> list[Verified[Order]]:
-        """Take out every order whose deadline is not after block `head`. O(blocks passed + orders expired).
+        """Remove and return every order whose deadline is not after block `head`. O(blocks passed + orders expired).
 
-        A lower `head` than before (a reorganised chain) takes nothing out and brings nothing back.
+        A lower `head` than before (after a reorganisation) changes nothing.
         """
         before, self._head = self._head, max(self._head, head)
         reached: Iterable[int] = range(before + 1, head + 1)
@@ -132,50 +139,81 @@ class OrderBook:
             keys = self._due.pop(block, [])
             self._listed -= len(keys)
             for key in keys:
-                link = self._links.get(key)  # None, or another order, where the one due has left the book
-                if link is not None and link.item.message.deadline == block:
-                    self.remove(order_id(link.item))
-                    expired.append(link.item)
+                node = self._nodes.get(key)  # None, or another order, if the one listed has left the book
+                if node is not None and node.item.message.deadline == block:
+                    self.remove(order_id(node.item))
+                    expired.append(node.item)
         return expired
 
     def orders(self) -> Iterator[Verified[Order]]:
-        """The open orders, oldest first. O(orders); the book may not change meanwhile."""
-        return (link.item for link in self._links.values())
+        """The open orders, oldest first. O(orders); the book must not change during the iteration."""
+        return (node.item for node in self._nodes.values())
 
     def _enter(self, order: Verified[Order]) -> None:
         message = order.message
-        key = order.hash if order.hash not in self._links else order_id(order)
-        link = self._links[key] = Link(order)
-        self._side(message).append(_terms(message), link)
+        key = order.hash if order.hash not in self._nodes else order_id(order)
+        node = self._nodes[key] = QueueNode(order)
+        self._side(message).append(_terms(message), node)
         self._list(key, message.deadline)
-        if self._listed > STALE + 2 * len(self._links):
-            self._list_anew()
+        if self._listed > STALE + 2 * len(self._nodes):
+            self._list_again()
 
     def _list(self, key: bytes, deadline: int) -> None:
         self._due.setdefault(deadline, []).append(key)
         self._listed += 1
 
-    def _list_anew(self) -> None:
-        """Forget the keys of those that have left: whoever posts orders chooses their deadlines, as late as he likes.
+    def _list_again(self) -> None:
+        """Rebuild the lists without the keys of orders that left, whose deadlines may be as late as their sender likes.
 
-        O(open orders), but so many orders come between two times that it costs each of them little.
+        O(open orders), but so rare that its share for each added order is small.
         """
         self._due.clear()
         self._listed = 0
-        for key, link in self._links.items():
-            self._list(key, link.item.message.deadline)
+        for key, node in self._nodes.items():
+            self._list(key, node.item.message.deadline)
 
     def _key(self, identity: bytes) -> bytes:
-        """Under what the order of this identity is or would be found.
+        """The key of the order with this identity, whether it is in the book or not.
 
-        Mostly its hash alone, which the order holds anyway; a second signer's order of the same hash has all of it.
+        It is the hash, which the order holds anyway; for another signer's order with the same hash, the identity.
         """
         digest = identity[:HASH_SIZE]
-        link = self._links.get(digest)
-        return digest if link is not None and order_id(link.item) == identity else identity
+        node = self._nodes.get(digest)
+        return digest if node is not None and order_id(node.item) == identity else identity
 
     def _side(self, message: Order) -> Queues[Terms, Verified[Order]]:
         return self._demands if isinstance(message, Demand) else self._offers
+
+
+def at_fault(match: Match, error: str, arguments: Sequence[Any]) -> tuple[Verified[Order], ...]:
+    """The orders that caused the contracts' `error` (name of a custom error) when the match was to be a liability.
+
+    Both orders, if the error and its arguments don't tell them apart.
+    """
+    both: tuple[Verified[Order], ...] = (match.demand, match.offer)
+    match error, *arguments:
+        case name, used if name == ORDER_USED:
+            return tuple(order for order in both if order.hash == _bytes(used)) or both
+        case "DeadlineReached", deadline:
+            return tuple(order for order in both if order.message.deadline == deadline) or both
+        case "WrongSigner" | "ERC20InsufficientBalance", str(address), *_:
+            return tuple(order for order in both if address_bytes(order.signer) == address_bytes(address)) or both
+        case "InvalidSignature", *_:
+            return both
+        case "ERC20InsufficientAllowance", _, _, needed if needed == match.offer.message.lighthouse_fee:
+            return both if needed in (match.demand.message.cost, match.demand.message.validator_fee) else (match.offer,)
+        case "ERC20InsufficientAllowance" | "ValidatorWithoutCode", *_:
+            return (match.demand,)
+    return both
+
+
+def reason_word(error: str) -> str:
+    """The machine-readable reason for a contract's error: its name, but never a text that a stranger's token chose."""
+    return error if error.isidentifier() else UNNAMED_ERROR
+
+
+def _bytes(value: bytes | str) -> bytes:
+    return bytes.fromhex(value.removeprefix("0x")) if isinstance(value, str) else bytes(value)
 
 
 def _terms(order: Order) -> Terms:

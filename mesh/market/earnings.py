@@ -1,4 +1,4 @@
-"""What a provider's work brings in, and what it costs."""
+"""What a provider earns and spends."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ if TYPE_CHECKING:
     from mesh.chain import Created, Reverted, Settled
 
 REASONS: Final = 64
-"""Reasons of rejections that are told apart at most: a stranger's contract may make up any number of them."""
+"""Rejection reasons that are counted apart; further ones, which a stranger's contract may invent, count as `OTHER`."""
 OTHER: Final = "Other"
 REMEMBERED: Final = 4096
-"""Transactions that can still be taken back; the chain replaces its last blocks only."""
+"""Liabilities whose entries can still be reverted; a reorganisation replaces only the last blocks."""
 WN_DIGITS: Final = 9
 WEI_DIGITS: Final = 18
 
 
 class Earnings(msgspec.Struct, frozen=True, kw_only=True):
-    """What a provider did so far; what the chain took back again does not count.
+    """What a provider did so far, without what reorganisations reverted.
 
-    Contracts made and finalized, messages rejected by reason; gas, and the wei paid for it, also for what failed;
-    fees, and XRT minted for the gas (both wn).
+    Contracts created and finalized; messages rejected, by reason; gas used, and wei spent on it, including failed
+    transactions; fees earned, and XRT minted for the gas (both wn).
     """
 
     created: int
@@ -44,8 +44,8 @@ class Earnings(msgspec.Struct, frozen=True, kw_only=True):
         )
 
 
-class Entry(NamedTuple):
-    """What one transaction changed, or several together. Named as the fields of `Earnings`."""
+class EarningsEntry(NamedTuple):
+    """What one or more transactions changed; the fields are those of `Earnings`."""
 
     created: int = 0
     finalized: int = 0
@@ -56,81 +56,83 @@ class Entry(NamedTuple):
 
 
 class Turnover(NamedTuple):
-    """All that was ever entered: it only grows. `matches` are the pairs that were to become contracts."""
+    """Everything that was ever entered; it only grows. `matches` counts the matches found."""
 
     matches: int
-    entered: Entry
-    taken_back: Entry
-    """What of it the chain took back again."""
+    entered: EarningsEntry
+    reverted: EarningsEntry
+    """The part of it that reorganisations reverted."""
 
 
 class EarningsLedger:
-    """The account of one provider."""
+    """Adds up what one provider earns and spends."""
 
     def __init__(self) -> None:
-        self._entered = Entry()
-        self._taken_back = Entry()
+        self._entered = EarningsEntry()
+        self._reverted = EarningsEntry()
         self._matches = 0
         self._rejected: Counter[str] = Counter()
-        self._made: OrderedDict[str, Entry] = OrderedDict()
-        self._ended: OrderedDict[str, Entry] = OrderedDict()
+        self._created: OrderedDict[str, EarningsEntry] = OrderedDict()
+        self._finalized: OrderedDict[str, EarningsEntry] = OrderedDict()
 
-    def made(self, created: Created, *, fee: int) -> None:
-        """A contract was made, for which its promisor paid `fee` (wn)."""
-        entry = Entry(created=1, gas_used=created.gas_used, spent=created.wei, fees=fee)
-        self._enter(self._made, created.liability, entry)
+    def created(self, created: Created, *, fee: int) -> None:
+        """A contract was created; its promisor paid `fee` (wn)."""
+        entry = EarningsEntry(created=1, gas_used=created.gas_used, spent=created.wei, fees=fee)
+        self._enter(self._created, created.liability, entry)
 
-    def ended(self, liability: str, settled: Settled) -> None:
+    def finalized(self, liability: str, settled: Settled) -> None:
         """The contract at the address `liability` was finalized."""
-        entry = Entry(finalized=1, gas_used=settled.gas_used, spent=settled.wei, minted=settled.minted)
-        self._enter(self._ended, liability, entry)
+        entry = EarningsEntry(finalized=1, gas_used=settled.gas_used, spent=settled.wei, minted=settled.minted)
+        self._enter(self._finalized, liability, entry)
 
     def failed(self, error: Reverted) -> None:
-        """A transaction was refused; it has cost something if it was mined."""
-        self._entered = _sum(self._entered, Entry(gas_used=error.gas_used, spent=error.wei))
+        """A transaction was reverted; it cost gas if it was mined."""
+        self._entered = _sum(self._entered, EarningsEntry(gas_used=error.gas_used, spent=error.wei))
 
     def rejected(self, reason: str) -> None:
-        """A message can't be used, for this reason (a machine-readable word)."""
+        """A message was rejected for this reason (a machine-readable word)."""
         known = reason in self._rejected or len(self._rejected) < REASONS
         self._rejected[reason if known else OTHER] += 1
 
     def matched(self) -> None:
-        """A demand and an offer agree."""
+        """A demand and an offer matched."""
         self._matches += 1
 
-    def unmade(self, liability: str) -> None:
-        """The chain took back that the contract was made."""
-        self._strike(self._made, liability)
+    def liability_reverted(self, liability: str) -> None:
+        """A reorganisation reverted the creation of a contract."""
+        self._take_off(self._created, liability)
 
-    def unended(self, liability: str) -> None:
-        """The chain took back that the contract was finalized."""
-        self._strike(self._ended, liability)
+    def finalization_reverted(self, liability: str) -> None:
+        """A reorganisation reverted the finalization of a contract."""
+        self._take_off(self._finalized, liability)
 
     def earnings(self) -> Earnings:
-        """The account as it stands."""
-        total = Entry(*(entered - undone for entered, undone in zip(self._entered, self._taken_back, strict=True)))
+        """The sums now."""
+        total = EarningsEntry(
+            *(entered - reverted for entered, reverted in zip(self._entered, self._reverted, strict=True))
+        )
         return Earnings(rejected=dict(self._rejected), **total._asdict())
 
     def turnover(self) -> Turnover:
-        """What the account has seen."""
-        return Turnover(self._matches, self._entered, self._taken_back)
+        """Everything that was entered, and what of it was reverted."""
+        return Turnover(self._matches, self._entered, self._reverted)
 
-    def _enter(self, page: OrderedDict[str, Entry], liability: str, entry: Entry) -> None:
-        self._strike(page, liability)
-        page[liability] = entry
+    def _enter(self, entries: OrderedDict[str, EarningsEntry], liability: str, entry: EarningsEntry) -> None:
+        self._take_off(entries, liability)
+        entries[liability] = entry
         self._entered = _sum(self._entered, entry)
-        if len(page) > REMEMBERED:
-            page.popitem(last=False)
+        if len(entries) > REMEMBERED:
+            entries.popitem(last=False)
 
-    def _strike(self, page: OrderedDict[str, Entry], liability: str) -> None:
-        self._taken_back = _sum(self._taken_back, page.pop(liability, Entry()))
+    def _take_off(self, entries: OrderedDict[str, EarningsEntry], liability: str) -> None:
+        self._reverted = _sum(self._reverted, entries.pop(liability, EarningsEntry()))
 
 
-def _sum(total: Entry, more: Entry) -> Entry:
-    return Entry(*(one + other for one, other in zip(total, more, strict=True)))
+def _sum(total: EarningsEntry, more: EarningsEntry) -> EarningsEntry:
+    return EarningsEntry(*(one + other for one, other in zip(total, more, strict=True)))
 
 
 def _decimal(amount: int, digits: int) -> str:
-    """An amount of the smallest unit as people write it, exactly."""
+    """An amount of the smallest unit as a decimal number, exactly."""
     whole, part = divmod(amount, 10**digits)
     return f"{whole:,}.{part:0{digits}}".rstrip("0").rstrip(".")

@@ -11,53 +11,54 @@ K = TypeVar("K", bound="Hashable")
 T = TypeVar("T")
 
 
-class Link(Generic[T]):
-    """A place in a queue, and what stands there. The queues are rings: the last link's `after` is the first.
+class QueueNode(Generic[T]):
+    """An item in a queue. A queue is a ring: the last node's `after` is the first.
 
-    Outside a queue it has no neighbours, not even itself: a cycle would keep the item until the garbage collector came.
+    Outside a queue a node has no neighbours, not even itself: a cycle would keep the item until the next garbage
+    collection.
     """
 
     __slots__ = ("after", "before", "item")
 
     def __init__(self, item: T) -> None:
         self.item = item
-        self.before: Link[T]
-        self.after: Link[T]
+        self.before: QueueNode[T]
+        self.after: QueueNode[T]
 
 
 class Queues(Generic[K, T]):
-    """A queue for each key; a key without a queue costs nothing."""
+    """A queue for each key; an empty queue takes no memory."""
 
     def __init__(self) -> None:
-        self._first: dict[K, Link[T]] = {}
+        self._first: dict[K, QueueNode[T]] = {}
 
     def __len__(self) -> int:
-        """How many keys have a queue."""
+        """The number of keys with a queue."""
         return len(self._first)
 
     def __iter__(self) -> Iterator[K]:
         return iter(self._first)
 
-    def first(self, key: K) -> Link[T] | None:
-        """The link that has waited longest at `key`."""
+    def first(self, key: K) -> QueueNode[T] | None:
+        """The node that has waited longest at `key`."""
         return self._first.get(key)
 
-    def append(self, key: K, link: Link[T]) -> None:
-        """Put a link, which stands in no queue, at the end of the one at `key`."""
+    def append(self, key: K, node: QueueNode[T]) -> None:
+        """Append a node, which is in no queue, to the queue at `key`."""
         first = self._first.get(key)
         if first is None:
-            self._first[key] = link.before = link.after = link
+            self._first[key] = node.before = node.after = node
         else:
             last = first.before
-            last.after = first.before = link
-            link.before, link.after = last, first
+            last.after = first.before = node
+            node.before, node.after = last, first
 
-    def remove(self, key: K, link: Link[T]) -> None:
-        """Take a link out of the queue at `key`, where it stands."""
-        if link.after is link:
+    def remove(self, key: K, node: QueueNode[T]) -> None:
+        """Remove a node from the queue at `key`, which it must be in."""
+        if node.after is node:
             del self._first[key]
         else:
-            link.before.after, link.after.before = link.after, link.before
-            if self._first[key] is link:
-                self._first[key] = link.after
-        del link.before, link.after
+            node.before.after, node.after.before = node.after, node.before
+            if self._first[key] is node:
+                self._first[key] = node.after
+        del node.before, node.after

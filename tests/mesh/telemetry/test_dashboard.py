@@ -13,8 +13,7 @@ from bridges.ipfs.metrics import Standing, bridge_families, content_families
 from bridges.serial.dialect import Counters
 from bridges.serial.metrics import families_of
 from bridges.serial.tally import EdgeStatistics
-from mesh.market.process import ProviderProcess
-from mesh.market.provider import Provider
+from mesh.market.provider import Provider, ProviderProcess
 from mesh.network import Endpoints, Network
 from mesh.telemetry.health import health_metrics
 from mesh.telemetry.metrics import labelled
@@ -83,7 +82,7 @@ async def role_families(place: Place) -> list[MetricFamily]:
         Provider(network.session, place.chains["provider"], place.market.deployment.lighthouse_name) as provider,
         robot,
     ):
-        provider._books.rejected("DeadlineReached")
+        provider.ledger.rejected("DeadlineReached")
         process = ProviderProcess(network, place.chains["provider"], [provider])
         # They tell nothing over HTTP here, and measure the same.
         of_provider = [*await process.measure(), health_metrics(process.health())]

@@ -11,8 +11,7 @@ from mesh.agent import JobFailed
 from mesh.background import Background
 from mesh.chain import NodeUnreachable
 from mesh.chain import metrics as chain_figures
-from mesh.market.process import ProviderProcess
-from mesh.market.provider import Provider
+from mesh.market.provider import Provider, ProviderProcess
 from mesh.network import Endpoints, Network
 from mesh.telemetry.serving import Telemetry
 from schemas import Demand, Empty, cid_of_bytes

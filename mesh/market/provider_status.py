@@ -1,0 +1,168 @@
+"""The status, health and metrics of a provider, and of a process with one or more providers."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+import mesh
+from mesh.chain.metrics import Asked, ChainMetrics, reading_families
+from mesh.network.metrics import link_state, message_families, network_families
+from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge, labelled
+from schemas.status import ALIVE, MarketStatus, Status
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    import zenoh
+
+    from mesh.chain import Chain
+    from mesh.market.book import OrderBook
+    from mesh.market.earnings import EarningsLedger
+    from mesh.market.provider import Provider
+    from mesh.market.settlement import Settlement
+    from mesh.market.transaction_queue import TransactionQueue
+    from mesh.network import Channel, Network, Subscription
+    from schemas.rpc import Nothing
+
+
+class ProviderStatusService:
+    """The status, health and metrics of the provider of `channel`'s market."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        chain: Chain,
+        channel: Channel,
+        *,
+        subscriptions: Sequence[Subscription[Any]],
+        book: OrderBook,
+        queue: TransactionQueue,
+        settlement: Settlement,
+        earnings: EarningsLedger,
+    ) -> None:
+        assert chain.account is not None
+        self._address = chain.account.address
+        self._session = session
+        self._chain = chain
+        self._channel = channel
+        self._subscriptions = subscriptions
+        self._book = book
+        self._queue = queue
+        self._settlement = settlement
+        self._earnings = earnings
+        self._stake = Asked(self._ask_stake)
+        self._began = time.monotonic()
+
+    async def status(self, _request: Nothing) -> Status:
+        """The status now, without asking chain or network."""
+        earned = self._earnings.earnings()
+        return Status(
+            role="provider",
+            address=self._address,
+            version=mesh.__version__,
+            zenoh_id=str(self._session.zid()),
+            lighthouse=self._channel.lighthouse,
+            parts=self.health(),
+            head=self._settlement.head,
+            chain_id=self._chain.chain_id,
+            xrt=self._chain.xrt,
+            uptime=round(time.monotonic() - self._began, 3),
+            market=MarketStatus(
+                open_orders=len(self._book),
+                created=earned.created,
+                finalized=earned.finalized,
+                rejected=earned.rejected,
+                gas_used=earned.gas_used,
+                spent=earned.spent,
+                fees=earned.fees,
+                minted=earned.minted,
+            ),
+        )
+
+    def health(self) -> dict[str, str]:
+        """The state of each part: sending transactions, and following the chain."""
+        transactions = ALIVE
+        if self._settlement.reading.is_down:
+            transactions = "wait for the node"
+        elif self._queue.is_down:
+            transactions = "wait"
+        return {
+            "transactions": transactions,
+            "listener": "waits for the node" if self._settlement.following.is_down else ALIVE,
+        }
+
+    async def measure(self) -> tuple[MetricFamily, ...]:
+        """The metrics now, labelled with the lighthouse; without those of the account."""
+        families = (
+            *message_families(self._subscriptions),
+            *self._market_families(),
+            *self._earnings_families(),
+            *reading_families(head=self._settlement.head, read_at=self._settlement.read_at),
+            *await self._stake.measure(),
+        )
+        return labelled(families, lighthouse=self._channel.lighthouse)
+
+    def _market_families(self) -> Iterable[MetricFamily]:
+        seen, rejected = self._earnings.turnover(), self._earnings.earnings().rejected
+        reverted = {"created": seen.reverted.created, "finalized": seen.reverted.finalized}
+        return (
+            gauge("aira_orders_open", "Orders in the book", len(self._book)),
+            counter("aira_matches_total", "Matches of a demand and an offer", seen.matches),
+            counter("aira_contracts_created_total", "Contracts that this provider created", seen.entered.created),
+            counter("aira_contracts_finalized_total", "Contracts that it finalized", seen.entered.finalized),
+            by_label(
+                "aira_contracts_taken_back_total", "counter", "Of these, reverted by reorganisations", "step", reverted
+            ),
+            by_label("aira_rejections_total", "counter", "Orders and results that it rejected", "reason", rejected),
+            gauge("aira_transactions_waiting", "Transactions that wait to be sent", self._queue.waiting),
+        )
+
+    def _earnings_families(self) -> Iterable[MetricFamily]:
+        seen = self._earnings.turnover()
+        reverted = {"fees": seen.reverted.fees, "minted": seen.reverted.minted}
+        return (
+            counter("aira_fees_earned_wn_total", "Fees of the created contracts, wn", seen.entered.fees),
+            counter("aira_minted_wn_total", "XRT minted for the gas of finalizing, wn", seen.entered.minted),
+            by_label(
+                "aira_earnings_taken_back_wn_total",
+                "counter",
+                "Of these, reverted by reorganisations, wn",
+                "of",
+                reverted,
+            ),
+        )
+
+    async def _ask_stake(self) -> Iterable[MetricFamily]:
+        assert self._channel.address is not None
+        state = await self._chain.lighthouses.get(self._channel.address)
+        stake, is_turn = state.stakes.get(self._address, 0), state.current == self._address
+        return (
+            gauge("aira_stake_wn", "This provider's stake at the lighthouse, wn", stake),
+            gauge("aira_turn", "1 while it is this provider's turn, 0 otherwise", float(is_turn)),
+            gauge("aira_lighthouse_providers", "Providers with a stake at the lighthouse", len(state.stakes)),
+        )
+
+
+class ProviderProcess:
+    """A process with the open `providers` of one account on `chain`, in `network`: one, or one for each lighthouse."""
+
+    def __init__(self, network: Network, chain: Chain, providers: Sequence[Provider]) -> None:
+        self._network = network
+        self._chain = ChainMetrics(chain)
+        self._providers = providers
+
+    async def measure(self) -> tuple[MetricFamily, ...]:
+        """The metrics of session, chain and account, and those of each provider with its lighthouse."""
+        families = [*network_families(self._network), *await self._chain.measure()]
+        for provider in self._providers:
+            families += await provider.measure()
+        return tuple(families)
+
+    def health(self) -> Mapping[str, str]:
+        """The state of each part; with several providers, their parts name the lighthouse."""
+        parts = {"channel": link_state(self._network)}
+        for provider in self._providers:
+            of = f" of {provider.channel.lighthouse}" if len(self._providers) > 1 else ""
+            parts |= {f"{part}{of}": state for part, state in provider.health().items()}
+        return parts
