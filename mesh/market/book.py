@@ -156,13 +156,13 @@ class OrderBook:
         self._side(message).append(_terms(message), node)
         self._list(key, message.deadline)
         if self._listed > STALE + 2 * len(self._nodes):
-            self._list_again()
+            self.compact()
 
     def _list(self, key: bytes, deadline: int) -> None:
         self._due.setdefault(deadline, []).append(key)
         self._listed += 1
 
-    def _list_again(self) -> None:
+    def compact(self) -> None:
         """Rebuild the lists without the keys of orders that left, whose deadlines may be as late as their sender likes.
 
         O(open orders), but so rare that its share for each added order is small.

@@ -14,7 +14,7 @@ from mesh.market.book import LIMIT, Match, OrderBook, Refusal
 from mesh.market.earnings import Earnings, EarningsLedger
 from mesh.market.order_book_service import OrderBookService
 from mesh.market.provider_status import ProviderProcess, ProviderStatusService
-from mesh.market.settlement import Settlement
+from mesh.market.settlement import OPEN_LIABILITIES, Settlement
 from mesh.market.transaction_queue import LEAST_GAS, RETRY, NoStake, TransactionQueue
 from mesh.network.channel import Channel
 from mesh.network.services import Services
@@ -40,9 +40,10 @@ __all__ = ["Earnings", "Provider", "ProviderProcess", "check_account"]
 class Provider(Role):
     """A provider of one lighthouse: `async with Provider(session, chain, lighthouse) as provider`, then `run`.
 
-    `lighthouse` is the ENS name; the chain's account must have a stake there. `limit` is the most open orders,
-    `matched` is called with each match before its liability is created, `retry` is the policy for transactions that
-    fail. The caller closes session and chain. When `run` is cancelled, a transaction that was sent may still be mined.
+    `lighthouse` is the ENS name; its chain account must have a stake there. `limit` is the most open orders, `matched`
+    is called with each match before its liability is created, `retry` is the policy for transactions that fail, and
+    `open_liabilities` the most records of open liabilities in memory. The caller closes session and chain. When `run`
+    is cancelled, a transaction that was sent may still be mined.
     """
 
     title = "provider"
@@ -56,6 +57,7 @@ class Provider(Role):
         limit: int = LIMIT,
         matched: Callable[[Match], None] = lambda match: None,
         retry: RetryPolicy = RETRY,
+        open_liabilities: int = OPEN_LIABILITIES,
     ) -> None:
         if chain.account is None:
             raise ValueError("a provider needs a chain with an account")
@@ -66,6 +68,7 @@ class Provider(Role):
         self._limit = limit
         self._matched = matched
         self._retry = retry
+        self._open_liabilities = open_liabilities
         self.ledger = EarningsLedger()
         self._source = LogSource("provider", self.address, self._lighthouse)
 
@@ -97,6 +100,7 @@ class Provider(Role):
             earnings=self.ledger,
             head=head,
             matched=self._matched,
+            open_limit=self._open_liabilities,
         )
         self._status = ProviderStatusService(
             self._session,

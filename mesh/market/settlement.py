@@ -137,7 +137,7 @@ class Settlement:
             self._tasks.create_task(self._create(outcome))
         elif isinstance(outcome, Refusal):
             if outcome is not Refusal.DUPLICATE:
-                self._reject(order, outcome.value, f"the order book refuses it: {outcome.value}")
+                self.reject(order, outcome.value, f"the order book refuses it: {outcome.value}")
             return outcome
         return None
 
@@ -148,7 +148,7 @@ class Settlement:
             if liability is None:
                 self._results.forget(result)
             elif result.signer != liability.promisor and liability.validator == ZERO_ADDRESS:
-                self._reject(result, "WrongSigner", f"signed by {result.signer}, not by the promisor")
+                self.reject(result, "WrongSigner", f"signed by {result.signer}, not by the promisor")
             elif not liability.is_finalized:
                 self._tasks.create_task(self._finalize(result))
 
@@ -183,7 +183,7 @@ class Settlement:
         """Reject some orders of a match; put the other one back into the book, unless it was used meanwhile."""
         for order in match:
             if order in rejected:
-                self._reject(order, _reason(error), str(error))
+                self.reject(order, _reason(error), str(error))
             elif not await self._chain.retrying(partial(self._is_used, order), outages=self.reading):
                 self.add(order)
 
@@ -202,10 +202,10 @@ class Settlement:
                 finalized = await self._queue.send(partial(self._chain.liabilities.finalize, self._lighthouse, message))
             except Reverted as error:
                 if error.reason != "AlreadyFinalized":
-                    self._reject(result, _reason(error), str(error))
+                    self.reject(result, _reason(error), str(error))
             except (NodeUnreachable, RequestRefused) as error:
                 # Perhaps not the result's fault; the promisor keeps sending it.
-                self._reject(result, _reason(error), str(error))
+                self.reject(result, _reason(error), str(error))
                 self._results.forget(result)
             else:
                 self._earnings.finalized(message.liability, finalized)
@@ -213,7 +213,7 @@ class Settlement:
                 event = log_event("contract-finalized", success=message.success, gas=finalized.gas_used)
                 log.info("finalized, success %s, gas %d", message.success, finalized.gas_used, extra=event)
 
-    def _reject(self, message: Verified[Any], reason: str, detail: str) -> None:
+    def reject(self, message: Verified[Any], reason: str, detail: str) -> None:
         """Count and publish a rejection. A used order's sender knows already that it became a contract."""
         self._earnings.rejected(reason)
         order = message.hash.hex()

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.market import patience, sending, watching
 from tests.mesh.market.floor import Floor
 from tests.support.market import Founded, founded
 
@@ -16,14 +15,6 @@ if TYPE_CHECKING:
     from tests.support.routers import EmbeddedRouter
 
 __all__ = ["founded"]
-
-
-@pytest.fixture
-def impatience(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is tried again is tried again soon."""
-    for module in (sending, watching):
-        monkeypatch.setattr(module, "RETRY", 0.05)
-    monkeypatch.setattr(patience, "PAUSE", 0.01)
 
 
 @pytest.fixture

@@ -13,6 +13,7 @@ from mesh.chain import XRT, Account, Chain, Timing
 from mesh.chain.events import NewLiability
 from mesh.market.provider import Provider
 from mesh.network import Channel, Endpoints, Network
+from mesh.retry import RetryPolicy
 from schemas import Demand, Offer, RejectKey, Result, market_selector, message_hash, parse_key
 from schemas.signing import Rejection
 from tests.support.orders import RECORDING, terms
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from schemas import Liability, SignedMessage
 
 QUICK = Timing(poll_interval=0.02, receipt_interval=0.01, attempts=1, retry_delay=0.01)
+QUICK_RETRY = RetryPolicy(initial=0.01, ceiling=0.1, attempts=8)
 STAKE = XRT
 
 _names = count(1)
@@ -128,7 +130,7 @@ class Floor:
         session = await self.new_session()
         async with (
             self.chain_of(role, endpoint, timing=timing) as chain,
-            Provider(session, chain, self.market, **options) as provider,
+            Provider(session, chain, self.market, **({"retry": QUICK_RETRY} | options)) as provider,
             Background() as tasks,
         ):
             tasks.start(provider.run(), f"{role} at work")

@@ -99,8 +99,8 @@ class BookAgainstNaiveBook(RuleBasedStateMachine):
         assert by_deadline(self.book.expire(head)) == by_deadline(self.naive.expire(head))
 
     @rule()
-    def make_lists_anew(self) -> None:
-        self.book._list_anew()
+    def compact(self) -> None:
+        self.book.compact()
 
     @invariant()
     def holds_the_same(self) -> None:

@@ -1,4 +1,4 @@
-"""A provider's account: what was earned, what was spent, what the chain took back."""
+"""What a provider earned and spent, and what a reorganisation reverted."""
 
 from __future__ import annotations
 
@@ -20,82 +20,82 @@ def settled() -> Settled:
 
 
 def test_a_whole_job_is_summed_up() -> None:
-    books = EarningsLedger()
-    books.made(created(), fee=5)
-    books.ended(ADDRESS, settled())
-    assert books.earnings() == Earnings(
+    ledger = EarningsLedger()
+    ledger.created(created(), fee=5)
+    ledger.finalized(ADDRESS, settled())
+    assert ledger.earnings() == Earnings(
         created=1, finalized=1, rejected={}, gas_used=250_000, spent=5 * 10**14, fees=5, minted=42_000
     )
 
 
-def test_what_failed_is_paid_for_if_it_was_mined() -> None:
-    books = EarningsLedger()
-    books.failed(Reverted("NotYourTurn"))
-    assert books.earnings() == NOTHING
-    books.failed(Reverted("NotYourTurn", gas_used=30_000, wei=7))
-    assert (books.earnings().gas_used, books.earnings().spent) == (30_000, 7)
+def test_a_failed_transaction_costs_gas_if_it_was_mined() -> None:
+    ledger = EarningsLedger()
+    ledger.failed(Reverted("NotYourTurn"))
+    assert ledger.earnings() == NOTHING
+    ledger.failed(Reverted("NotYourTurn", gas_used=30_000, wei=7))
+    assert (ledger.earnings().gas_used, ledger.earnings().spent) == (30_000, 7)
 
 
-def test_what_the_chain_takes_back_is_struck_out() -> None:
-    books = EarningsLedger()
-    books.made(created(), fee=5)
-    books.made(created(OTHER), fee=1)
-    books.ended(ADDRESS, settled())
-    books.unended(ADDRESS)
-    books.unmade(ADDRESS)
-    books.unmade(ADDRESS)
-    assert books.earnings() == Earnings(
+def test_a_reorganisation_takes_off_what_it_reverts() -> None:
+    ledger = EarningsLedger()
+    ledger.created(created(), fee=5)
+    ledger.created(created(OTHER), fee=1)
+    ledger.finalized(ADDRESS, settled())
+    ledger.finalization_reverted(ADDRESS)
+    ledger.liability_reverted(ADDRESS)
+    ledger.liability_reverted(ADDRESS)
+    assert ledger.earnings() == Earnings(
         created=1, finalized=0, rejected={}, gas_used=150_000, spent=3 * 10**14, fees=1, minted=0
     )
 
 
-def test_what_others_made_is_not_struck_out() -> None:
-    books = EarningsLedger()
-    books.unmade(ADDRESS)
-    books.unended(ADDRESS)
-    assert books.earnings() == NOTHING
+def test_what_others_did_is_not_taken_off() -> None:
+    ledger = EarningsLedger()
+    ledger.liability_reverted(ADDRESS)
+    ledger.finalization_reverted(ADDRESS)
+    assert ledger.earnings() == NOTHING
 
 
 def test_rejections_are_counted_by_reason() -> None:
-    books = EarningsLedger()
+    ledger = EarningsLedger()
     for reason in ("full", "expired", "full"):
-        books.rejected(reason)
-    assert books.earnings().rejected == {"full": 2, "expired": 1}
+        ledger.rejected(reason)
+    assert ledger.earnings().rejected == {"full": 2, "expired": 1}
 
 
 def test_the_account_is_one_line() -> None:
-    books = EarningsLedger()
-    books.made(created(), fee=2 * 10**9)
-    books.ended(ADDRESS, settled())
-    books.rejected("full")
-    assert str(books.earnings()) == (
+    ledger = EarningsLedger()
+    ledger.created(created(), fee=2 * 10**9)
+    ledger.finalized(ADDRESS, settled())
+    ledger.rejected("full")
+    assert str(ledger.earnings()) == (
         "contracts: 1 made, 1 finalized; messages rejected: 1; "
         "earned 2.000042 XRT (2 in fees, 0.000042 minted for gas), spent 0.0005 ETH on 250,000 gas"
     )
 
 
-def test_what_was_entered_only_grows_and_what_was_taken_back_is_apart() -> None:
-    books = EarningsLedger()
-    books.matched()
-    books.made(created(), fee=5)
-    books.ended(ADDRESS, settled())
-    books.unended(ADDRESS)
-    books.unmade(ADDRESS)
-    books.made(created(), fee=5)
-    seen = books.turnover()
+def test_what_was_entered_only_grows_and_what_was_reverted_is_apart() -> None:
+    ledger = EarningsLedger()
+    ledger.matched()
+    ledger.created(created(), fee=5)
+    ledger.finalized(ADDRESS, settled())
+    ledger.finalization_reverted(ADDRESS)
+    ledger.liability_reverted(ADDRESS)
+    ledger.created(created(), fee=5)
+    seen = ledger.turnover()
     assert seen.matches == 1
     assert (seen.entered.created, seen.entered.finalized, seen.entered.fees) == (2, 1, 10)
-    assert (seen.taken_back.created, seen.taken_back.finalized, seen.taken_back.fees) == (1, 1, 5)
-    assert books.earnings().created == 1
+    assert (seen.reverted.created, seen.reverted.finalized, seen.reverted.fees) == (1, 1, 5)
+    assert ledger.earnings().created == 1
 
 
-def test_reasons_that_strangers_make_up_are_told_apart_up_to_a_bound() -> None:
-    books = EarningsLedger()
-    books.rejected("DeadlineReached")
+def test_reasons_that_strangers_invent_are_counted_apart_up_to_a_limit() -> None:
+    ledger = EarningsLedger()
+    ledger.rejected("DeadlineReached")
     for number in range(1000):
-        books.rejected(f"MadeUp{number}")
-    books.rejected("DeadlineReached")
-    rejected = books.earnings().rejected
+        ledger.rejected(f"MadeUp{number}")
+    ledger.rejected("DeadlineReached")
+    rejected = ledger.earnings().rejected
     assert len(rejected) == REASONS + 1
     assert rejected["DeadlineReached"] == 2
     assert rejected[earnings.OTHER] == 1000 - (REASONS - 1)

@@ -1,4 +1,4 @@
-"""How a provider in trouble is seen to work on."""
+"""What a provider does while something fails."""
 
 from __future__ import annotations
 
@@ -7,14 +7,32 @@ from typing import TYPE_CHECKING
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
+    import pytest
+
     from mesh.market.provider import Provider
     from tests.mesh.market.floor import Floor
 
 
 async def works_on(floor: Floor, provider: Provider) -> bool:
-    """Whether the provider makes the contracts of those who mean well."""
+    """Whether the provider creates the contract of two good orders."""
     demand = floor.demand()
     floor.publish(demand, floor.offer())
     await floor.liability_of(demand)
     await until(lambda: provider.earnings().created > 0)
     return True
+
+
+async def until_read(floor: Floor, provider: Provider) -> None:
+    """Wait until the provider has read the chain up to its latest block."""
+    head = await floor.chain.block_number()
+    await until(lambda: provider.settlement.head >= head)
+
+
+def outages(caplog: pytest.LogCaptureFixture, name: str) -> list[str]:
+    """The codes of the errors with which outages of `name` began."""
+    return [record.facts["code"] for record in events(caplog, f"{name}-outage")]  # type: ignore[attr-defined]
+
+
+def events(caplog: pytest.LogCaptureFixture, name: str) -> list[object]:
+    """The logged events of that name."""
+    return [record for record in caplog.records if getattr(record, "event", "") == name]

@@ -107,7 +107,7 @@ async def test_a_rejected_order_is_logged_with_its_hash(place: Place, kept: LogH
         order = await robot.offer(objective=OBJECTIVE, cost=1)
         await until(lambda: len(provider.book), what="the order in the book")
         (message,) = provider.book.orders()
-        provider.reject(message, "expired", "too late")
+        provider.settlement.reject(message, "expired", "too late")
         (told,) = (await logs(place, "provider", level="warning")).entries
     assert (told.facts["order"], told.facts["reason"]) == (order, "expired")
 

@@ -14,10 +14,10 @@ from web3.providers.async_base import AsyncBaseProvider
 from mesh.chain import GWEI
 from mesh.devchain import JsonRpcServer
 from mesh.devchain.market import found_market
-from mesh.market import patience, sending
+from mesh.retry import RetryPolicy
 from schemas import cid_of_bytes, parse_cid
 from tests.mesh.market.floor import QUICK, Floor
-from tests.mesh.market.troubles import works_on
+from tests.mesh.market.troubles import events, outages, until_read, works_on
 from tests.support.ports import free_port
 from tests.support.waiting import until
 
@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 
     from tests.support.nodes import Anvil
     from tests.support.routers import EmbeddedRouter
-
-
-pytestmark = pytest.mark.usefixtures("impatience")
 
 
 @asynccontextmanager
@@ -75,33 +72,27 @@ async def test_a_node_that_fails_now_and_then_costs_no_order_and_no_result(floor
 
 
 @pytest.mark.parametrize("fails", ["silence", "refusal"])
-async def test_what_a_node_never_takes_makes_nobody_wait_and_is_rejected_in_the_end(
-    floor: Floor, fails: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_others_go_first_while_a_transaction_waits_that_the_node_never_takes(floor: Floor, fails: str) -> None:
     objective = cid_of_bytes(fails.encode())
-    async with floor.provider(endpoint=Moody(floor, parse_cid(objective), fails=fails)) as provider:
-        monkeypatch.setattr(patience, "PAUSE", 3600.0)
+    node, retry = Moody(floor, parse_cid(objective), fails=fails), RetryPolicy(initial=3600.0, ceiling=3600.0)
+    async with floor.provider(endpoint=node, retry=retry) as provider:
         guilty, offer = (make(cost=0, objective=objective) for make in (floor.demand, floor.offer))
         floor.publish(guilty, offer)
         assert await works_on(floor, provider)
         assert floor.rejections == []
 
-        monkeypatch.setattr(patience, "PAUSE", 0.01)
+
+@pytest.mark.parametrize("fails", ["silence", "refusal"])
+async def test_a_transaction_that_the_node_never_takes_is_rejected_after_the_last_attempt(
+    floor: Floor, fails: str
+) -> None:
+    objective = cid_of_bytes(fails.encode())
+    async with floor.provider(endpoint=Moody(floor, parse_cid(objective), fails=fails)):
         floor.publish(*(make(cost=0, objective=objective) for make in (floor.demand, floor.offer)))
         await until(lambda: len(floor.rejections) == 2)
         assert {one.reason for one in floor.rejections} == {
             "NodeUnreachable" if fails == "silence" else "RequestRefused"
         }
-
-
-async def test_no_more_than_so_much_waits_to_be_tried_again(floor: Floor, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(patience, "PAUSE", 3600.0)
-    monkeypatch.setattr(sending, "LATER", 1)
-    objective = cid_of_bytes(b"never")
-    async with floor.provider(endpoint=Moody(floor, parse_cid(objective))):
-        for _ in range(2):
-            floor.publish(*(make(cost=0, objective=objective) for make in (floor.demand, floor.offer)))
-        await until(lambda: len(floor.rejections) == 2)
 
 
 async def test_a_node_that_is_away_for_a_while_costs_no_order_and_no_result(
@@ -113,11 +104,11 @@ async def test_a_node_that_is_away_for_a_while_costs_no_order_and_no_result(
         first, second = floor.demand(cost=0), floor.demand(cost=0)
         floor.publish(first, floor.offer(cost=0))
         liability = await floor.liability_of(first)
-        await until(lambda: liability.address in provider._watching._open)
+        await until_read(floor, provider)
 
         await node.__aexit__(None, None, None)
         floor.publish(second, floor.offer(cost=0), floor.result(liability.address))
-        await until(lambda: "a transaction waits" in caplog.text and "can't be read on" in caplog.text)
+        await until(lambda: outages(caplog, "transactions") and outages(caplog, "chain"))
 
         async with served(floor, port):
             await floor.liability_of(second)
@@ -127,8 +118,8 @@ async def test_a_node_that_is_away_for_a_while_costs_no_order_and_no_result(
             await until(lambda: len(provider.book) == 1)
             await floor.mine(2)
             await until(lambda: len(provider.book) == 0)
-            assert caplog.text.count("can't be read on") == 1
-            assert caplog.text.count("a transaction waits") == 1
+            assert len(outages(caplog, "chain")) == 1
+            assert len(outages(caplog, "transactions")) == 1
     assert floor.rejections == []
 
 
@@ -142,7 +133,7 @@ async def test_a_provider_without_eth_says_so_and_goes_on_when_it_has_some(
         async with floor.provider("rival"):
             demand = floor.demand()
             floor.publish(demand, floor.offer())
-            await until(lambda: "send ETH to the account" in caplog.text)
+            await until(lambda: outages(caplog, "transactions") == ["insufficient-funds"])
 
             await floor.chain.tokens.send_eth(floor.address("rival"), balance - 10**18)
 
@@ -160,7 +151,7 @@ async def test_a_transaction_that_is_not_mined_for_long_is_waited_for(
         await floor.request("evm_setAutomine", False)
         demand = floor.demand()
         floor.publish(demand, floor.offer())
-        await until(lambda: "was not mined within" in caplog.text)
+        await until(lambda: outages(caplog, "transactions") == ["transaction-timeout"])
 
         await floor.request("evm_setIntervalMining", 1)
 
@@ -179,15 +170,15 @@ async def test_gas_that_is_too_dear_is_waited_for_and_said_once(
         await base_fee(floor, 900 * GWEI)
         demand = floor.demand()
         floor.publish(demand, floor.offer())
-        await until(lambda: "gas costs" in caplog.text)
+        await until(lambda: outages(caplog, "transactions"))
         await asyncio.sleep(0.5)  # for some more attempts
-        assert caplog.text.count("gas costs") == 1
+        assert outages(caplog, "transactions") == ["fee-too-high"]
 
         await base_fee(floor, GWEI)
 
         await floor.liability_of(demand)
         await until(lambda: provider.earnings().created == 1)
-        assert caplog.text.count("transactions go through again") == 1
+        assert len(events(caplog, "transactions-recovered")) == 1
         assert floor.rejections == []
 
 

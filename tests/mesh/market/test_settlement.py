@@ -1,16 +1,10 @@
-"""What became of messages: kept for the latest liabilities only."""
+"""The messages that are kept for a reorganisation."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from mesh.market import settled
-from mesh.market.settled import SettledMessages
+from mesh.market.settlement import SettledMessages
 from schemas import Demand, Offer, Result, verify_message
 from tests.support.orders import result, verified_demand, verified_offer
-
-if TYPE_CHECKING:
-    import pytest
 
 
 def test_messages_are_taken_out_by_kind_and_once() -> None:
@@ -25,9 +19,8 @@ def test_messages_are_taken_out_by_kind_and_once() -> None:
     assert messages.pop("b", Result) == []
 
 
-def test_the_oldest_liability_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(settled, "REMEMBERED", 2)
-    messages = SettledMessages()
+def test_the_oldest_liability_is_forgotten() -> None:
+    messages = SettledMessages(limit=2)
     for name in "abc":
         messages.add(name, verified_demand())
 

@@ -1,4 +1,4 @@
-"""Whose order it is that a contract refuses, for each error that tells."""
+"""Which order of a match caused an error of the contracts."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from mesh.market import Match
-from mesh.market.faults import at_fault, word_for
+from mesh.market.book import at_fault, reason_word
 from tests.support.orders import LIGHTHOUSE, PERSON, ROBOT, STRANGER, verified_demand, verified_offer
 
 DEMAND = verified_demand(cost=10, validator_fee=20, deadline=50)
@@ -17,7 +17,7 @@ FACTORY = LIGHTHOUSE
 
 
 @pytest.mark.parametrize(
-    ("reason", "arguments", "guilty"),
+    ("reason", "arguments", "expected"),
     [
         ("OrderUsed", (DEMAND.hash,), (DEMAND,)),
         ("OrderUsed", (OFFER.hash,), (OFFER,)),
@@ -44,31 +44,33 @@ FACTORY = LIGHTHOUSE
         ("some text of a stranger's token", (), MATCH),
     ],
 )
-def test_each_error_tells_of_its_order(reason: str, arguments: tuple[Any, ...], guilty: tuple[Any, ...]) -> None:
-    assert at_fault(MATCH, reason, arguments) == tuple(guilty)
+def test_each_error_names_the_orders_at_fault(
+    reason: str, arguments: tuple[Any, ...], expected: tuple[Any, ...]
+) -> None:
+    assert at_fault(MATCH, reason, arguments) == tuple(expected)
 
 
 @pytest.mark.parametrize(
     ("reason", "word"), [("CostMismatch", "CostMismatch"), ("", "Reverted"), ("please pay\nme", "Reverted")]
 )
-def test_a_strangers_text_is_no_word(reason: str, word: str) -> None:
-    assert word_for(reason) == word
+def test_a_text_of_a_strangers_token_is_not_a_reason(reason: str, word: str) -> None:
+    assert reason_word(reason) == word
 
 
 @pytest.mark.parametrize("fees", [{"cost": 30}, {"validator_fee": 30}], ids=lambda fees: next(iter(fees)))
-def test_an_allowance_that_either_may_owe_is_both_s_fault(fees: dict[str, Any]) -> None:
+def test_both_are_at_fault_for_an_allowance_that_either_may_lack(fees: dict[str, Any]) -> None:
     match = Match(verified_demand(**({"cost": 10} | fees)), OFFER)
 
     assert at_fault(match, "ERC20InsufficientAllowance", (FACTORY, 0, 30)) == tuple(match)
 
 
-def test_one_who_deals_with_himself_is_at_fault_twice() -> None:
+def test_both_orders_of_one_signer_are_at_fault() -> None:
     match = Match(DEMAND, verified_offer(signer=PERSON))
 
     assert at_fault(match, "ERC20InsufficientBalance", (PERSON.address, 0, 1)) == tuple(match)
 
 
-def test_equal_deadlines_are_both_s_fault() -> None:
+def test_both_are_at_fault_for_equal_deadlines() -> None:
     match = Match(DEMAND, verified_offer(deadline=50))
 
     assert at_fault(match, "DeadlineReached", (50,)) == tuple(match)
@@ -77,7 +79,7 @@ def test_equal_deadlines_are_both_s_fault() -> None:
 @pytest.mark.parametrize(
     "reason", ["OrderUsed", "DeadlineReached", "WrongSigner", "ERC20InsufficientBalance", "ERC20InsufficientAllowance"]
 )
-def test_an_error_without_its_arguments_tells_of_both(reason: str) -> None:
-    guilty = (DEMAND,) if reason == "ERC20InsufficientAllowance" else tuple(MATCH)
+def test_both_are_at_fault_for_an_error_without_arguments(reason: str) -> None:
+    expected = (DEMAND,) if reason == "ERC20InsufficientAllowance" else tuple(MATCH)
 
-    assert at_fault(MATCH, reason, ()) == guilty
+    assert at_fault(MATCH, reason, ()) == expected

@@ -8,18 +8,15 @@ from typing import TYPE_CHECKING
 import pytest
 from msgspec.structs import replace as replace_fields
 
-from mesh.market import order_id, watching
+from mesh.market import order_id
 from schemas import verify_message
 from tests.mesh.market.tokens import BURNS_ALL_GAS, deploy_token, refuses_with, says
-from tests.mesh.market.troubles import works_on
+from tests.mesh.market.troubles import outages, until_read, works_on
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
     from schemas import Liability
     from tests.mesh.market.floor import Floor
-
-
-pytestmark = pytest.mark.usefixtures("impatience")
 
 
 async def test_two_providers_share_the_work_in_their_turns(floor: Floor) -> None:
@@ -57,7 +54,7 @@ async def test_a_provider_without_a_stake_waits_and_rejects_nobody(
         demand = floor.demand()
         floor.publish(demand, floor.offer())
         with caplog.at_level("INFO"):
-            await until(lambda: "has no stake at the lighthouse" in caplog.text)
+            await until(lambda: outages(caplog, "transactions") == ["no-stake"])
 
         await floor.stake("provider", floor.lighthouse, 5)
 
@@ -130,7 +127,7 @@ async def test_what_the_chain_takes_back_is_done_again(floor: Floor) -> None:
         floor.publish(late := floor.demand(cost=0), floor.offer(cost=0))
         await floor.liability_of(late)
         await until(lambda: (provider.earnings().created, provider.earnings().finalized) == (2, 1))
-        await until(lambda: not provider._watching._open.keys() & {liability.address})
+        await until_read(floor, provider)
 
         await floor.request("evm_revert", snapshot)
         assert not (await floor.chain.liabilities.get(liability.address)).is_finalized
@@ -144,16 +141,13 @@ async def test_what_the_chain_takes_back_is_done_again(floor: Floor) -> None:
         assert len(await floor.liabilities_of(late)) == 1
 
 
-async def test_a_contract_whose_record_is_kept_no_more_is_ended_all_the_same(
-    floor: Floor, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(watching, "OPEN", 1)
-    async with floor.provider() as provider:
+async def test_a_contract_whose_record_is_kept_no_more_is_ended_all_the_same(floor: Floor) -> None:
+    async with floor.provider(open_liabilities=1) as provider:
         made: list[Liability] = []
         for _ in range(2):
             floor.publish(demand := floor.demand(cost=0), floor.offer(cost=0))
             made.append(await floor.liability_of(demand))
-            await until(lambda: list(provider._watching._open) == [made[-1].address])
+            await until_read(floor, provider)
 
         floor.publish(*(floor.result(liability.address) for liability in made))
         await until(lambda: provider.earnings().finalized == 2)
@@ -182,7 +176,7 @@ async def test_a_result_that_was_too_early_counts_when_it_is_sent_again(floor: F
         async with floor.provider() as provider:
             result = floor.result(created.liability)
             floor.publish(result, floor.result(floor.address("person")))
-            await until(lambda: provider._results.statistics().received == 2)
+            await until(lambda: provider.results.statistics().received == 2)
             again = await chain.liabilities.create(floor.lighthouse, demand, offer)
             assert again.liability == created.liability
 
