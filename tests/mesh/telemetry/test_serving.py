@@ -160,7 +160,7 @@ print(sorted(name for name in names if name in sys.modules))
         ("from mesh.telemetry.serving import Telemetry\nasyncio.run(Telemetry('').__aenter__())", ""),
         ("import mesh.agent.agent, mesh.agent.runtime", ""),
         ("import mesh.market.provider", ""),
-        ("import mesh.cli.provider, mesh.cli.router, mesh.cli.up, mesh.cli.chain.up", ""),
+        ("import mesh.cli.provider, mesh.cli.router, mesh.cli.up", ""),
         (
             "from bridges.serial.serving import telling\nwith telling(''): import bridges.serial.edge",
             '"web3", "aiohttp"',
