@@ -12,7 +12,8 @@ import zenoh
 from bridges.ipfs.adding import add_as_named
 from bridges.ipfs.errors import IpfsError
 from mesh.content import ContentUnavailable
-from mesh.content.serving import CID_SELECTOR, HOLDER
+from mesh.content.download import HOLDER
+from mesh.content.exchange import CID_SELECTOR
 from mesh.errors import AiraError, ClosedError, InvalidKey
 from mesh.network.crossing import call_in_loop
 from schemas import CidKey, InputError, parse_block, parse_key

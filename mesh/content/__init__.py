@@ -1,7 +1,9 @@
 """Files by CID: kept in a directory, and exchanged block by block over Zenoh."""
 
-from mesh.content.assembly import Assembly, is_block
-from mesh.content.dag import BlockRef
+from mesh.content.assembly import Assembly
+from mesh.content.dag import BlockRef, is_block
+from mesh.content.directory import StoreEntry, Usage
+from mesh.content.download import DownloadTiming
 from mesh.content.errors import (
     ContentCorrupt,
     ContentPinned,
@@ -12,8 +14,9 @@ from mesh.content.errors import (
     StoreFull,
 )
 from mesh.content.exchange import Exchange, ExchangeStatistics
-from mesh.content.holdings import EvictionReport, IntegrityReport, Progress, StoreEntry, Usage
-from mesh.content.store import Store
+from mesh.content.files import Progress
+from mesh.content.quota import EvictionReport
+from mesh.content.store import IntegrityReport, Store
 
 __all__ = [
     "Assembly",
@@ -22,6 +25,7 @@ __all__ = [
     "ContentPinned",
     "ContentTooLarge",
     "ContentUnavailable",
+    "DownloadTiming",
     "EvictionReport",
     "Exchange",
     "ExchangeStatistics",

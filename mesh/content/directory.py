@@ -1,30 +1,55 @@
-"""What one directory holds, for whose sake, and how much of it there may be."""
+"""The directory of a store: which files it holds, their pins and sizes, and what becomes of a finished file."""
 
 from __future__ import annotations
 
 import os
+import threading
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
 from mesh.content.errors import ContentPinned, ContentUnavailable
-from mesh.content.files import directory_lock
-from mesh.content.holdings import EvictionReport, StoreEntry, Usage
-from mesh.content.pins import Pins
-from mesh.content.quota import Room
-from mesh.content.recovery import DAMAGED_SUFFIX, damaged_in, held_in, is_cid, open_directory
+from mesh.content.files import directory_lock, stamp, sync_directory
+from mesh.content.quota import EvictionReport, Pins, Quota
+from mesh.content.recovery import DAMAGED_SUFFIX, is_cid, open_directory
 from mesh.errors import ConfigurationError
 from schemas.cid import parse_cid
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
     from types import TracebackType
+
+    from mesh.content.files import TemporaryFile
+    from mesh.content.index import BlockSpan
 
 USER: Final = "user"
 """Label of the pins that people set."""
 
 
-class Shelf:
-    """The directory of a store: a list of files with their pins and a quota. See `Store`, which also fills it."""
+@dataclass(frozen=True, kw_only=True)
+class StoreEntry:
+    """A file of a store. `used` is when it was last read, served or put (Unix time, seconds)."""
+
+    cid: str
+    size: int
+    used: float
+    pins: frozenset[str]
+    """The labels of its pins."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Usage:
+    """How much a store holds. `bytes` includes what is being written or fetched, or was set aside as damaged."""
+
+    files: int
+    bytes: int
+    pinned_bytes: int
+    quota: int | None
+    """None if there is no limit."""
+
+
+class StoreDirectory:
+    """What a store does without reading the files themselves: `Store` adds that."""
 
     def __init__(self, path: str | Path, *, quota: int | None) -> None:
         self.directory: Final = Path(path)
@@ -34,10 +59,13 @@ class Shelf:
             self._index, self._in_use = open_directory(self.directory)
         except OSError as error:
             raise ConfigurationError(
-                f"can't keep files in {self.directory}: {error.strerror}", hint="name a directory that can be written"
+                f"can't keep files in {self.directory}: {error.strerror}", hint="choose a writable directory"
             ) from error
-        self._room = Room(self.directory, self._index, self._pins, quota=quota)
+        self._quota = Quota(self.directory, self._index, self._pins, limit=quota)
         self._open = True
+        self._lock = threading.Lock()
+        self._checked: dict[str, tuple[int, ...]] = {}
+        """The stamps of files whose bytes were hashed, or written, by this process."""
 
     def __enter__(self) -> Self:
         return self
@@ -48,7 +76,7 @@ class Shelf:
         self.close()
 
     def close(self) -> None:
-        """Close the index. Safe to call twice; paths and open files stay good."""
+        """Close the index. Safe to call twice; paths and open files stay valid."""
         self._index.close()
         if self._open:
             self._open = False
@@ -65,10 +93,10 @@ class Shelf:
 
     def list(self) -> tuple[str, ...]:
         """The CIDs of all files held, sorted."""
-        return held_in(self.directory)
+        return tuple(sorted(name for name in os.listdir(self.directory) if is_cid(name)))
 
     def entries(self) -> tuple[StoreEntry, ...]:
-        """All files held, the least recently used first: the order in which they are deleted to make room."""
+        """All files held, in the order of eviction: the least recently used first."""
         held, pins = frozenset(self.list()), self._pins.by_cid()
         return tuple(
             StoreEntry(cid=file.name, size=file.size, used=file.used_ns / 1e9, pins=pins.get(file.name, frozenset()))
@@ -77,43 +105,45 @@ class Shelf:
         )
 
     def usage(self) -> Usage:
-        """How much is held, and how much may be."""
+        """How much is held, and the quota."""
         pins, files = self._pins.by_cid(), self._index.files()
         return Usage(
             files=sum(is_cid(file.name) for file in files),
             bytes=sum(file.size for file in files),
             pinned_bytes=sum(file.size for file in files if file.name in pins),
-            quota=self._room.quota,
+            quota=self._quota.limit,
         )
 
     def damaged(self) -> tuple[str, ...]:
-        """The CIDs of files that were found damaged and set aside, and that are not held again yet; sorted."""
-        return damaged_in(self.directory)
+        """The CIDs of files that were set aside as damaged and have not been replaced yet, sorted."""
+        names = os.listdir(self.directory)
+        cids = (name.removesuffix(DAMAGED_SUFFIX) for name in names if name.endswith(DAMAGED_SUFFIX))
+        return tuple(sorted(cid for cid in cids if is_cid(cid)))
 
     def pin(self, cid: str, label: str = USER) -> None:
-        """Keep the file from being deleted, from now on or from when it comes, until that label's pin is dropped.
+        """Protect the file from eviction, now or once it is held, until the pin of that label is removed.
 
-        Raises `InvalidCid`, and `InputError` for a label with other characters than letters, digits, `_` and `-`.
+        Raises `InvalidCid`, and `InputError` unless the label is 1 to 64 letters, digits, `_` and `-`.
         """
         with directory_lock(self.directory):
             self._pins.add(cid, label)
 
     def unpin(self, cid: str, label: str = USER) -> None:
-        """Drop one label's pin; nothing happens when there is none. Raises as `pin` does."""
+        """Remove the pin of one label, if there is one. Raises as `pin` does."""
         self._pins.drop(cid, label)
 
     def release(self, label: str) -> None:
-        """Drop all pins of a label, whatever they are on. Raises `InputError` if it can't be one."""
+        """Remove all pins of a label, whatever file they protect. Raises `InputError` if it is not a valid label."""
         self._pins.release(label)
 
     def pins(self) -> Mapping[str, frozenset[str]]:
-        """All CIDs that are pinned, held or not, each with the labels of its pins."""
+        """All pinned CIDs, held or not, each with the labels of its pins."""
         return self._pins.by_cid()
 
     def remove(self, cid: str) -> None:
-        """Delete a file, and what was set aside under its name.
+        """Delete a file, and any damaged one that was set aside under its name.
 
-        Raises `InvalidCid`, `ContentUnavailable` when it is not held, and `ContentPinned`.
+        Raises `InvalidCid`, `ContentUnavailable` if it is not held, and `ContentPinned`.
         """
         path = self._path(cid)
         aside = path.with_name(f"{cid}{DAMAGED_SUFFIX}")
@@ -129,10 +159,39 @@ class Shelf:
             raise ContentUnavailable(cid, "it is not in this store")
 
     def collect(self, quota: int | None = None) -> EvictionReport:
-        """Delete what was set aside and then the least recently used files, never a pinned one, until all together
-        are within `quota` bytes (the store's own if not given; without either, nothing)."""
-        allowed = self._room.quota if quota is None else quota
-        return EvictionReport(cids=(), bytes=0) if allowed is None else self._room.collect(allowed)
+        """Evict until all files together are within `quota` bytes; without one, the store's own.
+
+        Damaged files go first, then the least recently used; pinned ones stay. With neither quota, nothing is evicted.
+        """
+        limit = self._quota.limit if quota is None else quota
+        return EvictionReport(cids=(), bytes=0) if limit is None else self._quota.collect(limit)
+
+    def settle(
+        self,
+        temporary: TemporaryFile,
+        cid: str,
+        *,
+        size: int,
+        spans: Iterable[BlockSpan] = (),
+        pin: str | None = None,
+    ) -> Path:
+        """Rename a complete file to its CID, and index the blocks that are not yet indexed. It counts as checked."""
+        path, name = self._path(cid), temporary.path.name
+        aside = path.with_name(f"{cid}{DAMAGED_SUFFIX}")
+        self._index.add(name, spans, size=size)
+        temporary.finish(size)
+        with directory_lock(self.directory):
+            if pin is not None:
+                self._pins.add(cid, pin)
+            self._index.rename(name, cid)
+            temporary.rename(path)
+            aside.unlink(missing_ok=True)
+            self._index.forget(aside.name)
+            seen = stamp(path)
+        sync_directory(self.directory)
+        with self._lock:
+            self._checked[cid] = seen
+        return path
 
     def _path(self, cid: str) -> Path:
         parse_cid(cid)

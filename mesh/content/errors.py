@@ -1,4 +1,4 @@
-"""Why a file behind a CID can't be had, and why the store can't take one, or let go of it."""
+"""Errors of the content store and of fetching files."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ if TYPE_CHECKING:
 
 
 class ContentUnavailable(ContentError):
-    """Nobody who was asked has the file, or a block of it."""
+    """None of the sources asked has the file, or one of its blocks."""
 
     code = "content-unavailable"
 
     def __init__(self, cid: str, why: str) -> None:
         super().__init__(
-            f"{cid} is not to be had: {why}", hint="check the name, and that whoever has the file is on the network"
+            f"{cid} is not available: {why}", hint="check the CID, and that a machine with the file is on the network"
         )
         self.cid = cid
         self.why = why
 
 
 class ContentTooLarge(ContentError):
-    """A file is larger than what the caller, or the store, takes. Sizes are in bytes."""
+    """A file is larger than the caller, or the store, allows. Sizes are in bytes."""
 
     code = "content-too-large"
 
     def __init__(self, cid: str, *, size: int, limit: int) -> None:
         super().__init__(
-            f"{cid or 'the file'} is of {size} bytes at least, more than the {limit} allowed",
-            hint="raise the limit, or have the file made smaller",
+            f"{cid or 'the file'} is at least {size} bytes, more than the {limit} allowed",
+            hint="raise the limit, or use a smaller file",
         )
         self.cid = cid
         self.size = size
@@ -40,23 +40,26 @@ class ContentTooLarge(ContentError):
 
 
 class ContentCorrupt(ContentError):
-    """Bytes were offered, or kept, under a CID that they do not hash to, or that name no file.
+    """Bytes do not have the hash that their CID says, or are not a file.
 
-    `holders` are the Zenoh ids of those who offered them (empty when the bytes were our own, or came from elsewhere).
+    `reason` is machine-readable: `wrong-hash` or, for blocks with the right hash, `not-a-file`, `wrong-size`,
+    `empty-part`, `oversized-block`, `too-deep`, `too-many-blocks`, `not-indexed`. `holders` are the Zenoh ids of the
+    sessions that sent them (empty if they came from our disk, or from elsewhere).
     """
 
     code = "content-corrupt"
 
-    def __init__(self, cid: str, why: str, *, holders: Iterable[str] = ()) -> None:
+    def __init__(self, cid: str, why: str, *, reason: str = "wrong-hash", holders: Iterable[str] = ()) -> None:
         self.holders = tuple(holders)
-        offered = f" (offered by {', '.join(self.holders)})" if self.holders else ""
-        super().__init__(f"{cid} is corrupt: {why}{offered}", hint="fetch it again, from another holder")
+        senders = f" (sent by {', '.join(self.holders)})" if self.holders else ""
+        super().__init__(f"{cid} is corrupt: {why}{senders}", hint="fetch it again from another holder")
         self.cid = cid
         self.why = why
+        self.reason = reason
 
 
 class ContentPinned(AiraError):
-    """A file was to be removed that is pinned; `labels` say what for."""
+    """A file can't be removed because it is pinned, with these `labels`."""
 
     code = "content-pinned"
 
@@ -67,21 +70,21 @@ class ContentPinned(AiraError):
 
 
 class StoreFull(AiraError):
-    """The store has no room for a file: the disk under it is full, or its own quota is reached."""
+    """The store has no space for a file: its disk is full, or its quota is reached."""
 
     code = "store-full"
 
     def __init__(self, path: Path, *, why: str = "", hint: str = "") -> None:
         super().__init__(
-            why or f"no room left on the disk of {path}", hint=hint or "free some space, or move the store elsewhere"
+            why or f"the disk of {path} is full", hint=hint or "free some space, or move the store to another disk"
         )
         self.path = path
 
 
 class QuotaReached(StoreFull):
-    """All files together would be over the store's quota, `missing` bytes even if all that may be deleted were.
+    """A file does not fit the store's quota: `missing` bytes are too many even after evicting all that may be evicted.
 
-    `kept` bytes may not be: they are pinned, or being written.
+    `kept` bytes can't be evicted: they are pinned, or being written.
     """
 
     code = "quota-reached"
@@ -89,7 +92,7 @@ class QuotaReached(StoreFull):
     def __init__(self, path: Path, *, missing: int, quota: int, kept: int) -> None:
         super().__init__(
             path,
-            why=f"no room in the store {path}: {missing} bytes too many for its {quota}, of which {kept} are in use",
+            why=f"the store {path} is full: {missing} bytes exceed its quota of {quota}, of which {kept} are in use",
             hint="raise content_limit, or unpin or remove files",
         )
         self.missing = missing
@@ -98,14 +101,14 @@ class QuotaReached(StoreFull):
 
 
 class StoreDamaged(AiraError):
-    """The store's own books can't be read or written. The files themselves may be whole."""
+    """The store's index can't be read or written. The files themselves may be whole."""
 
     code = "store-damaged"
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(
             f"the store {path} is damaged: {why}",
-            hint="stop all that use it, then open it again: what it knows of its files is found out anew",
+            hint="stop all programs that use it, then open it again: the index will be rebuilt",
         )
         self.path = path
         self.why = why

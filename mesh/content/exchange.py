@@ -1,31 +1,40 @@
-"""Files by CID over Zenoh: what this agent holds is there for others, and what others hold can be fetched."""
+"""Files by CID over Zenoh: serve the blocks of a store to others, and fetch files that others hold."""
 
 from __future__ import annotations
 
 import asyncio
+import logging
+import threading
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Self
 from weakref import WeakValueDictionary
 
-from mesh.content.asking import Asker
-from mesh.content.download import Download
-from mesh.content.serving import BlockServer
-from mesh.errors import ClosedError
+import zenoh
+
+from mesh.content.download import HOLDER, BlockRequester, Download, DownloadTiming
+from mesh.errors import AiraError, ClosedError, InvalidKey
+from mesh.telemetry.context import log_event
+from schemas.keys import CidKey, parse_key
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
     from types import TracebackType
 
-    import zenoh
-
-    from mesh.content.holdings import Progress
+    from mesh.content.files import Progress
     from mesh.content.store import Store
 
+log = logging.getLogger(__name__)
+
 DEFAULT_TIMEOUT: Final = 30.0
-"""Seconds without a new block after which a fetch gives up."""
+"""Seconds without a new block after which a fetch fails."""
+CID_SELECTOR: Final = "aira/cid/*"
+
+_QUEUED: Final = 256
+"""Queries that may wait. Beyond it the oldest is dropped: its sender gets an empty reply at once, and asks again."""
+_TIMING: Final = DownloadTiming()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,34 +42,37 @@ class ExchangeStatistics:
     """What an exchange has done so far."""
 
     served: int
-    """Blocks given to who asked."""
+    """Blocks sent to others."""
     missed: int
-    """Queries for blocks that were not held."""
+    """Queries for blocks that are not held."""
     ignored: int
-    """Queries for somebody else, or with a wildcard."""
+    """Queries that were meant for another session, or had a wildcard."""
     fetched_blocks: int
     fetched_bytes: int
     corrupt_blocks: Mapping[str, int]
-    """Answers that were not what was asked for, by the holder's Zenoh id (which a liar may have made up)."""
+    """Replies that did not have the hash asked for, by the sender's Zenoh id (which the sender can forge)."""
 
 
 class Exchange:
-    """The door between a store and the network: `async with Exchange(session, store) as exchange`.
+    """Connects a store to the network: `async with Exchange(session, store) as exchange`.
 
-    Inside, blocks of the store are given to whoever asks on `aira/cid/{cid}`. `width` blocks of a fetch are on their
-    way at once. Session and store stay the caller's to close, after the exchange.
+    Inside, it serves blocks of the store on `aira/cid/{cid}`, and `fetch` gets files from others, `width` blocks at a
+    time. Session and store remain the caller's, who closes them after the exchange.
     """
 
-    def __init__(self, session: zenoh.Session, store: Store, *, width: int = 8) -> None:
+    def __init__(
+        self, session: zenoh.Session, store: Store, *, width: int = 8, timing: DownloadTiming = _TIMING
+    ) -> None:
         self._session = session
         self._store = store
         self._width = width
+        self._timing = timing
         self._server: BlockServer | None = None
         self._running: dict[Download, asyncio.Future[Path]] = {}
-        self._turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
+        self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
         self._blocks = 0
         self._bytes = 0
-        self._lies: Counter[str] = Counter()
+        self._corrupt: Counter[str] = Counter()
 
     async def __aenter__(self) -> Self:
         if self._server is not None:
@@ -88,23 +100,23 @@ class Exchange:
         timeout: float = DEFAULT_TIMEOUT,
         progress: Progress | None = None,
     ) -> Path:
-        """Where the file of that CID is in the store, once it is there whole and every block of it was checked.
+        """Where the file is in the store, once it is complete and every block of it was checked.
 
-        A file already held is hashed once per process. `timeout` is in seconds without a new block: a holder may
-        come late, a large file may take long. `size_limit` is in bytes. Cancelling keeps the blocks that came; the
-        next fetch goes on from them, in this process or another. `progress` is told, in the event loop, the bytes of
-        the file that are there and its size. A file that must stay is pinned before it is fetched.
+        A file that is already held is hashed once per process. `timeout` is in seconds without a new block: a holder
+        may appear late, and a large file may take long. `size_limit` is in bytes. Cancelling keeps the blocks that
+        arrived; the next fetch continues with them, in this process or another. `progress` is called in the event loop
+        with the bytes of the file that have arrived and its size. Pin a file before fetching it if it must stay.
 
-        Raises `InvalidCid`, `ContentUnavailable`, `ContentTooLarge`, `ContentCorrupt` (with the holders, if all that
-        answered lied), `QuotaReached`, `StoreFull`.
+        Raises `InvalidCid`, `ContentUnavailable`, `ContentTooLarge`, `ContentCorrupt` (with the holders, if all
+        replies were wrong), `QuotaReached`, `StoreFull`.
         """
-        turn = self._turns.setdefault(cid, asyncio.Lock())
-        async with turn:
+        lock = self._locks.setdefault(cid, asyncio.Lock())
+        async with lock:
             held = await asyncio.to_thread(self._store.checked, cid)
-            return held or await self._fetch(cid, size_limit, timeout, progress)
+            return held or await self._download(cid, size_limit, timeout, progress)
 
     def statistics(self) -> ExchangeStatistics:
-        """A snapshot of the counters. Blocks of fetches that are under way count when they end."""
+        """A snapshot of the counters. The blocks of a fetch are counted when it ends."""
         server = self._server
         return ExchangeStatistics(
             served=server.served if server else 0,
@@ -112,13 +124,20 @@ class Exchange:
             ignored=server.ignored if server else 0,
             fetched_blocks=self._blocks,
             fetched_bytes=self._bytes,
-            corrupt_blocks=dict(self._lies),
+            corrupt_blocks=dict(self._corrupt),
         )
 
-    async def _fetch(self, cid: str, size_limit: int | None, timeout: float, progress: Progress | None) -> Path:
-        loop, asker = asyncio.get_running_loop(), Asker(self._session)
-        tell = None if progress is None else _in_loop(loop, progress)
-        download = Download(self._store, asker, cid, patience=timeout, size_limit=size_limit, progress=tell)
+    async def _download(self, cid: str, size_limit: int | None, timeout: float, progress: Progress | None) -> Path:
+        loop, requester = asyncio.get_running_loop(), BlockRequester(self._session)
+        download = Download(
+            self._store,
+            requester,
+            cid,
+            patience=timeout,
+            timing=self._timing,
+            size_limit=size_limit,
+            progress=None if progress is None else _in_loop(loop, progress),
+        )
         with ThreadPoolExecutor(self._width + 1, thread_name_prefix=f"aira-fetch-{cid[-6:]}") as pool:
             running = loop.run_in_executor(pool, download.run, pool, self._width)
             self._running[download] = running
@@ -128,17 +147,76 @@ class Exchange:
                 download.stop()
                 await asyncio.wait([running])
                 if not running.cancelled():
-                    running.exception()  # taken note of: that it was stopped is no news
+                    running.exception()  # retrieve it: asyncio would report it as unhandled
                 raise
             finally:
                 del self._running[download]
                 self._blocks += download.blocks
                 self._bytes += download.bytes
-                self._lies.update(asker.lies)
+                self._corrupt.update(requester.corrupt_blocks)
+
+
+class BlockServer:
+    """Answers queries on `aira/cid/{cid}` with the bytes of the block, or with nothing if it is not held.
+
+    `start` and `stop` may block for a moment; neither closes the session. A thread of its own reads the disk.
+    """
+
+    def __init__(self, session: zenoh.Session, store: Store) -> None:
+        self._session = session
+        self._store = store
+        self._id = str(session.zid())
+        self._queryable: zenoh.Queryable[zenoh.Handler[zenoh.Query]] | None = None
+        self._thread = threading.Thread(target=self._serve, name="aira-blocks", daemon=True)
+        self.served = 0
+        self.missed = 0
+        self.ignored = 0
+
+    def start(self) -> None:
+        """Declare the queryable and begin to answer."""
+        self._queryable = self._session.declare_queryable(CID_SELECTOR, zenoh.handlers.RingChannel(_QUEUED))
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Undeclare the queryable and wait for the answer under way."""
+        if self._queryable is not None and not self._session.is_closed():
+            self._queryable.undeclare()  # type: ignore[no-untyped-call]
+        self._thread.join()
+
+    def _serve(self) -> None:
+        assert self._queryable is not None
+        for query in self._queryable:
+            with query:
+                try:
+                    self._answer(query)
+                except (OSError, AiraError, zenoh.ZError) as error:
+                    event = log_event("content-serve-failed", key=query.key_expr, error=error)
+                    log.exception("a query for a block could not be answered", extra=event)
+
+    def _answer(self, query: zenoh.Query) -> None:
+        key = _block_key(query)
+        if key is None or query.parameters.get(HOLDER, self._id) != self._id:
+            self.ignored += 1
+            return
+        block = self._store.get_block(key.cid)
+        if block is None:
+            self.missed += 1
+            return
+        query.reply(query.key_expr, block, encoding=zenoh.Encoding.APPLICATION_OCTET_STREAM)
+        self.served += 1
+
+
+def _block_key(query: zenoh.Query) -> CidKey | None:
+    """The key of the one block that a query names; None for a wildcard, which is never answered."""
+    try:
+        key = parse_key(str(query.key_expr))
+    except InvalidKey:
+        return None
+    return key if isinstance(key, CidKey) else None
 
 
 def _in_loop(loop: asyncio.AbstractEventLoop, progress: Progress) -> Progress:
-    def tell(done: int, total: int | None) -> None:
+    def call(done: int, total: int | None) -> None:
         loop.call_soon_threadsafe(progress, done, total)
 
-    return tell
+    return call

@@ -1,4 +1,4 @@
-"""Temporary files that belong to whoever holds their lock, and names that last."""
+"""Safe writing of files: temporary files with a lock, names that survive a crash, and streams that report progress."""
 
 from __future__ import annotations
 
@@ -7,49 +7,59 @@ import fcntl
 import os
 import secrets
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, Self, TypeAlias, cast
 
 from mesh.content.errors import StoreFull
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
     from types import TracebackType
 
+Progress: TypeAlias = "Callable[[int, int | None], None]"
+"""Is called with how far a long operation is: bytes done, and bytes in all or None if that is not known."""
+
 PUT_PREFIX: Final = ".put-"
-"""Starts the name of a file that is being written; worthless once its writer is gone."""
+"""Prefix of a file that is being written. It is deleted once its writer is gone."""
 PART_PREFIX: Final = ".part-"
-"""Starts the name of a file that is being fetched; the next fetch of the same CID goes on from it."""
+"""Prefix of a file that is being fetched. The next fetch of the same CID continues it."""
 
 _WRITE_BEHIND: Final = 8 << 20
-"""Bytes that are written before the disk is told to begin with them."""
-_NO_ROOM: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+"""Bytes written before the kernel is asked to start writing them to the disk."""
+_DISK_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+
+
+class Readable(Protocol):
+    """Anything to read bytes from; an empty read is its end."""
+
+    def read(self, size: int, /) -> bytes:
+        """The next bytes, at most `size`."""
 
 
 class TemporaryFile:
     """An open file under a temporary name in the directory of its final one, locked while it is open.
 
-    Leaving the `with` block closes it and, unless it was kept or got its name, deletes it. Other processes tell by
-    the lock whether its writer still lives.
+    Leaving the `with` block closes the file and deletes it, unless it was kept or renamed. The lock tells other
+    processes that its writer is still alive.
     """
 
     def __init__(self, path: Path, descriptor: int) -> None:
         self.path = path
         self._descriptor = descriptor
-        self._mine = True
+        self._delete_on_exit = True
         self._unwritten = 0
 
     @classmethod
     def create(cls, directory: Path, prefix: str) -> TemporaryFile:
-        """A new, empty file with a name of its own."""
+        """A new, empty file with a unique name."""
         while True:
-            made = cls.take(directory / f"{prefix}{secrets.token_hex(8)}")
-            if made is not None:
-                return made
+            created = cls.take(directory / f"{prefix}{secrets.token_hex(8)}")
+            if created is not None:
+                return created
 
     @classmethod
     def take(cls, path: Path) -> TemporaryFile | None:
-        """The file at `path`, made if it is not there, or None while somebody else holds it."""
+        """The file at `path`, created if it does not exist, or None if another writer has it locked."""
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -67,19 +77,19 @@ class TemporaryFile:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._mine:
+        if self._delete_on_exit:
             with suppress(FileNotFoundError):
                 self.path.unlink()
         os.close(self._descriptor)
 
     @property
     def is_kept(self) -> bool:
-        """Whether the file will be there, under either name, after the `with` block."""
-        return not self._mine
+        """Whether the file will still exist, under either name, after the `with` block."""
+        return not self._delete_on_exit
 
     @property
     def size(self) -> int:
-        """Its length in bytes now."""
+        """Its current length in bytes."""
         return os.fstat(self._descriptor).st_size
 
     def write(self, data: bytes, *, offset: int) -> None:
@@ -92,7 +102,7 @@ class TemporaryFile:
             self._unwritten += len(data)
             if self._unwritten >= _WRITE_BEHIND:
                 self._unwritten = 0
-                # Has the disk begin with what is there, so that `finish` does not wait for all of a large file.
+                # Starts the write-back now, so that `finish` does not wait for all of a large file.
                 os.posix_fadvise(self._descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
 
     def read(self, length: int, *, offset: int) -> bytes:
@@ -101,23 +111,23 @@ class TemporaryFile:
 
     def keep(self) -> None:
         """Leave the file where it is when the `with` block ends."""
-        self._mine = False
+        self._delete_on_exit = False
 
     def discard(self) -> None:
         """Delete the file when the `with` block ends, even if it was kept."""
-        self._mine = True
+        self._delete_on_exit = True
 
     def finish(self, size: int, *, mode: int = 0o444) -> None:
-        """Put its first `size` bytes on the disk, and nothing after them. Raises `StoreFull`."""
+        """Cut the file to `size` bytes and sync it to the disk. Raises `StoreFull`."""
         with raising_store_full(self.path.parent):
             os.ftruncate(self._descriptor, size)
             os.fchmod(self._descriptor, mode)
             os.fsync(self._descriptor)
 
     def rename(self, final: Path) -> None:
-        """Give the file its final name, replacing what is there. Atomic; lasts once the directory is synced."""
+        """Give the file its final name, replacing any file of that name. Atomic; durable after `sync_directory`."""
         self.path.rename(final)
-        self._mine = False
+        self._delete_on_exit = False
 
 
 @contextmanager
@@ -126,14 +136,14 @@ def raising_store_full(directory: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno in _NO_ROOM:
+        if error.errno in _DISK_FULL:
             raise StoreFull(directory) from error
         raise
 
 
 @contextmanager
 def directory_lock(directory: Path) -> Iterator[None]:
-    """LockedEntry the directory for this process (and thread) alone; waits for whoever has it."""
+    """Hold the exclusive lock of the directory, waiting for any other process or thread that has it."""
     descriptor = os.open(directory / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -142,8 +152,8 @@ def directory_lock(directory: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def is_taken(path: Path) -> bool:
-    """Whether somebody has locked the file at `path`, in this process or another: who writes it, or has it in use."""
+def is_locked(path: Path) -> bool:
+    """Whether this process or another has the file at `path` locked."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except FileNotFoundError:
@@ -158,7 +168,7 @@ def is_taken(path: Path) -> bool:
 
 
 def sync_directory(directory: Path) -> None:
-    """Put the directory's names on the disk: a rename lasts only after this."""
+    """Sync the names of the directory to the disk: a rename is durable only after this."""
     descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(descriptor)
@@ -167,6 +177,35 @@ def sync_directory(directory: Path) -> None:
 
 
 def stamp(path: Path) -> tuple[int, ...]:
-    """What is different once a file was changed or replaced."""
+    """A value that changes whenever the file is changed or replaced."""
     status = path.stat()
     return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+
+def read_or_nothing(descriptor: int, length: int, offset: int) -> bytes:
+    """The bytes at `offset`, or none if the disk fails to read them (EIO)."""
+    try:
+        return os.pread(descriptor, length, offset)
+    except OSError as error:
+        if error.errno != errno.EIO:
+            raise
+        return b""
+
+
+def with_progress(stream: BinaryIO, progress: Progress | None, *, total: int | None) -> BinaryIO:
+    """The same stream, for reading only, which calls `progress`, if given, after each read."""
+    return stream if progress is None else cast("BinaryIO", _ProgressStream(stream, progress, total=total))
+
+
+class _ProgressStream:
+    def __init__(self, stream: Readable, progress: Progress, *, total: int | None) -> None:
+        self._stream = stream
+        self._progress = progress
+        self._total = total
+        self._done = 0
+
+    def read(self, size: int, /) -> bytes:
+        data = self._stream.read(size)
+        self._done += len(data)
+        self._progress(self._done, self._total)
+        return data

@@ -22,7 +22,7 @@ from mesh.content import ContentTooLarge, ContentUnavailable, Exchange, Store
 from mesh.network import Endpoints, Network
 from schemas import CHUNK_SIZE, MAX_LINKS, blocks_of_stream, cid_of_bytes
 from tests.bridges.ipfs.legacy import Bare
-from tests.mesh.content.trees import chunked
+from tests.support.content import chunked
 from tests.support.ipfs import Kubo
 from tests.support.ports import free_port
 from tests.support.waiting import until

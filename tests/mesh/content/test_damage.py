@@ -15,9 +15,7 @@ import pytest
 from mesh.content import ContentCorrupt, ContentUnavailable, Exchange, Store, StoreDamaged
 from mesh.errors import ClosedError
 from schemas.unixfs import CHUNK_SIZE, cid_of_bytes
-from tests.mesh.content.holders import some
-from tests.mesh.content.test_store import ROOT, flip_a_bit, leftovers
-from tests.mesh.content.trees import chunked, leaf, parent
+from tests.support.content import ROOT, chunked, flip_bit, leaf, leftovers, parent, put_tree, sample_bytes
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -25,24 +23,10 @@ if TYPE_CHECKING:
 
     import zenoh
 
-    from schemas.unixfs import UnixfsBlock
-
-
-def put_tree(store: Store, blocks: list[UnixfsBlock]) -> str:
-    """Have a store hold the file of a tree, the root last."""
-    by_cid = {block.cid: block.data for block in blocks}
-    with store.assemble(blocks[-1].cid) as assembly:
-        waiting = [assembly.root]
-        while waiting:
-            place = waiting.pop()
-            waiting.extend(assembly.put(place, by_cid[place.cid]))
-        assembly.finish()
-    return blocks[-1].cid
-
 
 @pytest.mark.parametrize("size", [0, 1, CHUNK_SIZE, CHUNK_SIZE + 1, 175 * CHUNK_SIZE + 3])
 def test_a_file_is_read_from_any_position(store: Store, size: int) -> None:
-    data = some(size)
+    data = sample_bytes(size)
     cid = store.put_bytes(data)
     chance = random.Random(size)
     with store.open(cid) as file:
@@ -57,7 +41,7 @@ def test_a_file_is_read_from_any_position(store: Store, size: int) -> None:
 
 
 def test_a_file_of_other_chunking_is_read_and_copied(store: Store, tmp_path: Path) -> None:
-    data = some(50_000)
+    data = sample_bytes(50_000)
     cid = put_tree(store, chunked(data, 997))
     with store.open(cid) as file:
         file.seek(12_345)
@@ -75,9 +59,9 @@ def test_a_node_with_bytes_of_its_own_is_read(store: Store) -> None:
 
 
 def test_reading_stops_where_the_file_has_rotted_and_names_it(store: Store) -> None:
-    data = some(3 * CHUNK_SIZE)
+    data = sample_bytes(3 * CHUNK_SIZE)
     cid = store.put_bytes(data)
-    flip_a_bit(store.directory / cid, 2 * CHUNK_SIZE + 9)
+    flip_bit(store.directory / cid, 2 * CHUNK_SIZE + 9)
     with store.open(cid) as file:
         assert file.read(2 * CHUNK_SIZE) == data[: 2 * CHUNK_SIZE]
         with pytest.raises(ContentCorrupt) as caught:
@@ -89,7 +73,7 @@ def test_reading_stops_where_the_file_has_rotted_and_names_it(store: Store) -> N
 
 
 def test_a_file_that_was_cut_short_is_damaged(store: Store) -> None:
-    cid = store.put_bytes(some(2 * CHUNK_SIZE))
+    cid = store.put_bytes(sample_bytes(2 * CHUNK_SIZE))
     path = store.directory / cid
     path.chmod(0o644)
     os.truncate(path, CHUNK_SIZE)
@@ -99,7 +83,7 @@ def test_a_file_that_was_cut_short_is_damaged(store: Store) -> None:
 
 
 def test_a_copy_is_whole_or_not_there(store: Store, tmp_path: Path) -> None:
-    data = some(2 * CHUNK_SIZE + 1)
+    data = sample_bytes(2 * CHUNK_SIZE + 1)
     cid = store.put_bytes(data)
     target = tmp_path / "out" / "copy.bin"
     target.parent.mkdir()
@@ -109,7 +93,7 @@ def test_a_copy_is_whole_or_not_there(store: Store, tmp_path: Path) -> None:
     assert target.read_bytes() == data
     assert told[-1] == (len(data), len(data))
     assert os.access(target, os.W_OK)
-    flip_a_bit(store.directory / cid, CHUNK_SIZE)
+    flip_bit(store.directory / cid, CHUNK_SIZE)
     with pytest.raises(ContentCorrupt):
         store.copy(cid, target)
     assert target.read_bytes() == data
@@ -119,11 +103,11 @@ def test_a_copy_is_whole_or_not_there(store: Store, tmp_path: Path) -> None:
 
 
 def test_checking_the_store_names_every_damaged_file_and_no_other(store: Store) -> None:
-    cids = [store.put_bytes(some(size)) for size in (0, 5, 1000, CHUNK_SIZE + 1, 700_000)]
-    other = put_tree(store, chunked(some(9000), 1000))
+    cids = [store.put_bytes(sample_bytes(size)) for size in (0, 5, 1000, CHUNK_SIZE + 1, 700_000)]
+    other = put_tree(store, chunked(sample_bytes(9000), 1000))
     bad = sorted([cids[2], cids[4]])
-    flip_a_bit(store.directory / cids[2], 999)
-    flip_a_bit(store.directory / cids[4], 0)
+    flip_bit(store.directory / cids[2], 999)
+    flip_bit(store.directory / cids[4], 0)
     told: list[tuple[int, int | None]] = []
     found = store.check(progress=lambda done, total: told.append((done, total)))
     assert list(found.damaged) == bad
@@ -136,10 +120,10 @@ def test_checking_the_store_names_every_damaged_file_and_no_other(store: Store) 
 
 
 def test_a_damaged_file_that_is_put_again_is_damaged_no_more(store: Store) -> None:
-    cid = store.put_bytes(some(1000))
-    flip_a_bit(store.directory / cid, 1)
+    cid = store.put_bytes(sample_bytes(1000))
+    flip_bit(store.directory / cid, 1)
     assert store.checked(cid) is None
-    assert store.put_bytes(some(1000)) == cid
+    assert store.put_bytes(sample_bytes(1000)) == cid
     assert store.damaged() == ()
     assert store.check().damaged == ()
     assert store.usage().bytes == 1000
@@ -147,7 +131,7 @@ def test_a_damaged_file_that_is_put_again_is_damaged_no_more(store: Store) -> No
 
 def test_progress_of_a_put_is_told(store: Store, tmp_path: Path) -> None:
     source = tmp_path / "source"
-    source.write_bytes(some(3 * CHUNK_SIZE + 1))
+    source.write_bytes(sample_bytes(3 * CHUNK_SIZE + 1))
     told: list[tuple[int, int | None]] = []
     store.put_file(source, progress=lambda done, total: told.append((done, total)))
     assert told == sorted(told)
@@ -160,10 +144,10 @@ def test_progress_of_a_put_is_told(store: Store, tmp_path: Path) -> None:
 async def test_of_a_damaged_file_only_the_damaged_block_is_fetched_again(
     store: Store, holder_store: Store, session: zenoh.Session, other_session: zenoh.Session
 ) -> None:
-    data = some(20 * CHUNK_SIZE)
+    data = sample_bytes(20 * CHUNK_SIZE)
     cid = holder_store.put_bytes(data)
     store.put_bytes(data)
-    flip_a_bit(store.directory / cid, 7 * CHUNK_SIZE)
+    flip_bit(store.directory / cid, 7 * CHUNK_SIZE)
     assert store.check().damaged == (cid,)
     async with Exchange(other_session, holder_store) as holder, Exchange(session, store) as exchange:
         assert (await exchange.fetch(cid)).read_bytes() == data
@@ -180,9 +164,9 @@ async def test_a_holder_whose_file_has_rotted_sets_it_aside_and_the_other_holder
     other_session: zenoh.Session,
     third_session: zenoh.Session,
 ) -> None:
-    data = some(12 * CHUNK_SIZE)
+    data = sample_bytes(12 * CHUNK_SIZE)
     cid = holder_store.put_bytes(data)
-    flip_a_bit(holder_store.directory / cid, 5 * CHUNK_SIZE + 1)
+    flip_bit(holder_store.directory / cid, 5 * CHUNK_SIZE + 1)
     with Store(tmp_path / "good") as good_store:
         good_store.put_bytes(data)
         async with Exchange(other_session, holder_store) as damaged, Exchange(session, store) as exchange:

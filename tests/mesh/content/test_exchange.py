@@ -10,7 +10,7 @@ import pytest
 from mesh.content import ContentTooLarge, ContentUnavailable, Exchange, Store
 from mesh.errors import ClosedError, InvalidCid
 from schemas.unixfs import CHUNK_SIZE, blocks_of_stream, cid_of_bytes
-from tests.mesh.content.holders import answering, reaching, some
+from tests.support.content import answer_queries, sample_bytes, until_matched
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 async def test_a_file_is_fetched_from_who_has_it_and_given_on(
     tmp_path: Path, store: Store, holder_store: Store, session: zenoh.Session, other_session: zenoh.Session, size: int
 ) -> None:
-    data = some(size)
+    data = sample_bytes(size)
     cid = holder_store.put_bytes(data)
     async with Exchange(other_session, holder_store), Exchange(session, store) as exchange:
         path = await exchange.fetch(cid)
@@ -71,7 +71,7 @@ async def test_a_holder_may_come_late(
 async def test_too_large_a_file_is_refused_by_its_root_alone(
     store: Store, holder_store: Store, session: zenoh.Session, other_session: zenoh.Session
 ) -> None:
-    cid = holder_store.put_bytes(some(4 * CHUNK_SIZE))
+    cid = holder_store.put_bytes(sample_bytes(4 * CHUNK_SIZE))
     async with Exchange(other_session, holder_store) as holder, Exchange(session, store) as exchange:
         with pytest.raises(ContentTooLarge) as caught:
             await exchange.fetch(cid, size_limit=4 * CHUNK_SIZE - 1)
@@ -86,7 +86,7 @@ async def test_who_does_not_hold_a_block_or_is_not_meant_says_nothing(
     cid = holder_store.put_bytes(b"held")
     not_held = cid_of_bytes(b"not held")
     async with Exchange(other_session, holder_store) as holder:
-        await reaching(session)
+        await until_matched(session)
         for selector in ("aira/cid/*", f"aira/cid/{not_held}", f"aira/cid/{cid}?holder=somebody"):
             begin = time.monotonic()
             replies = await asyncio.to_thread(session.get, selector, timeout=30.0)
@@ -99,7 +99,7 @@ async def test_who_does_not_hold_a_block_or_is_not_meant_says_nothing(
 async def test_a_fetch_whose_holder_leaves_is_gone_on_with_from_what_came(
     store: Store, holder_store: Store, session: zenoh.Session, other_session: zenoh.Session
 ) -> None:
-    data = some(30 * CHUNK_SIZE)
+    data = sample_bytes(30 * CHUNK_SIZE)
     cid = holder_store.put_bytes(data)
     blocks = {block.cid: block.data for block in blocks_of_stream(io.BytesIO(data))}
     given = 0
@@ -111,7 +111,7 @@ async def test_a_fetch_whose_holder_leaves_is_gone_on_with_from_what_came(
             query.reply(query.key_expr, blocks[str(query.key_expr).rpartition("/")[2]])
 
     async with Exchange(session, store) as exchange:
-        with answering(other_session, give_a_few), pytest.raises(ContentUnavailable):
+        with answer_queries(other_session, give_a_few), pytest.raises(ContentUnavailable):
             await exchange.fetch(cid, timeout=0.5)
         first = exchange.statistics().fetched_blocks
         async with Exchange(other_session, holder_store):
@@ -141,15 +141,15 @@ async def test_cancelling_a_fetch_ends_it_and_loses_nothing(
 async def test_a_slow_holder_is_waited_for_as_long_as_blocks_come(
     store: Store, session: zenoh.Session, other_session: zenoh.Session
 ) -> None:
-    data = some(3 * CHUNK_SIZE)
+    data = sample_bytes(3 * CHUNK_SIZE)
     blocks = {block.cid: block.data for block in blocks_of_stream(io.BytesIO(data))}
 
     def answer_slowly(query: zenoh.Query) -> None:
         time.sleep(0.6)
         query.reply(query.key_expr, blocks[str(query.key_expr).rpartition("/")[2]])
 
-    with answering(other_session, answer_slowly):
-        await reaching(session)
+    with answer_queries(other_session, answer_slowly):
+        await until_matched(session)
         async with Exchange(session, store, width=1) as exchange:
             begin = time.monotonic()
             await exchange.fetch(cid_of_bytes(data), timeout=1.5)
@@ -159,7 +159,7 @@ async def test_a_slow_holder_is_waited_for_as_long_as_blocks_come(
 async def test_one_file_asked_for_twice_at_once_is_fetched_once(
     store: Store, holder_store: Store, session: zenoh.Session, other_session: zenoh.Session
 ) -> None:
-    cid = holder_store.put_bytes(some(8 * CHUNK_SIZE))
+    cid = holder_store.put_bytes(sample_bytes(8 * CHUNK_SIZE))
     async with Exchange(other_session, holder_store) as holder, Exchange(session, store) as exchange:
         paths = await asyncio.gather(*(exchange.fetch(cid) for _ in range(5)))
         assert set(paths) == {store.path(cid)}

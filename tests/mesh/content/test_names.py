@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from schemas.unixfs import CHUNK_SIZE, MAX_LINKS, cid_of_stream
-from tests.mesh.content.test_store import ROOT
+from tests.support.content import ROOT
 from tests.support.peers import require
 
 if TYPE_CHECKING:

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import io
-import os
 import random
 import resource
 import signal
@@ -9,7 +8,6 @@ import subprocess
 import sys
 import tracemalloc
 from contextlib import closing
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -18,44 +16,13 @@ from mesh.content import ContentCorrupt, ContentTooLarge, ContentUnavailable, St
 from mesh.content.index import BlockIndex
 from mesh.errors import ConfigurationError, InvalidCid
 from schemas.unixfs import CHUNK_SIZE, blocks_of_stream, cid_of_bytes
-from tests.mesh.content.trees import chunked
+from tests.support.content import ROOT, RandomStream, chunked, flip_bit, leftovers
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
 EMPTY_FILE = "QmbFMke1KXqnYyBBWxB74N4c5SBnJMVAiMNRcGu6x1AwQH"
-ROOT = Path(__file__).parents[3]
-
-
-class Endless(io.RawIOBase):
-    """A stream of `size` bytes that are made as they are read; `fail_at` is where it breaks."""
-
-    def __init__(self, size: int, fail_at: int | None = None) -> None:
-        self.left = size
-        self.fail_at = fail_at
-        self.random = random.Random(size)
-
-    def read(self, size: int = -1) -> bytes:
-        if self.fail_at is not None and self.left <= self.fail_at:
-            raise OSError("the source broke")
-        data = self.random.randbytes(min(size, self.left, 65_536))
-        self.left -= len(data)
-        return data
-
-
-def leftovers(directory: Path) -> list[str]:
-    """Files that are neither content nor the store's own."""
-    own = {".lock", ".open", ".pins", ".blocks.sqlite", ".blocks.sqlite-wal", ".blocks.sqlite-shm"}
-    return sorted(name for name in os.listdir(directory) if name not in own and not name.startswith("Qm"))
-
-
-def flip_a_bit(path: Path, offset: int) -> None:
-    path.chmod(0o644)
-    with path.open("r+b") as file:
-        file.seek(offset)
-        byte = file.read(1)
-        file.seek(offset)
-        file.write(bytes([byte[0] ^ 1]))
 
 
 @pytest.mark.parametrize(
@@ -81,7 +48,7 @@ def test_a_stream_of_any_size_is_put_in_constant_memory(store: Store) -> None:
     store.put_bytes(b"what is loaded once is not counted")
     tracemalloc.start()
     try:
-        store.put_stream(Endless(64 << 20))
+        store.put_stream(RandomStream(64 << 20))
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
@@ -108,14 +75,14 @@ def test_no_name_but_a_cid_reaches_the_disk(store: Store, name: str) -> None:
 
 def test_a_source_that_breaks_leaves_nothing(store: Store) -> None:
     with pytest.raises(OSError, match="the source broke"):
-        store.put_stream(Endless(3 << 20, fail_at=1 << 20))
+        store.put_stream(RandomStream(3 << 20, fail_at=1 << 20))
     assert store.list() == ()
     assert leftovers(store.directory) == []
 
 
 def test_a_source_that_breaks_late_leaves_nothing_in_the_index(store: Store) -> None:
     with pytest.raises(OSError, match="the source broke"):
-        store.put_stream(Endless(40 << 20, fail_at=1 << 20))
+        store.put_stream(RandomStream(40 << 20, fail_at=1 << 20))
     with closing(BlockIndex(store.directory / ".blocks.sqlite")) as index:
         assert index.files() == []
 
@@ -150,7 +117,7 @@ def test_a_full_disk_is_said_so_and_leaves_nothing(store: Store) -> None:
 def test_a_rotten_file_is_found_out_and_moved_aside(store: Store) -> None:
     data = random.Random(1).randbytes(600_000)
     cid = store.put_bytes(data)
-    flip_a_bit(store.directory / cid, 300_000)
+    flip_bit(store.directory / cid, 300_000)
     with pytest.raises(ContentCorrupt):
         store.verify(cid)
     assert not store.has(cid)
@@ -163,7 +130,7 @@ def test_a_rotten_file_is_found_out_and_moved_aside(store: Store) -> None:
 def test_a_file_that_changed_after_it_was_checked_is_hashed_again(store: Store) -> None:
     cid = store.put_bytes(bytes(1000))
     assert store.checked(cid) is not None
-    flip_a_bit(store.directory / cid, 10)
+    flip_bit(store.directory / cid, 10)
     assert store.checked(cid) is None
 
 
@@ -171,7 +138,7 @@ def test_rotten_bytes_are_never_given_as_a_block(store: Store) -> None:
     data = random.Random(2).randbytes(2 * CHUNK_SIZE)
     cid = store.put_bytes(data)
     first, second, root = blocks_of_stream(io.BytesIO(data))
-    flip_a_bit(store.directory / cid, CHUNK_SIZE + 5)
+    flip_bit(store.directory / cid, CHUNK_SIZE + 5)
     assert store.get_block(first.cid) == first.data
     assert store.damaged() == ()
     assert store.get_block(second.cid) is None
@@ -224,7 +191,7 @@ def test_a_file_of_other_chunking_is_checked_by_its_tree(store: Store) -> None:
     assert path.read_bytes() == data
     assert store.verify(root.cid) == path
     assert [store.get_block(block.cid) for block in leaves] == [block.data for block in leaves]
-    flip_a_bit(path, 5000)
+    flip_bit(path, 5000)
     with pytest.raises(ContentCorrupt):
         store.verify(root.cid)
 

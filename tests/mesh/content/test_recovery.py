@@ -12,7 +12,7 @@ import pytest
 
 from mesh.content import Store
 from schemas.unixfs import CHUNK_SIZE, blocks_of_stream
-from tests.mesh.content.test_store import ROOT, flip_a_bit, leftovers
+from tests.support.content import ROOT, flip_bit, leftovers
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -140,7 +140,7 @@ def test_setting_a_damaged_file_aside_may_be_killed_at_any_step(tmp_path: Path) 
         with Store(directory, quota=QUOTA) as store:
             cid = store.put_bytes(rotten)
             assert store.damaged() == ()
-        flip_a_bit(directory / cid, CHUNK_SIZE + 1)
+        flip_bit(directory / cid, CHUNK_SIZE + 1)
 
     def look(directory: Path) -> None:
         with Store(directory, quota=QUOTA) as store:

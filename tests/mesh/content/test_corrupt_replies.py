@@ -7,7 +7,7 @@ import pytest
 
 from mesh.content import ContentCorrupt, Exchange, Store
 from schemas.unixfs import CHUNK_SIZE, cid_of_bytes
-from tests.mesh.content.holders import answering, some
+from tests.support.content import answer_queries, sample_bytes
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ async def test_a_liar_is_counted_and_named_and_somebody_elses_answer_used(
     other_session: zenoh.Session,
     third_session: zenoh.Session,
 ) -> None:
-    data = some(3 * CHUNK_SIZE)
+    data = sample_bytes(3 * CHUNK_SIZE)
     cid = holder_store.put_bytes(data)
     lied = 0
 
@@ -30,7 +30,7 @@ async def test_a_liar_is_counted_and_named_and_somebody_elses_answer_used(
         query.reply(query.key_expr, b"not what was asked for")
         lied += 1
 
-    with answering(third_session, lie):
+    with answer_queries(third_session, lie):
         async with Exchange(session, store) as exchange:
             # The liar is alone at first, so that its answer is the one that comes.
             fetching = asyncio.create_task(exchange.fetch(cid))
@@ -50,7 +50,7 @@ async def test_a_holder_of_the_root_that_lies_about_the_parts_is_left_for_anothe
     other_session: zenoh.Session,
     third_session: zenoh.Session,
 ) -> None:
-    data = some(20 * CHUNK_SIZE)
+    data = sample_bytes(20 * CHUNK_SIZE)
     cid = holder_store.put_bytes(data)
     root = holder_store.get_block(cid)
     assert root is not None
@@ -65,7 +65,7 @@ async def test_a_holder_of_the_root_that_lies_about_the_parts_is_left_for_anothe
             query.reply(query.key_expr, true_root[:-1])
             loop.call_soon_threadsafe(lied.set)
 
-    with answering(third_session, half_lie):
+    with answer_queries(third_session, half_lie):
         async with Exchange(session, store) as exchange:
             fetching = asyncio.create_task(exchange.fetch(cid))
             await lied.wait()
@@ -78,7 +78,7 @@ async def test_if_all_lie_the_content_is_corrupt_and_they_are_named(
     store: Store, session: zenoh.Session, other_session: zenoh.Session
 ) -> None:
     cid = cid_of_bytes(b"true")
-    with answering(other_session, lambda query: query.reply(query.key_expr, bytes(3 << 20))):
+    with answer_queries(other_session, lambda query: query.reply(query.key_expr, bytes(3 << 20))):
         async with Exchange(session, store) as exchange:
             with pytest.raises(ContentCorrupt) as caught:
                 await exchange.fetch(cid, timeout=0.3)
@@ -94,7 +94,7 @@ async def test_a_holder_that_never_answers_does_not_hold_up_another(
     other_session: zenoh.Session,
     third_session: zenoh.Session,
 ) -> None:
-    data = some(10 * CHUNK_SIZE)
+    data = sample_bytes(10 * CHUNK_SIZE)
     cid = holder_store.put_bytes(data)
     kept: list[zenoh.Query] = []
     silent = third_session.declare_queryable("aira/cid/*", kept.append)
