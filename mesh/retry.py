@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import random
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -42,6 +41,12 @@ REMOTE: Final = RetryPolicy(initial=0.5, ceiling=30.0)
 """For a node, a router or a daemon that does not answer: retries until it does."""
 
 
+async def _sleep(seconds: float) -> None:
+    import asyncio  # on first use: edge processes retry without an event loop
+
+    await asyncio.sleep(seconds)
+
+
 class Backoff:
     """The attempts at one thing: `next_delay` after each failure, `reset` after a success.
 
@@ -52,7 +57,7 @@ class Backoff:
         self,
         policy: RetryPolicy = REMOTE,
         *,
-        sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
+        sleep: Callable[[float], Awaitable[None]] = _sleep,
         chance: Callable[[], float] = random.random,
     ) -> None:
         self._policy = policy

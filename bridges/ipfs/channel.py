@@ -20,8 +20,7 @@ from bridges.ipfs.report import figures_of, news
 from bridges.ipfs.status import BridgeStatus, status_key
 from bridges.ipfs.traffic import LIMIT, Fate, Traffic
 from mesh.errors import InvalidMessage
-from mesh.network import Pump
-from mesh.network.crossing import call_in_loop
+from mesh.network import Pump, call_in_loop
 from mesh.role import Role
 from schemas import lighthouse_selector
 

@@ -15,7 +15,7 @@ from mesh.content import ContentUnavailable
 from mesh.content.download import HOLDER
 from mesh.content.exchange import CID_SELECTOR
 from mesh.errors import AiraError, ClosedError, InvalidKey
-from mesh.network.crossing import call_in_loop
+from mesh.network import call_in_loop
 from schemas import CidKey, InputError, parse_block, parse_key
 from schemas.status import ContentMetrics
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from bridges.ipfs.writing import legacy_json
 from mesh.errors import AiraError, InvalidMessage
-from mesh.network.addressing import key_of
+from mesh.network.validation import key_of
 from schemas import (
     FeedbackKey,
     Message,

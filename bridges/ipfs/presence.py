@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import zenoh
 
 from bridges.ipfs.turns import ROLE, Turn, turn_of
-from mesh.network.crossing import call_in_loop
+from mesh.network import call_in_loop
 from schemas import InvalidKey, PresenceKey, parse_key, presence_selector
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from bridges.serial.edge import Edge
 from bridges.serial.ports import PortName
 from bridges.serial.telling import tell_log
 from mesh.cli.output import announce
-from mesh.network.opening import Opening
+from mesh.network.connecting import SessionOpening
 from mesh.running import INTERRUPTED
 from mesh.starting import AGAIN, lacking
 from mesh.telemetry.context import LogSource
@@ -99,7 +99,7 @@ def serve(device: DeviceId, wiring: Wiring, *, endpoints: Endpoints, told: Told)
     dialect = dialect_of(wiring.protocol, baud=wiring.baud, parameters=wiring.parameters)
     device.key(PRESENT)
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(INTERRUPTED))
-    with Opening(endpoints).run() as session:
+    with SessionOpening(endpoints).run() as session:
         edge = Edge(session, device, name, dialect, baud=wiring.baud, patience=wiring.patience, names=wiring.names)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda number, frame: edge.stop())

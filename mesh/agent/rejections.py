@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from mesh.background import Background
 from mesh.chain import NodeUnreachable, RequestRefused
-from mesh.network.crossing import call_in_loop
+from mesh.network import call_in_loop
 from schemas import InvalidRecord, market_selector
 from schemas.signing import Rejection
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 
 from mesh.doctor.certificate import own_identity
-from mesh.network.endpoints import SECURE
+from mesh.network.endpoints import TLS_PREFIXES
 from mesh.settings import DEFAULTS
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ class Case:
     @property
     def is_secure(self) -> bool:
         """Whether it goes to a site, where everybody shows a certificate."""
-        return any(locator.startswith(SECURE) for locator in self.connect)
+        return any(locator.startswith(TLS_PREFIXES) for locator in self.connect)
 
     @property
     def has_identity(self) -> bool:

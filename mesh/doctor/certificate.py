@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from mesh.errors import AiraError, ConfigurationError, InvalidAddress
-from mesh.network.endpoints import tls_of
+from mesh.network import Tls
 from mesh.network.handshake import check_files
 from schemas.address import parse_address
 
 if TYPE_CHECKING:
-    from mesh.network import Tls
     from mesh.settings import Settings
 
 
@@ -55,7 +54,7 @@ def shown_by(tls: Tls, *, mode: str) -> Shown | None:
 def own_identity(settings: Settings) -> Shown | None:
     """The same for the settings' certificate; None also where it is of no use, which is for a check to find."""
     try:
-        tls = tls_of(settings)
+        tls = Tls.from_settings(settings)
         return None if tls is None else shown_by(tls, mode="client")
     except AiraError:
         return None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 from mesh.doctor.findings import Finding, broken, of_error
 from mesh.errors import AiraError
-from mesh.network.crossing import call_in_loop
+from mesh.network import call_in_loop
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence

@@ -14,18 +14,18 @@ from typing import TYPE_CHECKING, Any, Final
 from mesh.doctor.certificate import context_of, end_of, shown_by, texts_of
 from mesh.doctor.clock import SOON, days_left
 from mesh.doctor.findings import Finding, broken, doubtful, sound
-from mesh.network.endpoints import check_locators, tls_of
-from mesh.network.handshake import EVERYWHERE, refusal
+from mesh.network import Tls
+from mesh.network.endpoints import check_locators
+from mesh.network.handshake import WILDCARD_HOSTS, refusal_reason
 
 if TYPE_CHECKING:
     from mesh.doctor.case import Case
-    from mesh.network import Tls
     from mesh.settings import Settings
 
 SECONDS: Final = 3.0
 """In which a router answers, or is taken for dead."""
 PLACE: Final = re.compile(r"(?P<kind>tcp|tls)/(?:\[(?P<six>[^\]]+)\]|(?P<host>[^:]+)):(?P<port>[0-9]+)")
-LOOPBACK: Final = dict(zip(EVERYWHERE, ("127.0.0.1", "::1"), strict=True))
+LOOPBACK: Final = dict(zip(WILDCARD_HOSTS, ("127.0.0.1", "::1"), strict=True))
 """Where this machine reaches who listens everywhere."""
 OWN_FILES: Final = "give --tls-ca, --tls-certificate and --tls-key of its site; `aira identity show` tells of them"
 
@@ -52,18 +52,22 @@ def look_at(locator: str, settings: Settings) -> Finding:
     except OSError as error:
         return _unanswered(locator, error)
     answers = f"{locator} answers in {(time.monotonic() - began) * 1000:.1f} ms"
-    return sound(answers) if place["kind"] == "tcp" else _shown(locator, tls_of(settings), (host, port), answers)
+    return (
+        sound(answers)
+        if place["kind"] == "tcp"
+        else _shown(locator, Tls.from_settings(settings), (host, port), answers)
+    )
 
 
 def is_everywhere(locator: str) -> bool:
     """Whether a router that listens there can't be asked by a name that its certificate has."""
     place = PLACE.match(locator)
-    return place is not None and place["kind"] == "tls" and (place["six"] or place["host"]) in EVERYWHERE
+    return place is not None and place["kind"] == "tls" and (place["six"] or place["host"]) in WILDCARD_HOSTS
 
 
 def look_at_certificate(case: Case) -> Finding:
     """Whether the own files can be used, and for how long. Raises `ConfigurationError` where they can't."""
-    tls = tls_of(case.settings)
+    tls = Tls.from_settings(case.settings)
     if tls is None:
         return broken("a tls/ endpoint needs the site's certificate, and none is named", do=OWN_FILES)
     own = shown_by(tls, mode="router" if case.role == "router" else "client")
@@ -92,7 +96,7 @@ def _shown(locator: str, tls: Tls | None, place: tuple[str, int], answers: str) 
     """What a router behind TLS shows, and whether it takes what we show."""
     if tls is None:
         return broken(f"{locator}: the router wants to know who comes, and there is no certificate", do=OWN_FILES)
-    if (why := refusal(tls, locator, SECONDS)) is not None:
+    if (why := refusal_reason(tls, locator, SECONDS)) is not None:
         return broken(f"{locator}: {why}", do=f"is this router of the site of {tls.ca}? {OWN_FILES}")
     certificate = _certificate_of(tls, place, named=not is_everywhere(locator))
     if certificate is None:

@@ -18,7 +18,7 @@ from mesh.doctor.writing import Pair
 from mesh.identity.admission import NotAdmittedYet
 from mesh.identity.routers import is_loopback
 from mesh.network import Endpoints, Network
-from mesh.network.endpoints import SECURE
+from mesh.network.endpoints import TLS_PREFIXES
 from schemas.key_chunks import address_chunk, lighthouse_chunk, name_chunk
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ class Wire:
         """The router let a write pass that no role may make."""
         if "router" in self._roles:
             return sound("not tried: a router's own identity may write everything; ask with a member's")
-        if self._locator.startswith(SECURE):
+        if self._locator.startswith(TLS_PREFIXES):
             return broken(f"the router lets anybody write anything: a write in {where} came through", do=ROSTER)
         if is_loopback(self._locator):
             return sound("the router is open: everybody may write everything, which is fine on this machine alone")

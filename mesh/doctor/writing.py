@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import zenoh
 
 from mesh.errors import RemoteError
-from mesh.network.crossing import call_in_loop
+from mesh.network import call_in_loop
 
 if TYPE_CHECKING:
     from collections.abc import Callable

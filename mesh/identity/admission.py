@@ -7,8 +7,7 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING, Final
 
 from mesh.errors import RemoteError
-from mesh.network import Network
-from mesh.network.crossing import call_in_loop
+from mesh.network import Network, call_in_loop
 from schemas.keys import DeviceTopicKey
 
 if TYPE_CHECKING:

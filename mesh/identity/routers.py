@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, Final
 from mesh.errors import ConfigurationError
 from mesh.identity.roster import read_roster
 from mesh.identity.zenoh_rules import access_control
-from mesh.network.endpoints import Endpoints, check_locators, tls_of
+from mesh.network import Tls
+from mesh.network.endpoints import Endpoints, check_locators
 
 if TYPE_CHECKING:
     from mesh.settings import Settings
@@ -29,14 +30,14 @@ def router_endpoints(settings: Settings) -> Endpoints:
     """
     if not settings.roster:
         check_loopback((*settings.listen, *settings.link))
-        return Endpoints(mode="router", listen=settings.listen, connect=settings.link, tls=tls_of(settings))
+        return Endpoints(mode="router", listen=settings.listen, connect=settings.link, tls=Tls.from_settings(settings))
     roster = read_roster(Path(settings.roster).expanduser())
     for locator in (*settings.listen, *settings.link):
         if not locator.startswith("tls/"):
             raise ConfigurationError(
                 f"{locator} does not tell who connects, and there is a roster", hint="write it as tls/HOST:PORT"
             )
-    tls = tls_of(settings)
+    tls = Tls.from_settings(settings)
     if tls is None:
         raise ConfigurationError(
             "a router with a roster needs the site's certificate, its own and its key",

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 import zenoh
 
-from mesh.network import verified_key
-from mesh.network.crossing import call_in_loop
+from mesh.network import call_in_loop, verified_key
 from schemas import encode, lighthouse_selector
 
 if TYPE_CHECKING:

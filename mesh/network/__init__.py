@@ -1,4 +1,4 @@
-"""Zenoh: sessions, the channel of verified messages, services."""
+"""Zenoh: sessions, the channel of verified messages, presence, services."""
 
 from __future__ import annotations
 
@@ -7,16 +7,14 @@ from typing import TYPE_CHECKING, Final
 from schemas.loading import on_demand
 
 if TYPE_CHECKING:
-    from mesh.network.addressing import message_key, verified_key
     from mesh.network.channel import Channel
-    from mesh.network.endpoints import Endpoints, free_endpoint
-    from mesh.network.errors import NotAdmitted
-    from mesh.network.pump import Pump
+    from mesh.network.connecting import NotAdmitted
+    from mesh.network.endpoints import Endpoints, Tls, free_endpoint
+    from mesh.network.pump import Pump, call_in_loop
     from mesh.network.services import ServiceFailed, Services, call
     from mesh.network.session import Network, NetworkChange
     from mesh.network.subscription import Subscription
-    from mesh.network.tls import Tls
-    from mesh.network.validation import MessageValidator, Statistics
+    from mesh.network.validation import MessageValidator, ValidationStatistics, message_key, verified_key
 
 _HOMES: Final = {
     "Channel": "mesh.network.channel",
@@ -24,20 +22,21 @@ _HOMES: Final = {
     "Endpoints": "mesh.network.endpoints",
     "Network": "mesh.network.session",
     "NetworkChange": "mesh.network.session",
-    "NotAdmitted": "mesh.network.errors",
+    "NotAdmitted": "mesh.network.connecting",
     "Pump": "mesh.network.pump",
     "ServiceFailed": "mesh.network.services",
     "Services": "mesh.network.services",
-    "Statistics": "mesh.network.validation",
     "Subscription": "mesh.network.subscription",
-    "Tls": "mesh.network.tls",
+    "Tls": "mesh.network.endpoints",
+    "ValidationStatistics": "mesh.network.validation",
     "call": "mesh.network.services",
+    "call_in_loop": "mesh.network.pump",
     "free_endpoint": "mesh.network.endpoints",
-    "message_key": "mesh.network.addressing",
-    "verified_key": "mesh.network.addressing",
+    "message_key": "mesh.network.validation",
+    "verified_key": "mesh.network.validation",
 }
 
-# An edge agent opens a session and needs no event loop for it.
+# Names load on first use: an edge process opens a session without asyncio.
 __getattr__ = on_demand(__name__, _HOMES)
 
 __all__ = [
@@ -50,10 +49,11 @@ __all__ = [
     "Pump",
     "ServiceFailed",
     "Services",
-    "Statistics",
     "Subscription",
     "Tls",
+    "ValidationStatistics",
     "call",
+    "call_in_loop",
     "free_endpoint",
     "message_key",
     "verified_key",

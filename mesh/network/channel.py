@@ -1,22 +1,22 @@
 """A lighthouse's channel: the market's messages, published and received verified.
 
-A lighthouse is a market; in keys it is its ENS name. Messages on the wire are gone once sent: the provider's order
-book is the market's memory and answers queries with the open orders, so `Subscription.recall` after subscribing
-misses nothing.
+Zenoh keeps no messages. The providers' order books do, and answer queries with the open orders: subscribe first and
+then call `Subscription.recall`, and you miss nothing.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+from contextvars import copy_context
 from typing import TYPE_CHECKING, Any, Self
 
 import zenoh
 
 from mesh.errors import ClosedError, InputError, InvalidKey
-from mesh.network.addressing import KINDS, message_key
+from mesh.network.pump import call_in_loop
 from mesh.network.subscription import RECALL_LIMIT, RECALL_TIMEOUT, Subscription
-from mesh.network.validation import M, MessageValidator
+from mesh.network.validation import M, MessageValidator, message_key
 from schemas import (
     Result,
     SignedMessage,
@@ -40,10 +40,10 @@ log = logging.getLogger(__name__)
 class Channel:
     """The channel of one lighthouse on an open session: `async with Channel(session, lighthouse) as channel`.
 
-    `lighthouse` is the ENS name of the market. `address`, where it is known, is what orders must name as their
-    lighthouse; `resolver` looks up ENS names in messages; `head` tells the latest block, for deadlines. Leaving
-    `async with` withdraws the presence tokens; the session stays the caller's to close. Raises `InvalidKey` for a name
-    that no key may hold.
+    `lighthouse` is the ENS name of the market. `address`, if given, is the lighthouse that orders must name;
+    `resolver` resolves ENS names in messages; `head` returns the latest block number, for deadlines. Leaving
+    `async with` withdraws the presence tokens and ends the watches; the caller closes the session. Raises `InvalidKey`
+    for a name that no key may contain.
     """
 
     def __init__(
@@ -57,16 +57,16 @@ class Channel:
     ) -> None:
         self._session = session
         self.lighthouse = lighthouse.lower()
-        lighthouse_selector(self.lighthouse)  # raises InvalidKey for a name that no key may hold
+        lighthouse_selector(self.lighthouse)  # raises InvalidKey
         self.address = address
         self._resolver = resolver
         self._head = head
-        self._tokens: list[Any] = []
+        self._declarations: list[Any] = []
         self._open = False
 
     async def __aenter__(self) -> Self:
         if self._open:
-            raise ClosedError("this channel is open already")
+            raise ClosedError("this channel is already open")
         self._open = True
         return self
 
@@ -74,16 +74,16 @@ class Channel:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._open = False
-        tokens, self._tokens = self._tokens, []
+        declarations, self._declarations = self._declarations, []
         if not self._session.is_closed():
-            for token in tokens:
-                token.undeclare()
+            for declaration in declarations:
+                declaration.undeclare()
 
     def publish(self, message: SignedMessage) -> str:
-        """Put a signed message on its key, at most once and without waiting; returns the key.
+        """Put a signed message on its key, at most once and without waiting; return the key.
 
-        Nothing tells whether anybody heard it: what must arrive is sent again until its effect is seen. Raises
-        `InputError` for a message without signature.
+        Delivery is not confirmed: send a message that must arrive again until its effect is seen. Raises `InputError`
+        for a message without a signature.
         """
         self._check_open()
         if not message.signature:
@@ -93,38 +93,63 @@ class Channel:
         return key
 
     def put(self, key: str, payload: bytes) -> None:
-        """Put bytes on a concrete key of the mesh, dropping rather than blocking when a link is congested.
+        """Put bytes on a key of the mesh. A congested link drops them rather than block.
 
-        Raises `InvalidKey` for a key with a wildcard: it would reach everybody.
+        Raises `InvalidKey` for a key with a wildcard, which would reach every subscriber.
         """
         self._check_open()
         if "*" in key:
-            raise InvalidKey(key, "it has a wildcard")
+            raise InvalidKey(key, "it contains a wildcard")
         self._session.put(key, payload, encoding="application/json", congestion_control=zenoh.CongestionControl.DROP)
 
     def subscribe(self, kind: type[M], *, model: str = "*", liability: str = "*") -> Subscription[M]:
-        """The verified messages of `kind` (`Demand`, `Offer` or `Result`) from now on.
+        """Subscribe to the verified messages of `kind` (`Demand`, `Offer` or `Result`).
 
-        With `model` (CIDv0) the network sends that model's orders only, with `liability` (an address) the Results for
-        that only.
+        `model` (CIDv0) limits orders to that model, `liability` (an address) limits Results to that liability; the
+        network filters at the source.
         """
         self._check_open()
-        selector = market_selector(self.lighthouse, KINDS[kind], model)
+        selector = market_selector(self.lighthouse, kind.kind, model)
         if liability != "*":
             selector = self._result_selector(kind, liability)
-        door: MessageValidator[M] = MessageValidator(
+        validator: MessageValidator[M] = MessageValidator(
             kind, lighthouse=self.lighthouse, address=self.address, head=self._head
         )
-        return Subscription(self._session, selector, door, self._resolver)
+        return Subscription(self._session, selector, validator, self._resolver)
 
     def announce(self, role: str, address: str) -> None:
-        """Show that the agent at `address` is here as `role`, for as long as the channel is open."""
+        """Announce the agent at `address` as present in `role`, for as long as the channel is open."""
         self._check_open()
         key = str(PresenceKey(self.lighthouse, role, address))
-        self._tokens.append(self._session.liveliness().declare_token(key))
+        self._declarations.append(self._session.liveliness().declare_token(key))
+
+    def watch_presence(
+        self,
+        appeared: Callable[[PresenceKey], object],
+        *,
+        gone: Callable[[PresenceKey], object] = lambda key: None,
+        role: str | None = None,
+    ) -> None:
+        """Call `appeared` for each announced agent, those of now included, and `gone` when one leaves.
+
+        `role` limits this to agents in that role, such as `provider`. The callbacks run in the event loop, in the
+        caller's context, until the channel closes. An agent whose link to its router broke is gone, too, and appears
+        again when the link is restored.
+        """
+        self._check_open()
+        loop, context = asyncio.get_running_loop(), copy_context()
+
+        def changed(sample: zenoh.Sample) -> None:
+            for key in _presence_keys([str(sample.key_expr)]):
+                if role is None or key.role == role:
+                    notify = appeared if sample.kind == zenoh.SampleKind.PUT else gone
+                    call_in_loop(loop, notify, key, context=context)
+
+        selector = presence_selector(self.lighthouse)
+        self._declarations.append(self._session.liveliness().declare_subscriber(selector, changed, history=True))
 
     async def present(self) -> list[PresenceKey]:
-        """Who is on the channel now: each announced role and address, in the order of their keys."""
+        """The agents that are announced on the channel now: role and address, in the order of their keys."""
         self._check_open()
         return await asyncio.to_thread(self._present)
 
@@ -136,7 +161,7 @@ class Channel:
 
     def _result_selector(self, kind: type[Any], liability: str) -> str:
         if kind is not Result:
-            raise InputError(f"the keys of a {KINDS[kind]} do not name a liability")
+            raise InputError(f"a {kind.kind} has no liability to select by")
         return market_selector(self.lighthouse, "result").replace("*", parse_address(liability).lower(), 1)
 
     def _check_open(self) -> None:
@@ -145,12 +170,12 @@ class Channel:
 
 
 def _presence_keys(texts: list[str]) -> Iterator[PresenceKey]:
-    """Those of the keys that are in the keyspace: anybody may declare a token on any."""
+    """The valid keys among `texts`: anybody may declare a token on any key."""
     for text in texts:
         try:
             key = parse_key(text)
         except InvalidKey as error:
-            log.debug("a presence token is left out: %s", error)
+            log.debug("ignored a presence token: %s", error)
             continue
         if isinstance(key, PresenceKey):
             yield key

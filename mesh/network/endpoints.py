@@ -1,4 +1,4 @@
-"""Where a Zenoh session goes, and as what."""
+"""The endpoints and the identity of a Zenoh session, and the Zenoh configuration made from them."""
 
 from __future__ import annotations
 
@@ -12,37 +12,82 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import zenoh
 
 from mesh.errors import ConfigurationError
-from mesh.network.tls import Tls
+from mesh.retry import RetryPolicy
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from mesh.settings import NetworkSettings
 
-RETRY: Final = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
-"""Pauses between attempts to reach a router again: short, so that an agent is back within a second."""
-ATTEMPT: Final = 3.0
-"""Seconds that an endpoint has to answer in one attempt."""
-QUEUED: Final = 16
-"""Batches of 64 kB that wait for a link before messages are dropped; Zenoh's own two lose some of a hundred puts."""
+RECONNECT: Final = RetryPolicy(initial=0.1, factor=1.5, ceiling=0.5)
+"""Delays between attempts to reach a router: short, so that an agent is back within a second."""
+ATTEMPT_TIMEOUT: Final = 3.0
+"""Seconds an endpoint has to answer in one attempt."""
+SEND_QUEUE_BATCHES: Final = 16
+"""Batches of 64 kB queued for a link before messages are dropped. Zenoh's default of two drops some of 100 puts."""
 LOCATOR: Final = re.compile(
     r"(?:tcp|udp|tls|quic|ws)/(?:\[[0-9A-Fa-f:.%]+\]|[^\s:/?#\[\]]+):(?P<port>[0-9]{1,5})(?:[?#]\S*)?"
     r"|(?:unixsock-stream|unixpipe|serial|vsock)/\S+"
 )
-"""What Zenoh takes for an endpoint; it does not complain of others, it only never connects to them."""
-SECURE: Final = ("tls/", "quic/")
-"""How locators begin on which both sides show certificates."""
+"""The endpoints that Zenoh connects to. It reports no error for others; it never connects to them."""
+TLS_PREFIXES: Final = ("tls/", "quic/")
+"""Prefixes of locators on which both sides show certificates."""
 HIGHEST_PORT: Final = 65_535
 
 
 @dataclass(frozen=True, kw_only=True)
-class Endpoints:
-    """Where a session goes, and as what.
+class Tls:
+    """The certificate files of one identity (paths, PEM): the site's, the session's own, and its key.
 
-    `connect` and `listen` are Zenoh locators (`tcp/HOST:PORT`). `mode` is `client` for agents, `router` for the
-    process that holds the market together; what that one connects to are other routers, which it goes on trying for
-    as long as it is open. `timeout` is in seconds; -1 waits for ever. `tls` is who the session is on
-    `tls/` locators. `access` is Zenoh's `access_control`: who may do what on this router.
+    A client may omit the last two; then only a router that requires no client certificate accepts it. Zenoh reads the
+    files on every connection, so a renewed certificate takes effect without a restart.
+    """
+
+    ca: Path
+    certificate: Path | None = None
+    key: Path | None = None
+
+    @classmethod
+    def from_settings(cls, settings: NetworkSettings) -> Tls | None:
+        """The identity that the settings name, None if they name none. Raises `ConfigurationError`."""
+        if not settings.tls_ca and (settings.tls_certificate or settings.tls_key):
+            raise ConfigurationError("tls_certificate is set, but tls_ca is not", hint="add --tls-ca")
+        if not settings.tls_ca:
+            return None
+        return cls(
+            ca=Path(settings.tls_ca).expanduser(),
+            certificate=Path(settings.tls_certificate).expanduser() if settings.tls_certificate else None,
+            key=Path(settings.tls_key).expanduser() if settings.tls_key else None,
+        )
+
+    @property
+    def pair(self) -> tuple[Path, Path] | None:
+        """The session's own certificate and its key, None without them."""
+        return None if self.certificate is None or self.key is None else (self.certificate, self.key)
+
+    def options(self, mode: str) -> dict[str, object]:
+        """Zenoh's options below `transport/link/tls` for a session in this mode. Paths are absolute."""
+        options: dict[str, object] = {
+            "root_ca_certificate": str(self.ca.absolute()),
+            "enable_mtls": self.pair is not None,
+            "verify_name_on_connect": True,
+            "close_link_on_expiration": True,
+        }
+        if self.pair is not None:
+            certificate, key = (str(path.absolute()) for path in self.pair)
+            for use in ("connect", "listen") if mode == "router" else ("connect",):
+                options |= {f"{use}_certificate": certificate, f"{use}_private_key": key}
+        return options
+
+
+@dataclass(frozen=True, kw_only=True)
+class Endpoints:
+    """Where a session connects and listens, and with what identity.
+
+    `connect` and `listen` are Zenoh locators (`tcp/HOST:PORT`). `mode` is `client` for agents and `router` for routers.
+    A router connects to other routers and retries them as long as it is open. `timeout` is the time in seconds to
+    reach a first router; -1 waits forever. `tls` is the identity on `tls/` locators. `access` is Zenoh's
+    `access_control`: the rights of each client of this router.
     """
 
     connect: tuple[str, ...] = ()
@@ -54,14 +99,14 @@ class Endpoints:
 
     @classmethod
     def from_settings(cls, settings: NetworkSettings) -> Endpoints:
-        """Where the settings' client connects to, and as whom."""
-        return cls(connect=settings.connect, timeout=settings.connect_timeout, tls=tls_of(settings))
+        """The endpoints and identity of a client. Raises `ConfigurationError` for an incomplete identity."""
+        return cls(connect=settings.connect, timeout=settings.connect_timeout, tls=Tls.from_settings(settings))
 
     def config(self) -> zenoh.Config:
-        """The Zenoh configuration of one attempt to open a session, in which each endpoint is tried once.
+        """The Zenoh configuration for one attempt to open a session, which tries each endpoint once.
 
-        Zenoh's own time limit is not used: within it only the first endpoint is tried, again and again. Raises
-        `ConfigurationError` for a locator that Zenoh would silently not use, and for a client without any.
+        Zenoh's own timeout is not used: within it, Zenoh tries only the first endpoint. Raises `ConfigurationError`
+        for a locator that Zenoh would silently ignore, for a client without a locator, and for unusable certificates.
         """
         self._check()
         config = zenoh.Config()
@@ -70,18 +115,22 @@ class Endpoints:
         return config
 
     def options(self) -> dict[str, object]:
-        """The options of that configuration, by their paths in Zenoh's."""
-        answer_within = min(self.timeout, ATTEMPT) if self.timeout > 0 else ATTEMPT
+        """The options of that configuration, by their path in Zenoh's configuration."""
+        answer_within = min(self.timeout, ATTEMPT_TIMEOUT) if self.timeout > 0 else ATTEMPT_TIMEOUT
         options: dict[str, object] = {
             "mode": self.mode,
             "connect/endpoints": list(self.connect),
             "listen/endpoints": list(self.listen),
             "connect/timeout_ms": -1 if self.mode == "router" else 0,
             "transport/unicast/open_timeout": max(1, int(answer_within * 1000)),
-            "connect/retry": RETRY,
-            "transport/link/tx/queue/size/data": QUEUED,
+            "connect/retry": {
+                "period_init_ms": round(RECONNECT.initial * 1000),
+                "period_max_ms": round(RECONNECT.ceiling * 1000),
+                "period_increase_factor": RECONNECT.factor,
+            },
+            "transport/link/tx/queue/size/data": SEND_QUEUE_BATCHES,
             "scouting/multicast/enabled": False,
-            # For others that would be found by scouting a router waits half a second.
+            # Otherwise a router waits half a second for others that scouting might find.
             "scouting/delay": 0,
         }
         if self.tls is not None:
@@ -93,11 +142,11 @@ class Endpoints:
     def _check(self) -> None:
         check_locators(*self.connect, *self.listen)
         if self.mode == "client" and not self.connect:
-            raise ConfigurationError("there is no Zenoh router to connect to", hint="name one with --connect")
-        if not any(locator.startswith(SECURE) for locator in (*self.connect, *self.listen)):
+            raise ConfigurationError("no Zenoh router to connect to", hint="name one with --connect tcp/HOST:PORT")
+        if not any(locator.startswith(TLS_PREFIXES) for locator in (*self.connect, *self.listen)):
             return
         if self.tls is not None:
-            from mesh.network.handshake import check_files  # with which comes Python's own TLS, some megabytes
+            from mesh.network.handshake import check_files  # loads Python's TLS, some megabytes
 
             check_files(self.tls, mode=self.mode)
         else:
@@ -107,7 +156,7 @@ class Endpoints:
 
 
 def check_locators(*locators: str) -> None:
-    """Raise `ConfigurationError` for what Zenoh would silently not use."""
+    """Raise `ConfigurationError` for a locator that Zenoh would silently ignore."""
     for locator in locators:
         parts = LOCATOR.fullmatch(locator)
         if parts is None or int(parts["port"] or 0) > HIGHEST_PORT:
@@ -117,21 +166,8 @@ def check_locators(*locators: str) -> None:
             )
 
 
-def tls_of(settings: NetworkSettings) -> Tls | None:
-    """The identity that the settings name, if they name any."""
-    if not settings.tls_ca and (settings.tls_certificate or settings.tls_key):
-        raise ConfigurationError("tls_certificate is set, and tls_ca is not", hint="give --tls-ca")
-    if not settings.tls_ca:
-        return None
-    return Tls(
-        ca=Path(settings.tls_ca).expanduser(),
-        certificate=Path(settings.tls_certificate).expanduser() if settings.tls_certificate else None,
-        key=Path(settings.tls_key).expanduser() if settings.tls_key else None,
-    )
-
-
 def free_endpoint() -> str:
-    """A loopback TCP locator whose port was free a moment ago, for a router inside this process."""
+    """A loopback TCP locator on a port that is free now, for a router inside this process."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

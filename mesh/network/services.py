@@ -1,7 +1,7 @@
-"""Services: questions to an agent over Zenoh, answered in its event loop; the queryables of `aira/agent/…/rpc/…`.
+"""Services: remote calls to an agent over Zenoh, handled in its event loop (queryables at `aira/agent/…/rpc/…`).
 
-Requests and replies are the JSON of the structs in `schemas.rpc`. An `AiraError` travels back as an error reply and is
-raised again where the question was asked.
+Requests and replies are the JSON of the structs in `schemas.rpc`. An `AiraError` in a handler is sent back as an error
+reply, which `call` raises as `ServiceFailed`.
 """
 
 from __future__ import annotations
@@ -11,12 +11,13 @@ import difflib
 import logging
 from contextvars import copy_context
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypeAlias
 
 import zenoh
 
 from mesh.errors import AiraError, ClosedError, RemoteError
-from mesh.network.crossing import call_in_loop
+from mesh.network.pump import call_in_loop
+from mesh.telemetry.context import log_event
 from schemas import InvalidRecord, Record, RpcKey
 from schemas.rpc import SERVICES, SPENDING
 
@@ -28,45 +29,48 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+FailureReason: TypeAlias = Literal["unknown-service", "no-agent", "timeout", "unreadable-reply", "agent-error"]
+
 TIMEOUT: Final = 10.0
-"""Seconds to wait for an answer."""
+"""Seconds to wait for a reply."""
 SPENDING_TIMEOUT: Final = 240.0
-"""Seconds to wait for an answer that is given when a transaction is mined: who asks again too early pays twice."""
-AT_ONCE: Final = 256
-"""Questions that an agent answers at the same time; whoever asks more is told to come again."""
+"""Seconds to wait for a reply that needs a mined transaction. Calling again too early would pay twice."""
+CONCURRENT_REQUESTS: Final = 256
+"""Requests that an agent handles at the same time; more get an error reply."""
 
 
 class Failure(Record, frozen=True):
-    """What an error reply holds: the error's line and what to do about it."""
+    """The content of an error reply: the error's message and hint."""
 
     error: str
     hint: str = ""
 
 
-BUSY: Final = Failure("the agent is answering too many questions", "ask again later").encode()
+BUSY: Final = Failure("the agent is handling too many requests", "try again later").encode()
 
 
 class ServiceFailed(RemoteError):
-    """The agent that was asked answered with an error, or did not answer; `service` is what was asked."""
+    """The agent replied to a call of `service` with an error, or did not reply; `reason` tells which."""
 
     code = "service-failed"
 
-    def __init__(self, service: str, why: str, *, hint: str = "") -> None:
+    def __init__(self, service: str, why: str, *, hint: str = "", reason: FailureReason = "agent-error") -> None:
         super().__init__(f"{service}: {why}", hint=hint)
         self.service = service
+        self.reason: FailureReason = reason
 
 
 class Services:
     """The services of the agent at `address`: `async with Services(session, address)`, then `offer` each.
 
-    Leaving `async with` withdraws them and breaks off what is not answered yet.
+    Leaving `async with` withdraws them and cancels requests in progress.
     """
 
     def __init__(self, session: zenoh.Session, address: str) -> None:
         self._session = session
         self._address = address
         self._queryables: list[Any] = []
-        self._answers: set[asyncio.Task[None]] = set()
+        self._requests: set[asyncio.Task[None]] = set()
         self._open = False
 
     async def __aenter__(self) -> Self:
@@ -81,42 +85,47 @@ class Services:
         if not self._session.is_closed():
             for queryable in queryables:
                 queryable.undeclare()
-        for answer in self._answers:
-            answer.cancel()
-        if self._answers:
-            await asyncio.wait(self._answers)
+        for request in self._requests:
+            request.cancel()
+        if self._requests:
+            await asyncio.wait(self._requests)
+
+    @property
+    def in_progress(self) -> int:
+        """The requests that are being handled."""
+        return len(self._requests)
 
     def offer(self, service: str, handler: Callable[[Any], Awaitable[Record]]) -> None:
-        """Answer `service` (one of `schemas.rpc.SERVICES`) with what `handler` makes of each request.
+        """Reply to requests for `service` (one of `schemas.rpc.SERVICES`) with the result of `handler`.
 
-        Requests are handled concurrently; an `AiraError` of the handler travels to who asked. Raises `ServiceFailed`
-        for a service that there isn't, `ClosedError` outside `async with`.
+        Requests are handled concurrently; an `AiraError` of the handler is sent to the caller. Raises `ServiceFailed`
+        for an unknown service, `ClosedError` outside `async with`.
         """
         if not self._open:
             raise ClosedError("the services are not open", hint="use them inside `async with`")
         loop, request_type = asyncio.get_running_loop(), _service(service).request
         key, context = str(RpcKey(self._address, service)), copy_context()
 
-        def asked(query: zenoh.Query) -> None:
-            call_in_loop(loop, self._answer_soon, query, key, request_type, handler, context=context)
+        def received(query: zenoh.Query) -> None:
+            call_in_loop(loop, self._accept, query, key, request_type, handler, context=context)
 
-        self._queryables.append(self._session.declare_queryable(key, asked))
+        self._queryables.append(self._session.declare_queryable(key, received))
 
-    def _answer_soon(
+    def _accept(
         self, query: zenoh.Query, key: str, request_type: type[Record], handler: Callable[[Any], Awaitable[Record]]
     ) -> None:
         if not self._open:
             query.drop()  # type: ignore[no-untyped-call]
             return
-        if len(self._answers) >= AT_ONCE:
+        if len(self._requests) >= CONCURRENT_REQUESTS:
             with query:
                 query.reply_err(BUSY)
             return
-        answer = asyncio.create_task(self._answer(query, key, request_type, handler), name=f"answer {key}")
-        self._answers.add(answer)
-        answer.add_done_callback(self._answers.discard)
+        request = asyncio.create_task(self._handle(query, key, request_type, handler), name=f"handle {key}")
+        self._requests.add(request)
+        request.add_done_callback(self._requests.discard)
 
-    async def _answer(
+    async def _handle(
         self, query: zenoh.Query, key: str, request_type: type[Record], handler: Callable[[Any], Awaitable[Record]]
     ) -> None:
         with query:
@@ -126,8 +135,8 @@ class Services:
             except AiraError as error:
                 query.reply_err(Failure(str(error), error.hint).encode())
             except Exception:
-                log.exception("service %s failed", key)
-                query.reply_err(Failure("the agent failed; its log says why").encode())
+                log.exception("service %s failed", key, extra=log_event("service-failed", key=key))
+                query.reply_err(Failure("the agent failed; see its log").encode())
             else:
                 query.reply(key, reply, encoding="application/json")
 
@@ -135,32 +144,34 @@ class Services:
 async def call(
     session: zenoh.Session, agent: str, service: str, request: Record, *, timeout: float | None = None
 ) -> Any:
-    """Ask `service` (one of `schemas.rpc.SERVICES`) of the agent at `agent` (address); its reply is that service's.
+    """Call `service` (one of `schemas.rpc.SERVICES`) of the agent at `agent` (address) and return its reply.
 
-    Raises `ServiceFailed` with the agent's own words, or that nobody answers within `timeout` seconds (by default
-    `TIMEOUT`, or `SPENDING_TIMEOUT` for what sends a transaction). Cancelling ends the asking; what was asked may be
-    done all the same.
+    Raises `ServiceFailed` with the agent's error, or when no reply arrives within `timeout` seconds (by default
+    `TIMEOUT`, or `SPENDING_TIMEOUT` for services that send a transaction). Cancelling stops the wait; the agent may
+    complete the request all the same.
     """
     if timeout is None:
         timeout = SPENDING_TIMEOUT if service in SPENDING else TIMEOUT
     key, reply_type = str(RpcKey(agent, service)), _service(service).reply
-    asking = zenoh.CancellationToken()
+    query = zenoh.CancellationToken()
     get = partial(session.get, key, payload=request.encode(), encoding="application/json", timeout=timeout)
     try:
-        reply = await asyncio.to_thread(lambda: next(iter(get(cancellation_token=asking)), None))
+        reply = await asyncio.to_thread(lambda: next(iter(get(cancellation_token=query)), None))
     finally:
-        asking.cancel()  # type: ignore[no-untyped-call]
+        query.cancel()  # type: ignore[no-untyped-call]
     if reply is not None and reply.ok is not None:
         return _read(service, reply_type, reply.ok.payload.to_bytes())
     if reply is not None and reply.err is not None:
         raise _failed(service, reply.err.payload.to_bytes(), timeout)
-    raise ServiceFailed(service, "nobody answers", hint="is the agent running, and on the same router?")
+    raise ServiceFailed(
+        service, "no agent answers", reason="no-agent", hint="is the agent running, and on the same router?"
+    )
 
 
 def _service(name: str) -> Service:
     if name not in SERVICES:
         nearest = difflib.get_close_matches(name, SERVICES, n=1, cutoff=0)[0]
-        raise ServiceFailed(name, "there is no such service", hint=f"did you mean {nearest!r}?")
+        raise ServiceFailed(name, "no such service", reason="unknown-service", hint=f"did you mean {nearest!r}?")
     return SERVICES[name]
 
 
@@ -168,12 +179,12 @@ def _read(service: str, reply_type: type[Record], payload: bytes) -> Record:
     try:
         return reply_type.decode(payload)
     except InvalidRecord as error:
-        raise ServiceFailed(service, f"the answer can't be read: {error}") from error
+        raise ServiceFailed(service, f"unreadable reply: {error}", reason="unreadable-reply") from error
 
 
 def _failed(service: str, payload: bytes, timeout: float) -> ServiceFailed:
     try:
         failure = Failure.decode(payload)
     except InvalidRecord:
-        return ServiceFailed(service, f"no answer within {timeout:g} s")  # Zenoh's own reply says `Timeout`
+        return ServiceFailed(service, f"no reply within {timeout:g} s", reason="timeout")  # Zenoh replies `Timeout`
     return ServiceFailed(service, failure.error, hint=failure.hint)

@@ -1,8 +1,7 @@
-"""One Zenoh session: opened by settings, closed for certain, with news of the network's loss and return.
+"""A Zenoh session with a lifetime, which reports when the last router is lost and when one is back.
 
-Source of the rules: the project's measurements of Zenoh 1.10 (a client that finds no router raises at once unless it
-is told to wait; subscribers and queryables come back unaided after a router's restart; a session left open keeps the
-interpreter from ending).
+Measured with Zenoh 1.10: a client that finds no router raises at once; subscribers and queryables are restored after a
+router's restart without our help; a session left open prevents the interpreter from exiting.
 """
 
 from __future__ import annotations
@@ -16,8 +15,9 @@ from typing import TYPE_CHECKING, Any, Self
 import zenoh
 
 from mesh.errors import ClosedError
-from mesh.network.crossing import call_in_loop
-from mesh.network.opening import Opening
+from mesh.network.connecting import SessionOpening
+from mesh.network.pump import call_in_loop
+from mesh.telemetry.context import log_event
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
@@ -29,19 +29,20 @@ log = logging.getLogger(__name__)
 
 
 class NetworkChange(Enum):
-    """What happened to the session's link to the mesh."""
+    """A change of the session's connection to the mesh."""
 
     LOST = "lost"
-    """The last router is gone. What is published now vanishes; keep it and send it again."""
+    """The last router was lost. Messages published now vanish; send them again."""
     REGAINED = "regained"
-    """A router answers again; subscribers, queryables and tokens have been declared anew by Zenoh."""
+    """A router is connected again, and Zenoh has restored subscribers, queryables and tokens."""
 
 
 class Network:
     """A Zenoh session with a lifetime: `async with Network(endpoints) as network`.
 
-    Opening and closing run in a thread, since both may block. Cancelling while it opens takes effect at once; the
-    thread ends with its attempt, some seconds later at most, and closes what came of it.
+    Opening and closing run in a thread, since both may block. Cancelling during opening takes effect at once; the
+    thread ends after its current attempt, within seconds, and closes the session if that succeeds. Raises
+    `NetworkUnavailable`, `NotAdmitted` or `ConfigurationError` when it can't be opened.
     """
 
     def __init__(self, endpoints: Endpoints) -> None:
@@ -50,7 +51,7 @@ class Network:
         self._watchers: set[asyncio.Queue[NetworkChange]] = set()
         self._linked: set[str] = set()
         self.losses = 0
-        """How often the network was lost since the session was made."""
+        """How often the last router was lost."""
         self._listener: Any = None
 
     @property
@@ -62,23 +63,23 @@ class Network:
 
     @property
     def id(self) -> str:
-        """The session's Zenoh id, as routers and peers show it."""
+        """The session's Zenoh id, as routers and peers report it."""
         return str(self.session.zid())
 
     @property
     def connected(self) -> bool:
-        """Whether a router is reachable now (a router itself always is, as long as it is open)."""
+        """Whether a router is connected now. A session in mode `router` is connected while it is open."""
         return self._session is not None and (self._endpoints.mode == "router" or bool(self._linked))
 
     @property
     def links(self) -> int:
-        """To how many others the session is linked: routers, or for a router its clients as well."""
+        """The number of connected routers; for a router, of its clients as well."""
         return len(self._linked)
 
     async def __aenter__(self) -> Self:
         if self._session is not None:
-            raise ClosedError("this network session is open already")
-        opening = Opening(self._endpoints)
+            raise ClosedError("this network session is already open")
+        opening = SessionOpening(self._endpoints)
         try:
             session = await asyncio.to_thread(opening.run)
             self._watch(session)
@@ -97,7 +98,7 @@ class Network:
             await asyncio.to_thread(session.close)
 
     def _watch(self, session: zenoh.Session) -> None:
-        """Follow the links. Those of now are read once the listener is there, so that none is missed in between."""
+        """Follow the links. The current ones are read after the listener is declared, so that none is missed."""
         loop, context = asyncio.get_running_loop(), copy_context()
         self._listener = session.info.declare_transport_events_listener(
             lambda event: call_in_loop(loop, self._transport_changed, event, context=context), history=True
@@ -114,13 +115,16 @@ class Network:
             return
         change = NetworkChange.REGAINED if self.connected else NetworkChange.LOST
         self.losses += change is NetworkChange.LOST
-        # No warning: commands say it in their own words.
-        log.info("a router is there again" if self.connected else "the router is gone; waiting for it")
+        # Not a warning: commands report the loss themselves.
+        if self.connected:
+            log.info("the router is back", extra=log_event("router-regained"))
+        else:
+            log.info("lost the router; waiting for it", extra=log_event("router-lost", losses=self.losses))
         for queue in self._watchers:
             queue.put_nowait(change)
 
     async def changes(self) -> AsyncGenerator[NetworkChange, None]:
-        """Each loss and return of the network since the iteration began, in order. Ends by cancellation or `aclose`."""
+        """Yield each loss and return of the network from now on. Ends by cancellation or `aclose`."""
         queue: asyncio.Queue[NetworkChange] = asyncio.Queue()
         self._watchers.add(queue)
         try:

@@ -1,4 +1,4 @@
-"""The verified messages of one kind, as they come."""
+"""A subscription: the verified messages of one kind, as an async iterator."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import zenoh
 
 from mesh.errors import AiraError
 from mesh.network.pump import Pump
-from mesh.network.validation import M, MessageValidator, Statistics, Unresolved
+from mesh.network.validation import M, MessageValidator, Unresolved, ValidationStatistics
 from schemas import Verified, names_in
 
 if TYPE_CHECKING:
@@ -23,42 +23,50 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 RECALL_TIMEOUT: Final = 5.0
-"""Seconds given to the providers to answer with their open orders."""
+"""Seconds that providers have to answer with their open orders."""
 RECALL_LIMIT: Final = 65_536
-"""Open orders taken from one recall at most."""
-LOOKING_UP: Final = 256
-"""Messages that wait for their ENS names at most; more are refused, since anybody may write names that nobody knows."""
+"""Open orders accepted from one recall, at most."""
+LOOKUP_LIMIT: Final = 256
+"""Messages that may wait for the resolution of their ENS names. More are rejected: anybody may send unknown names."""
 
 
 class Subscription(Generic[M]):
     """The verified messages of one kind, as an async iterator: `async with channel.subscribe(Demand) as demands`.
 
-    Ends by leaving `async with`; nothing arrives after that. One consumer. A message that names addresses by ENS is
-    overtaken by others while they are looked up. Raises `ClosedError` before it is entered.
+    The iteration ends when `async with` is left. Supports one consumer. Messages with ENS names are delivered once
+    `resolver` has resolved them, so later messages may overtake them; at most `lookup_limit` of them wait. Raises
+    `ClosedError` before it is entered.
     """
 
     def __init__(
-        self, session: zenoh.Session, selector: str, door: MessageValidator[M], resolver: Resolver | None
+        self,
+        session: zenoh.Session,
+        selector: str,
+        validator: MessageValidator[M],
+        resolver: Resolver | None,
+        *,
+        lookup_limit: int = LOOKUP_LIMIT,
     ) -> None:
         self._session = session
-        self._selector = selector
-        self._door: MessageValidator[M] = door
+        self.selector: Final = selector
+        """The key expression that is subscribed to."""
+        self._validator: MessageValidator[M] = validator
         self._resolver = resolver
-        self._pump: Pump[Verified[M] | Unresolved[M]] = Pump(session, selector, door)
-        self._named: asyncio.Queue[Unresolved[M]] = asyncio.Queue(LOOKING_UP)
-        self._recalls: set[zenoh.CancellationToken] = set()
+        self._pump: Pump[Verified[M] | Unresolved[M]] = Pump(session, selector, validator)
+        self._unresolved: asyncio.Queue[Unresolved[M]] = asyncio.Queue(lookup_limit)
+        self._queries: set[zenoh.CancellationToken] = set()
 
     async def __aenter__(self) -> Self:
         await self._pump.__aenter__()
-        self._looking_up = asyncio.create_task(self._look_up(), name=f"names on {self._selector}")
+        self._lookups = asyncio.create_task(self._resolve_names(), name=f"resolve names on {self.selector}")
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._looking_up.cancel()
-        for asking in tuple(self._recalls):
-            asking.cancel()  # type: ignore[no-untyped-call]
+        self._lookups.cancel()
+        for query in tuple(self._queries):
+            query.cancel()  # type: ignore[no-untyped-call]
         await self._pump.__aexit__(kind, error, trace)
 
     def __aiter__(self) -> Self:
@@ -66,60 +74,60 @@ class Subscription(Generic[M]):
 
     async def __anext__(self) -> Verified[M]:
         while isinstance(item := await anext(self._pump), Unresolved):
-            if self._resolver is None or self._named.full():
-                self._door.refuse("name")
+            if self._resolver is None or self._unresolved.full():
+                self._validator.reject("name")
             else:
-                self._named.put_nowait(item)
+                self._unresolved.put_nowait(item)
         return item
 
     async def recall(self) -> None:
-        """Ask the market's memory for what is open; the answers come out of the iterator, once each.
+        """Ask the providers for the open orders; the iterator yields each new one once.
 
-        Returns when all providers have answered or `RECALL_TIMEOUT` has passed; nobody there is no error. Cancelling
-        and leaving `async with` end the asking.
+        Returns when all providers have answered or after `RECALL_TIMEOUT`; having no provider is not an error.
+        Cancelling this call or leaving `async with` ends the query.
         """
         self._pump.check_entered()
-        asking = zenoh.CancellationToken()
-        self._recalls.add(asking)
+        query = zenoh.CancellationToken()
+        self._queries.add(query)
         try:
-            await asyncio.to_thread(self._recall, asking)
+            await asyncio.to_thread(self._recall, query)
         finally:
-            self._recalls.discard(asking)
-            asking.cancel()  # type: ignore[no-untyped-call]
+            self._queries.discard(query)
+            query.cancel()  # type: ignore[no-untyped-call]
 
-    def _recall(self, asking: zenoh.CancellationToken) -> None:
-        """Empty Zenoh's queue first, as a full one would stall the session; signatures are checked after that."""
-        # Not a RingChannel: what is still in it when the last answer has come is lost.
-        answers = self._session.get(
-            self._selector,
+    def _recall(self, query: zenoh.CancellationToken) -> None:
+        """Empty Zenoh's queue before verifying signatures: a full queue would stall the session."""
+        # Not a RingChannel, which loses what it still holds when the last reply arrives.
+        replies = self._session.get(
+            self.selector,
             zenoh.handlers.FifoChannel(RECALL_LIMIT),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=RECALL_TIMEOUT,
-            cancellation_token=asking,
+            cancellation_token=query,
         )
-        samples = deque((answer.ok for answer in answers if answer.ok is not None), maxlen=RECALL_LIMIT)
-        while samples and not asking.is_cancelled:
+        samples = deque((reply.ok for reply in replies if reply.ok is not None), maxlen=RECALL_LIMIT)
+        while samples and not query.is_cancelled:
             self._pump.feed(samples.popleft())
 
     @property
     def kind(self) -> str:
-        """What comes: `demand`, `offer` or `result`."""
-        return self._door.kind.__name__.lower()
+        """The kind of message: `demand`, `offer` or `result`."""
+        return self._validator.kind.__name__.lower()
 
     def forget(self, verified: Verified[M]) -> None:
-        """Let a message arrive once more when it is sent again: what had to be done with it can't be done yet."""
-        self._door.forget(verified)
+        """Deliver a message once more when it is sent again, because it can't be handled yet."""
+        self._validator.forget(verified)
 
-    def statistics(self) -> Statistics:
-        """What came in so far, what of it was refused and why, what was lost to a slow consumer."""
-        return self._door.statistics(received=self._pump.received, dropped=self._pump.dropped)
+    def statistics(self) -> ValidationStatistics:
+        """The messages received, rejected (by reason) and dropped so far."""
+        return self._validator.statistics(received=self._pump.received, dropped=self._pump.dropped)
 
-    async def _look_up(self) -> None:
-        """Resolve the names of one message after the other; a failure of the resolver's ends the iteration."""
+    async def _resolve_names(self) -> None:
+        """Resolve the names of one message after another. An unexpected error of the resolver ends the iteration."""
         try:
             while True:
-                unresolved = await self._named.get()
+                unresolved = await self._unresolved.get()
                 if (verified := await self._resolved(unresolved)) is not None:
                     self._pump.insert(verified)
         except Exception as error:
@@ -129,8 +137,8 @@ class Subscription(Generic[M]):
         assert self._resolver is not None
         try:
             addresses = {name: await self._resolver(name) for name in names_in(unresolved.message)}
-            return self._door.resolved(unresolved, addresses)
+            return self._validator.resolved(unresolved, addresses)
         except AiraError as error:
-            log.debug("a message names what can't be resolved: %s", error)
-            self._door.refuse("name")
+            log.debug("a name in a message can't be resolved: %s", error)
+            self._validator.reject("name")
             return None

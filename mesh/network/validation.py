@@ -1,7 +1,8 @@
-"""The door of the channel: what a sample must hold before anything else sees it.
+"""Validation of the channel's messages: every sample is checked here before anything else sees it.
 
-Checks go from cheap to dear, so that rubbish costs little: the JSON decodes, the message is new, the key says what the
-message says (so it is concrete, too), the deadline is ahead; only then the signature is recovered, once.
+Checks run from cheap to expensive, so that invalid input costs little: the JSON decodes, the message is new, its key
+is the one that its content requires (which rules out wildcards), its deadline lies ahead. The signature is verified
+last, and once.
 """
 
 from __future__ import annotations
@@ -9,12 +10,11 @@ from __future__ import annotations
 import threading
 from collections import Counter, OrderedDict
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
 
 import msgspec
 
 from mesh.errors import InvalidMessage
-from mesh.network.addressing import key_of, verified_key
 from schemas import Result, SignedMessage, Verified, decode, message_hash, names_in, resolve_names
 from schemas.signing import verify_hashed
 
@@ -26,20 +26,35 @@ if TYPE_CHECKING:
 M = TypeVar("M", bound=SignedMessage)
 
 AMBIGUOUS_NONCE: Final = "00" * 12
-"""How no nonce of generation 3 may begin."""
-REMEMBERED: Final = 65_536
-"""Messages of which the door remembers that they passed."""
+"""No nonce of generation 3 may start like this: the contracts would read it as a generation-5 order."""
+DEDUPLICATION_LIMIT: Final = 65_536
+"""Accepted messages that a validator remembers, to drop duplicates."""
+
+
+def message_key(lighthouse: str, message: SignedMessage) -> str:
+    """The key of `message` on the channel of `lighthouse` (ENS name, lower case)."""
+    return key_of(lighthouse, message, message_hash(message))
+
+
+def verified_key(lighthouse: str, verified: Verified[Any]) -> str:
+    """Like `message_key`, for a message whose hash is known."""
+    return key_of(lighthouse, verified.message, verified.hash)
+
+
+def key_of(lighthouse: str, message: SignedMessage, digest: bytes) -> str:
+    """Like `message_key`, given the message's hash. Constructing a message validates its fields, so this does not."""
+    return f"aira/{lighthouse}/{message.kind}/{message.key_chunk}/{digest.hex()}"
 
 
 class Unresolved(NamedTuple, Generic[M]):
-    """A message that names an address by ENS: it can't be hashed before the names are looked up."""
+    """A message that contains ENS names: it can be hashed and verified only after they are resolved."""
 
     message: M
     key: str
 
 
-class Statistics(msgspec.Struct, frozen=True, kw_only=True):
-    """What came through one door so far. `invalid` counts by reason; `dropped` fell out unseen, oldest first."""
+class ValidationStatistics(msgspec.Struct, frozen=True, kw_only=True):
+    """Counts of one subscription's messages: `invalid` by reason; `dropped` before validation, the oldest first."""
 
     received: int
     accepted: int
@@ -49,65 +64,74 @@ class Statistics(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MessageValidator(Generic[M]):
-    """Lets the verified messages of one kind pass, and counts the others.
+    """Verifies the messages of one kind, and counts those that it rejects.
 
-    `lighthouse` is the market's name in keys; `address`, where it is known, must be the orders' lighthouse. `head`
-    tells the number of the latest block, or 0 when it isn't known (then no deadline is checked). A message is the same
-    as one that passed when key and signature are: two signers of equal generation-3 terms are two messages. Safe to
-    use from several threads.
+    `lighthouse` is the market's name in keys; `address`, if given, must be the orders' lighthouse. `head` returns the
+    latest block number, or 0 when it isn't known (then no deadline is checked). A message is a duplicate when key and
+    signature equal those of one of the last `deduplication_limit` accepted messages: equal generation-3 terms from two
+    signers are two messages. Thread-safe.
     """
 
-    def __init__(self, kind: type[M], *, lighthouse: str, address: str | None, head: Callable[[], int]) -> None:
+    def __init__(
+        self,
+        kind: type[M],
+        *,
+        lighthouse: str,
+        address: str | None,
+        head: Callable[[], int],
+        deduplication_limit: int = DEDUPLICATION_LIMIT,
+    ) -> None:
         self.kind: type[M] = kind
         self._lighthouse = lighthouse
         self._address = address
         self._head = head
+        self._deduplication_limit = deduplication_limit
         self._lock = threading.Lock()
-        self._passed: OrderedDict[tuple[str, str], None] = OrderedDict()
+        self._seen: OrderedDict[tuple[str, str], None] = OrderedDict()
         self._invalid: Counter[str] = Counter()
         self._duplicate = 0
         self._accepted = 0
 
     def __call__(self, sample: zenoh.Sample) -> Verified[M] | Unresolved[M] | None:
-        """What a Zenoh sample holds, if it may pass."""
+        """The message in a Zenoh sample; see `check`."""
         return self.check(str(sample.key_expr), sample.payload.to_bytes())
 
     def check(self, key: str, payload: bytes) -> Verified[M] | Unresolved[M] | None:
-        """The message of `payload`, verified; or unresolved; or None, counted under its reason."""
+        """The verified message in `payload`; an `Unresolved` one; or None, which is counted under its reason."""
         try:
             message = decode(payload)
             if not isinstance(message, self.kind):
                 raise InvalidMessage("kind", f"a {type(message).__name__} on a key of {self.kind.__name__}")
-            if (key, message.signature) in self._passed:
+            if (key, message.signature) in self._seen:
                 self._count_duplicate()
                 return None
             return Unresolved(message, key) if names_in(message) else self._verified(message, key)
         except InvalidMessage as error:
-            self.refuse(error.reason)
+            self.reject(error.reason)
             return None
 
     def resolved(self, unresolved: Unresolved[M], addresses: Mapping[str, str]) -> Verified[M] | None:
-        """The message with its names replaced by `addresses` (name → address), checked like any other."""
+        """The message with its names replaced by `addresses` (name → address), verified; None if it is rejected."""
         try:
             return self._verified(resolve_names(unresolved.message, addresses), unresolved.key)
         except InvalidMessage as error:
-            self.refuse(error.reason)
+            self.reject(error.reason)
             return None
 
-    def refuse(self, reason: str) -> None:
-        """Count a message that does not pass."""
+    def reject(self, reason: str) -> None:
+        """Count a rejected message under `reason`."""
         with self._lock:
             self._invalid[reason] += 1
 
     def forget(self, verified: Verified[M]) -> None:
-        """Let a message that has passed pass once more, when it is sent again."""
+        """Accept an accepted message once more when it is sent again."""
         with self._lock:
-            self._passed.pop((verified_key(self._lighthouse, verified), verified.message.signature), None)
+            self._seen.pop((verified_key(self._lighthouse, verified), verified.message.signature), None)
 
-    def statistics(self, *, received: int, dropped: int) -> Statistics:
-        """What passed through this door, given what came to it and what was lost before."""
+    def statistics(self, *, received: int, dropped: int) -> ValidationStatistics:
+        """The counts so far, with what a subscription `received` and `dropped` before validation."""
         with self._lock:
-            return Statistics(
+            return ValidationStatistics(
                 received=received,
                 accepted=self._accepted,
                 invalid=dict(self._invalid),
@@ -121,7 +145,7 @@ class MessageValidator(Generic[M]):
             raise InvalidMessage("key", f"the message does not belong on {key}")
         self._check_order(message)
         verified = verify_hashed(message, digest)
-        return verified if self._passes_first(message, key) else None
+        return verified if self._accept_new(message, key) else None
 
     def _check_order(self, order: SignedMessage) -> None:
         if isinstance(order, Result):
@@ -137,14 +161,14 @@ class MessageValidator(Generic[M]):
         with self._lock:
             self._duplicate += 1
 
-    def _passes_first(self, message: M, key: str) -> bool:
-        """Remember that the message passes, and forget the oldest; False if it passed meanwhile on another thread."""
+    def _accept_new(self, message: M, key: str) -> bool:
+        """Record an accepted message, forgetting the oldest; False if another thread accepted the same one first."""
         with self._lock:
-            if (key, message.signature) in self._passed:
+            if (key, message.signature) in self._seen:
                 self._duplicate += 1
                 return False
-            if len(self._passed) >= REMEMBERED:
-                self._passed.popitem(last=False)
-            self._passed[key, message.signature] = None
+            if len(self._seen) >= self._deduplication_limit:
+                self._seen.popitem(last=False)
+            self._seen[key, message.signature] = None
             self._accepted += 1
         return True

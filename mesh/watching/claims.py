@@ -11,7 +11,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Generic, NamedTuple, TypeAlias, TypeVar
 
 from mesh.errors import AiraError, InputError
-from mesh.network import Statistics
+from mesh.network import ValidationStatistics
 from schemas import EventKey, Liability, RejectKey, parse_address, parse_cid, parse_key
 from schemas.signing import Rejection
 
@@ -60,11 +60,13 @@ class Reader(Generic[C]):
         with self._lock:
             self._refused[self._reason] += 1
 
-    def statistics(self, *, received: int, dropped: int) -> Statistics:
+    def statistics(self, *, received: int, dropped: int) -> ValidationStatistics:
         """What was read, given what came and what was lost before."""
         with self._lock:
             refused = dict(self._refused)
-            return Statistics(received=received, accepted=self._accepted, invalid=refused, duplicate=0, dropped=dropped)
+            return ValidationStatistics(
+                received=received, accepted=self._accepted, invalid=refused, duplicate=0, dropped=dropped
+            )
 
 
 def read_rejection(key: str, payload: bytes) -> Rejection:

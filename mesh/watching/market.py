@@ -8,8 +8,7 @@ from contextlib import AsyncExitStack
 from typing import TYPE_CHECKING, Any, Final, Self, TypeAlias
 
 from mesh.background import Background
-from mesh.network import Pump
-from mesh.network.crossing import call_in_loop
+from mesh.network import Pump, call_in_loop
 from mesh.watching.claims import JobEvent, Reader, read_event, read_rejection
 from mesh.watching.tally import Tally, added_up
 from schemas import (

@@ -10,7 +10,7 @@ import msgspec
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from mesh.network import Statistics
+    from mesh.network import ValidationStatistics
 
 
 class Tally(msgspec.Struct, frozen=True, kw_only=True):
@@ -22,7 +22,7 @@ class Tally(msgspec.Struct, frozen=True, kw_only=True):
     lost: int
 
 
-def added_up(statistics: Iterable[Statistics]) -> Tally:
+def added_up(statistics: Iterable[ValidationStatistics]) -> Tally:
     """The sum of what came by several ways."""
     refused: Counter[str] = Counter()
     received = duplicate = lost = 0

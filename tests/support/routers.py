@@ -20,14 +20,18 @@ if TYPE_CHECKING:
 class EmbeddedRouter:
     """A Zenoh session in mode `router` inside this process: no peer to install, up in milliseconds.
 
-    `stop` and `start` are a router that goes away and comes back on the same port. Both block for as long as Zenoh
-    takes, some milliseconds.
+    `stop` and `start` simulate an outage: the router returns on the same port. Both block for some milliseconds.
     """
 
     def __init__(self, port: int | None = None) -> None:
         self.port = port or free_port()
         self.endpoint = f"tcp/127.0.0.1:{self.port}"
         self._session: zenoh.Session | None = None
+
+    @property
+    def session(self) -> zenoh.Session | None:
+        """The router's own session while it runs."""
+        return self._session
 
     def start(self) -> None:
         """Open the session; clients may connect when this returns."""
@@ -77,7 +81,7 @@ class Zenohd(Server):
 
 
 def client_config(endpoint: str) -> zenoh.Config:
-    """The configuration of a client of the router at `endpoint`, which looks for nobody else."""
+    """The configuration of a client of the router at `endpoint`, without scouting."""
     config = {
         "mode": "client",
         "connect": {"endpoints": [endpoint]},
@@ -87,9 +91,9 @@ def client_config(endpoint: str) -> zenoh.Config:
 
 
 def _router_config(endpoint: str, more: Mapping[str, Any]) -> dict[str, Any]:
-    """Nothing is looked for on the network: tests that run side by side must not find each other's routers.
+    """Scouting is off, so that tests running at the same time do not find each other's routers.
 
-    The delay is the half second that a router would otherwise wait for others when it opens.
+    `delay` is the half second that a router would otherwise wait for others when it opens.
     """
     return {
         "mode": "router",

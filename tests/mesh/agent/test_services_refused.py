@@ -75,5 +75,5 @@ async def test_what_is_no_address_is_an_error_reply(control: Control, service: s
 async def test_an_agent_told_not_to_work_offers_only_to_read(place: Place) -> None:
     async with controlled(place, place.agent("robot", enable_executor=False)) as control:
         assert await control.read(ZERO_ADDRESS) == LiabilityRead(False)
-        with pytest.raises(ServiceFailed, match="nobody answers"):
+        with pytest.raises(ServiceFailed, match="no agent answers"):
             await control.start(ZERO_ADDRESS)

@@ -158,5 +158,5 @@ async def test_what_was_not_done_is_an_error(place: Place, capsys: pytest.Captur
 
 
 async def test_nobody_there_is_an_error(place: Place) -> None:
-    with pytest.raises(ServiceFailed, match=r"^eth/accounts: nobody answers$"):
+    with pytest.raises(ServiceFailed, match=r"^eth/accounts: no agent answers$"):
         await _call(place.settings("watcher"), (STRANGER.address, "eth/accounts", ()), timeout=2.0, as_json=False)

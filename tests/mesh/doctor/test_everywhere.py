@@ -55,7 +55,7 @@ async def test_a_router_of_a_foreign_site_on_every_address_is_named(site: Site, 
     finally:
         session.close()  # type: ignore[no-untyped-call]
 
-    assert "is not to be trusted" in found.cause("router")
+    assert "is not trusted" in found.cause("router")
 
 
 @pytest.mark.parametrize(("role", "option"), [("operator", "--connect"), ("edge", "--connect"), ("router", "--listen")])

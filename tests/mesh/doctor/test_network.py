@@ -99,7 +99,7 @@ async def test_the_router_of_a_foreign_site_is_named(site: Site, tmp_path: Path,
         found = await examined(case_of(site, ours))
 
     cause = found.cause("router")
-    assert "its own certificate is not to be trusted" in cause
+    assert "its certificate is not trusted" in cause
     assert f"is this router of the site of {ours.ca}?" in cause
 
 

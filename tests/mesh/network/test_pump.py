@@ -49,7 +49,7 @@ def pumps_running() -> list[str]:
     return [thread.name for thread in threading.enumerate() if thread.name.startswith("pump ")]
 
 
-async def test_samples_come_in_their_order(here: zenoh.Session, there: zenoh.Session) -> None:
+async def test_samples_arrive_in_order(here: zenoh.Session, there: zenoh.Session) -> None:
     async with Pump(here, KEY, number) as numbers:
         await until_heard(there, KEY)
         put(there, *range(2000))
@@ -58,7 +58,7 @@ async def test_samples_come_in_their_order(here: zenoh.Session, there: zenoh.Ses
         assert (numbers.received, numbers.dropped) == (2000, 0)
 
 
-async def test_what_the_conversion_turns_down_is_left_out(here: zenoh.Session, there: zenoh.Session) -> None:
+async def test_samples_converted_to_none_are_skipped(here: zenoh.Session, there: zenoh.Session) -> None:
     def even(sample: zenoh.Sample) -> int | None:
         return number(sample) if number(sample) % 2 == 0 else None
 
@@ -69,7 +69,7 @@ async def test_what_the_conversion_turns_down_is_left_out(here: zenoh.Session, t
         assert await take(numbers, 500) == list(range(0, 1000, 2))
 
 
-async def test_the_conversion_runs_beside_the_loop(here: zenoh.Session, there: zenoh.Session) -> None:
+async def test_the_conversion_runs_on_the_pumps_thread(here: zenoh.Session, there: zenoh.Session) -> None:
     async with Pump(here, KEY, lambda _: threading.current_thread().name) as names:
         await until_heard(there, KEY)
         put(there, 1)
@@ -77,7 +77,7 @@ async def test_the_conversion_runs_beside_the_loop(here: zenoh.Session, there: z
         assert await anext(names) == f"pump {KEY}"
 
 
-async def test_a_slow_consumer_loses_the_oldest_and_each_one_is_counted(
+async def test_a_slow_consumer_loses_the_oldest_samples_and_each_is_counted(
     here: zenoh.Session, there: zenoh.Session
 ) -> None:
     async with Pump(here, KEY, number, capacity=64) as numbers:
@@ -93,7 +93,7 @@ async def test_a_slow_consumer_loses_the_oldest_and_each_one_is_counted(
         assert numbers.received == len(taken) + 1 + numbers.dropped
 
 
-async def test_a_consumer_that_is_given_up_loses_nothing(here: zenoh.Session, there: zenoh.Session) -> None:
+async def test_a_cancelled_consumer_loses_nothing(here: zenoh.Session, there: zenoh.Session) -> None:
     async with Pump(here, KEY, number) as numbers:
         await until_heard(there, KEY)
         waiting = asyncio.create_task(anext(numbers))
@@ -104,7 +104,7 @@ async def test_a_consumer_that_is_given_up_loses_nothing(here: zenoh.Session, th
         assert await take(numbers, 3) == [1, 2, 3]
 
 
-async def test_what_is_fed_comes_out_beside_the_live_samples(here: zenoh.Session, there: zenoh.Session) -> None:
+async def test_fed_samples_are_delivered_beside_live_ones(here: zenoh.Session, there: zenoh.Session) -> None:
     samples = await some_samples(here, there, 3)
 
     async with Pump(here, "test/elsewhere", number) as numbers:
@@ -115,13 +115,12 @@ async def test_what_is_fed_comes_out_beside_the_live_samples(here: zenoh.Session
         assert numbers.received == 3
 
 
-async def test_feeding_never_waits_for_the_consumer_and_what_finds_no_room_is_counted(
-    here: zenoh.Session, there: zenoh.Session, monkeypatch: pytest.MonkeyPatch
+async def test_feeding_never_waits_for_the_consumer_and_counts_what_it_drops(
+    here: zenoh.Session, there: zenoh.Session
 ) -> None:
-    monkeypatch.setattr(pump, "FED_CAPACITY", 1000)
     (sample,) = await some_samples(here, there, 1)
 
-    async with Pump(here, "test/elsewhere", number) as numbers:
+    async with Pump(here, "test/elsewhere", number, fed_capacity=1000) as numbers:
         with at_most(5):
             for _ in range(20_000):
                 numbers.feed(sample)
@@ -147,7 +146,7 @@ async def test_counts_are_exact_when_threads_feed_while_samples_arrive(
         assert (numbers.received, numbers.dropped) == (2000, 0)
 
 
-async def test_leaving_ends_the_iteration_of_whoever_waits(here: zenoh.Session) -> None:
+async def test_leaving_ends_a_waiting_iteration(here: zenoh.Session) -> None:
     async with Pump(here, KEY, number) as numbers:
         consuming = asyncio.create_task(collect(numbers))
         await asyncio.sleep(0)
@@ -159,7 +158,7 @@ async def test_leaving_ends_the_iteration_of_whoever_waits(here: zenoh.Session) 
 
 
 @pytest.mark.parametrize("capacity", [64, 8192])
-async def test_leaving_does_not_wait_for_a_consumer_that_stands_still(
+async def test_leaving_does_not_wait_for_a_stalled_consumer(
     here: zenoh.Session, there: zenoh.Session, capacity: int
 ) -> None:
     numbers = await Pump(here, KEY, number, capacity=capacity).__aenter__()
@@ -181,17 +180,17 @@ async def test_leaving_after_the_session_was_closed_does_not_hang(here: zenoh.Se
     assert not pumps_running()
 
 
-async def test_a_session_that_is_closed_ends_the_iteration_with_an_error(here: zenoh.Session) -> None:
+async def test_closing_the_session_ends_the_iteration_with_an_error(here: zenoh.Session) -> None:
     async with Pump(here, KEY, number) as numbers:
         consuming = asyncio.create_task(take(numbers, 1))
         await asyncio.sleep(0)
         here.close()  # type: ignore[no-untyped-call]
 
-        with at_most(2), pytest.raises(ClosedError, match="session of a subscription was closed"):
+        with at_most(2), pytest.raises(ClosedError):
             await consuming
 
 
-async def test_nothing_is_left_running_when_the_session_does_not_take_the_subscription(here: zenoh.Session) -> None:
+async def test_no_thread_is_left_when_the_subscription_fails(here: zenoh.Session) -> None:
     here.close()  # type: ignore[no-untyped-call]
 
     with pytest.raises(zenoh.ZError):
@@ -200,7 +199,7 @@ async def test_nothing_is_left_running_when_the_session_does_not_take_the_subscr
     assert not pumps_running()
 
 
-async def test_what_the_conversion_raises_comes_out_after_what_came_before(
+async def test_an_error_of_the_conversion_is_raised_after_the_samples_before_it(
     here: zenoh.Session, there: zenoh.Session
 ) -> None:
     async with Pump(here, KEY, number) as numbers:
@@ -216,22 +215,22 @@ async def test_what_the_conversion_raises_comes_out_after_what_came_before(
         others: list[zenoh.Sample] = []
         with here.declare_subscriber("test/others", others.append):
             await until_heard(there, "test/others")
-            await asyncio.to_thread(put, there, *range(2 * pump.QUEUE))
+            await asyncio.to_thread(put, there, *range(2 * pump.ZENOH_QUEUE))
             there.put("test/others", b"")
-            await until(lambda: others, what="what others say after the pump has failed")
+            await until(lambda: others, what="samples for others after the pump has failed")
 
     assert not pumps_running()
 
 
-async def test_it_is_used_inside_async_with_and_once(here: zenoh.Session) -> None:
+async def test_a_pump_is_used_inside_async_with_and_once(here: zenoh.Session) -> None:
     numbers = Pump(here, KEY, number)
-    with pytest.raises(ClosedError, match="not open"):
+    with pytest.raises(ClosedError):
         await anext(numbers)
 
     async with numbers:
         pass
 
-    with pytest.raises(ClosedError, match="used once"):
+    with pytest.raises(ClosedError):
         await numbers.__aenter__()
 
 

@@ -1,4 +1,4 @@
-"""Sessions: opened or explained, closed for certain, and back again after the router was away."""
+"""Sessions: opening, its errors, closing, and reconnection after the router was away."""
 
 from __future__ import annotations
 
@@ -47,26 +47,26 @@ async def test_a_client_opens_and_closes(router: EmbeddedRouter) -> None:
     assert not network.connected
 
 
-async def test_no_router_is_one_line_and_what_to_do() -> None:
+async def test_a_missing_router_is_reported_with_a_hint() -> None:
     endpoint = free_endpoint()
 
     with at_most(2), pytest.raises(NetworkUnavailable) as error:
         async with client(endpoint, timeout=0.5):
             pass
 
-    assert str(error.value) == f"no Zenoh router at {endpoint} (no answer within 0.5 s)"
+    assert error.value.code == "network-unavailable"
     assert "aira router" in error.value.hint
     assert error.value.endpoints == (endpoint,)
 
 
-async def test_a_host_that_accepts_and_says_nothing_is_given_up_in_time() -> None:
+async def test_a_host_that_accepts_but_never_answers_times_out() -> None:
     with closing(socket.create_server(("127.0.0.1", 0))) as mute, at_most(3), pytest.raises(NetworkUnavailable):
         async with client(f"tcp/127.0.0.1:{mute.getsockname()[1]}", timeout=0.5):
             pass
 
 
 @pytest.mark.parametrize("timeout", [20, -1])
-async def test_a_router_that_comes_later_is_waited_for(timeout: float) -> None:
+async def test_a_client_waits_for_a_router_that_starts_later(timeout: float) -> None:
     with closing(socket.create_server(("127.0.0.1", 0))) as somebody_else:
         port = somebody_else.getsockname()[1]
         network = client(f"tcp/127.0.0.1:{port}", timeout=timeout)
@@ -81,7 +81,7 @@ async def test_a_router_that_comes_later_is_waited_for(timeout: float) -> None:
         await network.__aexit__(None, None, None)
 
 
-async def test_the_second_of_two_routers_will_do(router: EmbeddedRouter) -> None:
+async def test_the_second_of_two_routers_is_used(router: EmbeddedRouter) -> None:
     async with client(free_endpoint(), router.endpoint) as network:
         assert network.connected
 
@@ -101,7 +101,7 @@ async def test_the_second_of_two_routers_will_do(router: EmbeddedRouter) -> None
         "",
     ],
 )
-async def test_a_locator_that_zenoh_would_never_connect_to_is_refused(locator: str) -> None:
+async def test_an_invalid_locator_is_rejected(locator: str) -> None:
     with at_most(1), pytest.raises(ConfigurationError) as error:
         async with client(locator):
             pass
@@ -115,13 +115,13 @@ async def test_a_locator_that_zenoh_would_never_connect_to_is_refused(locator: s
     ["tcp/localhost:7447", "tcp/[::1]:7447", "udp/127.0.0.1:1", "ws/h:1", "unixsock-stream//tmp/socket",
      "tcp/127.0.0.1:7447#iface=lo"],
 )  # fmt: skip
-def test_the_locators_of_zenoh_are_taken(locator: str) -> None:
+def test_zenohs_locators_are_accepted(locator: str) -> None:
     Endpoints(connect=(locator,)).config()
     Endpoints(mode="router", listen=(locator,)).config()
 
 
-async def test_a_client_without_any_router_to_connect_to_is_refused() -> None:
-    with pytest.raises(ConfigurationError, match="no Zenoh router to connect to"):
+async def test_a_client_without_a_locator_is_rejected() -> None:
+    with pytest.raises(ConfigurationError):
         async with client():
             pass
 
@@ -155,7 +155,7 @@ async def test_the_session_is_there_only_inside_async_with(router: EmbeddedRoute
         network.session  # noqa: B018
 
     async with network:
-        with pytest.raises(ClosedError, match="open already"):
+        with pytest.raises(ClosedError):
             await network.__aenter__()
 
     with pytest.raises(ClosedError):
@@ -170,7 +170,7 @@ async def test_a_network_can_be_opened_again(router: EmbeddedRouter) -> None:
             assert network.connected
 
 
-async def test_loss_and_return_of_the_router_are_told_and_subscriptions_work_again_unaided(zenohd: Zenohd) -> None:
+async def test_loss_and_return_of_the_router_are_reported_and_subscriptions_are_restored(zenohd: Zenohd) -> None:
     heard: list[str] = []
     async with client(zenohd.endpoint) as network, client(zenohd.endpoint) as other:
         with other.session.declare_subscriber("test/**", lambda sample: heard.append(str(sample.key_expr))):
@@ -190,7 +190,7 @@ async def test_loss_and_return_of_the_router_are_told_and_subscriptions_work_aga
             await until(lambda: heard == ["test/after"])
 
 
-async def test_each_watcher_is_told() -> None:
+async def test_each_watcher_is_notified() -> None:
     router = EmbeddedRouter()
     with router:
         async with (
@@ -233,15 +233,15 @@ async def test_cancelling_the_opening_takes_effect_at_once() -> None:
         await opening
 
 
-async def test_a_session_that_comes_after_its_opening_was_cancelled_is_closed(router: EmbeddedRouter) -> None:
+async def test_a_session_that_opens_after_its_cancellation_is_closed(router: EmbeddedRouter) -> None:
     opened: set[str] = set()
     closed: set[str] = set()
 
     def changed(event: zenoh.TransportEvent) -> None:
         (opened if event.kind == zenoh.SampleKind.PUT else closed).add(str(event.transport.zid))
 
-    assert router._session is not None
-    listener = router._session.info.declare_transport_events_listener(changed)
+    assert router.session is not None
+    listener = router.session.info.declare_transport_events_listener(changed)
     async with asyncio.timeout(10):
         while len(opened) < 3:
             opening = asyncio.create_task(client(router.endpoint).__aenter__())

@@ -1,4 +1,4 @@
-"""The door: who may pass, and under which reason the others are counted."""
+"""The message validator: which messages it accepts, and under which reason it counts the others."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from mesh.network import MessageValidator, message_key, verification
+from mesh.network import MessageValidator, ValidationStatistics, message_key
 from mesh.network.validation import Unresolved
 from schemas import Demand, Offer, Result, SignedMessage, Verified, encode, message_hash
 from tests.support.orders import (
@@ -29,7 +29,7 @@ HEAD = 100
 NAME = "xrt.3.robonomics.eth"
 
 
-def door(kind: type[Any] = Demand, **options: Any) -> MessageValidator[Any]:
+def validator(kind: type[Any] = Demand, **options: Any) -> MessageValidator[Any]:
     given: dict[str, Any] = {"lighthouse": MARKET, "address": LIGHTHOUSE, "head": lambda: HEAD} | options
     return MessageValidator(kind, **given)
 
@@ -38,25 +38,23 @@ def counted(checked: MessageValidator[Any]) -> dict[str, int]:
     return dict(checked.statistics(received=0, dropped=0).invalid)
 
 
-def pass_through(
-    checked: MessageValidator[Any], message: SignedMessage, key: str | None = None
-) -> Verified[Any] | None:
-    passed = checked.check(key or message_key(MARKET, message), encode(message))
-    assert not isinstance(passed, Unresolved)
-    return passed
+def check(checked: MessageValidator[Any], message: SignedMessage, key: str | None = None) -> Verified[Any] | None:
+    accepted = checked.check(key or message_key(MARKET, message), encode(message))
+    assert not isinstance(accepted, Unresolved)
+    return accepted
 
 
 @pytest.mark.parametrize(("kind", "make"), [(Demand, demand), (Offer, offer), (Result, result)])
-def test_a_signed_message_on_its_key_passes_with_hash_and_signer(kind: type[Any], make: Any) -> None:
+def test_a_signed_message_on_its_key_is_accepted_with_hash_and_signer(kind: type[Any], make: Any) -> None:
     message = make(signer=STRANGER)
 
-    assert pass_through(door(kind), message) == Verified(message, message_hash(message), STRANGER.address)
+    assert check(validator(kind), message) == Verified(message, message_hash(message), STRANGER.address)
 
 
-def test_a_generation_5_order_passes_too() -> None:
+def test_a_generation_5_order_is_accepted() -> None:
     message = demand(signer=PERSON, sender=PERSON.address, nonce=7)
 
-    assert pass_through(door(), message) is not None
+    assert check(validator(), message) is not None
 
 
 WRONG_ORDERS: dict[str, Demand | Offer] = {
@@ -74,10 +72,10 @@ WRONG_ORDERS: dict[str, Demand | Offer] = {
 
 
 @pytest.mark.parametrize("reason", WRONG_ORDERS)
-def test_an_order_that_is_wrong_is_counted_under_its_reason(reason: str) -> None:
-    checked = door()
+def test_an_invalid_order_is_counted_under_its_reason(reason: str) -> None:
+    checked = validator()
 
-    assert pass_through(checked, WRONG_ORDERS[reason]) is None
+    assert check(checked, WRONG_ORDERS[reason]) is None
     assert counted(checked) == {reason: 1}
 
 
@@ -94,8 +92,8 @@ def test_an_order_that_is_wrong_is_counted_under_its_reason(reason: str) -> None
         (b'{"tx": "' + b"00" * 32 + b'"}', "kind"),
     ],
 )
-def test_what_is_no_message_is_counted_as_such(payload: bytes, reason: str) -> None:
-    checked = door()
+def test_invalid_input_is_counted_under_its_reason(payload: bytes, reason: str) -> None:
+    checked = validator()
 
     assert checked.check(message_key(MARKET, demand()), payload) is None
     assert counted(checked) == {reason: 1}
@@ -121,15 +119,15 @@ RIGHT_KEY = message_key(MARKET, MESSAGE)
         "**",
     ],
 )
-def test_a_message_on_another_key_than_its_own_is_counted(key: str) -> None:
-    checked = door()
+def test_a_message_on_the_wrong_key_is_counted(key: str) -> None:
+    checked = validator()
 
-    assert pass_through(checked, MESSAGE, key) is None
+    assert check(checked, MESSAGE, key) is None
     assert counted(checked) == {"key": 1}
 
 
 def test_a_changed_message_does_not_belong_on_the_key_of_the_original() -> None:
-    checked, message = door(), demand(cost=1)
+    checked, message = validator(), demand(cost=1)
     altered = json.loads(encode(message)) | {"cost": 2}
 
     assert checked.check(message_key(MARKET, message), json.dumps(altered).encode()) is None
@@ -137,80 +135,79 @@ def test_a_changed_message_does_not_belong_on_the_key_of_the_original() -> None:
 
 
 def test_a_result_belongs_on_the_key_of_its_liability() -> None:
-    checked, message = door(Result), result(liability=ROBOT.address)
+    checked, message = validator(Result), result(liability=ROBOT.address)
     other = message_key(MARKET, message).replace(ROBOT.address.lower(), STRANGER.address.lower())
 
-    assert pass_through(checked, message, other) is None
+    assert check(checked, message, other) is None
     assert counted(checked) == {"key": 1}
 
 
-def test_eleven_zero_bytes_of_a_nonce_are_none_too_many() -> None:
-    assert pass_through(door(), demand(nonce="00" * 11 + "ff" * 21)) is not None
+def test_a_nonce_may_start_with_eleven_zero_bytes() -> None:
+    assert check(validator(), demand(nonce="00" * 11 + "ff" * 21)) is not None
 
 
 def test_an_order_is_valid_until_the_block_before_its_deadline() -> None:
-    assert pass_through(door(), demand(deadline=HEAD + 1)) is not None
-    assert pass_through(door(), demand(deadline=HEAD)) is None
+    assert check(validator(), demand(deadline=HEAD + 1)) is not None
+    assert check(validator(), demand(deadline=HEAD)) is None
 
 
 def test_without_the_head_and_the_address_neither_is_checked() -> None:
-    checked = door(address=None, head=lambda: 0)
+    checked = validator(address=None, head=lambda: 0)
 
-    assert pass_through(checked, demand(deadline=1, lighthouse=STRANGER.address)) is not None
+    assert check(checked, demand(deadline=1, lighthouse=STRANGER.address)) is not None
 
 
-def test_the_same_message_passes_once() -> None:
-    checked, message = door(), demand()
+def test_the_same_message_is_accepted_once() -> None:
+    checked, message = validator(), demand()
 
-    assert [pass_through(checked, message) is not None for _ in range(3)] == [True, False, False]
-    assert checked.statistics(received=3, dropped=0) == verification.Statistics(
+    assert [check(checked, message) is not None for _ in range(3)] == [True, False, False]
+    assert checked.statistics(received=3, dropped=0) == ValidationStatistics(
         received=3, accepted=1, invalid={}, duplicate=2, dropped=0
     )
 
 
 def test_equal_terms_of_generation_3_signed_by_two_people_are_two_messages() -> None:
-    checked, same = door(), terms()
+    checked, same = validator(), terms()
     first, second = (signer.sign(Demand(**same, validator_fee=0)) for signer in (PERSON, STRANGER))
 
     assert message_key(MARKET, first) == message_key(MARKET, second)
-    passed = [pass_through(checked, message) for message in (first, second)]
-    assert [one.signer for one in passed if one is not None] == [PERSON.address, STRANGER.address]
+    accepted = [check(checked, message) for message in (first, second)]
+    assert [one.signer for one in accepted if one is not None] == [PERSON.address, STRANGER.address]
 
 
-def test_a_message_that_did_not_pass_may_pass_later() -> None:
+def test_a_rejected_message_may_be_accepted_later() -> None:
     head = HEAD
-    checked, message = door(head=lambda: head), demand(deadline=HEAD)
-    assert pass_through(checked, message) is None
+    checked, message = validator(head=lambda: head), demand(deadline=HEAD)
+    assert check(checked, message) is None
 
     head = HEAD - 1
 
-    assert pass_through(checked, message) is not None
+    assert check(checked, message) is not None
 
 
-def test_a_forgotten_message_passes_once_more() -> None:
-    checked, message = door(), demand()
-    passed = pass_through(checked, message)
-    assert passed is not None
+def test_a_forgotten_message_is_accepted_once_more() -> None:
+    checked, message = validator(), demand()
+    accepted = check(checked, message)
+    assert accepted is not None
 
-    checked.forget(passed)
-    checked.forget(passed)
+    checked.forget(accepted)
+    checked.forget(accepted)
 
-    assert pass_through(checked, message) == passed
-    assert pass_through(checked, message) is None
+    assert check(checked, message) == accepted
+    assert check(checked, message) is None
 
 
-def test_the_memory_of_what_passed_is_limited_and_the_oldest_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(verification, "REMEMBERED", 2)
-    checked, messages = door(), [demand() for _ in range(3)]
+def test_the_deduplication_window_is_limited_and_drops_the_oldest() -> None:
+    checked, messages = validator(deduplication_limit=2), [demand() for _ in range(3)]
     for message in messages:
-        assert pass_through(checked, message) is not None
+        assert check(checked, message) is not None
 
-    assert pass_through(checked, messages[2]) is None
-    assert pass_through(checked, messages[0]) is not None
+    assert check(checked, messages[2]) is None
+    assert check(checked, messages[0]) is not None
 
 
-def test_a_message_with_a_name_waits_until_it_is_looked_up_and_passes_then() -> None:
-    checked, message = door(), demand(token=STRANGER.address)
+def test_a_message_with_a_name_is_accepted_once_the_name_is_resolved() -> None:
+    checked, message = validator(), demand(token=STRANGER.address)
     named = json.loads(encode(message)) | {"token": NAME.upper()}
     key = message_key(MARKET, message)
 
@@ -221,16 +218,16 @@ def test_a_message_with_a_name_waits_until_it_is_looked_up_and_passes_then() -> 
     assert checked.resolved(waiting, {NAME: STRANGER.address}) == Verified(
         message, message_hash(message), PERSON.address
     )
-    assert checked.check(key, json.dumps(named).encode()) is None, "a duplicate is not looked up again"
-    assert checked.resolved(waiting, {NAME: STRANGER.address}) is None, "what passed meanwhile does not pass twice"
+    assert checked.check(key, json.dumps(named).encode()) is None, "a duplicate is not resolved again"
+    assert checked.resolved(waiting, {NAME: STRANGER.address}) is None, "it was accepted meanwhile"
     assert checked.statistics(received=0, dropped=0).duplicate == 2
 
 
 @pytest.mark.parametrize(
     ("address", "reason"), [({NAME: ROBOT.address}, "key"), ({}, "unresolved-name")], ids=["wrong", "missing"]
 )
-def test_a_name_that_means_something_else_than_what_was_signed_is_counted(address: dict[str, str], reason: str) -> None:
-    checked, message = door(), demand(token=STRANGER.address)
+def test_a_name_that_resolves_to_another_address_is_counted(address: dict[str, str], reason: str) -> None:
+    checked, message = validator(), demand(token=STRANGER.address)
     named = json.loads(encode(message)) | {"token": NAME}
     waiting = checked.check(message_key(MARKET, message), json.dumps(named).encode())
     assert isinstance(waiting, Unresolved)
@@ -239,30 +236,29 @@ def test_a_name_that_means_something_else_than_what_was_signed_is_counted(addres
     assert counted(checked) == {reason: 1}
 
 
-def test_many_threads_let_each_message_pass_once_and_count_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(verification, "REMEMBERED", 300)
-    checked = door()
+def test_many_threads_accept_each_message_once_and_count_exactly() -> None:
+    checked = validator(deduplication_limit=300)
     messages = [demand() for _ in range(200)]
-    refused = offer()
+    rejected = offer()
 
     def check_all() -> list[bytes]:
-        passed = [pass_through(checked, message) for message in messages]
+        accepted = [check(checked, message) for message in messages]
         for _ in range(200):
-            pass_through(checked, refused)
-        return [one.hash for one in passed if one is not None]
+            check(checked, rejected)
+        return [one.hash for one in accepted if one is not None]
 
     with ThreadPoolExecutor(8) as threads:
         jobs = [threads.submit(check_all) for _ in range(8)]
-        passed = Counter(digest for job in jobs for digest in job.result())
+        accepted = Counter(digest for job in jobs for digest in job.result())
 
-    assert passed == Counter(message_hash(message) for message in messages)
+    assert accepted == Counter(message_hash(message) for message in messages)
     statistics = checked.statistics(received=0, dropped=0)
     assert statistics.duplicate == 7 * 200
     assert statistics.invalid == {"kind": 8 * 200}
 
 
 def test_an_altered_result_does_not_belong_on_the_key_of_the_original() -> None:
-    checked, message = door(Result), result(success=True)
+    checked, message = validator(Result), result(success=True)
     altered = json.loads(encode(message)) | {"success": False}
 
     assert checked.check(message_key(MARKET, message), json.dumps(altered).encode()) is None

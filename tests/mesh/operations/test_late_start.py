@@ -149,7 +149,7 @@ async def test_an_agent_that_is_not_let_in_waits_until_it_is(tmp_path: Path) -> 
             "AIRA_TLS_CERTIFICATE": str(member.certificate),
             "AIRA_TLS_KEY": str(member.key),
         }
-        out = "the agent waits: not let in by the Zenoh router"
+        out = "the agent waits: rejected by the Zenoh router"
         with site.open_router("wheel"), started(*AGENT, says=out, variables=variables) as server:
             shutil.copytree(mine.path, member.path, dirs_exist_ok=True)
             await says(server, " on airalab.lighthouse")

@@ -198,7 +198,7 @@ async def test_on_a_closed_site_operators_may_ask_and_agents_may_not(tmp_path: P
             await until_answered(operator.session, str(RpcKey(ROBOT.address, "logs")))
             reply = await call(operator.session, ROBOT.address, "logs", ReadLogs(lines=1))
             assert [entry.message for entry in reply.entries] == ["a secret of the site"]
-            with pytest.raises(ServiceFailed, match="nobody answers"):
+            with pytest.raises(ServiceFailed, match="no agent answers"):
                 await call(person.session, ROBOT.address, "logs", ReadLogs(), timeout=3)
 
 
