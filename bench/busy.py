@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 from crowd import PATIENCE, SPAWN, router
 from mesh import Agent
 from mesh.background import Background
-from mesh.demo.objective import write_objective
+from mesh.demo.lamp import write_objective
 from mesh.devchain import EmbeddedChain
 from mesh.devchain.anvil import find_anvil, serve_anvil
 from mesh.devchain.market import found_market

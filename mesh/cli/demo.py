@@ -21,8 +21,8 @@ def command(objective: Path | None, generation: str, out: Path | None, as_json: 
     objective to its device, records it and signs the Result, the contract pays. Everything is real and local: Zenoh
     sessions, an EVM, signatures, files."""
     from mesh.demo.demo import Demo
-    from mesh.demo.story import JsonStory, SpokenStory
+    from mesh.demo.narration import JsonNarrator, TextNarrator
 
-    story = JsonStory() if as_json else SpokenStory()
-    demo = Demo(objective=objective, generation=int(generation), out=out, story=story)
+    narrator = JsonNarrator() if as_json else TextNarrator()
+    demo = Demo(objective=objective, generation=int(generation), out=out, narrator=narrator)
     run_to_end(demo.run)

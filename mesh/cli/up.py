@@ -151,11 +151,11 @@ def chain_up(settings: Settings, host: str, port: int, block_time: float | None,
 async def _show_health(url: str, telemetry: Telemetry) -> None:
     """Tell how the chain at `url` is, if anybody is to be told, until cancelled."""
     from mesh.chain import Node
-    from mesh.demo.looking import Look
+    from mesh.devchain.monitor import ChainMonitor
 
     if not telemetry.url:
         await asyncio.Event().wait()
     async with Node(url) as node:
-        look = Look(node)
-        with telemetry.showing(measure=look.measure, health=look.health):
-            await look.run()
+        monitor = ChainMonitor(node)
+        with telemetry.showing(measure=monitor.measure, health=monitor.health):
+            await monitor.run()

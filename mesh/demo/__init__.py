@@ -1,1 +1,1 @@
-"""A whole market in one process: for a first look, and for development."""
+"""`aira demo`: a whole market in one process, and one job on it."""

@@ -1,4 +1,4 @@
-"""One job, told as it happens: every role on a session of its own through a local router, on an embedded chain."""
+"""One job from demand to payment. Each role has a Zenoh session of its own; the chain is embedded."""
 
 from __future__ import annotations
 
@@ -7,15 +7,13 @@ import shutil
 import tempfile
 import time
 from contextlib import AsyncExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from mesh.agent import Agent, Phase
 from mesh.background import Background
 from mesh.chain import XRT
-from mesh.demo.device import BLINK, Lamp
-from mesh.demo.objective import write_objective
+from mesh.demo.lamp import BLINK_SECONDS, Lamp, write_objective
 from mesh.devchain import EmbeddedChain
 from mesh.devchain.market import ROLES, Market, found_market
 from mesh.errors import ConfigurationError, InputError, RemoteError
@@ -29,7 +27,7 @@ if TYPE_CHECKING:
     from web3.providers.async_base import AsyncBaseProvider
 
     from mesh.agent import Contract, Outcome
-    from mesh.demo.story import JsonStory, SpokenStory
+    from mesh.demo.narration import Narrator
     from mesh.market.book import Match
     from mesh.recording import Objective
     from schemas import Liability
@@ -37,128 +35,95 @@ if TYPE_CHECKING:
 COST: Final = 42 * XRT
 """What the person pays, wn."""
 MODEL: Final = cid_of_bytes(b"aira-mesh demo: a lamp that blinks for each message\n")
-"""The behaviour model of the demo's robot: any content has a name."""
-PATIENCE: Final = 60.0
-"""Seconds until a demand that nobody takes is given up; for the job, beyond the time that its objective takes."""
+"""The model of the demo's robot; any content has a CID."""
+TIMEOUT: Final = 60.0
+"""Seconds for the demand to become a contract, and for the job, in addition to its objective's duration."""
 
 
-@dataclass(frozen=True, kw_only=True)
+class DemoStalled(RemoteError):
+    """The demo did not finish in time."""
+
+    code = "demo-stalled"
+
+
+class OutputNotWritable(ConfigurationError):
+    """A file or folder can't be written."""
+
+    code = "output-not-writable"
+
+
 class Demo:
-    """What to show: the objective's file (None: three blinks), the generation of the messages, where files are kept."""
+    """The demo: router, chain, provider, robot and person.
 
-    objective: Path | None
-    generation: int
-    out: Path | None
-    story: SpokenStory | JsonStory
+    `objective` is a file (None: three blinks), `generation` that of the messages, `out` the folder where objective and
+    recording are kept (None: nowhere). `timeout` is in seconds (see `TIMEOUT`).
+    """
+
+    def __init__(
+        self, *, objective: Path | None, generation: int, out: Path | None, narrator: Narrator, timeout: float = TIMEOUT
+    ) -> None:
+        self._path = objective
+        self._generation = generation
+        self._out = out
+        self._narrator = narrator
+        self._timeout = timeout
+        self._match: Match | None = None
+        self._success = False
+        self._finalized = asyncio.Event()
+        self._market: Market
+        self._person: Agent
 
     async def run(self) -> None:
-        """Run the whole story. Raises an `AiraError` before anything is created when the objective is unfit."""
+        """Run the whole demo, once.
+
+        Raises `InputError` for an objective that can't be played and `OutputNotWritable`, both before anything is
+        opened, and `DemoStalled`.
+        """
         started = time.monotonic()
         with tempfile.TemporaryDirectory(prefix="aira-demo-") as temporary:
-            scene = Path(temporary)
-            objective = await asyncio.to_thread(self._prepare, scene)
+            folder = Path(temporary)
+            objective = await asyncio.to_thread(self._prepare, folder)
             try:
                 async with AsyncExitStack() as stack:
-                    stage = await _Stage.set_up(self, stack, scene)
-                    await stage.play(objective, started)
+                    await self._open(stack, folder)
+                    await self._do_job(objective, started)
             except TimeoutError:
-                raise RemoteError("the demo stands still", hint="is this machine very busy? try again") from None
+                raise DemoStalled(
+                    "the demo did not finish in time", hint="is this machine very busy? try again"
+                ) from None
 
-    def _prepare(self, scene: Path) -> Objective:
-        """The objective, examined, and a place for what is kept. Raises `InputError`, `ConfigurationError`."""
-        if self.out is not None:
+    def _prepare(self, folder: Path) -> Objective:
+        """Check the objective, and make the output folder."""
+        if self._out is not None:
             try:
-                self.out.mkdir(parents=True, exist_ok=True)
+                self._out.mkdir(parents=True, exist_ok=True)
             except OSError as error:
-                raise ConfigurationError(f"can't keep files in {self.out}: {error.strerror}") from None
-        path = self.objective
+                raise OutputNotWritable(f"can't keep files in {self._out}: {error.strerror}") from None
+        path = self._path
         if path is None:
-            path = scene / "blink.mcap"
+            path = folder / "blink.mcap"
             write_objective(path)
         elif not path.is_file():
             raise InputError(f"there is no file {path}", hint="give an MCAP file or a ROS 1 bag")
         return open_objective(path)
 
-
-class _Stage:
-    """Router, chain, provider, robot and person, all open."""
-
-    def __init__(self, demo: Demo, scene: Path) -> None:
-        self._story = demo.story
-        self._demo = demo
-        self._scene = scene
+    async def _open(self, stack: AsyncExitStack, folder: Path) -> None:
+        """Open router, chain, provider, robot and person; `stack` closes them."""
+        self._narrator.chapter("A market is founded")
         self._endpoint = free_endpoint()
-        self._match: Match | None = None
-        self._success = False
-        self._finalized = asyncio.Event()
-
-    @classmethod
-    async def set_up(cls, demo: Demo, stack: AsyncExitStack, scene: Path) -> _Stage:
-        """Open everything in its order; `stack` closes it."""
-        stage = cls(demo, scene)
-        demo.story.chapter("A market is founded")
-        await stage._open_network(stack)
-        node = await stack.enter_async_context(EmbeddedChain())
-        stage._market = await found_market(node.provider, node.funded_keys)
-        stage._tell_contracts()
-        await stage._open_provider(stack, node.provider)
-        stage._robot = await stage._open_agent(stack, node.provider, "robot")
-        stage._person = await stage._open_agent(stack, node.provider, "person")
-        return stage
-
-    _market: Market
-    _robot: Agent
-    _person: Agent
-
-    async def play(self, objective: Objective, started: float) -> None:
-        """The job, from the demand to the payment."""
-        story, person, path = self._story, self._person, objective.path
-        before = await self._balances()
-        story.chapter("A person wants work done")
-        cid = await asyncio.to_thread(cid_of_file, path)
-        story.tell("person", "objective", f"holds the objective {path.name}\n{cid}", objective=cid, file=str(path))
-        story.tell("person", "asking", f"will pay {_xrt(COST)} for it, and publishes a Demand", model=MODEL, cost=COST)
-        async with asyncio.timeout(PATIENCE):
-            contract = await person.demand(path, cost=COST)
-        async with asyncio.timeout(PATIENCE + objective.duration_ns / 1e9 + objective.count * BLINK):
-            outcome = await contract.outcome()
-            await self._finalized.wait()
-        recording = await contract.recording()
-        self._tell_payment(before, await self._balances())
-        kept = await asyncio.to_thread(self._keep, recording, outcome.result, path, cid)
-        story.tell(
-            "person", "recording", f"has the recording {kept}\n{outcome.result}", result=outcome.result, path=kept
-        )
-        self._end(contract, outcome, cid, started)
-
-    def _end(self, contract: Contract, outcome: Outcome, objective: str, started: float) -> None:
-        assert self._match is not None
-        self._story.end(
-            liability=contract.address,
-            demand=self._match.demand.hash.hex(),
-            offer=self._match.offer.hash.hex(),
-            objective=objective,
-            result=outcome.result,
-            success=self._success,
-            paid=outcome.success,
-            cost=COST,
-            generation=self._demo.generation,
-            seconds=round(time.monotonic() - started, 3),
-        )
-
-    async def _open_network(self, stack: AsyncExitStack) -> None:
         network = await stack.enter_async_context(Network(Endpoints(listen=(self._endpoint,), mode="router")))
-        self._story.tell(
-            "market",
-            "router",
-            f"Zenoh router at {self._endpoint}, id {network.id}",
-            endpoint=self._endpoint,
-            zid=network.id,
-        )
+        router = f"Zenoh router at {self._endpoint}, id {network.id}"
+        self._narrator.event("market", "router", router, endpoint=self._endpoint, zid=network.id)
+        node = await stack.enter_async_context(EmbeddedChain())
+        self._market = await found_market(node.provider, node.funded_keys)
+        self._report_contracts()
+        await self._open_provider(stack, node.provider)
+        await self._open_agent(stack, node.provider, "robot", folder)
+        self._person = await self._open_agent(stack, node.provider, "person", folder)
 
-    def _tell_contracts(self) -> None:
+    def _report_contracts(self) -> None:
         deployment = self._market.deployment
-        self._story.tell(
+        self._narrator.event(
             "market",
             "contracts",
             f"contracts on an embedded chain\nfactory    {deployment.factory}\nlighthouse {deployment.lighthouse}"
@@ -174,39 +139,38 @@ class _Stage:
         chain = await stack.enter_async_context(self._market.chain(node, "provider"))
         lighthouse = self._market.deployment.lighthouse_name
         provider = await stack.enter_async_context(
-            Provider(network.session, chain, lighthouse, matched=self._tell_match)
+            Provider(network.session, chain, lighthouse, matched=self._report_match)
         )
         tasks = await stack.enter_async_context(Background())
         tasks.start(provider.run(), "demo provider")
-        self._introduce("provider", provider.address, network.id)
+        self._report_account("provider", provider.address, network.id)
 
-    async def _open_agent(self, stack: AsyncExitStack, node: AsyncBaseProvider, role: str) -> Agent:
+    async def _open_agent(self, stack: AsyncExitStack, node: AsyncBaseProvider, role: str, folder: Path) -> Agent:
         settings = Settings(
             connect=(self._endpoint,),
-            data_dir=str(self._scene / role),
+            data_dir=str(folder / role),
             lighthouse_contract=self._market.deployment.lighthouse_name,
             ens_contract=self._market.deployment.ens,
-            generation=5 if self._demo.generation == 5 else 3,
+            generation=5 if self._generation == 5 else 3,
         )
         chain = await stack.enter_async_context(self._market.chain(node, role))
         agent = Agent(MODEL, settings=settings, account=self._market.accounts[role], chain=chain)
         if role == "robot":
-            self._teach(agent)
+            self._add_handlers(agent)
         await stack.enter_async_context(agent)
-        self._introduce(role, agent.address, agent.parts.network.id)
+        self._report_account(role, agent.address, agent.parts.network.id)
         return agent
 
-    def _introduce(self, role: str, address: str, zid: str) -> None:
-        self._story.tell(role, "account", f"account {address}, Zenoh id {zid}", address=address, zid=zid)
+    def _report_account(self, role: str, address: str, zid: str) -> None:
+        self._narrator.event(role, "account", f"account {address}, Zenoh id {zid}", address=address, zid=zid)
 
-    def _teach(self, robot: Agent) -> None:
-        """What the robot does: it offers to do every demand of its model, and plays objectives to its lamp."""
-        lamp = Lamp(self._story)
-        robot.on("*")(lamp.play)
+    def _add_handlers(self, robot: Agent) -> None:
+        """Let the robot offer to do every demand for its model, and play objectives to its lamp."""
+        robot.on("*")(Lamp(self._narrator).play)
 
         @robot.on_demand
         async def offer(demand: Verified[Demand]) -> None:
-            self._story.tell(
+            self._narrator.event(
                 "robot",
                 "demand",
                 f"hears the Demand {demand.hash.hex()[:16]}… and publishes an Offer",
@@ -217,11 +181,11 @@ class _Stage:
 
         @robot.on_liability
         async def phase(phase: Phase, liability: Liability) -> None:
-            self._tell_phase(phase, liability)
+            self._report_phase(phase, liability)
 
-    def _tell_match(self, match: Match) -> None:
+    def _report_match(self, match: Match) -> None:
         self._match = match
-        self._story.tell(
+        self._narrator.event(
             "provider",
             "match",
             "Demand and Offer agree; asks the lighthouse for a contract",
@@ -229,29 +193,24 @@ class _Stage:
             offer=match.offer.hash.hex(),
         )
 
-    def _tell_phase(self, phase: Phase, liability: Liability) -> None:
-        """The job's way, as the robot's own ledger tells it."""
-        tell, address = self._story.tell, liability.address
+    def _report_phase(self, phase: Phase, liability: Liability) -> None:
+        """Report the phases of the job, which the robot's ledger records."""
+        event, address = self._narrator.event, liability.address
         match phase:
             case Phase.INCOMING:
-                self._story.chapter("A contract holds the money")
-                tell(
-                    "contract",
-                    "liability",
-                    f"liability {address} holds {_xrt(liability.cost)}",
-                    liability=address,
-                    cost=int(liability.cost),
-                )
-                tell("robot", "incoming", "fetches the objective by its CID and examines it", liability=address)
+                self._narrator.chapter("A contract holds the money")
+                holds = f"liability {address} holds {_xrt(liability.cost)}"
+                event("contract", "liability", holds, liability=address, cost=int(liability.cost))
+                event("robot", "incoming", "fetches the objective by its CID and examines it", liability=address)
             case Phase.READY:
-                tell("robot", "ready", "is ready", liability=address)
+                event("robot", "ready", "is ready", liability=address)
             case Phase.RUNNING:
-                self._story.chapter("The robot works")
-                tell("robot", "running", "plays the objective and records its device", liability=address)
+                self._narrator.chapter("The robot works")
+                event("robot", "running", "plays the objective and records its device", liability=address)
             case Phase.COMPLETE:
                 self._success = liability.is_success
                 done = "done" if liability.is_success else "not done"
-                tell(
+                event(
                     "robot",
                     "complete",
                     f"signs the Result: {done}, recording\n{liability.result}",
@@ -259,23 +218,40 @@ class _Stage:
                     result=liability.result,
                     success=liability.is_success,
                 )
-                self._story.chapter("The contract pays" if liability.is_success else "The contract refunds")
+                self._narrator.chapter("The contract pays" if liability.is_success else "The contract refunds")
             case Phase.FINALIZED:
-                tell("contract", "finalized", "liability is finalized", liability=address)
+                event("contract", "finalized", "liability is finalized", liability=address)
                 self._finalized.set()
 
-    def _tell_payment(self, before: dict[str, int], after: dict[str, int]) -> None:
+    async def _do_job(self, objective: Objective, started: float) -> None:
+        """Publish the demand, wait until the job is done and paid, and keep the recording."""
+        before, path = await self._balances(), objective.path
+        self._narrator.chapter("A person wants work done")
+        cid = await asyncio.to_thread(cid_of_file, path)
+        event = self._narrator.event
+        event("person", "objective", f"holds the objective {path.name}\n{cid}", objective=cid, file=str(path))
+        event("person", "asking", f"will pay {_xrt(COST)} for it, and publishes a Demand", model=MODEL, cost=COST)
+        async with asyncio.timeout(self._timeout):
+            contract = await self._person.demand(path, cost=COST)
+        async with asyncio.timeout(self._timeout + objective.duration_ns / 1e9 + objective.count * BLINK_SECONDS):
+            outcome = await contract.outcome()
+            await self._finalized.wait()
+        recording, after = await contract.recording(), await self._balances()
         for role in ROLES:
-            words = f"had {_xrt(before[role])}, has {_xrt(after[role])}"
-            self._story.tell(role, "balance", words, before=before[role], after=after[role])
+            balance = f"had {_xrt(before[role])}, has {_xrt(after[role])}"
+            event(role, "balance", balance, before=before[role], after=after[role])
+        kept = await asyncio.to_thread(self._keep, recording, outcome.result, path, cid)
+        words = f"has the recording {kept}\n{outcome.result}"
+        event("person", "recording", words, result=outcome.result, path=kept)
+        self._summarize(contract, outcome, cid, started)
 
     async def _balances(self) -> dict[str, int]:
         chain = self._person.parts.chain
         return {role: await chain.tokens.balance(account.address) for role, account in self._market.accounts.items()}
 
     def _keep(self, recording: Path, result: str, objective: Path, cid: str) -> str:
-        """Copy recording and objective, by their CIDs, to where they outlive the demo; says where the recording is."""
-        out = self._demo.out
+        """Copy recording and objective to the output folder, named by their CIDs; return where the recording is."""
+        out = self._out
         if out is None:
             return f"{result}.mcap (keep it with --out DIR)"
         kept = out / f"{result}.mcap"
@@ -283,12 +259,27 @@ class _Stage:
             try:
                 shutil.copyfile(source, target)
             except shutil.SameFileError:
-                continue  # what an earlier demo kept is played again
+                continue  # the objective is one that an earlier demo kept
             except OSError as error:
-                raise ConfigurationError(f"can't keep {target}: {error.strerror}") from None
+                raise OutputNotWritable(f"can't keep {target}: {error.strerror}") from None
         return str(kept)
+
+    def _summarize(self, contract: Contract, outcome: Outcome, objective: str, started: float) -> None:
+        assert self._match is not None
+        self._narrator.summary(
+            liability=contract.address,
+            demand=self._match.demand.hash.hex(),
+            offer=self._match.offer.hash.hex(),
+            objective=objective,
+            result=outcome.result,
+            success=self._success,
+            paid=outcome.success,
+            cost=COST,
+            generation=self._generation,
+            seconds=round(time.monotonic() - started, 3),
+        )
 
 
 def _xrt(wn: int) -> str:
-    """An amount of wn in XRT, as people write it."""
+    """An amount of wn as a decimal number of XRT."""
     return f"{wn / XRT:,.9f}".rstrip("0").rstrip(".") + " XRT"

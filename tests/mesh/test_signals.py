@@ -133,7 +133,7 @@ main()
 
 
 @pytest.mark.parametrize(
-    "module", ["mesh.cli", "click", "schemas.errors", "mesh.cli.demo", "web3", "zenoh", "mesh.demo.story"]
+    "module", ["mesh.cli", "click", "schemas.errors", "mesh.cli.demo", "web3", "zenoh", "mesh.demo.narration"]
 )
 def test_an_interrupt_while_a_program_is_being_loaded_ends_it_quietly(module: str) -> None:
     done = run(sys.executable, "-c", LOADING.format(module=module))

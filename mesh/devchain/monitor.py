@@ -1,4 +1,4 @@
-"""A look at a served chain now and then, for an operator: whether it answers, and how high it is."""
+"""Health and metrics of a chain that this process serves."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ if TYPE_CHECKING:
 
     from mesh.chain import Node
 
-LOOK: Final = 1.0
-"""Seconds between two looks."""
+INTERVAL: Final = 1.0
+"""Seconds between two checks."""
 
 
-class Look:
-    """Looks at the chain of `node`, which is open, while it runs."""
+class ChainMonitor:
+    """Checks the chain of an open `node` regularly while `run` runs."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
         self._head: int | None = None
 
     async def run(self) -> None:
-        """Look until cancelled."""
+        """Check until cancelled."""
         while True:
             try:
                 self._head = await self._node.block_number()
             except (NodeUnreachable, RequestRefused):
                 self._head = None
-            await asyncio.sleep(LOOK)
+            await asyncio.sleep(INTERVAL)
 
     async def measure(self) -> tuple[MetricFamily, ...]:
-        """How high the chain is, if that is known."""
-        return (
-            () if self._head is None else (gauge("aira_chain_head_block", "The last block that was read", self._head),)
-        )
+        """The number of the latest block; nothing while the chain does not answer."""
+        if self._head is None:
+            return ()
+        return (gauge("aira_chain_head_block", "The last block that was read", self._head),)
 
     def health(self) -> Mapping[str, str]:
         """Whether the chain answers."""

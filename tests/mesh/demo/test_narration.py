@@ -1,4 +1,4 @@
-"""How the demo tells what happens: the order of it, to whom, and what it makes of odd messages and of no hearers."""
+"""The demo's output: its order, odd messages, and a reader that closes its end."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.demo.story import JsonStory, SpokenStory
+from mesh.demo.narration import JsonNarrator, TextNarrator
 from schemas import Empty, String
 from tests.support.commands import AIRA, aira, environment
 from tests.support.objectives import objective
@@ -49,16 +49,16 @@ STEPS = (
 )
 
 
-def test_people_are_told_the_steps_in_their_order() -> None:
+def test_the_text_has_the_steps_in_their_order() -> None:
     done = aira("demo")
     assert (done.returncode, done.stderr) == (0, "")
     lines = iter(done.stdout.splitlines())
     for step in STEPS:
-        assert any(line.startswith(step) for line in lines), f"{step!r} is not told, or not in its place"
+        assert any(line.startswith(step) for line in lines), f"{step!r} is missing, or not in its place"
 
 
-def test_programs_are_told_messages_as_people_may_see_them(tmp_path: Path) -> None:
-    """An objective is anybody's: it must not steer the terminal that the demo runs in."""
+def test_messages_are_printed_without_control_characters(tmp_path: Path) -> None:
+    """An objective may come from anyone; it must not control the terminal."""
     path = tmp_path / "odd.mcap"
     values = (String("red"), String("\x1b[2Jgone\n"), String("x" * 61), String(""), b"\x00\x01", {"a": 1}, Empty())
     path.write_bytes(objective(*(("/odd", value) for value in values), step_ns=0))
@@ -78,7 +78,7 @@ def test_programs_are_told_messages_as_people_may_see_them(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("form", [(), ("--json",)])
-def test_a_demo_whose_hearer_leaves_goes_on_quietly(form: tuple[str, ...]) -> None:
+def test_a_demo_goes_on_after_its_reader_closed_stdout(form: tuple[str, ...]) -> None:
     """As with `aira demo | head`: no traceback, no hanging."""
     pipe = subprocess.PIPE
     with subprocess.Popen([*AIRA, "demo", *form], stdout=pipe, stderr=pipe, env=environment({})) as process:
@@ -91,22 +91,22 @@ def test_a_demo_whose_hearer_leaves_goes_on_quietly(form: tuple[str, ...]) -> No
 
 
 def test_further_lines_are_indented_and_long_ones_stay_whole(capsys: pytest.CaptureFixture[str]) -> None:
-    story = SpokenStory()
-    story.chapter("A chapter")
-    story.tell("robot", "asking", "[b]says[/b]\n" + "0x" * 200)
+    narrator = TextNarrator()
+    narrator.chapter("A chapter")
+    narrator.event("robot", "asking", "[b]says[/b]\n" + "0x" * 200)
     assert capsys.readouterr().out == f"\nA chapter\n  robot     [b]says[/b]\n{' ' * 12}{'0x' * 200}\n"
 
 
 @pytest.mark.parametrize(("paid", "word"), [(True, "paid"), (False, "refunded")])
-def test_the_end_says_what_became_of_the_money(paid: bool, word: str, capsys: pytest.CaptureFixture[str]) -> None:
-    SpokenStory().end(paid=paid, seconds=1.25)
+def test_the_last_line_says_if_the_robot_was_paid(paid: bool, word: str, capsys: pytest.CaptureFixture[str]) -> None:
+    TextNarrator().summary(paid=paid, seconds=1.25)
     assert capsys.readouterr().out == f"\nDone in 1.2 s: the job was {word}.\n"
 
 
-def test_programs_are_told_facts_and_no_words(capsys: pytest.CaptureFixture[str]) -> None:
-    story = JsonStory()
-    story.chapter("A chapter")
-    story.tell("robot", "ready", "is ready", liability="0x1")
-    story.end(paid=False)
-    told: list[dict[str, Any]] = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert told == [{"event": "ready", "who": "robot", "liability": "0x1"}, {"paid": False}]
+def test_objects_hold_the_facts_without_the_text(capsys: pytest.CaptureFixture[str]) -> None:
+    narrator = JsonNarrator()
+    narrator.chapter("A chapter")
+    narrator.event("robot", "ready", "is ready", liability="0x1")
+    narrator.summary(paid=False)
+    objects: list[dict[str, Any]] = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert objects == [{"event": "ready", "who": "robot", "liability": "0x1"}, {"paid": False}]
