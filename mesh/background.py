@@ -11,9 +11,9 @@ if TYPE_CHECKING:
 
 
 class Background:
-    """`async with Background() as tasks: tasks.start(...)`; leaving it ends them all.
+    """`async with Background() as tasks: tasks.start(...)`; leaving it cancels the tasks.
 
-    When one fails, the body is cancelled and its error raised (in a group only when several failed).
+    If a task fails, the body is cancelled and the task's error is raised (in a group if several failed).
     """
 
     def __init__(self) -> None:

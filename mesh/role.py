@@ -1,4 +1,4 @@
-"""What every role is: opened and closed by `async with`, and at work while it runs."""
+"""The base class of roles, such as provider, bridge and agent: opened by `async with`, working while `run` runs."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ if TYPE_CHECKING:
 
 
 class Role(ABC):
-    """`async with role`, then `await role.run()`. Leaving closes what was opened, the last first.
+    """`async with role`, then `await role.run()`. Leaving closes everything in reverse order.
 
-    A subclass says who it is in `title`, for people to read, opens what it stands on in `_open`, and does what it is
-    for in `_work`. Where `_open` fails, what it has opened so far is closed.
+    A subclass sets `title`, opens what it needs in `_open` and works in `_work`. If `_open` fails, what it opened until
+    then is closed.
     """
 
     title: ClassVar[str]
+    """The role's name in error messages."""
     _stack: AsyncExitStack | None = None
 
     async def __aenter__(self) -> Self:
@@ -50,8 +51,8 @@ class Role(ABC):
 
     @abstractmethod
     async def _open(self, stack: AsyncExitStack) -> None:
-        """Open what the role stands on, onto `stack`."""
+        """Open what the role needs, on `stack`."""
 
     @abstractmethod
     async def _work(self) -> None:
-        """Do what the role is for, until cancelled."""
+        """Do the role's work until cancelled."""

@@ -1,4 +1,4 @@
-"""How a program of the mesh runs and ends: signals, errors as one line, exit codes."""
+"""Running a program: signals, error messages, exit codes."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 INTERRUPTED: Final = 130
-"""Exit code of a command that Ctrl-C kept from its end."""
+"""Exit code of a command that was interrupted by Ctrl-C or SIGTERM."""
 STOPPING: Final = (signal.SIGINT, signal.SIGTERM)
-"""The signals that ask a program to end."""
-BEAT: Final = 0.1
-"""Seconds between two moments at which a program that is tidying up notices a second Ctrl-C."""
+"""The signals that stop a program."""
+WAKE_INTERVAL: Final = 0.1
+"""Seconds between two wake-ups of the event loop during cleanup, at which a second Ctrl-C takes effect."""
 
 
 def run_to_end(main: Callable[[], Coroutine[Any, Any, object]]) -> None:
-    """Run what has an end; Ctrl-C and SIGTERM break it off with exit code 130. Exits 1 or 2 on errors."""
+    """Run a command; Ctrl-C and SIGTERM end it with exit code 130, errors with 1 or 2."""
     if not _run(main):
         sys.exit(INTERRUPTED)
 
@@ -33,9 +33,9 @@ def run_to_end(main: Callable[[], Coroutine[Any, Any, object]]) -> None:
 def run_until_stopped(
     main: Callable[[], Coroutine[Any, Any, object]], *, settings: Settings | None = None, role: str = ""
 ) -> None:
-    """Run a server; Ctrl-C and SIGTERM are its normal end. Exits 1 or 2 on errors.
+    """Run a server; Ctrl-C and SIGTERM are its normal end. Errors end it with exit code 1 or 2.
 
-    It logs as the `settings` say, and is called `role` there.
+    `settings` configure its log, `role` is its name there.
     """
     from mesh.telemetry.logs import configure_logging, configure_logging_from
 
@@ -47,22 +47,22 @@ def run_until_stopped(
 
 
 def fail(error: AiraError) -> NoReturn:
-    """Say what is wrong, and exit: 2 for what the caller gave, 1 for the rest."""
-    tell(error)
+    """Report an error and exit: with 2 for an `InputError` or a `ConfigurationError`, else with 1."""
+    report(error)
     sys.exit(2 if isinstance(error, InputError | ConfigurationError) else 1)
 
 
-def tell(error: AiraError) -> None:
-    """Say what is wrong and what to do in a line each, without what opens doors in the addresses that it names.
+def report(error: AiraError) -> None:
+    """Print an error and its hint to stderr, one line each, without secrets in URLs.
 
-    Where a server logs in JSON, that is an event of its log.
+    A server that logs in JSON logs an event instead.
     """
-    from mesh.telemetry.context import log_event  # here, as few commands come to this
+    from mesh.telemetry.context import log_event  # here, as most commands never need it
     from mesh.telemetry.events import without_secrets
     from mesh.telemetry.logs import logs_json
 
     if logs_json():
-        log.error("%s", error, extra=log_event("failed", code=error.code, hint=error.hint))
+        log.error("%s", error, extra=log_event("program-failed", code=error.code, hint=error.hint))
         return
     print(f"aira: {without_secrets(str(error))} [{error.code}]", file=sys.stderr)
     if error.hint:
@@ -70,13 +70,13 @@ def tell(error: AiraError) -> None:
 
 
 def _run(main: Callable[[], Coroutine[Any, Any, object]]) -> bool:
-    """Whether `main` came to its end (false: a signal stopped it)."""
-    import asyncio  # here, as the small commands need nothing of it but `fail`
+    """Run `main`; returns False if a signal stopped it."""
+    import asyncio  # here, as small commands only use `fail`
 
     before = {number: signal.getsignal(number) for number in STOPPING}
     try:
         return asyncio.run(_until_signal(main))
-    except KeyboardInterrupt:  # before the loop listens to signals, or the second Ctrl-C
+    except KeyboardInterrupt:  # before the loop handles signals, or a second Ctrl-C
         return False
     except AiraError as error:
         fail(error)
@@ -87,12 +87,12 @@ def _run(main: Callable[[], Coroutine[Any, Any, object]]) -> bool:
         fail(cause)
     finally:
         for number, handler in before.items():
-            if handler is not None:  # none was set by Python
+            if handler is not None:  # None: it was not set by Python
                 signal.signal(number, handler)
 
 
 async def _until_signal(main: Callable[[], Coroutine[Any, Any, object]]) -> bool:
-    """Run `main` as a task; the first signal cancels it, a second one has its usual effect."""
+    """Run `main` as a task; the first signal cancels it, a second one has its default effect."""
     import asyncio
 
     loop = asyncio.get_running_loop()
@@ -105,11 +105,11 @@ async def _until_signal(main: Callable[[], Coroutine[Any, Any, object]]) -> bool
         for number in STOPPING:
             loop.remove_signal_handler(number)
         work.cancel()
-        beat()
+        wake()
 
-    def beat() -> None:
-        """A loop without handlers sleeps on when a signal comes to another thread, or just before it goes to sleep."""
-        loop.call_later(BEAT, beat)
+    def wake() -> None:
+        """Keep the loop awake: without handlers a signal to another thread would not end its sleep."""
+        loop.call_later(WAKE_INTERVAL, wake)
 
     for number in STOPPING:
         loop.add_signal_handler(number, stop)
@@ -122,7 +122,7 @@ async def _until_signal(main: Callable[[], Coroutine[Any, Any, object]]) -> bool
 
 
 def _cause(group: BaseExceptionGroup[BaseException]) -> AiraError | None:
-    """The one error that explains a group, if there is one: tasks that fail together mostly fail for one reason."""
+    """The first error of a group that holds only `AiraError`s (they mostly have one cause); None for other groups."""
     matching, rest = group.split(AiraError)
     if matching is None or rest is not None:
         return None

@@ -1,5 +1,7 @@
-"""The start of a server that waits for what it needs, instead of ending with a line: for its files, a router, a node,
-contracts and a stake. Asked for by `connect_timeout = -1`; what is waited for is said once."""
+"""How a server starts while something that it needs is missing: a file, the router, the node, contracts, a stake.
+
+By default it ends with an error. With `connect_timeout = -1` it waits and tries again, and logs once what it waits for.
+"""
 
 from __future__ import annotations
 
@@ -9,120 +11,125 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from mesh.errors import ConfigurationError, RemoteError
 from mesh.outage_log import OutageLog
+from mesh.retry import Backoff, RetryPolicy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from contextlib import AbstractAsyncContextManager, AsyncExitStack
     from pathlib import Path
 
-    from mesh.settings import Settings
+    from mesh.settings import NetworkSettings, Settings
 
 log = logging.getLogger(__name__)
 
-AGAIN: Final = 1.0
-"""Seconds between two attempts."""
+STARTUP: Final = RetryPolicy(initial=0.5, ceiling=5.0)
+"""Shorter delays than elsewhere: at a start somebody is usually setting the missing parts up."""
 
 T = TypeVar("T")
 
 
-def waits_for_ever(settings: Settings) -> bool:
-    """Whether a server with these settings waits for what is not there yet."""
-    return settings.connect_timeout < 0
-
-
 class FilesMissing(ConfigurationError):
-    """Files that the settings name are not there."""
+    """Files that the settings name do not exist."""
 
     code = "files-missing"
 
     def __init__(self, files: Sequence[str]) -> None:
-        super().__init__(f"files that are not there yet: {', '.join(files)}")
+        super().__init__(f"missing files: {', '.join(files)}")
+        self.files = tuple(files)
 
 
 class FilesNotReadable(ConfigurationError):
-    """Files that the settings name are there, and not for this user to read."""
+    """The user may not read files that the settings name."""
 
     code = "files-not-readable"
 
     def __init__(self, files: Sequence[str]) -> None:
         user = os.geteuid()
         super().__init__(
-            f"files that user {user} may not read: {', '.join(files)}", hint=f"give them to it: chown -R {user} FOLDER"
+            f"user {user} may not read the files {', '.join(files)}",
+            hint=f"change their owner: chown -R {user} FOLDER",
         )
+        self.files = tuple(files)
 
 
-def lacking(settings: Settings) -> Iterator[None]:
-    """Yields as long as one of the files that the settings name can't be read, for the caller to sleep; says so once.
-
-    Ends at once where nothing is to be waited for: what reads the file says then that it is not there.
-    """
-    trouble = OutageLog(log, "files")
-    while waits_for_ever(settings) and (error := _lack(settings)) is not None:
-        trouble.failed(error, "waiting")
-        yield
-    trouble.recovered("the files are there")
+def waits_forever(settings: NetworkSettings) -> bool:
+    """Whether a server with these settings waits for what is missing."""
+    return settings.connect_timeout < 0
 
 
-async def files(settings: Settings) -> None:
-    """Wait for the files that the settings name, where they say so."""
+async def wait_for_files(settings: Settings, *, retry: RetryPolicy = STARTUP) -> None:
+    """Wait until the files that the settings name are readable, if the settings say to wait."""
     import asyncio  # here, as an edge agent has no event loop
 
-    for _ in lacking(settings):
-        await asyncio.sleep(AGAIN)
+    for delay in file_delays(settings, retry=retry):
+        await asyncio.sleep(delay)
 
 
-async def entered(
+def file_delays(settings: Settings, *, retry: RetryPolicy = STARTUP) -> Iterator[float]:
+    """Yield the seconds until the next check, as long as a file that the settings name is not readable.
+
+    Ends at once if the settings don't say to wait: reading the file reports the error then.
+    """
+    outages, backoff = OutageLog(log, "files"), Backoff(retry)
+    while waits_forever(settings) and (error := _file_error(settings)) is not None:
+        outages.failed(error, "waiting for files")
+        delay = backoff.next_delay()
+        if delay is None:
+            return
+        yield delay
+    outages.recovered("the files are readable")
+
+
+async def open_when_ready(
     stack: AsyncExitStack,
-    settings: Settings,
+    settings: NetworkSettings,
     make: Callable[[], AbstractAsyncContextManager[T]],
     *,
     role: str,
-    waits: Callable[[str], None] = lambda why: None,
+    on_wait: Callable[[str], None] = lambda reason: None,
+    retry: RetryPolicy = STARTUP,
 ) -> T:
-    """What `make` opens, on the stack; where the settings wait for ever, tried again for as long as what it needs of
-    others (a router, a node, contracts, a stake) is not there.
+    """Enter what `make` returns on `stack`. If the settings say to wait, try again after each `RemoteError`.
 
-    `role` is who waits, for people to read; `waits` is told why, each time. Raises what opening raises: with an end to
-    its patience also `RemoteError`.
+    `role` names the server in the log; `on_wait` is called with the reason of each failure. Raises the errors of
+    entering; `RemoteError` only if the settings don't say to wait.
     """
-    import asyncio
-
-    trouble = OutageLog(log, "startup")
+    outages, backoff = OutageLog(log, "startup"), Backoff(retry)
     while True:
         try:
             opened = await stack.enter_async_context(make())
         except RemoteError as error:
-            if not waits_for_ever(settings):
+            if not waits_forever(settings):
                 raise
-            trouble.failed(error, f"the {role} waits")
-            waits(str(error))
-            await asyncio.sleep(AGAIN)
+            outages.failed(error, f"the {role} waits")
+            on_wait(str(error))
+            if not await backoff.wait():
+                raise
         else:
-            trouble.recovered(f"the {role} waits no longer")
+            outages.recovered(f"the {role} starts")
             return opened
 
 
-def _lack(settings: Settings) -> ConfigurationError | None:
-    """What is the matter with the files that the settings name."""
-    missing, closed = [], []
-    for path in _named(settings):
+def _file_error(settings: Settings) -> ConfigurationError | None:
+    """The error of the files that the settings name; None if all are readable."""
+    missing, unreadable = [], []
+    for path in _required_files(settings):
         try:
             path.open("rb").close()
         except FileNotFoundError:
             missing.append(str(path))
         except PermissionError:
-            closed.append(str(path))
+            unreadable.append(str(path))
         except OSError:
-            continue  # a folder, as an engine makes of a file that is missing: who reads it says what is the matter
-    if closed:
-        return FilesNotReadable(closed)
+            continue  # such as a folder, which a container engine makes for a missing file: reading it reports that
+    if unreadable:
+        return FilesNotReadable(unreadable)
     return FilesMissing(missing) if missing else None
 
 
-def _named(settings: Settings) -> Iterator[Path]:
-    """The files that the settings name for a server to have."""
+def _required_files(settings: Settings) -> Iterator[Path]:
     from pathlib import Path
 
     for option in ("roster", "tls_ca", "tls_certificate", "tls_key", "keyfile", "keyfile_password_file"):
-        if named := getattr(settings, option):
-            yield Path(named).expanduser()
+        if path := getattr(settings, option):
+            yield Path(path).expanduser()

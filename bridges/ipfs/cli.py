@@ -86,13 +86,13 @@ async def _serve(settings: Settings, lighthouses: tuple[str, ...]) -> None:
             f"the IPFS bridge needs {error.name}, which is not installed", hint="pip install 'aira-mesh[ipfs]'"
         ) from error
 
-    from mesh.starting import files
+    from mesh.starting import wait_for_files
     from mesh.telemetry.serving import Telemetry
 
     base_url(settings.ipfs_http_provider)  # before anything is waited for
     async with AsyncExitStack() as stack:
         telemetry = await stack.enter_async_context(Telemetry(settings.metrics_listen))
-        await files(settings)
+        await wait_for_files(settings)
         chain = _chain(settings)
         network = await _network(settings, stack, waits=telemetry.starting)
         bridge = await stack.enter_async_context(

@@ -18,7 +18,7 @@ from bridges.serial.telling import tell_log
 from mesh.cli.output import announce
 from mesh.network.connecting import SessionOpening
 from mesh.running import INTERRUPTED
-from mesh.starting import AGAIN, lacking
+from mesh.starting import file_delays
 from mesh.telemetry.context import LogSource
 from mesh.telemetry.logs import set_process_source
 from schemas.address import parse_address
@@ -69,8 +69,8 @@ def dialect_of(protocol: Protocol, *, baud: int, parameters: Mapping[str, object
 def wait_for_files(settings: Settings) -> None:
     """Wait for the files that the settings name, where they say so. On the main thread, as `serve`."""
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(INTERRUPTED))
-    for _ in lacking(settings):
-        time.sleep(AGAIN)
+    for delay in file_delays(settings):
+        time.sleep(delay)
 
 
 @contextmanager

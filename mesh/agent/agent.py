@@ -15,7 +15,7 @@ from mesh.background import Background
 from mesh.composition import load_account
 from mesh.errors import ClosedError, ConfigurationError
 from mesh.settings import load
-from mesh.starting import entered, files
+from mesh.starting import open_when_ready, wait_for_files
 from mesh.telemetry.context import LogSource, source_context
 from mesh.telemetry.logs import set_process_source
 from mesh.telemetry.serving import Telemetry
@@ -230,7 +230,7 @@ class Agent:
     async def _open(self, stack: AsyncExitStack) -> None:
         """Open the parts, then start what runs beside them."""
         await stack.enter_async_context(self.telemetry)
-        await files(self.settings)
+        await wait_for_files(self.settings)
         account = self._account
         if account is None and self.settings.keyfile:
             account = await asyncio.to_thread(load_account, self.settings)
@@ -274,7 +274,7 @@ class Agent:
         from mesh.agent.runtime import AgentRuntime  # loads web3, which an agent that watches does without
 
         make = partial(working, self.settings, account, self._given_chain)
-        parts = await entered(stack, self.settings, make, role="agent", waits=self.telemetry.starting)
+        parts = await open_when_ready(stack, self.settings, make, role="agent", on_wait=self.telemetry.starting)
         performer = HandlerTopics(self._hooks) if self._hooks.topics else None
         worker = self._worker = AgentRuntime(parts, performer=performer, witnesses=self._hooks.liabilities)
         self._channel = parts.channel

@@ -12,7 +12,7 @@ from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import print_facts, print_json, printable
 from mesh.errors import AiraError, ConfigurationError, InputError
 from mesh.identity.roles import ROLES
-from mesh.running import fail, run_to_end, tell
+from mesh.running import fail, report, run_to_end
 from mesh.settings import NetworkSettings, options_of
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def renew(
             facts = _renew(folder, _site(site), days, roster) if is_due else before
         except AiraError as error:
             if failed is not None:
-                tell(failed)
+                report(failed)
             failed = error
             continue
         if is_due or as_json:

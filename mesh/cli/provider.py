@@ -54,16 +54,16 @@ def command(settings: Settings) -> None:
 
 async def _serve(settings: Settings) -> None:
     from mesh.composition import load_account
-    from mesh.starting import entered, files
+    from mesh.starting import open_when_ready, wait_for_files
 
     lighthouse = settings.lighthouse_contract
     async with AsyncExitStack() as stack:
         telemetry = await stack.enter_async_context(Telemetry(settings.metrics_listen))
-        await files(settings)
+        await wait_for_files(settings)
         account = await asyncio.to_thread(load_account, settings)
         set_process_source(LogSource("provider", account.address, lighthouse.lower()))
         make = partial(_opened, settings, account, telemetry)
-        network, provider = await entered(stack, settings, make, role="provider", waits=telemetry.starting)
+        network, provider = await open_when_ready(stack, settings, make, role="provider", on_wait=telemetry.starting)
         words = f"provider {provider.address} serves {lighthouse}, Zenoh id {network.id}"
         announce(log, "provider-started", words, provider=provider.address, zenoh=network.id)
         tasks = await stack.enter_async_context(Background())

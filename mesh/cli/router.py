@@ -103,10 +103,10 @@ def config(settings: Settings, out: Path) -> None:
 async def _serve(settings: Settings) -> None:
     from mesh.identity.routers import router_endpoints
     from mesh.network import Network
-    from mesh.starting import files
+    from mesh.starting import wait_for_files
 
     async with Telemetry(settings.metrics_listen) as telemetry:
-        await files(settings)
+        await wait_for_files(settings)
         endpoints = router_endpoints(settings)
         while True:
             certificate = _contents(endpoints)

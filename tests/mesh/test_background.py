@@ -1,4 +1,4 @@
-"""Tasks beside a body: how they end, and whose error comes out."""
+"""Background tasks: how they end, and which error is raised."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ async def fail(error: Exception) -> None:
     raise error
 
 
-async def test_leaving_ends_all_tasks() -> None:
+async def test_leaving_cancels_all_tasks() -> None:
     ended: list[str] = []
 
     async with asyncio.timeout(5), Background() as tasks:
@@ -37,7 +37,7 @@ async def test_leaving_ends_all_tasks() -> None:
     assert sorted(ended) == ["a", "b"]
 
 
-async def test_a_task_has_the_name_that_it_was_given() -> None:
+async def test_a_task_has_its_name() -> None:
     async with Background() as tasks:
         tasks.start(for_ever([], ""), "the name")
 
@@ -52,7 +52,7 @@ async def beside(*works: Coroutine[Any, Any, None], body: Coroutine[Any, Any, No
         await body
 
 
-async def test_a_task_that_fails_ends_the_body_and_the_others_and_its_error_comes_out() -> None:
+async def test_a_failed_task_cancels_body_and_other_tasks_and_its_error_is_raised() -> None:
     ended: list[str] = []
 
     with pytest.raises(ValueError, match="broken"):
@@ -61,7 +61,7 @@ async def test_a_task_that_fails_ends_the_body_and_the_others_and_its_error_come
     assert sorted(ended) == ["a", "body"]
 
 
-async def test_an_error_of_the_body_comes_out_as_it_is() -> None:
+async def test_an_error_of_the_body_is_raised() -> None:
     ended: list[str] = []
 
     with pytest.raises(ValueError, match="body"):
@@ -70,7 +70,7 @@ async def test_an_error_of_the_body_comes_out_as_it_is() -> None:
     assert ended == ["a"]
 
 
-async def test_several_errors_come_out_as_a_group() -> None:
+async def test_several_errors_are_raised_as_a_group() -> None:
     with pytest.raises(ExceptionGroup) as raised:
         await beside(fail(ValueError("one")), fail(TypeError("two")), body=for_ever([], "body"))
 
@@ -97,7 +97,7 @@ async def test_cancelling_the_body_from_outside_stays_a_cancellation() -> None:
     assert ended == ["a"]
 
 
-async def test_a_task_that_ends_by_itself_disturbs_nobody() -> None:
+async def test_a_task_may_end_before_the_body() -> None:
     done: list[str] = []
 
     async def short(name: str) -> None:

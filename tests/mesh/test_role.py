@@ -1,3 +1,5 @@
+"""How a role opens, runs and closes."""
+
 from __future__ import annotations
 
 import asyncio
@@ -14,27 +16,27 @@ if TYPE_CHECKING:
     from contextlib import AsyncExitStack
 
 
-class Clerk(Role):
-    """Opens two drawers, of which the second may be stuck, and writes."""
+class ExampleRole(Role):
+    """Opens two parts, `first` and `second`, and works. It may fail between them."""
 
-    title = "clerk"
+    title = "example"
 
-    def __init__(self, *, stuck: bool = False) -> None:
+    def __init__(self, *, fails: bool = False) -> None:
         self.done: list[str] = []
-        self._stuck = stuck
+        self._fails = fails
 
     async def _open(self, stack: AsyncExitStack) -> None:
-        await stack.enter_async_context(self._drawer("upper"))
-        if self._stuck:
-            raise OSError("stuck")
-        await stack.enter_async_context(self._drawer("lower"))
+        await stack.enter_async_context(self._part("first"))
+        if self._fails:
+            raise OSError("broken")
+        await stack.enter_async_context(self._part("second"))
 
     async def _work(self) -> None:
-        self.done.append("writes")
+        self.done.append("works")
         await asyncio.Event().wait()
 
     @asynccontextmanager
-    async def _drawer(self, name: str) -> AsyncIterator[None]:
+    async def _part(self, name: str) -> AsyncIterator[None]:
         self.done.append(f"opens {name}")
         try:
             yield
@@ -42,32 +44,32 @@ class Clerk(Role):
             self.done.append(f"closes {name}")
 
 
-async def test_a_role_works_while_it_is_open_and_closes_the_last_first() -> None:
-    clerk = Clerk()
-    async with clerk:
-        assert clerk.is_open
+async def test_a_role_works_while_it_is_open_and_closes_in_reverse_order() -> None:
+    role = ExampleRole()
+    async with role:
+        assert role.is_open
         with pytest.raises(TimeoutError):
             async with asyncio.timeout(0.05):
-                await clerk.run()
-    assert clerk.done == ["opens upper", "opens lower", "writes", "closes lower", "closes upper"]
-    assert not clerk.is_open
+                await role.run()
+    assert role.done == ["opens first", "opens second", "works", "closes second", "closes first"]
+    assert not role.is_open
 
 
-async def test_a_role_that_is_not_open_does_not_run_and_one_that_is_does_not_open_again() -> None:
-    clerk = Clerk()
-    with pytest.raises(ClosedError, match="this clerk is not open"):
-        await clerk.run()
-    async with clerk:
-        with pytest.raises(ClosedError, match="this clerk is open already"):
-            await clerk.__aenter__()
-        assert clerk.done == ["opens upper", "opens lower"]
-    async with clerk:
-        assert clerk.is_open
+async def test_a_closed_role_does_not_run_and_an_open_one_does_not_open_again() -> None:
+    role = ExampleRole()
+    with pytest.raises(ClosedError, match="this example is not open"):
+        await role.run()
+    async with role:
+        with pytest.raises(ClosedError, match="this example is open already"):
+            await role.__aenter__()
+        assert role.done == ["opens first", "opens second"]
+    async with role:
+        assert role.is_open
 
 
-async def test_what_was_opened_is_closed_where_the_rest_can_not_be() -> None:
-    clerk = Clerk(stuck=True)
-    with pytest.raises(OSError, match="stuck"):
-        await clerk.__aenter__()
-    assert clerk.done == ["opens upper", "closes upper"]
-    assert not clerk.is_open
+async def test_opened_parts_are_closed_when_opening_fails() -> None:
+    role = ExampleRole(fails=True)
+    with pytest.raises(OSError, match="broken"):
+        await role.__aenter__()
+    assert role.done == ["opens first", "closes first"]
+    assert not role.is_open

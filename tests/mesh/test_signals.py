@@ -1,4 +1,4 @@
-"""The ends of a program in this process: what signals, errors and groups of errors come to."""
+"""How a program that runs in this process ends: by signals, errors and groups of errors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.errors import ConfigurationError, NetworkUnavailable, RemoteError
+from mesh.errors import AiraError, ConfigurationError, NetworkUnavailable, RemoteError
 from mesh.running import run_to_end, run_until_stopped
 from tests.support.commands import run
 
@@ -21,11 +21,11 @@ BOTH = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 
 
 class Work:
-    """Something to do that gets a signal while it is done."""
+    """Work that gets a signal while it runs."""
 
     def __init__(self, number: signal.Signals) -> None:
         self._number = number
-        self.tidied = False
+        self.cleaned_up = False
 
     async def run(self) -> None:
         try:
@@ -33,11 +33,11 @@ class Work:
             await asyncio.Event().wait()
         finally:
             await asyncio.sleep(0)
-            self.tidied = True
+            self.cleaned_up = True
 
 
-class Stubborn(Work):
-    """Work that comes to its end although it was told to stop."""
+class IgnoresCancellation(Work):
+    """Work that ends normally although it was cancelled."""
 
     async def run(self) -> None:
         with suppress(asyncio.CancelledError):
@@ -61,52 +61,52 @@ def code_of(program: Callable[[], None]) -> object:
 
 
 @BOTH
-@pytest.mark.parametrize("kind", [Work, Stubborn])
-def test_what_has_an_end_and_was_stopped_exits_with_130(number: signal.Signals, kind: type[Work]) -> None:
+@pytest.mark.parametrize("kind", [Work, IgnoresCancellation])
+def test_a_command_that_was_stopped_exits_with_130(number: signal.Signals, kind: type[Work]) -> None:
     work = kind(number)
     assert code_of(lambda: run_to_end(work.run)) == 130
-    assert work.tidied
+    assert work.cleaned_up
 
 
 @BOTH
 def test_a_server_that_was_stopped_ends_normally(number: signal.Signals) -> None:
     work = Work(number)
     run_until_stopped(work.run)
-    assert work.tidied
+    assert work.cleaned_up
 
 
 @BOTH
 @pytest.mark.parametrize("stopped", [True, False])
-def test_afterwards_signals_mean_what_they_did_before(number: signal.Signals, stopped: bool) -> None:
-    heard: list[int] = []
-    before = signal.signal(number, lambda number, frame: heard.append(number))
+def test_the_signal_handlers_of_before_are_restored(number: signal.Signals, stopped: bool) -> None:
+    received: list[int] = []
+    before = signal.signal(number, lambda number, frame: received.append(number))
     try:
         run_until_stopped(Work(number).run if stopped else fail_together)
         signal.raise_signal(number)
     finally:
         signal.signal(number, before)
-    assert heard == [number]
+    assert received == [number]
 
 
-def test_of_a_group_the_first_error_is_told_with_its_hint(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_first_error_of_a_group_is_printed_with_its_hint(capsys: pytest.CaptureFixture[str]) -> None:
     error = NetworkUnavailable(("tcp/127.0.0.1:1",), "no answer")
     assert code_of(lambda: run_to_end(lambda: fail_together(error, ConfigurationError("other")))) == 1
-    assert capsys.readouterr().err == f"aira: {error}\n      {error.hint}\n"
+    assert capsys.readouterr().err == f"aira: {error} [{error.code}]\n      {error.hint}\n"
 
 
 @pytest.mark.parametrize(("error", "code"), [(ConfigurationError("so"), 2), (RemoteError("so"), 1)])
-def test_whose_fault_it_is_tells_the_exit_code(error: Exception, code: int, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_kind_of_error_sets_the_exit_code(error: AiraError, code: int, capsys: pytest.CaptureFixture[str]) -> None:
     assert code_of(lambda: run_until_stopped(lambda: fail_together(error))) == code
-    assert capsys.readouterr() == ("", "aira: so\n")
+    assert capsys.readouterr() == ("", f"aira: so [{error.code}]\n")
 
 
-def test_an_error_that_nobody_foresaw_is_never_hidden_in_a_group() -> None:
+def test_an_unexpected_error_is_never_hidden_in_a_group() -> None:
     with pytest.raises(ExceptionGroup) as group:
         run_to_end(lambda: fail_together(RemoteError("so"), ZeroDivisionError()))
     assert group.value.subgroup(ZeroDivisionError) is not None
 
 
-def test_an_error_while_tidying_up_is_told() -> None:
+def test_an_error_during_cleanup_is_an_error_of_the_program() -> None:
     async def main() -> None:
         try:
             await Work(signal.SIGINT).run()
@@ -135,6 +135,6 @@ main()
 @pytest.mark.parametrize(
     "module", ["mesh.cli", "click", "schemas.errors", "mesh.cli.demo", "web3", "zenoh", "mesh.demo.narration"]
 )
-def test_an_interrupt_while_a_program_is_being_loaded_ends_it_quietly(module: str) -> None:
+def test_an_interrupt_while_modules_are_imported_ends_the_program_quietly(module: str) -> None:
     done = run(sys.executable, "-c", LOADING.format(module=module))
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")

@@ -65,7 +65,7 @@ def test_libraries_log_only_warnings_unless_the_level_is_debug() -> None:
 def test_an_error_that_ends_a_server_is_an_event_with_its_hint() -> None:
     (event,) = told('raise RemoteError("the node is gone", hint="start it")', code=1)
     assert (event["level"], event["message"], event["hint"]) == ("error", "the node is gone", "start it")
-    assert (event["event"], event["code"]) == ("failed", "remote-error")
+    assert (event["event"], event["code"]) == ("program-failed", "remote-error")
     assert said('raise RemoteError("the node is gone", hint="start it")', code=1) == [
         "aira: the node is gone [remote-error]",
         "      start it",
