@@ -1,4 +1,4 @@
-"""What `aira doctor` asks an IPFS daemon: is it there, are we let in, what is it, does it carry PubSub?"""
+"""The checks of the IPFS daemon for `aira doctor`: whether it answers, admits us, and has PubSub and peers."""
 
 from __future__ import annotations
 
@@ -8,22 +8,21 @@ from typing import TYPE_CHECKING, Final
 
 from bridges.ipfs.daemon import Daemon
 from bridges.ipfs.service import authorization_of
-from mesh.doctor.checks import Check
-from mesh.doctor.findings import Finding, doubtful, sound
+from mesh.doctor.checks import Check, CheckResult, passed, warning
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from mesh.doctor.case import Case
+    from mesh.doctor.context import DoctorContext
     from mesh.settings import Settings
 
 PATIENCE: Final = 4.0
 """Seconds for an answer."""
 
 
-def checks(case: Case) -> list[Check]:
-    """The checks of a case's daemon."""
-    settings = case.settings
+def checks(context: DoctorContext) -> list[Check]:
+    """The checks of the daemon (entry point `aira.doctor_checks`)."""
+    settings = context.settings
     daemon = Check("ipfs daemon", partial(check_daemon, settings))
     needs = ((daemon,),)
     return [
@@ -33,30 +32,30 @@ def checks(case: Case) -> list[Check]:
     ]
 
 
-async def check_daemon(settings: Settings) -> Finding:
-    """That it answers and lets us in. Raises `DaemonUnreachable`, `AccessDenied`, `ConfigurationError`."""
+async def check_daemon(settings: Settings) -> CheckResult:
+    """Whether it answers and admits us. Raises `DaemonUnreachable`, `AccessDenied`, `ConfigurationError`."""
     async with _greeted(settings) as daemon:
-        return sound(f"{daemon.version} at {daemon.api}, speaks the {daemon.dialect} dialect")
+        return passed(f"{daemon.version} at {daemon.api}, speaks the {daemon.dialect} dialect")
 
 
-async def check_pubsub(settings: Settings) -> Finding:
-    """That PubSub is enabled, and whether others are on the lighthouse's topic. Raises `PubSubDisabled`."""
+async def check_pubsub(settings: Settings) -> CheckResult:
+    """Whether PubSub is enabled, and how many others subscribe to the lighthouse's topic. Raises `PubSubDisabled`."""
     async with _greeted(settings) as daemon:
         topic = settings.lighthouse_contract
         listeners = len(await daemon.listeners(topic))
-        return sound(f"enabled; {listeners} other{'' if listeners == 1 else 's'} on {topic}")
+        return passed(f"enabled; {listeners} other{'' if listeners == 1 else 's'} on {topic}")
 
 
-async def check_swarm(settings: Settings) -> Finding:
-    """That the daemon is connected to others."""
+async def check_swarm(settings: Settings) -> CheckResult:
+    """Whether the daemon is connected to others."""
     async with _greeted(settings) as daemon:
         count = len(await daemon.neighbours())
         if not count:
-            return doubtful(
-                "the daemon is connected to no other: what is published there nobody hears",
-                do="name the legacy nodes with --ipfs-swarm-connect /…/p2p/ID, or let the daemon reach the internet",
+            return warning(
+                "the daemon is connected to no other, so nobody receives what it publishes",
+                hint="name the legacy nodes with --ipfs-swarm-connect /…/p2p/ID, or let the daemon reach the internet",
             )
-        return sound(f"connected to {count} other{'' if count == 1 else 's'}")
+        return passed(f"connected to {count} other{'' if count == 1 else 's'}")
 
 
 @asynccontextmanager

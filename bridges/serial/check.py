@@ -1,4 +1,4 @@
-"""What `aira doctor` looks at on a serial line: the port, and the board at its other end."""
+"""The checks of a serial line for `aira doctor`: the port, and the board at its other end."""
 
 from __future__ import annotations
 
@@ -15,84 +15,88 @@ from bridges.serial.errors import LineError
 from bridges.serial.line import Line
 from bridges.serial.ports import Port, PortName
 from bridges.serial.serving import dialect_of
-from mesh.doctor.checks import Check, aside
-from mesh.doctor.findings import Finding, broken, sound
+from mesh.doctor.checks import Check, CheckResult, failed, in_thread, passed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from mesh.doctor.case import Case
-    from mesh.doctor.case import Line as LineOptions
+    from mesh.doctor.context import DoctorContext, SerialSettings
 
-ANSWER: Final = 5.0
-"""Seconds in which a board answers; opening the port starts it anew, which takes most of two."""
+ANSWER_TIMEOUT: Final = 5.0
+"""Seconds in which a board must answer. Opening the port restarts it, which takes almost two."""
 
 
-def checks(case: Case) -> list[Check]:
-    """The checks of a case's serial line."""
-    port = Check("serial port", partial(aside, look_at_port, case.line))
-    board = Check("serial board", partial(aside, listen_to_board, case.line), needs=((port,),))
+def checks(context: DoctorContext) -> list[Check]:
+    """The checks of the serial line (entry point `aira.doctor_checks`)."""
+    port = Check("serial port", partial(in_thread, check_port, context.serial))
+    board = Check("serial board", partial(in_thread, check_board, context.serial), needs=((port,),))
     return [port, board]
 
 
-def look_at_port(line: LineOptions) -> Finding:
-    """Whether the port is there, may be used, and is used by nobody else. Raises `PortMissing`, `InputError`."""
-    if not line.port:
-        return broken("no serial port is named", do="give --port /dev/ttyACM0, or usb:VENDOR:PRODUCT")
-    path = PortName(line.port).find()
+def check_port(settings: SerialSettings) -> CheckResult:
+    """Whether the port exists, may be used, and is not in use. Raises `PortMissing`, `InputError`."""
+    if not settings.port:
+        return failed("no serial port is named", hint="give --port /dev/ttyACM0, or usb:VENDOR:PRODUCT")
+    path = PortName(settings.port).find()
     try:
-        Port(path, baud=line.baud).close()
+        Port(path, baud=settings.baud).close()
     except LineError as error:
         return _unusable(path, error)
-    return sound(f"{path} opens at {line.baud:,} baud" + (f", found as {line.port}" if line.port != str(path) else ""))
+    return passed(
+        f"{path} opens at {settings.baud:,} baud"
+        + (f", found as {settings.port}" if settings.port != str(path) else "")
+    )
 
 
-def listen_to_board(line: LineOptions) -> Finding:
-    """Whether a board answers in the protocol. Opening the port starts most boards anew."""
-    dialect = dialect_of(line.protocol, baud=line.baud, parameters={})
+def check_board(settings: SerialSettings, *, timeout: float = ANSWER_TIMEOUT) -> CheckResult:
+    """Whether a board answers in the protocol. Opening the port restarts most boards."""
+    dialect = dialect_of(settings.protocol, baud=settings.baud, parameters={})
     ready = threading.Event()
     there = Line(
-        PortName(line.port),
+        PortName(settings.port),
         dialect,
-        baud=line.baud,
+        baud=settings.baud,
         deliver=lambda happening: ready.set() if isinstance(happening, Ready) else None,
     )
     thread = threading.Thread(target=there.run, name="line of the doctor", daemon=True)
     began = time.monotonic()
     thread.start()
-    answered = ready.wait(ANSWER)
+    answered = ready.wait(timeout)
     there.stop()
-    thread.join(ANSWER)
+    thread.join(timeout)
     if answered and (about := dialect.about) is not None:
         name = " ".join(filter(None, (about.name, about.version))) or "a sketch"
         took = time.monotonic() - began
-        return sound(f"{name} speaks {line.protocol}, {len(about.topics)} topics, after {took:.1f} s")
-    other = "rosserial" if line.protocol == "frames" else "frames"
-    return broken(
-        f"no board answers in {line.protocol} at {line.baud:,} baud",
-        do=f"is the firmware loaded, does --baud fit it, and does it speak {line.protocol}? else --protocol {other}",
+        return passed(f"{name} speaks {settings.protocol}, {len(about.topics)} topics, after {took:.1f} s")
+    other = "rosserial" if settings.protocol == "frames" else "frames"
+    return failed(
+        f"no board answers in {settings.protocol} at {settings.baud:,} baud",
+        hint=f"is the firmware loaded, does --baud fit it, and does it speak {settings.protocol}?"
+        f" else --protocol {other}",
     )
 
 
-def _unusable(path: Path, error: LineError) -> Finding:
-    """Why a port that is there can't be opened, and what helps."""
+def _unusable(path: Path, error: LineError) -> CheckResult:
+    """Why an existing port can't be opened, and what to do."""
     why = str(error)
     if "permission" in why:
         return _forbidden(path)
     if "another process" in why:
-        return broken(why, do=f"`fuser {path}` shows which; if it is `aira edge`, stop it to have the line tried")
-    return broken(why, do="is this the board's port? `ls -l /dev/serial/by-id` shows what is plugged in")
+        return failed(why, hint=f"`fuser {path}` shows which; if it is `aira edge`, stop it to have the line tried")
+    return failed(why, hint="is this the board's port? `ls -l /dev/serial/by-id` shows what is plugged in")
 
 
-def _forbidden(path: Path) -> Finding:
+def _forbidden(path: Path) -> CheckResult:
     """Ports belong to a group; on Debian to `dialout`."""
     about = path.stat()
     group, user = _name(grp.getgrgid, about.st_gid), _name(pwd.getpwuid, os.geteuid())
     found = f"{path} can't be opened by {user}: no permission; it belongs to the group {group}"
     if about.st_gid == 0:
-        return broken(f"{found}, which nobody should be in", do="have udev give it to the group dialout, and join that")
-    return broken(found, do=f"sudo usermod -aG {group} {user}, then log in anew (a service: restart it)")
+        return failed(
+            f"{found}, which nobody should be in", hint="have udev give it to the group dialout, and join that"
+        )
+    return failed(found, hint=f"sudo usermod -aG {group} {user}, then log in again (a service: restart it)")
 
 
 def _name(find: Callable[[int], Sequence[object]], number: int) -> str:

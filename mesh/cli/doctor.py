@@ -10,17 +10,17 @@ import click
 
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import plural, print_json, print_line, printable
-from mesh.doctor.case import Case, Line, Role, examined_as
-from mesh.doctor.findings import Verdict
+from mesh.doctor.checks import CheckStatus
+from mesh.doctor.context import DoctorContext, Role, SerialSettings, with_identity
 from mesh.errors import AiraError, InputError
 from mesh.running import fail, run_to_end
 from mesh.settings import ChainSettings, NetworkSettings, options_of
 
 if TYPE_CHECKING:
-    from mesh.doctor.checks import Checked
+    from mesh.doctor.checks import CompletedCheck
     from mesh.settings import Settings
 
-COLOURS: Final = {Verdict.OK: "green", Verdict.WARN: "yellow", Verdict.FAIL: "red"}
+COLOURS: Final = {CheckStatus.OK: "green", CheckStatus.WARN: "yellow", CheckStatus.FAIL: "red"}
 MARK: Final = 6
 """Columns of the mark before each line."""
 
@@ -66,76 +66,76 @@ def command(settings: Settings, as_json: bool, timeout: float, role: Role | None
     can't be tried because of a failure before it is left out. Exits 1 if anything fails.
     """
     try:
-        case = _case(settings, role, **options)
+        context = _case(settings, role, **options)
     except AiraError as error:
         fail(error)
     failed: list[str] = []
-    run_to_end(lambda: _examine(case, failed, seconds=timeout, as_json=as_json))
+    run_to_end(lambda: _examine(context, failed, seconds=timeout, as_json=as_json))
     if failed:
         sys.exit(1)
 
 
-def _case(settings: Settings, role: Role | None, **options: Any) -> Case:
+def _case(settings: Settings, role: Role | None, **options: Any) -> DoctorContext:
     """Who is examined. Raises `InputError` for options that can't be meant together."""
     agent, device = options["agent"], options["device"]
     if bool(agent) != bool(device):
         raise InputError("of --agent and --device one is missing")
-    return examined_as(
-        Case(
+    return with_identity(
+        DoctorContext(
             settings=settings,
-            asked_role=role,
+            requested_role=role,
             agent=agent,
             device=device,
-            line=Line(port=options["port"], protocol=options["protocol"], baud=options["baud"]),
+            serial=SerialSettings(port=options["port"], protocol=options["protocol"], baud=options["baud"]),
             chain_id=options["chain_id"] or 0,
         )
     )
 
 
-async def _examine(case: Case, failed: list[str], *, seconds: float, as_json: bool) -> None:
+async def _examine(context: DoctorContext, failed: list[str], *, seconds: float, as_json: bool) -> None:
     """Make the checks and tell each; the names of those that fail go into `failed`."""
-    from mesh.doctor import checks_for, examine
+    from mesh.doctor import checks_for, run_checks
 
-    verdicts: dict[Verdict, list[str]] = {verdict: [] for verdict in Verdict}
+    by_status: dict[CheckStatus, list[str]] = {status: [] for status in CheckStatus}
     left_out: list[str] = []
-    async with checks_for(case) as checks, aclosing(examine(checks, seconds=seconds)) as examined:
+    async with checks_for(context) as checks, aclosing(run_checks(checks, seconds=seconds)) as examined:
         width = max(len(check.name) for check in checks)
         async for checked in examined:
-            if checked.finding is None:
+            if checked.result is None:
                 left_out.append(checked.name)
                 continue
-            verdicts[checked.finding.verdict].append(checked.name)
+            by_status[checked.result.status].append(checked.name)
             if as_json:
-                _print_object(case, checked)
+                _print_object(context, checked)
             else:
-                _say_line(case, checked, width)
+                _say_line(context, checked, width)
     if not as_json:
-        _sum_up(case, len(checks), verdicts, left_out)
-    failed += verdicts[Verdict.FAIL]
+        _sum_up(context, len(checks), by_status, left_out)
+    failed += by_status[CheckStatus.FAIL]
 
 
-def _print_object(case: Case, checked: Checked) -> None:
-    assert checked.finding is not None
-    found, do = (case.without_secrets(text) for text in checked.finding[1:])
-    print_json({"name": checked.name, "ok": checked.finding.ok, "found": found, "do": do})
+def _print_object(context: DoctorContext, checked: CompletedCheck) -> None:
+    assert checked.result is not None
+    found, do = (context.without_secrets(text) for text in checked.result[1:])
+    print_json({"name": checked.name, "ok": checked.result.ok, "found": found, "do": do})
 
 
-def _say_line(case: Case, checked: Checked, width: int) -> None:
-    assert checked.finding is not None
-    verdict, found, do = checked.finding
-    mark = click.style(f"{verdict.value:<{MARK}}", fg=COLOURS[verdict], bold=verdict is Verdict.FAIL)
-    print_line(f"{mark}{checked.name:<{width}}  {printable(case.without_secrets(found))}")
+def _say_line(context: DoctorContext, checked: CompletedCheck, width: int) -> None:
+    assert checked.result is not None
+    status, found, do = checked.result
+    mark = click.style(f"{status.value:<{MARK}}", fg=COLOURS[status], bold=status is CheckStatus.FAIL)
+    print_line(f"{mark}{checked.name:<{width}}  {printable(context.without_secrets(found))}")
     if do:
-        print_line(f"{'':<{MARK + width}}  -> {printable(case.without_secrets(do))}")
+        print_line(f"{'':<{MARK + width}}  -> {printable(context.without_secrets(do))}")
 
 
-def _sum_up(case: Case, count: int, verdicts: dict[Verdict, list[str]], left_out: list[str]) -> None:
-    failed, warned = verdicts[Verdict.FAIL], verdicts[Verdict.WARN]
+def _sum_up(context: DoctorContext, count: int, by_status: dict[CheckStatus, list[str]], left_out: list[str]) -> None:
+    failed, warned = by_status[CheckStatus.FAIL], by_status[CheckStatus.WARN]
     print_line()
     if left_out:
         print_line(f"not tried, because of a failure before: {', '.join(left_out)}")
     if failed:
-        print_line(f"{plural(len(failed), 'check')} of {count} failed for the role {case.role}: {', '.join(failed)}")
+        print_line(f"{plural(len(failed), 'check')} of {count} failed for the role {context.role}: {', '.join(failed)}")
     else:
         warnings = f"; with a warning: {', '.join(warned)}" if warned else ""
-        print_line(f"all {count} checks are in order for the role {case.role}{warnings}")
+        print_line(f"all {count} checks are in order for the role {context.role}{warnings}")

@@ -1,10 +1,22 @@
-"""`aira doctor`: what stands in the way of a role on this machine, what it is, and what to do about it."""
+"""`aira doctor`: checks what a role needs on this machine, and says what is wrong and what to do about it."""
 
 from __future__ import annotations
 
-from mesh.doctor.case import Case
-from mesh.doctor.checks import Check, Checked, examine
-from mesh.doctor.findings import Finding, Verdict, broken, doubtful, sound
-from mesh.doctor.plan import checks_for
+from mesh.doctor.checks import Check, CheckResult, CheckStatus, CompletedCheck, failed, passed, run_checks, warning
+from mesh.doctor.context import DoctorContext, SerialSettings, with_identity
+from mesh.doctor.registry import checks_for
 
-__all__ = ["Case", "Check", "Checked", "Finding", "Verdict", "broken", "checks_for", "doubtful", "examine", "sound"]
+__all__ = [
+    "Check",
+    "CheckResult",
+    "CheckStatus",
+    "CompletedCheck",
+    "DoctorContext",
+    "SerialSettings",
+    "checks_for",
+    "failed",
+    "passed",
+    "run_checks",
+    "warning",
+    "with_identity",
+]

@@ -1,4 +1,4 @@
-"""The own certificate: whose it is, and how long it lasts, by Python's TLS: an edge machine has no other library."""
+"""The own certificate: its holder and its expiry. Uses Python's `ssl` only: edge machines have no other library."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Shown:
-    """What a certificate says: the address that it is for (as in keys), its holder's name and roles, and when it ends
-    (seconds since 1970)."""
+class CertificateInfo:
+    """What a certificate says: its holder's address (as in keys), name and roles, and its expiry (seconds since the
+    epoch)."""
 
     address: str
     name: str
@@ -26,16 +26,16 @@ class Shown:
     until: float
 
 
-def shown_by(tls: Tls, *, mode: str) -> Shown | None:
-    """What the own certificate says; None where there is none. `mode` is `router` or `client`.
+def certificate_info(tls: Tls, *, mode: str) -> CertificateInfo | None:
+    """What the own certificate says; None if there is none. `mode` is `router` or `client`.
 
-    Raises `ConfigurationError` for files that can't be used, and for a certificate that is for no address.
+    Raises `ConfigurationError` for unusable files, and for a certificate whose common name is no address.
     """
     check_files(tls, mode=mode)
     if tls.pair is None:
         return None
-    said = _peer_certificate(tls)
-    (address, *_) = texts_of(said, "commonName") or ("",)
+    subject = _peer_certificate(tls)
+    (address, *_) = subject_values(subject, "commonName") or ("",)
     try:
         address = parse_address(address).lower()
     except InvalidAddress:
@@ -43,35 +43,35 @@ def shown_by(tls: Tls, *, mode: str) -> Shown | None:
             f"the certificate {tls.certificate} is for {address or 'nobody'!r}, and not for an address",
             hint="`aira identity new` makes certificates by which routers know an account",
         ) from None
-    return Shown(
+    return CertificateInfo(
         address=address,
-        name=next(iter(texts_of(said, "organizationName")), ""),
-        roles=texts_of(said, "organizationalUnitName"),
-        until=end_of(said),
+        name=next(iter(subject_values(subject, "organizationName")), ""),
+        roles=subject_values(subject, "organizationalUnitName"),
+        until=expiry_of(subject),
     )
 
 
-def own_identity(settings: Settings) -> Shown | None:
-    """The same for the settings' certificate; None also where it is of no use, which is for a check to find."""
+def own_identity(settings: Settings) -> CertificateInfo | None:
+    """What the certificate in the settings says; None also if it is unusable, which a check reports."""
     try:
         tls = Tls.from_settings(settings)
-        return None if tls is None else shown_by(tls, mode="client")
+        return None if tls is None else certificate_info(tls, mode="client")
     except AiraError:
         return None
 
 
-def texts_of(certificate: dict[str, Any], name: str) -> tuple[str, ...]:
-    """What a certificate, as `ssl` gives it, says of its holder under that name."""
+def subject_values(certificate: dict[str, Any], name: str) -> tuple[str, ...]:
+    """The values of a subject field of a certificate, as `ssl` represents it."""
     return tuple(str(text) for part in certificate.get("subject", ()) for key, text in part if key == name)
 
 
-def end_of(certificate: dict[str, Any]) -> float:
-    """When it ends, in seconds since 1970."""
+def expiry_of(certificate: dict[str, Any]) -> float:
+    """Its expiry, in seconds since the epoch."""
     return float(ssl.cert_time_to_seconds(str(certificate["notAfter"])))
 
 
-def context_of(tls: Tls, protocol: ssl._SSLMethod) -> ssl.SSLContext:
-    """TLS as Zenoh speaks it, with files that were checked."""
+def tls_context(tls: Tls, protocol: ssl._SSLMethod) -> ssl.SSLContext:
+    """TLS settings like Zenoh's, with files that were checked before."""
     context = ssl.SSLContext(protocol)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     context.load_verify_locations(tls.ca)
@@ -81,8 +81,8 @@ def context_of(tls: Tls, protocol: ssl._SSLMethod) -> ssl.SSLContext:
 
 
 def _peer_certificate(tls: Tls) -> dict[str, Any]:
-    """The own certificate as another sees it: in a handshake with itself, in memory."""
-    client, server = context_of(tls, ssl.PROTOCOL_TLS_CLIENT), context_of(tls, ssl.PROTOCOL_TLS_SERVER)
+    """Read the own certificate by a handshake with itself, in memory."""
+    client, server = tls_context(tls, ssl.PROTOCOL_TLS_CLIENT), tls_context(tls, ssl.PROTOCOL_TLS_SERVER)
     client.check_hostname = False
     client.verify_mode = ssl.CERT_NONE
     server.verify_mode = ssl.CERT_REQUIRED

@@ -1,4 +1,4 @@
-"""The chain: its nodes, whether they are on one chain and alive, the contracts and whose they are."""
+"""The chain: whether its nodes answer and are on one chain, and which contracts are deployed."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from mesh.chain import GWEI, Chain, FeePolicy, Node, Timing
 from mesh.chain.errors import NoContracts, RequestRefused
 from mesh.chain.recognition import is_ours
-from mesh.doctor.clock import RECENT, against_chain, against_node, spoken
-from mesh.doctor.findings import Finding, broken, doubtful, sound
+from mesh.doctor.checks import CheckResult, failed, passed, warning
+from mesh.doctor.machine import RECENT, compare_chain_clock, compare_node_clock, duration
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable
@@ -21,16 +21,16 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 QUICK: Final = Timing(request_timeout=3.0, attempts=1)
-"""A node that does not answer at once is a finding."""
+"""No retries: a node that does not answer at once is a result."""
 DEVELOPMENT: Final = ("anvil", "eth-tester", "ethereumtester", "hardhat", "ganache", "aira")
-"""What the clients of development chains call themselves, in lower case: their blocks come when there is something."""
+"""Client names of development chains, in lower case. These make a block only when there are transactions."""
 
 
-class Ledgers:
-    """The nodes and the contracts that the settings name, to be checked.
+class ChainChecks:
+    """The checks of the nodes and contracts that the settings name.
 
-    `check_chain` opens the nodes onto `stack` for the checks behind it, and `check_contracts` the contracts. `expected`
-    is the chain's number (EIP-155), 0 for any.
+    `check_chain` opens the nodes onto `stack` and `check_contracts` the contracts; the other checks need them.
+    `expected` is the chain id (EIP-155), 0 for any.
     """
 
     def __init__(self, settings: Settings, stack: AsyncExitStack, *, expected: int = 0) -> None:
@@ -48,96 +48,101 @@ class Ledgers:
             contracts=settings.contracts,
         )
 
-    async def check_node(self, endpoint: str) -> Finding:
-        """That one node answers, has all blocks, and goes on. Raises `NodeUnreachable`."""
+    async def check_node(self, endpoint: str) -> CheckResult:
+        """Whether a node answers, is synced, and gets new blocks. Raises `NodeUnreachable`."""
         async with Node(endpoint, timing=QUICK) as node:
-            client = await _if_told(node.web3.client_version, otherwise="")
+            client = await _unless_refused(node.web3.client_version, otherwise="")
             block = await node.web3.eth.get_block("latest")
-            syncing = await _if_told(node.web3.eth.syncing, otherwise=False)
-            told = await _told_time(endpoint)
-            # By its own clock: ours may be wrong, which is for another check to say.
-            number, age = int(block["number"]), (time.time() if told is None else told) - int(block["timestamp"])
+            syncing = await _unless_refused(node.web3.eth.syncing, otherwise=False)
+            node_time = await _server_time(endpoint)
+            # By the node's clock: ours may be wrong, which another check reports.
+            number, age = (
+                int(block["number"]),
+                (time.time() if node_time is None else node_time) - int(block["timestamp"]),
+            )
             if syncing:
-                return broken(
-                    f"{endpoint} is not done with syncing: it is at block {number:,}",
-                    do="wait until it is; until then it knows nothing of what happens",
+                return failed(
+                    f"{endpoint} is still syncing: it is at block {number:,}",
+                    hint="wait until it is done; until then it does not know the newest blocks",
                 )
-            if stands_still(client, number=number, age=age):
-                return broken(
-                    f"{endpoint} stands still: its newest block {number:,} is {spoken(age)} old",
-                    do="is the node connected to others, and has it room on its disk? see its log",
+            if is_stalled(client, number=number, age=age):
+                return failed(
+                    f"{endpoint} is stalled: its newest block {number:,} is {duration(age)} old",
+                    hint="is the node connected to others, and has its disk free space? see its log",
                 )
-            old = f"{spoken(max(age, 0))} old"
+            old = f"{duration(max(age, 0))} old"
             about = f"chain {node.chain_id}, block {number:,}, {old}"
-            return sound(f"{endpoint} answers: {about}{f', {client}' if client else ''}")
+            return passed(f"{endpoint} answers: {about}{f', {client}' if client else ''}")
 
-    async def check_chain(self) -> Finding:
-        """That all nodes are on one chain, the right one. Raises `WrongChain`, `NodeUnreachable`."""
+    async def check_chain(self) -> CheckResult:
+        """Whether all nodes are on one chain, the expected one. Raises `WrongChain`, `NodeUnreachable`."""
         await self._stack.enter_async_context(self.node)
         found = self.node.chain_id
         if self._expected and found != self._expected:
-            return broken(
+            return failed(
                 f"{self.node.endpoint} is on the chain {found}, and it should be {self._expected}",
-                do="name a node of the right chain with --web3-http-provider",
+                hint="name a node of the right chain with --web3-http-provider",
             )
-        return sound(f"{found}, genesis {await self._genesis()}")
+        return passed(f"{found}, genesis {await self._genesis()}")
 
-    async def check_clock(self) -> Finding:
-        """This clock against the newest block."""
+    async def check_clock(self) -> CheckResult:
+        """Compare this clock with the newest block."""
         block = await self.node.web3.eth.get_block("latest")
-        return against_chain(float(block["timestamp"]), time.time())
+        return compare_chain_clock(float(block["timestamp"]), time.time())
 
-    async def check_contracts(self) -> Finding:
-        """That registry, factory and XRT are there, and whose they are. Raises `NoContracts`, `UnknownName`."""
+    async def check_contracts(self) -> CheckResult:
+        """Whether registry, factory and XRT are the expected contracts. Raises `NoContracts`, `UnknownName`."""
         chain = await self._stack.enter_async_context(self.chain)
-        asked, ours = self._settings.contracts, await is_ours(chain)
+        expected, ours = self._settings.contracts, await is_ours(chain)
         where = f"factory {chain.factory}, XRT {chain.xrt}"
-        if asked == "mesh" and not ours:
-            return broken(
+        if expected == "mesh" and not ours:
+            return failed(
                 f"the factory or XRT is not this project's code: {where}",
-                do="give --contracts original if they are the original ones; else check --ens-contract and the names",
+                hint="give --contracts original if they are the original ones; else check --ens-contract and the names",
             )
-        if asked == "original" and ours:
-            return broken(f"they are not the original contracts, but this project's: {where}", do="--contracts mesh")
-        return sound(f"{'this project' if ours else 'the original one'}'s: {where}")
+        if expected == "original" and ours:
+            return failed(f"they are not the original contracts, but this project's: {where}", hint="--contracts mesh")
+        return passed(f"{'this project' if ours else 'the original one'}'s: {where}")
 
-    async def check_lighthouse(self) -> Finding:
-        """That the market is there, and is one of the factory's. Raises `UnknownName`."""
+    async def check_lighthouse(self) -> CheckResult:
+        """Whether the lighthouse exists and belongs to the factory. Raises `UnknownName`."""
         name = self._settings.lighthouse_contract
         address = await self.chain.names.lighthouse(name)
         if not await self.chain.lighthouses.exists(address):
-            return broken(
+            return failed(
                 f"{name} is {address}, which is no lighthouse of this factory",
-                do="`aira lighthouse list` shows those that there are; name one with --lighthouse-contract",
+                hint="`aira lighthouse list` shows them; name one with --lighthouse-contract",
             )
         state = await self.chain.lighthouses.get(address)
         providers = len(state.stakes)
         if not providers:
-            return doubtful(
-                f"{name} ({address}) has no provider: nobody brings its orders together",
-                do="`aira lighthouse join STAKE` makes an account its provider; then run `aira provider`",
+            return warning(
+                f"{name} ({address}) has no provider: nobody matches its orders",
+                hint="`aira lighthouse join STAKE` makes an account its provider; then run `aira provider`",
             )
-        return sound(f"{name} is {address}, with {providers} provider{'s' if providers > 1 else ''}")
+        return passed(f"{name} is {address}, with {providers} provider{'s' if providers > 1 else ''}")
 
-    async def check_token(self) -> Finding:
-        """That the token that pays is one. Raises `UnknownName`, `NoContracts`."""
+    async def check_token(self) -> CheckResult:
+        """Whether the token that pays is an ERC-20 token. Raises `UnknownName`, `NoContracts`."""
         token = await self.chain.tokens.info(self._settings.erc20_token)
         if not token.total_supply:
             raise NoContracts(f"token with any supply at {token.address}", self.node.chain_id)
-        return sound(f"{token.symbol or 'without a symbol'}, {token.decimals} decimals, at {token.address}")
+        return passed(f"{token.symbol or 'without a symbol'}, {token.decimals} decimals, at {token.address}")
 
     async def _genesis(self) -> str:
-        return "0x" + bytes((await self.node.web3.eth.get_block(0))["hash"]).hex()[:16] + "…"
+        return "0x" + (await self.node.block_hash(0)).hex()[:16] + "…"
 
 
-async def check_node_clock(endpoint: str) -> Finding:
-    """The clock of the node's machine against this one."""
-    told = await _told_time(endpoint)
-    return sound("the node does not tell its time") if told is None else against_node(told, time.time())
+async def check_node_clock(endpoint: str) -> CheckResult:
+    """Compare this clock with that of the node's machine."""
+    node_time = await _server_time(endpoint)
+    return (
+        passed("the node does not report its time") if node_time is None else compare_node_clock(node_time, time.time())
+    )
 
 
-async def _if_told(asked: Awaitable[Any], *, otherwise: T) -> T:
-    """What a node answers; what is taken for it where it refuses to, as gateways do that know some methods only."""
+async def _unless_refused(asked: Awaitable[Any], *, otherwise: T) -> T:
+    """A node's answer, or `otherwise` if it refuses the method, as gateways do that allow only some."""
     try:
         answer: T = await asked
     except RequestRefused:
@@ -145,8 +150,8 @@ async def _if_told(asked: Awaitable[Any], *, otherwise: T) -> T:
     return answer
 
 
-async def _told_time(endpoint: str) -> float | None:
-    """The time of the node's machine, as it says in its HTTP header (seconds since 1970); None if it does not."""
+async def _server_time(endpoint: str) -> float | None:
+    """The time of the node's machine by its HTTP header `Date` (seconds since the epoch); None without one."""
     if not endpoint.startswith("http"):
         return None
     from aiohttp import ClientError, ClientSession, ClientTimeout
@@ -163,11 +168,11 @@ async def _told_time(endpoint: str) -> float | None:
 
 
 def nodes_of(settings: Settings) -> tuple[str, ...]:
-    """The addresses of the nodes, one each. Raises `ConfigurationError` where there is none."""
+    """The addresses of the nodes. Raises `ConfigurationError` if there is none."""
     return tuple(part.strip() for part in settings.node.split(",") if part.strip())
 
 
-def stands_still(client: str, *, number: int, age: float) -> bool:
-    """Whether a newest block of that age (seconds) says that the node gets none any more. Only on a development chain
-    blocks come no sooner than there is something for them."""
+def is_stalled(client: str, *, number: int, age: float) -> bool:
+    """Whether a newest block of this age (seconds) means that the node has stopped getting blocks. On a development
+    chain it does not: a block is made only when there are transactions."""
     return age > RECENT and number > 0 and not client.lower().startswith(DEVELOPMENT)

@@ -1,13 +1,13 @@
-"""Making checks: all at the same time, each for itself, within a time for all of them."""
+"""Checks and their results. All run at the same time, each on its own, within one time limit for all."""
 
 from __future__ import annotations
 
 import asyncio
 import threading
 from dataclasses import dataclass
+from enum import Enum
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
-from mesh.doctor.findings import Finding, broken, of_error
 from mesh.errors import AiraError
 from mesh.network import call_in_loop
 
@@ -26,52 +26,96 @@ EXTRAS: Final = {
     "serial": "serial",
     "cobs": "serial",
 }
-"""Packages that not every machine has, and the extra of ours that brings each."""
+"""Optional packages, and the extra of aira-mesh that installs each."""
+
+
+class CheckStatus(Enum):
+    """Whether something works."""
+
+    OK = "ok"
+    WARN = "warn"
+    """It works now, but something should be done at some time, or for some uses."""
+    FAIL = "FAIL"
+
+
+class CheckResult(NamedTuple):
+    """What a check found, in one line, and what to do about it (empty if it is in order)."""
+
+    status: CheckStatus
+    message: str
+    hint: str = ""
+
+    @property
+    def ok(self) -> bool:
+        """Whether it works, with or without a warning."""
+        return self.status is not CheckStatus.FAIL
+
+
+def passed(message: str) -> CheckResult:
+    """It is in order."""
+    return CheckResult(CheckStatus.OK, message)
+
+
+def warning(message: str, *, hint: str) -> CheckResult:
+    """It works now, but something should be done."""
+    return CheckResult(CheckStatus.WARN, message, hint)
+
+
+def failed(message: str, *, hint: str) -> CheckResult:
+    """It does not work."""
+    return CheckResult(CheckStatus.FAIL, message, hint)
+
+
+def from_error(error: AiraError) -> CheckResult:
+    """An error as a failed check."""
+    return failed(str(error), hint=error.hint or "see docs/deploy.md; `aira settings` shows the settings in force")
 
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """Something to look at: `make` says what it found; an `AiraError` that it raises is a finding, too.
+    """Something to check: `run` returns the result; an `AiraError` that it raises is a failed check.
 
-    It is made when of each group in `needs` at least one check was made and has not failed. So a cause is named once,
-    and not again by all that depends on it.
+    It runs if at least one check of each group in `needs` has run and not failed. So a cause is reported once, and not
+    again by every check that depends on it.
     """
 
     name: str
-    make: Callable[[], Awaitable[Finding]]
+    run: Callable[[], Awaitable[CheckResult]]
     needs: tuple[tuple[Check, ...], ...] = ()
 
 
-class Checked(NamedTuple):
-    """A check, and what came of it: None if it could not be made."""
+class CompletedCheck(NamedTuple):
+    """A check and its result; None if it was skipped because of an earlier failure."""
 
     name: str
-    finding: Finding | None
+    result: CheckResult | None
 
 
-async def examine(checks: Sequence[Check], *, seconds: float) -> AsyncGenerator[Checked]:
-    """Make the checks; each is yielded in its turn, as soon as it is known.
+async def run_checks(checks: Sequence[Check], *, seconds: float) -> AsyncGenerator[CompletedCheck]:
+    """Run the checks and yield each in order, as soon as its result is known.
 
-    One that has no answer `seconds` after the beginning fails. Whoever does not read to the end closes the generator.
+    A check without a result `seconds` after the start fails. A caller that does not read to the end must close the
+    generator.
     """
-    ends = asyncio.get_running_loop().time() + seconds
-    tasks: dict[Check, asyncio.Task[Finding | None]] = {}
+    deadline = asyncio.get_running_loop().time() + seconds
+    tasks: dict[Check, asyncio.Task[CheckResult | None]] = {}
     for check in checks:
         groups = [[tasks[needed] for needed in group] for group in check.needs]
-        tasks[check] = asyncio.create_task(_made(check, groups, ends=ends, seconds=seconds), name=check.name)
+        tasks[check] = asyncio.create_task(_run(check, groups, deadline=deadline, seconds=seconds), name=check.name)
     try:
         for check, task in tasks.items():
-            yield Checked(check.name, await task)
+            yield CompletedCheck(check.name, await task)
     finally:
         for task in tasks.values():
             task.cancel()
         await asyncio.gather(*tasks.values(), return_exceptions=True)
 
 
-async def aside(function: Callable[..., T], *arguments: Any) -> T:
-    """What a function that blocks returns, or raises. It runs in a thread that nobody waits for in the end.
+async def in_thread(function: Callable[..., T], *arguments: Any) -> T:
+    """Run a blocking function in a daemon thread.
 
-    A dead name server or disk holds a call for minutes; the program ends before.
+    Unlike `asyncio.to_thread`, the end of the program does not wait for it: a dead name server or disk can hold a call
+    for minutes.
     """
     loop = asyncio.get_running_loop()
     outcome: asyncio.Future[T] = loop.create_future()
@@ -96,22 +140,22 @@ async def aside(function: Callable[..., T], *arguments: Any) -> T:
     return await outcome
 
 
-async def _made(
-    check: Check, groups: list[list[asyncio.Task[Finding | None]]], *, ends: float, seconds: float
-) -> Finding | None:
+async def _run(
+    check: Check, groups: list[list[asyncio.Task[CheckResult | None]]], *, deadline: float, seconds: float
+) -> CheckResult | None:
     for group in groups:
-        if not any(finding is not None and finding.ok for finding in [await needed for needed in group]):
+        if not any(result is not None and result.ok for result in [await needed for needed in group]):
             return None
     try:
-        async with asyncio.timeout_at(ends) as limit:
-            return await check.make()
+        async with asyncio.timeout_at(deadline) as limit:
+            return await check.run()
     except AiraError as error:
-        return of_error(error)
+        return from_error(error)
     except TimeoutError:
         if not limit.expired():
             raise
-        return broken(f"no answer within {seconds:g} s", do="a longer --timeout tells a slow one from a dead one")
+        return failed(f"no answer within {seconds:g} s", hint="a longer --timeout tells a slow one from a dead one")
     except ModuleNotFoundError as error:
         if (extra := EXTRAS.get((error.name or "").partition(".")[0])) is None:
             raise
-        return broken(f"this needs {error.name}, which is not installed here", do=f"pip install 'aira-mesh[{extra}]'")
+        return failed(f"this needs {error.name}, which is not installed here", hint=f"pip install 'aira-mesh[{extra}]'")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.mesh.cli.chains import Town
-from tests.mesh.doctor.wards import Ward
+from tests.mesh.doctor.machines import Machine
 from tests.support.sites import Site
 
 if TYPE_CHECKING:
@@ -27,8 +27,8 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Town]:
 
 
 @pytest.fixture
-def ward(town: Town, router: EmbeddedRouter, tmp_path: Path) -> Ward:
-    return Ward(town, router.endpoint, tmp_path)
+def machine(town: Town, router: EmbeddedRouter, tmp_path: Path) -> Machine:
+    return Machine(town, router.endpoint, tmp_path)
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""A case examined in this process, and what was found."""
+"""A context examined in this process, and what was found."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections import defaultdict
 from contextlib import aclosing
 from typing import TYPE_CHECKING, Any
 
-from mesh.doctor import Case, Check, Finding, Verdict, checks_for, examine
-from mesh.doctor.case import examined_as
+from mesh.doctor import Check, CheckResult, CheckStatus, DoctorContext, checks_for, run_checks
+from mesh.doctor.context import with_identity
 from mesh.settings import Settings
 
 if TYPE_CHECKING:
@@ -20,41 +20,41 @@ if TYPE_CHECKING:
 SECONDS = 60.0
 
 
-class Found(defaultdict[str, list[Finding]]):
+class Found(defaultdict[str, list[CheckResult]]):
     """What was found, by the names of the checks; those that were left out are not in it."""
 
-    def one(self, name: str) -> Finding:
+    def one(self, name: str) -> CheckResult:
         """What the only check of that name found."""
-        (finding,) = self[name]
-        return finding
+        (result,) = self[name]
+        return result
 
     @property
     def failed(self) -> list[str]:
         """The names of the checks that failed."""
-        return [name for name, findings in self.items() for finding in findings if not finding.ok]
+        return [name for name, results in self.items() for result in results if not result.ok]
 
     def cause(self, name: str) -> str:
         """What the only check that failed found, which is that one, and which says what to do."""
         assert self.failed == [name], dict(self)
-        (finding,) = [finding for finding in self[name] if not finding.ok]
-        assert finding.verdict is Verdict.FAIL
-        assert finding.do
-        return f"{finding.found}; {finding.do}"
+        (result,) = [result for result in self[name] if not result.ok]
+        assert result.status is CheckStatus.FAIL
+        assert result.hint
+        return f"{result.message}; {result.hint}"
 
 
-async def examined(case: Case, *, seconds: float = SECONDS) -> Found:
-    """All checks of a case made."""
-    async with checks_for(examined_as(case)) as checks:
+async def examined(context: DoctorContext, *, seconds: float = SECONDS) -> Found:
+    """All checks of a context made."""
+    async with checks_for(with_identity(context)) as checks:
         return await made(checks, seconds=seconds)
 
 
 async def made(checks: Sequence[Check], *, seconds: float = SECONDS) -> Found:
     """These checks made."""
     found = Found(list)
-    async with aclosing(examine(checks, seconds=seconds)) as examining:
+    async with aclosing(run_checks(checks, seconds=seconds)) as examining:
         async for checked in examining:
-            if checked.finding is not None:
-                found[checked.name].append(checked.finding)
+            if checked.result is not None:
+                found[checked.name].append(checked.result)
     return found
 
 
@@ -67,6 +67,6 @@ def settings_of(endpoints: Endpoints, **options: Any) -> Settings:
     return Settings(connect=endpoints.connect, **files, **options)
 
 
-def case_of(site: Site, folder: MemberFolder, **options: str) -> Case:
-    """An operator's case, of whom only the network matters, with the identity in a folder."""
-    return Case(settings=settings_of(site.client(folder), **options), asked_role="operator")
+def context_of_member(site: Site, folder: MemberFolder, **options: str) -> DoctorContext:
+    """An operator's context, of whom only the network matters, with the identity in a folder."""
+    return DoctorContext(settings=settings_of(site.client(folder), **options), requested_role="operator")

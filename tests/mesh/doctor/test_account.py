@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import pytest
+
 from mesh.chain import XRT, Account, Chain, DeploymentPlan, deploy, new_private_key, write_keyfile
-from mesh.doctor import Case, Verdict
+from mesh.doctor import CheckStatus, DoctorContext
+from mesh.doctor.account import ETH, Currency, at_least
 from mesh.settings import Settings
 from tests.mesh.cli.chains import PASSWORD, TIMING, write_quick_keyfile
 from tests.mesh.doctor.examining import examined
@@ -13,7 +16,7 @@ from tests.mesh.doctor.examining import examined
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tests.mesh.doctor.wards import Ward
+    from tests.mesh.doctor.machines import Machine
     from tests.support.nodes import Anvil
     from tests.support.routers import EmbeddedRouter
 
@@ -21,11 +24,11 @@ if TYPE_CHECKING:
 LIGHTHOUSE = "airalab.lighthouse.3.robonomics.eth"
 
 
-async def test_a_wrong_password_is_named_and_not_shown(ward: Ward) -> None:
-    settings = ward.settings("robot")
-    (ward.folder / "password").write_text("open barley\n")
+async def test_a_wrong_password_is_named_and_not_shown(machine: Machine) -> None:
+    settings = machine.settings("robot")
+    (machine.folder / "password").write_text("open barley\n")
 
-    found = await examined(Case(settings=settings, asked_role="agent"))
+    found = await examined(DoctorContext(settings=settings, requested_role="agent"))
 
     cause = found.cause("keyfile")
     assert "the password in" in cause
@@ -34,42 +37,42 @@ async def test_a_wrong_password_is_named_and_not_shown(ward: Ward) -> None:
     assert "ether" not in found
 
 
-async def test_a_keyfile_that_others_may_read_is_a_warning(ward: Ward) -> None:
-    settings = ward.settings("robot")
-    (ward.folder / "password").chmod(0o644)
+async def test_a_keyfile_that_others_may_read_is_a_warning(machine: Machine) -> None:
+    settings = machine.settings("robot")
+    (machine.folder / "password").chmod(0o644)
 
-    finding = (await examined(Case(settings=settings, asked_role="agent"))).one("keyfile")
+    result = (await examined(DoctorContext(settings=settings, requested_role="agent"))).one("keyfile")
 
-    assert finding.verdict is Verdict.WARN
-    assert finding.do == f"chmod 600 {ward.folder / 'password'}"
-
-
-async def test_a_keyfile_that_is_not_there_is_named(ward: Ward) -> None:
-    settings = ward.settings("robot", keyfile=str(ward.folder / "lost.json"))
-
-    assert "lost.json" in (await examined(Case(settings=settings, asked_role="agent"))).cause("keyfile")
+    assert result.status is CheckStatus.WARN
+    assert result.hint == f"chmod 600 {machine.folder / 'password'}"
 
 
-def poor(ward: Ward) -> dict[str, Any]:
+async def test_a_keyfile_that_is_not_there_is_named(machine: Machine) -> None:
+    settings = machine.settings("robot", keyfile=str(machine.folder / "lost.json"))
+
+    assert "lost.json" in (await examined(DoctorContext(settings=settings, requested_role="agent"))).cause("keyfile")
+
+
+def poor(machine: Machine) -> dict[str, Any]:
     """The settings of an account that has nothing."""
-    keyfile = write_quick_keyfile(ward.folder / "poor.json", new_private_key())
+    keyfile = write_quick_keyfile(machine.folder / "poor.json", new_private_key())
     keyfile.chmod(0o600)
     return {"keyfile": str(keyfile)}
 
 
-async def test_an_account_without_ether_is_named_where_it_has_to_pay_gas(ward: Ward) -> None:
-    person = await ward.examined("person", "robot", **poor(ward))
-    agent = await ward.examined("agent", "robot", **poor(ward))
+async def test_an_account_without_ether_is_named_where_it_has_to_pay_gas(machine: Machine) -> None:
+    person = await machine.examined("person", "robot", **poor(machine))
+    agent = await machine.examined("agent", "robot", **poor(machine))
 
     assert {"ether", "tokens", "allowance"} == set(person.failed)
-    assert "has 0 ETH: gas for no transaction" in person.one("ether").found
-    assert "send it " in person.one("ether").do
+    assert "has 0 ETH: gas for no transaction" in person.one("ether").message
+    assert "send it " in person.one("ether").hint
     assert agent.failed == []
-    assert agent.one("ether").verdict is Verdict.WARN
+    assert agent.one("ether").status is CheckStatus.WARN
 
 
-async def test_a_provider_without_a_stake_is_told_how_to_get_one(ward: Ward) -> None:
-    found = await ward.examined("provider", "stranger")
+async def test_a_provider_without_a_stake_is_told_how_to_get_one(machine: Machine) -> None:
+    found = await machine.examined("provider", "stranger")
 
     cause = found.cause("stake")
     assert f"has no stake at the lighthouse {LIGHTHOUSE}" in cause
@@ -77,19 +80,19 @@ async def test_a_provider_without_a_stake_is_told_how_to_get_one(ward: Ward) -> 
     assert "turn" not in found
 
 
-async def test_a_missing_allowance_is_named_with_the_command_that_gives_it(ward: Ward) -> None:
-    person = await ward.examined("person", "person")
-    ward.town.ask("person", lambda chain: chain.tokens.approve(chain.factory, 0))
+async def test_a_missing_allowance_is_named_with_the_command_that_gives_it(machine: Machine) -> None:
+    person = await machine.examined("person", "person")
+    machine.town.ask("person", lambda chain: chain.tokens.approve(chain.factory, 0))
     try:
-        without = await ward.examined("person", "person")
+        without = await machine.examined("person", "person")
     finally:
-        ward.town.ask("person", lambda chain: chain.tokens.approve(chain.factory, 1_000 * XRT))
+        machine.town.ask("person", lambda chain: chain.tokens.approve(chain.factory, 1_000 * XRT))
 
-    assert person.one("allowance").found == "the factory may take 1,000 XRT"
-    finding = without.one("allowance")
-    assert finding.verdict is Verdict.WARN
-    assert "the factory may take no XRT from" in finding.found
-    assert "`aira xrt approve factory AMOUNT`" in finding.do
+    assert person.one("allowance").message == "the factory may take 1,000 XRT"
+    result = without.one("allowance")
+    assert result.status is CheckStatus.WARN
+    assert "the factory may take no XRT from" in result.message
+    assert "`aira xrt approve factory AMOUNT`" in result.hint
 
 
 async def test_the_turn_of_another_is_told(router: EmbeddedRouter, anvil: Anvil, tmp_path: Path) -> None:
@@ -113,14 +116,26 @@ async def test_the_turn_of_another_is_told(router: EmbeddedRouter, anvil: Anvil,
         lighthouse_contract=deployed.lighthouse_name,
     )
 
-    found = await examined(Case(settings=settings, asked_role="provider"))
+    found = await examined(DoctorContext(settings=settings, requested_role="provider"))
 
     assert found.failed == []
-    assert found.one("turn").found.startswith(f"{first.address}'s (1 of 2)")
-    assert found.one("turn").found.endswith("this account waits for its turn")
+    assert found.one("turn").message.startswith(f"{first.address}'s (1 of 2)")
+    assert found.one("turn").message.endswith("this account waits for its turn")
 
 
-async def test_gas_above_the_own_ceiling_is_named(ward: Ward) -> None:
-    found = await ward.examined("person", "person", max_fee_gwei=1e-9)
+async def test_gas_above_the_own_ceiling_is_named(machine: Machine) -> None:
+    found = await machine.examined("person", "person", max_fee_gwei=1e-9)
 
     assert "the ceiling is 1e-09 gwei" in found.cause("ether")
+
+
+@pytest.mark.parametrize(
+    ("wei", "asked"),
+    [(1, "0.000000001 ETH"), (1_000_000_001, "0.000000002 ETH"), (10**18, "1 ETH"), (5 * 10**14, "0.0005 ETH")],
+)
+def test_what_is_asked_for_is_never_less_than_what_is_needed(wei: int, asked: str) -> None:
+    assert at_least(wei, ETH) == asked
+
+
+def test_a_coin_with_few_decimals_is_asked_for_exactly() -> None:
+    assert at_least(1_500_000_001, Currency("XRT", 9)) == "1.500000001 XRT"

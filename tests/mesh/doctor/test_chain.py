@@ -9,47 +9,47 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.doctor import Verdict
-from mesh.doctor.chain import stands_still
+from mesh.doctor import CheckStatus
+from mesh.doctor.chain import is_stalled
 from tests.support.nodes import Anvil
 from tests.support.ports import free_port
 
 if TYPE_CHECKING:
-    from tests.mesh.doctor.wards import Ward
+    from tests.mesh.doctor.machines import Machine
 
 
-async def test_an_agent_with_an_account_is_sound(ward: Ward) -> None:
-    found = await ward.examined("agent", "robot")
-
-    assert found.failed == []
-    assert {finding.verdict for findings in found.values() for finding in findings} == {Verdict.OK}
-    assert f"{ward.town.url} answers: chain " in found.one("node").found
-    assert found.one("contracts").found.startswith("this project's: factory ")
-    assert found.one("lighthouse").found.endswith("with 1 provider")
-    assert ward.town.people["robot"].address in found.one("keyfile").found
-    assert "1,000 XRT" in found.one("tokens").found
-
-
-async def test_a_provider_with_a_stake_is_sound_and_told_whose_turn_it_is(ward: Ward) -> None:
-    found = await ward.examined("provider", "provider")
+async def test_an_agent_with_an_account_is_sound(machine: Machine) -> None:
+    found = await machine.examined("agent", "robot")
 
     assert found.failed == []
-    assert "100 XRT at airalab.lighthouse.3.robonomics.eth: 100 transactions a turn" in found.one("stake").found
-    assert found.one("turn").found.startswith("its own, ")
+    assert {result.status for results in found.values() for result in results} == {CheckStatus.OK}
+    assert f"{machine.town.url} answers: chain " in found.one("node").message
+    assert found.one("contracts").message.startswith("this project's: factory ")
+    assert found.one("lighthouse").message.endswith("with 1 provider")
+    assert machine.town.people["robot"].address in found.one("keyfile").message
+    assert "1,000 XRT" in found.one("tokens").message
 
 
-async def test_who_only_looks_on_needs_no_account_and_who_is_to_be_an_agent_does(ward: Ward) -> None:
-    looking = await ward.examined(None)
-    asked = await ward.examined("agent")
+async def test_a_provider_with_a_stake_is_sound_and_told_whose_turn_it_is(machine: Machine) -> None:
+    found = await machine.examined("provider", "provider")
+
+    assert found.failed == []
+    assert "100 XRT at airalab.lighthouse.3.robonomics.eth: 100 transactions a turn" in found.one("stake").message
+    assert found.one("turn").message.startswith("its own, ")
+
+
+async def test_who_only_looks_on_needs_no_account_and_who_is_to_be_an_agent_does(machine: Machine) -> None:
+    looking = await machine.examined(None)
+    asked = await machine.examined("agent")
 
     assert looking.failed == []
     assert "keyfile" not in looking
     assert "`aira account new`" in asked.cause("keyfile")
 
 
-async def test_a_node_that_is_not_there_is_named_once(ward: Ward) -> None:
+async def test_a_node_that_is_not_there_is_named_once(machine: Machine) -> None:
     url = f"http://127.0.0.1:{free_port()}"
-    found = await ward.examined("agent", "robot", web3_http_provider=url)
+    found = await machine.examined("agent", "robot", web3_http_provider=url)
 
     cause = found.cause("node")
     assert url in cause
@@ -58,27 +58,27 @@ async def test_a_node_that_is_not_there_is_named_once(ward: Ward) -> None:
     assert found.one("data folder").ok
 
 
-async def test_a_chain_that_is_not_the_expected_one_is_named_by_both_numbers(ward: Ward) -> None:
-    found = await ward.examined("agent", chain_id=1)
+async def test_a_chain_that_is_not_the_expected_one_is_named_by_both_numbers(machine: Machine) -> None:
+    found = await machine.examined("agent", chain_id=1)
 
-    cause = "; ".join(finding.found for finding in found["chain"])
+    cause = "; ".join(result.message for result in found["chain"])
     assert cause.endswith(", and it should be 1")
     assert "chain" in found.failed
     assert "contracts" not in found
 
 
-async def test_nodes_of_different_chains_are_told_apart(ward: Ward, anvil: Anvil) -> None:
-    found = await ward.examined("bridge", web3_http_provider=f"{ward.town.url}, {anvil.url}")
+async def test_nodes_of_different_chains_are_told_apart(machine: Machine, anvil: Anvil) -> None:
+    found = await machine.examined("bridge", web3_http_provider=f"{machine.town.url}, {anvil.url}")
 
-    assert [finding.ok for finding in found["node"]] == [True, True]
-    assert "is on the chain 31337, the others" in found.one("chain").found
+    assert [result.ok for result in found["node"]] == [True, True]
+    assert "is on the chain 31337, the others" in found.one("chain").message
     assert not found.one("chain").ok
 
 
 async def test_a_chain_without_the_contracts_is_named_and_what_else_is_wrong_is_not_blamed(
-    ward: Ward, anvil: Anvil
+    machine: Machine, anvil: Anvil
 ) -> None:
-    found = await ward.examined("agent", "robot", web3_http_provider=anvil.url)
+    found = await machine.examined("agent", "robot", web3_http_provider=anvil.url)
 
     cause = found.cause("contracts")
     assert "the chain 31337 has no ENS registry" in cause
@@ -87,40 +87,40 @@ async def test_a_chain_without_the_contracts_is_named_and_what_else_is_wrong_is_
     assert "lighthouse" not in found
 
 
-async def test_names_that_the_registry_does_not_know_are_named(ward: Ward) -> None:
-    factory = await ward.examined("agent", "robot", factory_contract="factory.7.robonomics.eth")
-    market = await ward.examined("agent", "robot", lighthouse_contract="nowhere.lighthouse.3.robonomics.eth")
-    token = await ward.examined("agent", "robot", erc20_token="gold.3.robonomics.eth")
+async def test_names_that_the_registry_does_not_know_are_named(machine: Machine) -> None:
+    factory = await machine.examined("agent", "robot", factory_contract="factory.7.robonomics.eth")
+    market = await machine.examined("agent", "robot", lighthouse_contract="nowhere.lighthouse.3.robonomics.eth")
+    token = await machine.examined("agent", "robot", erc20_token="gold.3.robonomics.eth")
 
     assert "factory.7.robonomics.eth" in factory.cause("contracts")
     assert "nowhere.lighthouse.3.robonomics.eth" in market.cause("lighthouse")
     assert not token.one("token").ok
-    assert "gold.3.robonomics.eth" in token.one("token").found
+    assert "gold.3.robonomics.eth" in token.one("token").message
 
 
-async def test_an_address_that_is_no_lighthouse_of_the_factory_is_named(ward: Ward) -> None:
-    found = await ward.examined("agent", "robot", lighthouse_contract=ward.town.deployment.xrt)
+async def test_an_address_that_is_no_lighthouse_of_the_factory_is_named(machine: Machine) -> None:
+    found = await machine.examined("agent", "robot", lighthouse_contract=machine.town.deployment.xrt)
 
     assert "is no lighthouse of this factory" in found.cause("lighthouse")
 
 
-async def test_contracts_taken_for_the_original_ones_are_told_from_these(ward: Ward) -> None:
-    found = await ward.examined("agent", contracts="original")
+async def test_contracts_taken_for_the_original_ones_are_told_from_these(machine: Machine) -> None:
+    found = await machine.examined("agent", contracts="original")
 
-    assert "not the original contracts, but this project's" in found.one("contracts").found
-    assert found.one("contracts").do == "--contracts mesh"
+    assert "not the original contracts, but this project's" in found.one("contracts").message
+    assert found.one("contracts").hint == "--contracts mesh"
 
 
-async def test_a_websocket_that_was_named_has_to_answer(ward: Ward) -> None:
+async def test_a_websocket_that_was_named_has_to_answer(machine: Machine) -> None:
     dead = f"ws://127.0.0.1:{free_port()}"
-    alive = ward.town.url.replace("http", "ws")
+    alive = machine.town.url.replace("http", "ws")
 
-    assert dead in (await ward.examined(None, web3_ws_provider=dead)).cause("websocket")
-    assert (await ward.examined(None, web3_ws_provider=alive)).one("websocket").ok
+    assert dead in (await machine.examined(None, web3_ws_provider=dead)).cause("websocket")
+    assert (await machine.examined(None, web3_ws_provider=alive)).one("websocket").ok
 
 
-async def test_what_is_no_address_of_a_node_is_a_finding(ward: Ward) -> None:
-    assert "is not the address of a node" in (await ward.examined(None, web3_http_provider="8545")).cause("node")
+async def test_what_is_no_address_of_a_node_is_a_finding(machine: Machine) -> None:
+    assert "is not the address of a node" in (await machine.examined(None, web3_http_provider="8545")).cause("node")
 
 
 @pytest.mark.parametrize(
@@ -135,30 +135,30 @@ async def test_what_is_no_address_of_a_node_is_a_finding(ward: Ward) -> None:
 def test_a_chain_stands_still_without_a_new_block_unless_it_is_one_for_development(
     client: str, age: float, still: bool
 ) -> None:
-    assert stands_still(client, number=7, age=age) is still
-    assert not stands_still(client, number=0, age=age)
+    assert is_stalled(client, number=7, age=age) is still
+    assert not is_stalled(client, number=0, age=age)
 
 
-async def test_an_old_block_of_a_development_chain_says_nothing_about_the_clock(ward: Ward) -> None:
+async def test_an_old_block_of_a_development_chain_says_nothing_about_the_clock(machine: Machine) -> None:
     with Anvil(arguments=("--timestamp", str(int(time.time()) - 86_400))) as old:
         ask(old, "evm_setNextBlockTimestamp", int(time.time()) - 7_300)
         ask(old, "anvil_mine", "0x1")
-        found = await ward.examined(None, web3_http_provider=old.url)
+        found = await machine.examined(None, web3_http_provider=old.url)
 
     assert found.one("node").ok
-    assert found.one("chain clock").found == "the newest block is 2 hours old, and says nothing about the clock"
+    assert found.one("chain clock").message == "the newest block is 2 hours old, and says nothing about the clock"
 
 
-async def test_a_clock_behind_the_chain_s_is_named(ward: Ward, anvil: Anvil) -> None:
+async def test_a_clock_behind_the_chain_s_is_named(machine: Machine, anvil: Anvil) -> None:
     ask(anvil, "evm_setNextBlockTimestamp", int(time.time()) + 3_600)
     ask(anvil, "anvil_mine", "0x1")
 
-    found = await ward.examined(None, web3_http_provider=anvil.url)
+    found = await machine.examined(None, web3_http_provider=anvil.url)
 
-    finding = found.one("chain clock")
-    assert not finding.ok
-    assert "60 minutes behind the chain's" in finding.found
-    assert "set the clock" in finding.do
+    result = found.one("chain clock")
+    assert not result.ok
+    assert "60 minutes behind the chain's" in result.message
+    assert "set the clock" in result.hint
 
 
 def ask(anvil: Anvil, method: str, *parameters: object) -> None:

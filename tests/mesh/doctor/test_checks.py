@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.doctor import Check, Finding, Verdict, broken, doubtful, examine, sound
-from mesh.doctor.checks import aside
+from mesh.doctor import Check, CheckResult, CheckStatus, failed, passed, run_checks, warning
+from mesh.doctor.checks import in_thread
 from mesh.errors import ConfigurationError, RemoteError
 from tests.support.waiting import at_most
 
@@ -18,50 +18,50 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
-def check(name: str, finding: Finding, *needs: Sequence[Check]) -> Check:
-    async def make() -> Finding:
-        return finding
+def check(name: str, result: CheckResult, *needs: Sequence[Check]) -> Check:
+    async def make() -> CheckResult:
+        return result
 
     return Check(name, make, needs=tuple(map(tuple, needs)))
 
 
 def failing(name: str, error: BaseException) -> Check:
-    async def make() -> Finding:
+    async def make() -> CheckResult:
         raise error
 
     return Check(name, make)
 
 
-async def made(*checks: Check, seconds: float = 30.0) -> dict[str, Finding | None]:
-    async with aclosing(examine(checks, seconds=seconds)) as examined:
-        return {checked.name: checked.finding async for checked in examined}
+async def made(*checks: Check, seconds: float = 30.0) -> dict[str, CheckResult | None]:
+    async with aclosing(run_checks(checks, seconds=seconds)) as examined:
+        return {checked.name: checked.result async for checked in examined}
 
 
 async def test_what_is_found_comes_in_the_order_of_the_checks_and_not_in_that_of_their_ends() -> None:
     second_is_done = asyncio.Event()
 
-    async def first() -> Finding:
+    async def first() -> CheckResult:
         await second_is_done.wait()
-        return sound("first")
+        return passed("first")
 
-    async def second() -> Finding:
+    async def second() -> CheckResult:
         second_is_done.set()
-        return sound("second")
+        return passed("second")
 
     assert list(await made(Check("one", first), Check("two", second))) == ["one", "two"]
 
 
 async def test_an_error_is_a_finding_with_what_it_says_and_what_it_says_to_do() -> None:
-    found = await made(failing("node", RemoteError("nobody there", hint="start it")), check("disk", sound("fine")))
+    found = await made(failing("node", RemoteError("nobody there", hint="start it")), check("disk", passed("fine")))
 
-    assert found == {"node": Finding(Verdict.FAIL, "nobody there", "start it"), "disk": sound("fine")}
+    assert found == {"node": CheckResult(CheckStatus.FAIL, "nobody there", "start it"), "disk": passed("fine")}
 
 
 async def test_something_is_to_be_done_even_about_an_error_without_a_hint() -> None:
-    (finding,) = (await made(failing("node", ConfigurationError("no")))).values()
+    (result,) = (await made(failing("node", ConfigurationError("no")))).values()
 
-    assert finding is not None
-    assert finding.do
+    assert result is not None
+    assert result.hint
 
 
 async def test_a_failure_of_the_program_itself_is_none_of_the_machine() -> None:
@@ -72,52 +72,52 @@ async def test_a_failure_of_the_program_itself_is_none_of_the_machine() -> None:
 async def test_a_missing_package_is_named_with_the_extra_that_brings_it() -> None:
     found = await made(failing("node", ModuleNotFoundError("no", name="web3.eth")))
 
-    assert found["node"] == broken(
-        "this needs web3.eth, which is not installed here", do="pip install 'aira-mesh[chain]'"
+    assert found["node"] == failed(
+        "this needs web3.eth, which is not installed here", hint="pip install 'aira-mesh[chain]'"
     )
 
 
 async def test_what_needs_something_that_failed_is_left_out_and_so_is_what_needs_that() -> None:
-    node = check("node", broken("dead", do="start it"))
-    chain = check("chain", sound("never made"), [node])
-    account = check("account", sound("never made"), [chain])
+    node = check("node", failed("dead", hint="start it"))
+    chain = check("chain", passed("never made"), [node])
+    account = check("account", passed("never made"), [chain])
 
     assert await made(node, chain, account) == {"node": node_finding(), "chain": None, "account": None}
 
 
-def node_finding() -> Finding:
-    return broken("dead", do="start it")
+def node_finding() -> CheckResult:
+    return failed("dead", hint="start it")
 
 
 async def test_of_a_group_one_is_enough_and_a_warning_is_no_failure() -> None:
-    dead, alive = check("a", broken("dead", do="start it")), check("b", doubtful("old", do="renew it"))
+    dead, alive = check("a", failed("dead", hint="start it")), check("b", warning("old", hint="renew it"))
 
-    found = await made(dead, alive, check("session", sound("open"), [dead, alive]))
+    found = await made(dead, alive, check("session", passed("open"), [dead, alive]))
 
-    assert found["session"] == sound("open")
+    assert found["session"] == passed("open")
 
 
 async def test_who_has_no_answer_in_time_fails_and_holds_up_nobody() -> None:
-    async def never() -> Finding:
+    async def never() -> CheckResult:
         await asyncio.Event().wait()
-        return sound("never")
+        return passed("never")
 
     with at_most(5):
-        found = await made(Check("slow", never), check("quick", sound("there")), seconds=0.2)
+        found = await made(Check("slow", never), check("quick", passed("there")), seconds=0.2)
 
     slow = found["slow"]
     assert slow is not None
-    assert (slow.ok, slow.found) == (False, "no answer within 0.2 s")
-    assert "--timeout" in slow.do
-    assert found["quick"] == sound("there")
+    assert (slow.ok, slow.message) == (False, "no answer within 0.2 s")
+    assert "--timeout" in slow.hint
+    assert found["quick"] == passed("there")
 
 
 async def test_a_call_that_blocks_for_ever_ends_with_the_time_too() -> None:
     released = threading.Event()
 
-    async def blocked() -> Finding:
-        await aside(released.wait)
-        return sound("never")
+    async def blocked() -> CheckResult:
+        await in_thread(released.wait)
+        return passed("never")
 
     with at_most(5):
         found = await made(Check("disk", blocked), seconds=0.2)
@@ -132,20 +132,20 @@ async def test_what_a_call_beside_the_loop_raises_is_raised() -> None:
         raise RemoteError(words)
 
     with pytest.raises(RemoteError, match="not now"):
-        await aside(refuse, "not now")
+        await in_thread(refuse, "not now")
 
 
 async def test_who_reads_no_further_ends_the_checks() -> None:
     ended = asyncio.Event()
 
-    async def long() -> Finding:
+    async def long() -> CheckResult:
         try:
             await asyncio.Event().wait()
         finally:
             ended.set()
-        return sound("never")
+        return passed("never")
 
-    async with aclosing(examine([check("one", sound("there")), Check("two", long)], seconds=30)) as examined:
+    async with aclosing(run_checks([check("one", passed("there")), Check("two", long)], seconds=30)) as examined:
         async for _ in examined:
             break
 

@@ -4,43 +4,46 @@ from __future__ import annotations
 
 import pytest
 
-from mesh.doctor.clock import against_chain, against_node, against_router, days_left, spoken
+from mesh.doctor.machine import compare_chain_clock, compare_node_clock, compare_router_clock, duration, time_left
 
 NOW = 1_800_000_000.0
 
 
 @pytest.mark.parametrize("ahead", [-4.9, 0.0, 4.9])
 def test_some_seconds_are_tolerated(ahead: float) -> None:
-    assert against_router(NOW - ahead, NOW).ok
-    assert against_node(NOW - ahead, NOW).ok
+    assert compare_router_clock(NOW - ahead, NOW).ok
+    assert compare_node_clock(NOW - ahead, NOW).ok
 
 
 @pytest.mark.parametrize(
     ("ahead", "words"), [(7_300.0, "2 hours ahead of"), (-600.0, "10 minutes behind"), (9.0, "9 s ahead of")]
 )
 def test_more_is_said_with_its_size_and_direction_and_what_to_do(ahead: float, words: str) -> None:
-    for finding in (against_router(NOW - ahead, NOW), against_node(NOW - ahead, NOW)):
-        assert not finding.ok
-        assert f"this machine's clock is {words} t" in finding.found
-        assert "set the clock" in finding.do
+    for result in (compare_router_clock(NOW - ahead, NOW), compare_node_clock(NOW - ahead, NOW)):
+        assert not result.ok
+        assert f"this machine's clock is {words} t" in result.message
+        assert "set the clock" in result.hint
 
 
 def test_a_block_from_the_future_means_a_clock_that_is_behind() -> None:
-    assert "2 days behind the chain's" in against_chain(NOW + 2 * 86_400, NOW).found
-    assert not against_chain(NOW + 31, NOW).ok
-    assert against_chain(NOW + 29, NOW).ok
+    assert "2 days behind the chain's" in compare_chain_clock(NOW + 2 * 86_400, NOW).message
+    assert not compare_chain_clock(NOW + 31, NOW).ok
+    assert compare_chain_clock(NOW + 29, NOW).ok
 
 
 def test_an_old_block_says_nothing() -> None:
-    assert against_chain(NOW - 7_200, NOW).found == "the newest block is 2 hours old, and says nothing about the clock"
+    assert (
+        compare_chain_clock(NOW - 7_200, NOW).message
+        == "the newest block is 2 hours old, and says nothing about the clock"
+    )
 
 
 def test_lengths_of_time_are_in_the_unit_that_says_them_best() -> None:
-    assert [spoken(seconds) for seconds in (0.4, 90, 150, 7_300, 3 * 86_400)] == [
+    assert [duration(seconds) for seconds in (0.4, 90, 150, 7_300, 3 * 86_400)] == [
         "0 s",
         "90 s",
         "2 minutes",
         "2 hours",
         "3 days",
     ]
-    assert days_left(0) == "over"
+    assert time_left(0) == "over"

@@ -9,9 +9,9 @@ import socket
 import sys
 from typing import TYPE_CHECKING, Any
 
-from mesh.doctor import Case
-from mesh.doctor.case import Line
-from mesh.doctor.certificate import Shown
+from mesh.doctor import DoctorContext
+from mesh.doctor.certificate import CertificateInfo
+from mesh.doctor.context import SerialSettings
 from mesh.identity import Member
 from mesh.settings import Settings
 from tests.mesh.cli.chains import PASSWORD, Town
@@ -160,18 +160,21 @@ def test_the_certificate_s_role_is_taken_where_none_is_named(tmp_path: Path) -> 
     assert "refused, as it should be: " in done.stdout
 
 
-def shown(*roles: str) -> Shown:
+def shown(*roles: str) -> CertificateInfo:
     """What a certificate with these roles says."""
-    return Shown(address=ARM, name="somebody", roles=roles, until=0.0)
+    return CertificateInfo(address=ARM, name="somebody", roles=roles, until=0.0)
 
 
 def test_the_role_follows_from_the_settings() -> None:
-    assert Case(settings=Settings()).role == "agent"
-    assert Case(settings=Settings(roster="roster.toml")).role == "router"
-    assert Case(settings=Settings(), line=Line(port="/dev/ttyACM0")).role == "edge"
-    assert Case(settings=Settings(), identity=shown("watcher")).role == "operator"
-    assert Case(settings=Settings(), identity=shown("provider")).role == "provider"
-    assert Case(settings=Settings(roster="roster.toml"), asked_role="person", identity=shown("edge")).role == "person"
+    assert DoctorContext(settings=Settings()).role == "agent"
+    assert DoctorContext(settings=Settings(roster="roster.toml")).role == "router"
+    assert DoctorContext(settings=Settings(), serial=SerialSettings(port="/dev/ttyACM0")).role == "edge"
+    assert DoctorContext(settings=Settings(), identity=shown("watcher")).role == "operator"
+    assert DoctorContext(settings=Settings(), identity=shown("provider")).role == "provider"
+    assert (
+        DoctorContext(settings=Settings(roster="roster.toml"), requested_role="person", identity=shown("edge")).role
+        == "person"
+    )
 
 
 def test_nothing_is_left_behind(town: Town, router: EmbeddedRouter, tmp_path: Path) -> None:

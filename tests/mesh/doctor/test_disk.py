@@ -6,8 +6,8 @@ import os
 import sys
 from typing import TYPE_CHECKING
 
-from mesh.doctor import Case, Verdict
-from mesh.doctor.disk import LEAST, look_at_folder, look_at_room
+from mesh.doctor import CheckStatus, DoctorContext
+from mesh.doctor.machine import LEAST, check_data_folder, check_disk_space
 from mesh.settings import Settings
 from tests.mesh.doctor.examining import examined
 from tests.support.commands import run
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 AS_NOBODY = """
 import os, sys
 from pathlib import Path
-from mesh.doctor.disk import look_at_folder, look_at_room
+from mesh.doctor.machine import check_data_folder, check_disk_space
 folder = Path(sys.argv[1])
 if os.geteuid() == 0:
     os.setgroups([]), os.setgid(65534), os.setuid(65534)
@@ -29,17 +29,17 @@ print(*{look}, sep="\\n")
 
 
 def test_a_folder_that_takes_a_file_is_sound_and_keeps_nothing_of_it(tmp_path: Path) -> None:
-    finding = look_at_folder(tmp_path)
+    result = check_data_folder(tmp_path)
 
-    assert finding.verdict is Verdict.OK
-    assert finding.found.startswith(f"{tmp_path} is written and synced in ")
+    assert result.status is CheckStatus.OK
+    assert result.message.startswith(f"{tmp_path} is written and synced in ")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_that_is_yet_to_be_made_is_looked_at_where_it_will_be(tmp_path: Path) -> None:
-    finding = look_at_folder(tmp_path / "a" / "b")
+    result = check_data_folder(tmp_path / "a" / "b")
 
-    assert finding.found == f"{tmp_path / 'a' / 'b'} is made at the start; {tmp_path} takes it"
+    assert result.message == f"{tmp_path / 'a' / 'b'} will be created at the start; {tmp_path} is writable"
     assert not (tmp_path / "a").exists()
 
 
@@ -48,10 +48,10 @@ def test_a_folder_of_another_user_is_named_with_both_and_the_cure(tmp_path: Path
     for parent in tmp_path.parents:
         if parent.stat().st_uid == os.geteuid() and parent != parent.parent:
             parent.chmod(parent.stat().st_mode | 0o011)
-    done = run(sys.executable, "-c", AS_NOBODY.format(look="look_at_folder(folder)"), tmp_path)
+    done = run(sys.executable, "-c", AS_NOBODY.format(look="check_data_folder(folder)"), tmp_path)
 
-    verdict, found, do = done.stdout.splitlines()
-    assert verdict == "Verdict.FAIL", done.stderr
+    status, found, do = done.stdout.splitlines()
+    assert status == "CheckStatus.FAIL", done.stderr
     assert f"{tmp_path} can't be written: Permission denied; it belongs to " in found
     assert do.startswith("sudo chown -R ")
     assert "--data-dir" in do
@@ -64,7 +64,7 @@ def test_what_is_above_a_folder_that_is_yet_to_be_made_stays_whose_it_is(tmp_pat
             parent.chmod(parent.stat().st_mode | 0o011)
     for mode in (0o555, 0o500):
         tmp_path.chmod(mode)
-        done = run(sys.executable, "-c", AS_NOBODY.format(look="look_at_folder(folder)"), folder)
+        done = run(sys.executable, "-c", AS_NOBODY.format(look="check_data_folder(folder)"), folder)
         _, found, do = done.stdout.splitlines()
         assert f"{tmp_path} can't be written: Permission denied" in found
         assert do.startswith("sudo install -d -o ")
@@ -80,35 +80,35 @@ def test_files_that_this_user_does_not_see_are_not_counted(tmp_path: Path) -> No
     for folder in (tmp_path, *tmp_path.parents):
         if folder.stat().st_uid == os.geteuid() and folder != folder.parent:
             folder.chmod(folder.stat().st_mode | 0o055)
-    done = run(sys.executable, "-c", AS_NOBODY.format(look="look_at_room(folder, content_limit=1)"), tmp_path)
+    done = run(sys.executable, "-c", AS_NOBODY.format(look="check_disk_space(folder, content_limit=1)"), tmp_path)
 
-    assert done.stdout.splitlines()[:1] == ["Verdict.OK"], done.stderr
+    assert done.stdout.splitlines()[:1] == ["CheckStatus.OK"], done.stderr
 
 
 async def test_a_data_dir_that_is_a_file_is_named(tmp_path: Path) -> None:
     (tmp_path / "state").write_text("")
     with EmbeddedRouter() as router:
         settings = Settings(connect=(router.endpoint,), data_dir=str(tmp_path / "state" / "deeper"))
-        found = await examined(Case(settings=settings, asked_role="bridge"))
+        found = await examined(DoctorContext(settings=settings, requested_role="bridge"))
 
     assert "data folder" in found.failed
-    assert found.one("data folder").found.endswith("can't be written: Not a directory")
-    assert found.one("data folder").do == "give another folder with --data-dir"
+    assert found.one("data folder").message.endswith("can't be written: Not a directory")
+    assert found.one("data folder").hint == "give another folder with --data-dir"
     assert "disk space" not in found
 
 
 def test_a_full_disk_is_said_to_be_full(tmp_path: Path) -> None:
     with file_size_limit(1024):
-        finding = look_at_folder(tmp_path)
+        result = check_data_folder(tmp_path)
 
-    assert not finding.ok
-    assert finding.found.startswith(f"the disk of {tmp_path} is full")
-    assert "free some space" in finding.do
+    assert not result.ok
+    assert result.message.startswith(f"the disk of {tmp_path} is full")
+    assert "free some space" in result.hint
     assert list(tmp_path.iterdir()) == []
 
 
 def test_room_for_all_that_may_be_kept_is_sound(tmp_path: Path) -> None:
-    assert look_at_room(tmp_path, content_limit=1024).verdict is Verdict.OK
+    assert check_disk_space(tmp_path, content_limit=1024).status is CheckStatus.OK
 
 
 def test_a_limit_beyond_the_disk_is_a_warning_that_counts_what_is_kept(tmp_path: Path) -> None:
@@ -117,13 +117,13 @@ def test_a_limit_beyond_the_disk_is_a_warning_that_counts_what_is_kept(tmp_path:
     (store / "Qm").write_bytes(b"")
     os.truncate(store / "Qm", 3 * 1024**3)
 
-    finding = look_at_room(tmp_path, content_limit=1024**5)
+    result = check_disk_space(tmp_path, content_limit=1024**5)
 
-    assert finding.verdict is Verdict.WARN
-    assert "3.0 GiB kept of at most 1,048,576.0 GiB" in finding.found
-    assert "--content-limit" in finding.do
+    assert result.status is CheckStatus.WARN
+    assert "3.0 GiB kept of at most 1,048,576.0 GiB" in result.message
+    assert "--content-limit" in result.hint
 
 
 def test_a_disk_without_room_for_a_ledger_fails(tmp_path: Path) -> None:
-    assert not look_at_room(tmp_path, content_limit=1024, least=1024**6).ok
-    assert look_at_room(tmp_path, content_limit=1024, least=LEAST).ok
+    assert not check_disk_space(tmp_path, content_limit=1024, least=1024**6).ok
+    assert check_disk_space(tmp_path, content_limit=1024, least=LEAST).ok

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.doctor import Case, Verdict
+from mesh.doctor import CheckStatus, DoctorContext
 from mesh.identity import Member
 from mesh.settings import Settings
-from tests.mesh.doctor.examining import case_of, examined, settings_of
+from tests.mesh.doctor.examining import context_of_member, examined, settings_of
 from tests.support.sites import MARKET, Site
 from tests.support.waiting import at_most
 
@@ -26,53 +26,53 @@ ROUTERS = pytest.mark.parametrize("kind", ["wheel", "zenohd"])
 async def test_a_member_of_a_site_is_let_in_heeded_and_denied_what_is_not_his(site: Site, kind: str) -> None:
     arm = site.enlist(Member(name="arm-1", address=ARM, roles=("agent",)))
     with site.open_router(kind):
-        found = await examined(case_of(site, arm))
+        found = await examined(context_of_member(site, arm))
 
     assert found.failed == []
     assert list(found) == ["certificate", "router", "session", "own write", "denied write", "router clock"]
-    assert "arm-1, agent" in found.one("certificate").found
-    assert "takes our certificate and shows that of router" in found.one("router").found
-    assert found.one("own write").found.startswith("heard back through the router in ")
-    assert found.one("denied write").found == f"refused, as it should be: a write in the market {MARKET}"
-    assert "from the router's clock" in found.one("router clock").found
+    assert "arm-1, agent" in found.one("certificate").message
+    assert "takes our certificate and shows that of router" in found.one("router").message
+    assert found.one("own write").message.startswith("heard back through the router in ")
+    assert found.one("denied write").message == f"refused, as it should be: a write in the market {MARKET}"
+    assert "from the router's clock" in found.one("router clock").message
 
 
 @pytest.mark.parametrize("role", ["agent", "person", "provider", "operator", "bridge", "watcher"])
 async def test_every_role_is_sound_where_it_is_given_its_rights(site: Site, role: Role) -> None:
     folder = site.enlist(Member(name="somebody", address=ARM, roles=(role,)))
     with site.open_router("wheel"):
-        found = await examined(case_of(site, folder))
+        found = await examined(context_of_member(site, folder))
 
     assert found.failed == []
-    assert found.one("denied write").found.startswith("refused, as it should be: ")
-    assert ("the space of another" in found.one("denied write").found) is (role in ("operator", "watcher"))
+    assert found.one("denied write").message.startswith("refused, as it should be: ")
+    assert ("the space of another" in found.one("denied write").message) is (role in ("operator", "watcher"))
 
 
 async def test_an_edge_agent_is_tried_at_the_device_that_it_serves(site: Site) -> None:
     folder = site.enlist(Member(name="board", address=ARM, roles=("edge",), agent=AGENT, device="lamp"))
     settings = settings_of(site.client(folder))
     with site.open_router("wheel"):
-        named = await examined(Case(settings=settings, asked_role="operator", agent=AGENT, device="lamp"))
-        unnamed = await examined(Case(settings=settings, asked_role="edge"))
+        named = await examined(DoctorContext(settings=settings, requested_role="operator", agent=AGENT, device="lamp"))
+        unnamed = await examined(DoctorContext(settings=settings, requested_role="edge"))
 
     assert named.failed == []
-    assert named.one("denied write").found == "refused, as it should be: a write in the jobs of its agent"
+    assert named.one("denied write").message == "refused, as it should be: a write in the jobs of its agent"
     assert "own write" in unnamed.failed
 
 
 async def test_an_edge_agent_s_own_device_need_not_be_named(site: Site) -> None:
     folder = site.enlist(Member(name="board", address=ARM, roles=("edge",)))
     with site.open_router("wheel"):
-        found = await examined(Case(settings=settings_of(site.client(folder))))
+        found = await examined(DoctorContext(settings=settings_of(site.client(folder))))
 
     assert found.failed == ["serial port"]
-    assert found.one("denied write").found == "refused, as it should be: a write in the jobs of its agent"
+    assert found.one("denied write").message == "refused, as it should be: a write in the jobs of its agent"
 
 
 async def test_an_expired_certificate_is_named_and_the_router_is_not_blamed(site: Site) -> None:
     arm = site.certify("arm", ARM, "agent", days=1e-9)
     with site.open_router("wheel"):
-        found = await examined(case_of(site, arm))
+        found = await examined(context_of_member(site, arm))
 
     cause = found.cause("certificate")
     assert "it has expired" in cause
@@ -83,12 +83,12 @@ async def test_an_expired_certificate_is_named_and_the_router_is_not_blamed(site
 async def test_a_certificate_that_ends_soon_is_a_warning_with_its_end(site: Site) -> None:
     arm = site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
     with site.open_router("wheel"):
-        found = await examined(case_of(site, arm))
+        found = await examined(context_of_member(site, arm))
 
-    finding = found.one("certificate")
-    assert finding.verdict is Verdict.WARN
-    assert time.strftime("%Y-%m-", time.gmtime(time.time() + 86_400)) in finding.found
-    assert "aira identity renew" in finding.do
+    result = found.one("certificate")
+    assert result.status is CheckStatus.WARN
+    assert time.strftime("%Y-%m-", time.gmtime(time.time() + 86_400)) in result.message
+    assert "aira identity renew" in result.hint
 
 
 @ROUTERS
@@ -100,7 +100,7 @@ async def test_who_is_let_in_and_not_heeded_is_told_so(site: Site, kind: str, re
     else:
         arm = site.certify("arm", ARM, "agent")
     with site.open_router(kind):
-        found = await examined(case_of(site, arm))
+        found = await examined(context_of_member(site, arm))
 
     cause = found.cause("own write")
     assert "it is not in the roster, or revoked" in cause
@@ -110,7 +110,7 @@ async def test_who_is_let_in_and_not_heeded_is_told_so(site: Site, kind: str, re
 async def test_a_market_that_the_site_does_not_carry_is_named(site: Site) -> None:
     arm = site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
     with site.open_router("wheel"):
-        found = await examined(case_of(site, arm, lighthouse_contract="other.lighthouse.3.robonomics.eth"))
+        found = await examined(context_of_member(site, arm, lighthouse_contract="other.lighthouse.3.robonomics.eth"))
 
     cause = found.cause("denied write")
     assert "does not let this identity hear the market other.lighthouse.3.robonomics.eth" in cause
@@ -121,21 +121,21 @@ async def test_a_certificate_without_its_site_s_is_a_finding_and_no_crash(site: 
     arm = site.certify("arm", ARM, "agent")
     settings = Settings(connect=(site.endpoint,), tls_certificate=str(arm.certificate), tls_key=str(arm.key))
 
-    found = await examined(Case(settings=settings, asked_role="operator"))
+    found = await examined(DoctorContext(settings=settings, requested_role="operator"))
 
     assert "tls_ca is not" in found.cause("certificate")
 
 
 async def test_a_router_s_own_case_is_its_roster_and_where_it_listens(site: Site) -> None:
     site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
-    case = Case(settings=site.settings())
-    idle = await examined(case)
+    context = DoctorContext(settings=site.settings())
+    idle = await examined(context)
     with site.open_router("wheel"):
-        running = await examined(case)
+        running = await examined(context)
 
-    assert case.role == "router"
+    assert context.role == "router"
     assert "no router listens there" in idle.cause("router")
-    assert idle.one("roster").found == f"1 member, none revoked, markets {MARKET}"
+    assert idle.one("roster").message == f"1 member, none revoked, markets {MARKET}"
     assert running.failed == []
     assert list(running) == ["roster", "certificate", "router", "session"]
 
@@ -143,7 +143,7 @@ async def test_a_router_s_own_case_is_its_roster_and_where_it_listens(site: Site
 async def test_a_roster_that_can_t_be_read_is_named(site: Site) -> None:
     site.roster.write_text("[[member]]\nname = 1\n")
     with at_most(30):
-        found = await examined(Case(settings=site.settings()))
+        found = await examined(DoctorContext(settings=site.settings()))
 
     assert "roster" in found.failed
-    assert str(site.roster) in found.one("roster").found
+    assert str(site.roster) in found.one("roster").message

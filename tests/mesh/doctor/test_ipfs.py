@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from bridges.ipfs.check import checks
-from mesh.doctor import Case, Verdict
+from mesh.doctor import CheckStatus, DoctorContext
 from mesh.settings import Settings
 from tests.bridges.ipfs.replays import RecentDaemon
 from tests.mesh.doctor.examining import Found, examined, made
@@ -26,15 +26,17 @@ class Mute(JsIpfs):
 
 async def found_at(api: str, **options: Any) -> Found:
     """What is found of the daemon there."""
-    return await made(checks(Case(settings=Settings(ipfs_http_provider=api, **options), asked_role="bridge")))
+    return await made(
+        checks(DoctorContext(settings=Settings(ipfs_http_provider=api, **options), requested_role="bridge"))
+    )
 
 
 async def test_a_daemon_with_pubsub_is_sound_and_named(js_ipfs: JsIpfs) -> None:
     found = await found_at(js_ipfs.api)
 
     assert found.failed == []
-    assert found.one("ipfs daemon").found == f"js-ipfs 0.18.1 at {js_ipfs.api}, speaks the multibase dialect"
-    assert found.one("ipfs pubsub").found.startswith("enabled; ")
+    assert found.one("ipfs daemon").message == f"js-ipfs 0.18.1 at {js_ipfs.api}, speaks the multibase dialect"
+    assert found.one("ipfs pubsub").message.startswith("enabled; ")
 
 
 async def test_a_daemon_without_pubsub_is_told_how_to_get_it_and_one_that_knows_nobody_is_a_warning() -> None:
@@ -43,8 +45,8 @@ async def test_a_daemon_without_pubsub_is_told_how_to_get_it_and_one_that_knows_
 
     assert "not enabled" in found.cause("ipfs pubsub")
     assert "ipfs config --json Pubsub.Enabled true" in found.cause("ipfs pubsub")
-    assert found.one("ipfs swarm").verdict is Verdict.WARN
-    assert "--ipfs-swarm-connect" in found.one("ipfs swarm").do
+    assert found.one("ipfs swarm").status is CheckStatus.WARN
+    assert "--ipfs-swarm-connect" in found.one("ipfs swarm").hint
 
 
 async def test_a_daemon_that_wants_a_password_is_told_from_one_that_is_not_there(tmp_path: Path) -> None:
@@ -71,18 +73,18 @@ async def test_a_daemon_that_is_not_there_is_named_once() -> None:
 
 
 async def test_a_password_in_the_daemon_s_address_is_not_shown() -> None:
-    case = Case(settings=Settings(ipfs_http_provider=f"http://me:sesame@127.0.0.1:{free_port()}"))
+    context = DoctorContext(settings=Settings(ipfs_http_provider=f"http://me:sesame@127.0.0.1:{free_port()}"))
 
-    found = (await made(checks(case))).one("ipfs daemon")
+    found = (await made(checks(context))).one("ipfs daemon")
 
     assert not found.ok
     assert "sesame" not in str(found)
 
 
 def test_only_a_bridge_needs_a_daemon_unless_one_is_named() -> None:
-    assert "ipfs" not in Case(settings=Settings()).fields
-    assert "ipfs" in Case(settings=Settings(), asked_role="bridge").fields
-    assert "ipfs" in Case(settings=Settings(ipfs_http_provider="http://ipfs:5001")).fields
+    assert "bridge" not in DoctorContext(settings=Settings()).roles
+    assert "bridge" in DoctorContext(settings=Settings(), requested_role="bridge").roles
+    assert "bridge" in DoctorContext(settings=Settings(ipfs_http_provider="http://ipfs:5001")).roles
 
 
 async def test_a_bridge_without_a_daemon_hears_of_it_among_the_rest() -> None:
@@ -92,4 +94,8 @@ async def test_a_bridge_without_a_daemon_hears_of_it_among_the_rest() -> None:
         ipfs_http_provider=f"http://127.0.0.1:{free_port()}",
     )
 
-    assert (await examined(Case(settings=settings, asked_role="bridge"))).failed == ["router", "node", "ipfs daemon"]
+    assert (await examined(DoctorContext(settings=settings, requested_role="bridge"))).failed == [
+        "router",
+        "node",
+        "ipfs daemon",
+    ]

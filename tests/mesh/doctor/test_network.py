@@ -1,4 +1,4 @@
-"""Routers that are sound, dead, foreign, or open to everybody."""
+"""Routers that are passed, dead, foreign, or open to everybody."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 import pytest
 import zenoh
 
-from mesh.doctor import Case, Verdict
+from mesh.doctor import CheckStatus, DoctorContext
 from mesh.identity import Member
 from mesh.identity.routers import zenohd_configuration
 from mesh.network import Endpoints, Tls
 from mesh.settings import Settings
-from tests.mesh.doctor.examining import case_of, examined, settings_of
+from tests.mesh.doctor.examining import context_of_member, examined, settings_of
 from tests.support.ports import free_port
 from tests.support.sites import Site, SiteZenohd
 from tests.support.waiting import at_most
@@ -33,15 +33,15 @@ ROUTERS = pytest.mark.parametrize("kind", ["wheel", "zenohd"])
 
 
 async def test_the_open_router_of_one_machine_is_said_to_be_open(router: EmbeddedRouter) -> None:
-    found = await examined(Case(settings=Settings(connect=(router.endpoint,)), asked_role="operator"))
+    found = await examined(DoctorContext(settings=Settings(connect=(router.endpoint,)), requested_role="operator"))
 
     assert found.failed == []
-    assert found.one("denied write").verdict is Verdict.OK
-    assert "open: everybody may write everything" in found.one("denied write").found
+    assert found.one("denied write").status is CheckStatus.OK
+    assert "open: everybody may write everything" in found.one("denied write").message
 
 
 async def test_the_stand_alone_router_is_as_good(zenohd: Zenohd) -> None:
-    found = await examined(Case(settings=Settings(connect=(zenohd.endpoint,)), asked_role="operator"))
+    found = await examined(DoctorContext(settings=Settings(connect=(zenohd.endpoint,)), requested_role="operator"))
 
     assert found.failed == []
 
@@ -49,7 +49,7 @@ async def test_the_stand_alone_router_is_as_good(zenohd: Zenohd) -> None:
 async def test_no_router_is_named_once_with_its_address_and_how_to_start_one() -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with at_most(20):
-        found = await examined(Case(settings=Settings(connect=(endpoint,)), asked_role="operator"))
+        found = await examined(DoctorContext(settings=Settings(connect=(endpoint,)), requested_role="operator"))
 
     cause = found.cause("router")
     assert f"{endpoint}: no router listens there" in cause
@@ -59,14 +59,16 @@ async def test_no_router_is_named_once_with_its_address_and_how_to_start_one() -
 
 async def test_a_dead_router_beside_a_living_one_is_seen(router: EmbeddedRouter) -> None:
     dead = f"tcp/127.0.0.1:{free_port()}"
-    found = await examined(Case(settings=Settings(connect=(dead, router.endpoint)), asked_role="operator"))
+    found = await examined(DoctorContext(settings=Settings(connect=(dead, router.endpoint)), requested_role="operator"))
 
     assert dead in found.cause("router")
     assert found.one("own write").ok
 
 
 async def test_a_name_that_does_not_resolve_is_told_from_a_router_that_is_not_there() -> None:
-    found = await examined(Case(settings=Settings(connect=("tcp/no-such-host.invalid:7447",)), asked_role="operator"))
+    found = await examined(
+        DoctorContext(settings=Settings(connect=("tcp/no-such-host.invalid:7447",)), requested_role="operator")
+    )
 
     assert "the name no-such-host.invalid is not known here" in found.cause("router")
 
@@ -86,7 +88,7 @@ def other_server() -> Iterator[str]:
 
 
 async def test_what_answers_and_is_no_router_is_found_by_the_session(other_server: str) -> None:
-    found = await examined(Case(settings=Settings(connect=(other_server,)), asked_role="operator"))
+    found = await examined(DoctorContext(settings=Settings(connect=(other_server,)), requested_role="operator"))
 
     assert "no Zenoh router at" in found.cause("session")
 
@@ -96,7 +98,7 @@ async def test_the_router_of_a_foreign_site_is_named(site: Site, tmp_path: Path,
     (tmp_path / "other").mkdir()
     ours = Site(tmp_path / "other").certify("arm", ARM, "agent")
     with site.open_router(kind):
-        found = await examined(case_of(site, ours))
+        found = await examined(context_of_member(site, ours))
 
     cause = found.cause("router")
     assert "its certificate is not trusted" in cause
@@ -116,7 +118,7 @@ def open_router(site: Site, kind: str) -> AbstractContextManager[object]:
 async def test_a_router_that_lets_pass_what_the_roster_denies_is_found_out(site: Site, kind: str) -> None:
     arm = site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
     with open_router(site, kind):
-        found = await examined(case_of(site, arm))
+        found = await examined(context_of_member(site, arm))
 
     cause = found.cause("denied write")
     assert "the router lets anybody write anything" in cause
@@ -136,17 +138,17 @@ async def test_each_router_of_a_site_is_tried_and_the_one_that_forbids_nothing_i
     arm = site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
     settings = dataclasses.replace(settings_of(site.client(arm)), connect=(site.endpoint, leaky))
     with site.open_router("wheel"):
-        found = await examined(Case(settings=settings, asked_role="operator"))
+        found = await examined(DoctorContext(settings=settings, requested_role="operator"))
 
     assert found.cause("denied write").startswith(f"{leaky}: the router lets anybody write anything")
-    assert found["denied write"][0].found.startswith(f"{site.endpoint}: refused, as it should be")
+    assert found["denied write"][0].message.startswith(f"{site.endpoint}: refused, as it should be")
 
 
 async def test_a_router_open_to_other_machines_is_a_failure() -> None:
     host = own_address()
     endpoint = f"tcp/{host}:{free_port()}"
     with zenoh.open(Endpoints(mode="router", listen=(endpoint,)).config()):
-        found = await examined(Case(settings=Settings(connect=(endpoint,)), asked_role="operator"))
+        found = await examined(DoctorContext(settings=Settings(connect=(endpoint,)), requested_role="operator"))
 
     cause = found.cause("denied write")
     assert "open to everybody who reaches it" in cause

@@ -12,8 +12,8 @@ import pytest
 
 from bridges.serial import check
 from bridges.serial.ports import Port
-from mesh.doctor import Case
-from mesh.doctor.case import Line
+from mesh.doctor import DoctorContext
+from mesh.doctor.context import SerialSettings
 from mesh.settings import Settings
 from tests.mesh.doctor.examining import examined
 from tests.support.boards import COUNTER, ROSSERIAL_ECHO, board
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 IMPORTS = """
 import os, sys
-from bridges.serial.check import look_at_port
-from mesh.doctor.case import Line
+from bridges.serial.check import check_port
+from mesh.doctor.context import SerialSettings
 """
-LOOK = f"{IMPORTS}print(*look_at_port(Line(port=sys.argv[1])), sep=os.linesep)"
+LOOK = f"{IMPORTS}print(*check_port(SerialSettings(port=sys.argv[1])), sep=os.linesep)"
 AS_NOBODY = LOOK.replace("print", "if os.geteuid() == 0: os.setgroups([]), os.setgid(65534), os.setuid(65534)\nprint")
 
 
@@ -43,15 +43,17 @@ def silent() -> Iterator[str]:
 
 
 def test_a_port_that_opens_is_sound(silent: str) -> None:
-    assert check.look_at_port(Line(port=silent)).found == f"{silent} opens at 57,600 baud"
+    assert check.check_port(SerialSettings(port=silent)).message == f"{silent} opens at 57,600 baud"
 
 
 async def test_a_port_that_is_not_there_is_named(router: EmbeddedRouter) -> None:
-    case = Case(settings=Settings(connect=(router.endpoint,)), line=Line(port="/dev/ttyNOTHING"))
+    context = DoctorContext(
+        settings=Settings(connect=(router.endpoint,)), serial=SerialSettings(port="/dev/ttyNOTHING")
+    )
 
-    found = await examined(case)
+    found = await examined(context)
 
-    assert case.role == "edge"
+    assert context.role == "edge"
     cause = found.cause("serial port")
     assert "no serial port /dev/ttyNOTHING" in cause
     assert "is the board plugged in?" in cause
@@ -64,12 +66,12 @@ def test_a_port_without_permission_is_named_with_its_group_and_the_cure(silent: 
         os.chown(silent, -1, grp.getgrnam("dialout").gr_gid)
     done = run(sys.executable, "-c", AS_NOBODY, silent)
 
-    verdict, found, do = done.stdout.splitlines()
-    assert verdict == "Verdict.FAIL", done.stderr
+    status, found, do = done.stdout.splitlines()
+    assert status == "CheckStatus.FAIL", done.stderr
     assert f"{silent} can't be opened by " in found
     assert "no permission; it belongs to the group " in found
     assert do.startswith("sudo usermod -aG ")
-    assert "log in anew" in do
+    assert "log in again" in do
 
 
 def test_a_port_that_another_program_uses_is_told_from_a_forbidden_one(silent: str) -> None:
@@ -79,42 +81,40 @@ def test_a_port_that_another_program_uses_is_told_from_a_forbidden_one(silent: s
     finally:
         port.close()
 
-    verdict, found, do = done.stdout.splitlines()
-    assert verdict == "Verdict.FAIL", done.stderr
+    status, found, do = done.stdout.splitlines()
+    assert status == "CheckStatus.FAIL", done.stderr
     assert "another process uses it" in found
     assert "fuser" in do
 
 
 def test_a_file_that_is_no_port_is_said_to_be_none() -> None:
-    finding = check.look_at_port(Line(port="/dev/null"))
+    result = check.check_port(SerialSettings(port="/dev/null"))
 
-    assert not finding.ok
-    assert "it is no serial port" in finding.found
+    assert not result.ok
+    assert "it is no serial port" in result.message
 
 
-def test_a_port_on_which_nobody_answers_is_told_what_may_be_wrong(silent: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(check, "ANSWER", 0.5)
+def test_a_port_on_which_nobody_answers_is_told_what_may_be_wrong(silent: str) -> None:
+    result = check.check_board(SerialSettings(port=silent), timeout=0.5)
 
-    finding = check.listen_to_board(Line(port=silent))
-
-    assert not finding.ok
-    assert finding.found == "no board answers in frames at 57,600 baud"
-    assert "--protocol rosserial" in finding.do
+    assert not result.ok
+    assert result.message == "no board answers in frames at 57,600 baud"
+    assert "--protocol rosserial" in result.hint
 
 
 def test_a_board_that_answers_is_named_with_what_it_speaks() -> None:
     with board(COUNTER) as there:
-        finding = check.listen_to_board(Line(port=str(there.port)))
+        result = check.check_board(SerialSettings(port=str(there.port)))
 
-    assert finding.ok, finding
-    assert "speaks frames" in finding.found
+    assert result.ok, result
+    assert "speaks frames" in result.message
 
 
 def test_a_rosserial_board_answers_in_rosserial_only() -> None:
     with board(ROSSERIAL_ECHO) as there:
-        as_rosserial = check.listen_to_board(Line(port=str(there.port), protocol="rosserial"))
-        as_frames = check.listen_to_board(Line(port=str(there.port)))
+        as_rosserial = check.check_board(SerialSettings(port=str(there.port), protocol="rosserial"))
+        as_frames = check.check_board(SerialSettings(port=str(there.port)))
 
     assert as_rosserial.ok, as_rosserial
-    assert "speaks rosserial" in as_rosserial.found
+    assert "speaks rosserial" in as_rosserial.message
     assert not as_frames.ok

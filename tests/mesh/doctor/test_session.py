@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 import zenoh
 
-from mesh.doctor.writing import Pair
+from mesh.doctor.session import SessionPair
 from mesh.errors import RemoteError
 from tests.support.routers import client_config
 
@@ -50,12 +50,12 @@ async def far_from(endpoint: str) -> AsyncIterator[str]:
 
 
 @asynccontextmanager
-async def pair(near: str, far: str) -> AsyncIterator[Pair]:
+async def pair(near: str, far: str) -> AsyncIterator[SessionPair]:
     """A writer beside the router, and a reader far from it."""
     writer = await asyncio.to_thread(zenoh.open, client_config(near))
     reader = await asyncio.to_thread(zenoh.open, client_config(far))
     try:
-        yield Pair(writer, reader)
+        yield SessionPair(writer, reader)
     finally:
         for session in (reader, writer):
             await asyncio.to_thread(session.close)
@@ -74,4 +74,4 @@ async def test_nothing_is_said_of_what_is_denied_where_not_even_the_rest_comes_t
 ) -> None:
     async with pair(router.endpoint, router.endpoint) as both:
         with pytest.raises(RemoteError, match="did not come back"):
-            await both.passing(("aira/test/foreign",), own="aira/test/own", barrier="aira/test/unheard")
+            await both.delivered(("aira/test/foreign",), own="aira/test/own", barrier="aira/test/unheard")

@@ -11,12 +11,12 @@ from contextlib import contextmanager
 from email.utils import formatdate
 from typing import TYPE_CHECKING, Any
 
-from mesh.doctor import Verdict
+from mesh.doctor import CheckStatus
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from tests.mesh.doctor.wards import Ward
+    from tests.mesh.doctor.machines import Machine
 
 HOUR = 3600
 GETH = "Geth/v1.14.0-stable"
@@ -65,16 +65,16 @@ def gateway(node: str, *, behind: float = 0.0, refused: tuple[str, ...] = ()) ->
         server.server_close()
 
 
-async def test_a_gateway_without_some_methods_is_a_sound_node(ward: Ward) -> None:
-    with gateway(ward.town.url, refused=("web3_clientVersion", "eth_syncing")) as url:
-        found = await ward.examined("agent", "robot", web3_http_provider=url)
+async def test_a_gateway_without_some_methods_is_a_sound_node(machine: Machine) -> None:
+    with gateway(machine.town.url, refused=("web3_clientVersion", "eth_syncing")) as url:
+        found = await machine.examined("agent", "robot", web3_http_provider=url)
 
     assert found.failed == []
-    assert found.one("node").verdict is Verdict.OK
+    assert found.one("node").status is CheckStatus.OK
 
 
-async def test_a_clock_ahead_is_named_and_not_taken_for_a_node_that_stands_still(ward: Ward) -> None:
-    with gateway(ward.town.url, behind=HOUR) as url:
-        found = await ward.examined("agent", "robot", web3_http_provider=url)
+async def test_a_clock_ahead_is_named_and_not_taken_for_a_node_that_stands_still(machine: Machine) -> None:
+    with gateway(machine.town.url, behind=HOUR) as url:
+        found = await machine.examined("agent", "robot", web3_http_provider=url)
 
     assert "60 minutes ahead of that of the node's machine" in found.cause("node clock")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 import zenoh
 
-from mesh.doctor import Case
+from mesh.doctor import DoctorContext
 from mesh.identity import Member
 from mesh.identity.routers import router_endpoints
 from mesh.settings import Settings
@@ -18,7 +18,7 @@ from tests.support.sites import Site
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.doctor.case import Role
+    from mesh.doctor.context import Role
 
 HOSTS = pytest.mark.parametrize("hosts", [("127.0.0.1",), ("router.site.example",)])
 
@@ -36,12 +36,12 @@ async def test_a_router_on_every_address_is_sound(site: Site, hosts: tuple[str, 
     settings = settings_everywhere(site, hosts)
     session = zenoh.open(router_endpoints(settings).config())
     try:
-        found = await examined(Case(settings=settings))
+        found = await examined(DoctorContext(settings=settings))
     finally:
         session.close()  # type: ignore[no-untyped-call]
 
     assert found.failed == [], dict(found)
-    assert "takes our certificate and shows that of everywhere" in found.one("router").found
+    assert "takes our certificate and shows that of everywhere" in found.one("router").message
 
 
 async def test_a_router_of_a_foreign_site_on_every_address_is_named(site: Site, tmp_path: Path) -> None:
@@ -51,7 +51,7 @@ async def test_a_router_of_a_foreign_site_on_every_address_is_named(site: Site, 
     foreign = replace(settings_everywhere(other, ("127.0.0.1",)), listen=settings.listen)
     session = zenoh.open(router_endpoints(foreign).config())
     try:
-        found = await examined(Case(settings=settings))
+        found = await examined(DoctorContext(settings=settings))
     finally:
         session.close()  # type: ignore[no-untyped-call]
 
@@ -60,8 +60,8 @@ async def test_a_router_of_a_foreign_site_on_every_address_is_named(site: Site, 
 
 @pytest.mark.parametrize(("role", "option"), [("operator", "--connect"), ("edge", "--connect"), ("router", "--listen")])
 async def test_settings_without_a_router_are_named(role: Role, option: str) -> None:
-    found = await examined(Case(settings=Settings(connect=(), listen=()), asked_role=role))
+    found = await examined(DoctorContext(settings=Settings(connect=(), listen=()), requested_role=role))
 
-    finding = found.one("router")
-    assert (finding.ok, finding.found) == (False, "the settings name no router")
-    assert option in finding.do
+    result = found.one("router")
+    assert (result.ok, result.message) == (False, "the settings name no router")
+    assert option in result.hint

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from mesh.doctor import Case
+from mesh.doctor import DoctorContext
 from mesh.settings import Settings
 from tests.mesh.cli.chains import PASSWORD, Town
 from tests.mesh.doctor.examining import Found, examined
@@ -12,10 +12,10 @@ from tests.mesh.doctor.examining import Found, examined
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.doctor.case import Role
+    from mesh.doctor.context import Role
 
 
-class Ward:
+class Machine:
     """Where the town's people are examined: with a router, and folders of their own."""
 
     def __init__(self, town: Town, endpoint: str, folder: Path) -> None:
@@ -39,4 +39,6 @@ class Ward:
         return Settings(**(named | options))
 
     async def examined(self, role: Role | None, who: str = "", *, chain_id: int = 0, **options: Any) -> Found:
-        return await examined(Case(settings=self.settings(who, **options), asked_role=role, chain_id=chain_id))
+        return await examined(
+            DoctorContext(settings=self.settings(who, **options), requested_role=role, chain_id=chain_id)
+        )

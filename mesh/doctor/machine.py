@@ -1,0 +1,174 @@
+"""This machine: its clock compared with others, and the disk that holds its state.
+
+A wrong clock makes certificates look expired or not yet valid, and the times in recordings worthless. The checks of the
+disk block.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import pwd
+import shutil
+import stat
+import tempfile
+import time
+from typing import TYPE_CHECKING, Final
+
+from mesh.doctor.checks import CheckResult, failed, passed, warning
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+DAY: Final = 86_400.0
+SOON: Final = 7 * DAY
+"""A certificate should be renewed this many seconds before it expires."""
+TOLERATED: Final = 5.0
+"""Seconds by which two clocks may differ."""
+AHEAD: Final = 30.0
+"""Seconds by which a block may be in the future: development chains add a second per block, however fast."""
+RECENT: Final = 120.0
+"""Seconds for which the time of a block can be compared with the clock."""
+CURE: Final = (
+    "set the clock, best by NTP (timedatectl set-ntp true); certificates hold by it, and recordings have their times"
+    " from it"
+)
+PROBE: Final = 64 * 1024
+"""Bytes written as a test and deleted."""
+LEAST: Final = 100 * 1024**2
+"""Free bytes below which ledger and recordings will soon fail."""
+FULL: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+FORBIDDEN: Final = (errno.EACCES, errno.EPERM)
+SLOW: Final = 1.0
+"""Seconds for a small file above which a disk is too slow for a ledger that is synced at each step."""
+
+
+def compare_router_clock(theirs: float, ours: float) -> CheckResult:
+    """Compare the router's clock with this one, both read at the same moment (seconds since the epoch)."""
+    ahead = ours - theirs
+    if abs(ahead) <= TOLERATED:
+        return passed(f"{abs(ahead):.2f} s from the router's clock")
+    return failed(f"this machine's clock is {_apart(ahead)} the router's", hint=CURE)
+
+
+def compare_node_clock(theirs: float, ours: float) -> CheckResult:
+    """Compare the clock of the node's machine, in whole seconds, with this one (seconds since the epoch)."""
+    ahead = ours - theirs
+    if abs(ahead) <= TOLERATED + 1:
+        return passed("as the node's clock, to the second")
+    return failed(f"this machine's clock is {_apart(ahead)} that of the node's machine", hint=CURE)
+
+
+def compare_chain_clock(block_time: float, ours: float) -> CheckResult:
+    """Compare the time of the newest block with this clock (seconds since the epoch)."""
+    age = ours - block_time
+    if age < -AHEAD:
+        return failed(
+            f"the newest block is from the future: this clock is {duration(-age)} behind the chain's", hint=CURE
+        )
+    if age > RECENT:
+        return passed(f"the newest block is {duration(age)} old, and says nothing about the clock")
+    return passed(f"fits the newest block, {'of now' if age < 1 else duration(age) + ' old'}")
+
+
+def duration(seconds: float) -> str:
+    """A duration in the most readable unit."""
+    for name, length in (("days", DAY), ("hours", 3600.0), ("minutes", 60.0)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:.0f} {name}"
+    return f"{seconds:.0f} s"
+
+
+def time_left(until: float) -> str:
+    """How long it is until then (seconds since the epoch)."""
+    left = until - time.time()
+    return f"{duration(left)} left" if left > 0 else "over"
+
+
+def _apart(ahead: float) -> str:
+    return f"{duration(abs(ahead))} {'ahead of' if ahead > 0 else 'behind'}"
+
+
+def check_data_folder(folder: Path) -> CheckResult:
+    """Whether a file can be written and synced in the state's folder, or where that will be created."""
+    there = _nearest(folder)
+    began = time.monotonic()
+    try:
+        with tempfile.NamedTemporaryFile(dir=there, prefix=".aira-doctor-") as probe:
+            probe.write(bytes(PROBE))
+            probe.flush()
+            os.fsync(probe.fileno())
+    except OSError as error:
+        return _refused(folder, there, error)
+    took = time.monotonic() - began
+    if took > SLOW:
+        return warning(
+            f"{there} takes {took:.1f} s to write and sync a small file",
+            hint="use a local disk for --data-dir; each step of a job waits for it",
+        )
+    if there != folder:
+        return passed(f"{folder} will be created at the start; {there} is writable")
+    return passed(f"{folder} is written and synced in {took * 1000:.0f} ms, and belongs to {_owner(folder)}")
+
+
+def check_disk_space(folder: Path, *, content_limit: int, least: int = LEAST) -> CheckResult:
+    """Whether at least `least` bytes are free, and the store has room to grow to `content_limit` bytes."""
+    free = shutil.disk_usage(_nearest(folder)).free
+    kept = sum(map(_size, folder.glob("*/content/*")))
+    shown = f"{_gigabytes(free)} free, {_gigabytes(kept)} kept of at most {_gigabytes(content_limit)}"
+    if free < least:
+        return failed(f"{shown} in {folder}", hint="free some space, or give --data-dir on another disk")
+    if free + kept < content_limit:
+        return warning(shown, hint="give a --content-limit that the disk has room for, or free some space")
+    return passed(shown)
+
+
+def _refused(folder: Path, there: Path, error: OSError) -> CheckResult:
+    """Why no file can be written in `there`: the folder, or the one in which it will be created."""
+    if error.errno in FULL:
+        return failed(
+            f"the disk of {there} is full: {error.strerror}",
+            hint="free some space there, or give --data-dir on another disk",
+        )
+    other = "give another folder with --data-dir"
+    if error.errno not in FORBIDDEN:
+        return failed(f"{there} can't be written: {error.strerror}", hint=other)
+    user = os.geteuid()
+    # A folder above may belong to the system: don't suggest changing its owner.
+    own = f"sudo chown -R {user} {folder}" if there == folder else f"sudo install -d -o {user} {folder}"
+    return failed(
+        f"{there} can't be written: {error.strerror}; it belongs to {_owner(there)}, and this is {_user(user)}",
+        hint=f"{own}, or {other}",
+    )
+
+
+def _nearest(folder: Path) -> Path:
+    """The folder, or the nearest existing one above it that this user can see."""
+    return next(path for path in (folder, *folder.absolute().parents) if os.path.exists(path))
+
+
+def _size(path: Path) -> int:
+    """Bytes of a file; 0 if it was deleted meanwhile or this user can't see it."""
+    try:
+        about = path.stat()
+    except OSError:
+        return 0
+    return about.st_size if stat.S_ISREG(about.st_mode) else 0
+
+
+def _owner(path: Path) -> str:
+    try:
+        return _user(path.stat().st_uid)
+    except OSError:
+        return "an unknown user"
+
+
+def _user(number: int) -> str:
+    try:
+        return pwd.getpwuid(number).pw_name
+    except KeyError:
+        return f"the user {number}"
+
+
+def _gigabytes(size: int) -> str:
+    return f"{size / 1024**3:,.1f} GiB"
