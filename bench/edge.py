@@ -20,13 +20,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import zenoh
 
-from bridges.serial import frames, roswire
+from bridges.serial import frames, rosserial
 from bridges.serial.boards import SimulatedBoard
-from bridges.serial.dialect import Command, Ended, Happening, Ready, Said
+from bridges.serial.dialect import BoardReady, Command, CommandFinished, LineEvent, MessageReceived, load_dialect
 from bridges.serial.firmware import compile_sketch
-from bridges.serial.line import Line
-from bridges.serial.ports import PortName
-from bridges.serial.serving import dialect_of
+from bridges.serial.line import PortName, SerialLine
 from mesh.errors import AiraError
 from mesh.network import Endpoints, free_endpoint
 from mesh.running import fail
@@ -36,10 +34,9 @@ from schemas.payloads import String
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from bridges.serial.serving import Protocol
 
 LIBRARIES: Final = Path(__file__).parents[1] / "examples" / "firmware"
-SKETCHES: Final[dict[Protocol, Path]] = {
+SKETCHES: Final[dict[str, Path]] = {
     "frames": LIBRARIES / "AiraFrames" / "examples" / "Echo",
     "rosserial": LIBRARIES / "MiniRosserial" / "examples" / "Echo",
 }
@@ -69,7 +66,7 @@ def main() -> None:
         sys.exit(f"an edge agent is to have {MOST_MEMORY:g} MB and {MOST_START:g} s at most")
 
 
-def compiled(protocol: Protocol, baud: int, folder: Path) -> Path:
+def compiled(protocol: str, baud: int, folder: Path) -> Path:
     """The echo firmware of a protocol at a baud rate."""
     elf = folder / f"{protocol}-{baud}.elf"
     return compile_sketch(SKETCHES[protocol], elf, libraries=[LIBRARIES], defines=[f"BAUD={baud}"])
@@ -113,33 +110,33 @@ def resident(pid: int) -> float:
     return int(status["VmRSS"].split()[0]) / 1024
 
 
-def round_trips(protocol: Protocol, baud: int, elf: Path, calls: int) -> dict[str, float]:
+def round_trips(protocol: str, baud: int, elf: Path, calls: int) -> dict[str, float]:
     """16 bytes to the board and back, one after the other, each on a line at rest: milliseconds, median."""
-    arrived: SimpleQueue[tuple[Happening, float]] = SimpleQueue()
-    dialect = dialect_of(protocol, baud=baud, parameters={})
+    arrived: SimpleQueue[tuple[LineEvent, float]] = SimpleQueue()
+    dialect = load_dialect(protocol)(baud=baud)
     took = []
     topic, payload, answer = (
-        ("/echo", b'"0123456789abcde"', Ended)
+        ("/echo", b'"0123456789abcde"', CommandFinished)
         if protocol == "frames"
-        else ("/hear", String("0123456789ab").encode(), Said)
+        else ("/hear", String("0123456789ab").encode(), MessageReceived)
     )
     with SimulatedBoard(elf) as board:
-        line = Line(
+        line = SerialLine(
             PortName(str(board.port)),
             dialect,
             baud=baud,
-            deliver=lambda happening: arrived.put((happening, time.perf_counter())),
+            on_event=lambda happening: arrived.put((happening, time.perf_counter())),
         )
         thread = threading.Thread(target=line.run, name="line")
         thread.start()
         try:
-            _next(arrived, Ready)
+            _next(arrived, BoardReady)
             for _ in range(calls):
                 began = time.perf_counter()
-                line.do(lambda: dialect.submit(Command(topic, payload), time.monotonic()))
+                line.call_soon(lambda: dialect.submit(Command(topic, payload), time.monotonic()))
                 took.append(_next(arrived, answer) - began)
-                if answer is not Ended:
-                    _next(arrived, Ended)
+                if answer is not CommandFinished:
+                    _next(arrived, CommandFinished)
                     time.sleep(AT_REST)
         finally:
             line.stop()
@@ -148,11 +145,11 @@ def round_trips(protocol: Protocol, baud: int, elf: Path, calls: int) -> dict[st
     return {"p50_ms": round(p50, 2), "wire_ms": round(wire, 2), "ratio": round(p50 / wire, 2)}
 
 
-def wire_bytes(protocol: Protocol) -> int:
+def wire_bytes(protocol: str) -> int:
     """Bytes of a round trip: the message and its answer."""
     if protocol == "frames":
-        return 2 * len(frames.encode(frames.Frame(frames.Kind.CALL, 0, 0, bytes(16))))
-    return 2 * roswire.frame_size(16)
+        return 2 * len(frames.encode_frame(frames.Frame(frames.FrameKind.CALL, 0, 0, bytes(16))))
+    return 2 * rosserial.frame_size(16)
 
 
 def _seen(present: threading.Event, sample: zenoh.Sample) -> None:
@@ -160,7 +157,7 @@ def _seen(present: threading.Event, sample: zenoh.Sample) -> None:
         present.set()
 
 
-def _next(arrived: SimpleQueue[tuple[Happening, float]], kind: type[Happening]) -> float:
+def _next(arrived: SimpleQueue[tuple[LineEvent, float]], kind: type[LineEvent]) -> float:
     """When the next happening of that kind came."""
     while True:
         happening, when = arrived.get(timeout=SECONDS)

@@ -30,7 +30,7 @@ def test_a_name_that_is_not_there_is_told_as_python_tells_it(package: str) -> No
         ("from schemas import DeviceTopicKey", "coincurve"),
         ("from mesh.network import Endpoints", "asyncio"),
         ("from mesh import Settings", "zenoh"),
-        ("from bridges.serial import PortName", "zenoh"),
+        ("from bridges.serial import CallFailed", "zenoh"),
     ],
 )
 def test_what_is_not_asked_for_is_not_loaded(statement: str, absent: str) -> None:

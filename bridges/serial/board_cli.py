@@ -1,4 +1,4 @@
-"""`aira board`: boards without hardware."""
+"""`aira board`: simulated boards."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ HELP = "lines to type: adc 0-7 MILLIVOLTS, noise 0-1, unplug, plug, reset, quit"
 
 @click.group("board", short_help="run firmware on a simulated board")
 def command() -> None:
-    """Run a board that is not there: firmware in a simulated Arduino Uno."""
+    """Run firmware on a simulated Arduino Uno."""
 
 
 @command.command("run")
 @click.argument("firmware", type=click.Path(exists=True, dir_okay=False, path_type=Path))
-@click.option("--reset-on-open", "opening", flag_value="resets", help="opening the port resets it, as a real Uno")
-def run(firmware: Path, opening: str | None) -> None:
-    """Run FIRMWARE (an ELF file), print the port to use, and show its pins as they change.
+@click.option("--reset-on-open", is_flag=True, help="opening the port resets the board, as on a real Uno")
+def run(firmware: Path, reset_on_open: bool) -> None:
+    """Run FIRMWARE (an ELF file), print its port, and show its pins as they change.
 
-    Lines on stdin do to it what hands would: `adc 0 2500` puts 2.5 V on A0, `unplug` and `plug` pull the cable,
+    Lines on stdin control the board: `adc 0 2500` puts 2.5 V on A0, `unplug` and `plug` pull and connect the cable,
     `reset` presses the button, `noise 0.01` damages one byte in a hundred on the line. `quit` or Ctrl-C ends it.
     """
     from bridges.serial.boards import SimulatedBoard
 
     try:
-        with SimulatedBoard(firmware, resets=opening is not None, watch=_show) as board:
+        with SimulatedBoard(firmware, resets=reset_on_open, watch=_show) as board:
             click.echo(f"{HELP}\nuse it with: aira edge {board.port} --agent ADDRESS")
             for line in sys.stdin:
                 if line.strip() == "quit":
                     return
-                board.tell(line)
+                board.send(line)
             board.wait_for_end()
     except AiraError as error:
         fail(error)
@@ -48,6 +48,6 @@ def _show(line: str) -> None:
         case ["pin", pin, level, microseconds]:
             click.echo(f"{int(microseconds) / 1e6:10.3f} s  pin {pin:>2}  {'high' if level == '1' else 'low'}")
         case ["unknown", *words]:
-            click.echo(f"{' '.join(words)!r} is nothing a board understands; {HELP}", err=True)
+            click.echo(f"{' '.join(words)!r} is not a command; {HELP}", err=True)
         case ["port" | "opened" | "closed" | "unplugged" | "crashed", *_]:
             click.echo(line)

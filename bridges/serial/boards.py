@@ -1,7 +1,7 @@
-"""Boards without hardware: firmware in a simulated Arduino Uno, its serial line on a pseudo-terminal.
+"""Simulated boards: firmware in a simulated Arduino Uno, with its serial line on a pseudo-terminal.
 
-The simulator is a small C program of ours on libsimavr; it is compiled when it is first needed and kept in the cache
-folder that the tests' programs share. A board takes about two thirds of a core.
+The simulator is a small C program of ours on libsimavr; it is compiled on first use and kept in the cache folder that
+the programs of the tests share. A board uses about two thirds of a core.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
-from bridges.serial.errors import ConfigurationError
-from mesh.errors import InputError, RemoteError
+from mesh.errors import ConfigurationError, InputError, RemoteError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,34 +25,34 @@ if TYPE_CHECKING:
 SOURCE: Final = Path(__file__).parent / "board" / "board.c"
 HEADER: Final = Path("/usr/include/simavr/sim_avr.h")
 START: Final = 30.0
-"""Seconds that a board has to come up."""
+"""Seconds that a board has to start."""
 STOP: Final = 5.0
 AVR: Final = 83
-"""What an ELF file calls the processor (EM_AVR)."""
+"""The number of the processor in ELF files (EM_AVR)."""
 
 
-class NoFirmware(InputError):
-    """A file is not what a board runs."""
+class InvalidFirmware(InputError):
+    """A file is not an ELF file for an AVR."""
 
-    code = "no-firmware"
+    code = "invalid-firmware"
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(
-            f"{path} is no firmware for an Uno: {why}",
-            hint="`python -m bridges.serial.firmware SKETCH -o FOLDER` makes an ELF file of a sketch",
+            f"{path} is not firmware for an Uno: {why}",
+            hint="`python -m bridges.serial.firmware SKETCH -o FOLDER` compiles a sketch to an ELF file",
         )
         self.path = path
 
 
 class BoardFailed(RemoteError):
-    """The simulated board ended, or did not do what was waited for; the text has what it said last."""
+    """The simulated board stopped, or did not do what was expected; the text has its last output."""
 
     code = "board-failed"
 
 
 @dataclass(frozen=True)
 class PinChange:
-    """A pin went high or low; `at` is in seconds of the board's own time."""
+    """A pin changed its level; `at` is in seconds of the board's own time."""
 
     pin: int
     high: bool
@@ -61,7 +60,7 @@ class PinChange:
 
 
 def simulator() -> Path:
-    """The simulator's program, compiled if need be. Raises `ConfigurationError` where libsimavr or gcc is missing."""
+    """The simulator's program, compiled if necessary. Raises `ConfigurationError` where libsimavr or gcc is missing."""
     source = SOURCE.read_bytes()
     program = _cache() / f"board-{hashlib.sha256(source).hexdigest()[:12]}"
     if program.exists():
@@ -84,24 +83,24 @@ def simulator() -> Path:
 
 
 def check_firmware(path: Path) -> None:
-    """Raise `NoFirmware` for a file that is no ELF file with code for an AVR."""
+    """Raise `InvalidFirmware` for a file that is not an ELF file with code for an AVR."""
     try:
         with path.open("rb") as file:
             head = file.read(20)
     except OSError as error:
-        raise NoFirmware(path, error.strerror or str(error)) from None
+        raise InvalidFirmware(path, error.strerror or str(error)) from None
     if not head.startswith(b"\x7fELF"):
-        raise NoFirmware(path, "it is no ELF file")
+        raise InvalidFirmware(path, "it is not an ELF file")
     if int.from_bytes(head[18:20], "little") != AVR:
-        raise NoFirmware(path, "it is for another processor")
+        raise InvalidFirmware(path, "it is for another processor")
 
 
 class SimulatedBoard:
-    """A board with the firmware `elf`: `with SimulatedBoard(elf) as board`; then `board.port` can be opened.
+    """A board with the firmware `elf`: `with SimulatedBoard(elf) as board`, then open `board.port`.
 
     `port` stays the same when the cable is pulled and plugged in again. With `resets`, opening the port resets the
-    board, as it does a real Uno. Leaving `with` ends it. Entering it raises `NoFirmware`, `ConfigurationError` where
-    the simulator can't be had, and `BoardFailed`.
+    board, as it does a real Uno. `watch` is called with each line of the simulator's output. Entering raises
+    `InvalidFirmware`, `ConfigurationError` if the simulator can't be compiled, and `BoardFailed`.
     """
 
     def __init__(self, elf: Path, *, resets: bool = False, watch: Callable[[str], object] | None = None) -> None:
@@ -110,12 +109,12 @@ class SimulatedBoard:
         self._watch = watch
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self.port = Path()
-        """The path to open while the board runs; there is nothing while the cable is out."""
+        """The path to open while the board runs; it does not exist while the cable is pulled."""
         self.pins: list[PinChange] = []
         """The changes of all pins so far, in order."""
-        self.said: list[str] = []
-        """All that the simulator has said."""
-        self._heard = threading.Condition()
+        self.output: list[str] = []
+        """The lines that the simulator has printed."""
+        self._changed = threading.Condition()
         self._process: subprocess.Popen[str] | None = None
 
     def __enter__(self) -> Self:
@@ -154,28 +153,28 @@ class SimulatedBoard:
         if self._folder is not None:
             self._folder.cleanup()
 
-    def apply(self, channel: int, millivolts: int) -> None:
-        """Put a voltage, 0 to 5000 mV, on the analog input A0 to A7 with that number."""
-        self.tell(f"adc {channel} {millivolts}")
+    def set_voltage(self, channel: int, millivolts: int) -> None:
+        """Put a voltage, 0 to 5000 mV, on the analog input A0 to A7 of that number."""
+        self.send(f"adc {channel} {millivolts}")
 
-    def disturb(self, rate: float, *, seed: int = 1) -> None:
-        """From now on damage this share of the bytes on the line, each way."""
-        self.tell(f"noise {rate} {seed}")
+    def add_noise(self, rate: float, *, seed: int = 1) -> None:
+        """From now on damage this share of the bytes on the line, in both directions."""
+        self.send(f"noise {rate} {seed}")
 
     def reset(self) -> None:
         """Press the reset button."""
-        self.tell("reset")
+        self.send("reset")
 
     def unplug(self) -> None:
-        """Pull the cable; the board runs on."""
+        """Pull the cable; the board keeps running."""
         count = self._count("unplugged")
-        self.tell("unplug")
-        self.wait_until(lambda: self._count("unplugged") > count, what="the unplugging")
+        self.send("unplug")
+        self.wait_until(lambda: self._count("unplugged") > count, what="the unplugged")
 
     def plug(self) -> None:
         """Plug the cable in again."""
         count = self._count("port ")
-        self.tell("plug")
+        self.send("plug")
         self.wait_until(lambda: self._count("port ") > count, what="the port")
 
     def changes(self, pin: int) -> list[PinChange]:
@@ -183,43 +182,43 @@ class SimulatedBoard:
         return [change for change in self.pins if change.pin == pin]
 
     def wait_until(self, condition: Callable[[], object], *, what: str, seconds: float = START) -> None:
-        """Return when `condition()`, looked at whenever the board says something, is true. Raises `BoardFailed`."""
+        """Return when `condition()`, checked after each line of output, is true. Raises `BoardFailed`."""
         deadline = time.monotonic() + seconds
-        with self._heard:
+        with self._changed:
             while not condition():
                 left = deadline - time.monotonic()
                 if left <= 0 or (self._process is not None and self._process.poll() is not None):
-                    raise BoardFailed(f"{what} did not come about; the board said: {' | '.join(self.said[-10:])}")
-                self._heard.wait(min(left, 0.2))
+                    raise BoardFailed(f"waited in vain for {what}; the board said: {' | '.join(self.output[-10:])}")
+                self._changed.wait(min(left, 0.2))
 
     def wait_for_end(self) -> None:
-        """Return when the simulator has ended."""
+        """Return when the simulator has stopped."""
         self._running().wait()
 
     def _read(self, process: subprocess.Popen[str]) -> None:
         assert process.stdout is not None
         for line in process.stdout:
-            with self._heard:
-                self.said.append(line.strip())
+            with self._changed:
+                self.output.append(line.strip())
                 match line.split():
                     case ["pin", pin, level, microseconds]:
                         self.pins.append(PinChange(int(pin), level == "1", int(microseconds) / 1e6))
-                self._heard.notify_all()
+                self._changed.notify_all()
             if self._watch is not None:
                 self._watch(line.strip())
 
     def _count(self, word: str) -> int:
-        return sum(line.startswith(word) for line in self.said)
+        return sum(line.startswith(word) for line in self.output)
 
-    def tell(self, line: str) -> None:
-        """Give the simulator a line as it takes them: see `board.c`. Raises `BoardFailed` when it has ended."""
+    def send(self, line: str) -> None:
+        """Send the simulator a command line: see `board.c`. Raises `BoardFailed` when it has stopped."""
         process = self._running()
         assert process.stdin is not None
         try:
             process.stdin.write(f"{line.strip()}\n")
             process.stdin.flush()
         except BrokenPipeError:
-            raise BoardFailed(f"the board has ended; it said: {' | '.join(self.said[-10:])}") from None
+            raise BoardFailed(f"the board has stopped; it said: {' | '.join(self.output[-10:])}") from None
 
     def _running(self) -> subprocess.Popen[str]:
         if self._process is None:
@@ -228,5 +227,5 @@ class SimulatedBoard:
 
 
 def _cache() -> Path:
-    """The folder that `make peers` uses, too; may be deleted at any time."""
+    """The folder that `make peers` also uses; it may be deleted at any time."""
     return Path(os.environ.get("AIRA_PEERS_CACHE") or "~/.cache/aira-mesh").expanduser()

@@ -10,11 +10,9 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from bridges.serial.dialect import Ready
+from bridges.serial.dialect import BoardReady, dialect_names, load_dialect
 from bridges.serial.errors import LineError
-from bridges.serial.line import Line
-from bridges.serial.ports import Port, PortName
-from bridges.serial.serving import dialect_of
+from bridges.serial.line import PortName, SerialLine, SerialPort
 from mesh.doctor.checks import Check, CheckResult, failed, in_thread, passed
 
 if TYPE_CHECKING:
@@ -40,7 +38,7 @@ def check_port(settings: SerialSettings) -> CheckResult:
         return failed("no serial port is named", hint="give --port /dev/ttyACM0, or usb:VENDOR:PRODUCT")
     path = PortName(settings.port).find()
     try:
-        Port(path, baud=settings.baud).close()
+        SerialPort(path, baud=settings.baud).close()
     except LineError as error:
         return _unusable(path, error)
     return passed(
@@ -51,29 +49,29 @@ def check_port(settings: SerialSettings) -> CheckResult:
 
 def check_board(settings: SerialSettings, *, timeout: float = ANSWER_TIMEOUT) -> CheckResult:
     """Whether a board answers in the protocol. Opening the port restarts most boards."""
-    dialect = dialect_of(settings.protocol, baud=settings.baud, parameters={})
+    dialect = load_dialect(settings.protocol)(baud=settings.baud)
     ready = threading.Event()
-    there = Line(
+    line = SerialLine(
         PortName(settings.port),
         dialect,
         baud=settings.baud,
-        deliver=lambda happening: ready.set() if isinstance(happening, Ready) else None,
+        on_event=lambda event: ready.set() if isinstance(event, BoardReady) else None,
     )
-    thread = threading.Thread(target=there.run, name="line of the doctor", daemon=True)
+    thread = threading.Thread(target=line.run, name="line of the doctor", daemon=True)
     began = time.monotonic()
     thread.start()
     answered = ready.wait(timeout)
-    there.stop()
+    line.stop()
     thread.join(timeout)
-    if answered and (about := dialect.about) is not None:
-        name = " ".join(filter(None, (about.name, about.version))) or "a sketch"
+    if answered and (info := dialect.info) is not None:
+        name = " ".join(filter(None, (info.name, info.version))) or "a sketch"
         took = time.monotonic() - began
-        return passed(f"{name} speaks {settings.protocol}, {len(about.topics)} topics, after {took:.1f} s")
-    other = "rosserial" if settings.protocol == "frames" else "frames"
+        return passed(f"{name} speaks {settings.protocol}, {len(info.topics)} topics, after {took:.1f} s")
+    others = " or ".join(f"--protocol {name}" for name in dialect_names() if name != settings.protocol)
     return failed(
         f"no board answers in {settings.protocol} at {settings.baud:,} baud",
         hint=f"is the firmware loaded, does --baud fit it, and does it speak {settings.protocol}?"
-        f" else --protocol {other}",
+        f" else {others}",
     )
 
 

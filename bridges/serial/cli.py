@@ -1,4 +1,4 @@
-"""`aira edge`: a device on a serial line becomes part of its agent."""
+"""`aira edge`: connect a device on a serial line to its agent."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from bridges.serial.dialect import dialect_names
 from mesh.cli.options import with_settings
 from mesh.errors import AiraError
 from mesh.running import fail
@@ -13,12 +14,11 @@ from mesh.settings import NetworkSettings, TelemetrySettings, options_of
 from mesh.telemetry.logs import configure_logging_from
 
 if TYPE_CHECKING:
-    from bridges.serial.serving import Protocol
     from mesh.settings import Settings
 
 
 def _renaming(context: click.Context, option: click.Parameter, given: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
-    """The pairs of TOPIC=NAME."""
+    """Parse TOPIC=NAME into pairs."""
     pairs = tuple(text.partition("=")[::2] for text in given)
     for text, (topic, name) in zip(given, pairs, strict=True):
         if not topic.startswith("/") or not name.startswith("/"):
@@ -27,7 +27,7 @@ def _renaming(context: click.Context, option: click.Parameter, given: tuple[str,
 
 
 def _parameter(context: click.Context, option: click.Parameter, given: tuple[str, ...]) -> dict[str, object]:
-    """The values of NAME=VALUE: numbers where they are some, and lists where there are commas."""
+    """Parse NAME=VALUE: numbers where possible, and lists if there are commas."""
     parameters: dict[str, object] = {}
     for text in given:
         name, equals, value = text.partition("=")
@@ -50,13 +50,13 @@ def _number(text: str) -> int | float | str:
 @click.command("edge", short_help="connect a device on a serial line to the mesh")
 @click.argument("port")
 @click.option("--agent", required=True, metavar="ADDRESS", help="account of the agent that the device belongs to")
-@click.option("--name", default="board", show_default=True, help="what the device is called among the agent's keys")
+@click.option("--name", default="board", show_default=True, help="name of the device in the agent's keys")
 @click.option(
     "--protocol",
-    type=click.Choice(["frames", "rosserial"]),
+    type=click.Choice(dialect_names()),
     default="frames",
     show_default=True,
-    help="what the firmware speaks: our own frames, or rosserial version 2",
+    help="the firmware's protocol: our own frames, rosserial version 2, or an installed one",
 )
 @click.option("--baud", type=click.IntRange(300, 4_000_000), default=57_600, show_default=True, help="bits per second")
 @click.option(
@@ -64,7 +64,7 @@ def _number(text: str) -> int | float | str:
     type=click.FloatRange(0, 3600),
     default=30.0,
     show_default=True,
-    help="seconds that a command waits for a board that is not there, or busy",
+    help="seconds that a command waits for a board that is absent or busy",
 )
 @click.option(
     "--param",
@@ -72,7 +72,7 @@ def _number(text: str) -> int | float | str:
     multiple=True,
     metavar="NAME=VALUE",
     callback=_parameter,
-    help="a parameter that a rosserial sketch may ask for; several values with commas",
+    help="a parameter that a rosserial sketch may request; several values with commas",
 )
 @click.option(
     "--map",
@@ -80,7 +80,7 @@ def _number(text: str) -> int | float | str:
     multiple=True,
     metavar="TOPIC=NAME",
     callback=_renaming,
-    help="what the board's topic, or all beneath it, is called in the mesh: /led=/left/led, /=/left",
+    help="rename a topic of the board and all below it: /led=/left/led, /=/left",
 )
 @with_settings(*options_of(NetworkSettings), *options_of(TelemetrySettings))
 def command(
@@ -88,35 +88,34 @@ def command(
     port: str,
     agent: str,
     name: str,
-    protocol: Protocol,
+    protocol: str,
     baud: int,
     patience: float,
     parameters: dict[str, object],
     renamed: tuple[tuple[str, str], ...],
 ) -> None:
-    """Bring the device at PORT into the mesh. Ctrl-C ends it.
+    """Connect the device at PORT to its agent. Ctrl-C ends it.
 
-    PORT is a path (/dev/ttyACM0, or one under /dev/serial/by-id, which stays the same), or a USB id
-    (usb:2341:0043, with a serial number behind it if there are several). A port that is not there, or goes away, is
-    waited for.
+    PORT is a path (/dev/ttyACM0, or one under /dev/serial/by-id, which does not change), or a USB id (usb:2341:0043,
+    followed by a serial number if there are several). If the port is missing or unplugged, the command waits for it.
 
-    A command on a topic of a job reaches all of the agent's devices that have a topic of that name; --map gives those
-    of this device other names.
+    A command on a topic of a job reaches all devices of the agent that have a topic of that name; --map renames those
+    of this device.
     """
-    from bridges.serial.device_id import DeviceId
-    from bridges.serial.names import Names
-    from bridges.serial.serving import Wiring, serve, telling, wait_for_files
+    from bridges.serial.naming import DeviceId, TopicNames
+    from bridges.serial.process import EdgeOptions, run_edge, serve_metrics, wait_for_files
     from mesh.network.endpoints import Endpoints
 
     configure_logging_from(settings, "edge")
     device = DeviceId(agent=agent, name=name)
     endpoints = Endpoints.from_settings(settings)
     try:
-        with telling(settings.metrics_listen) as told:
+        with serve_metrics(settings.metrics_listen) as metrics:
             wait_for_files(settings)
-            wiring = Wiring(
-                port=port, protocol=protocol, baud=baud, patience=patience, parameters=parameters, names=Names(renamed)
+            names = TopicNames(renamed)
+            options = EdgeOptions(
+                port=port, protocol=protocol, baud=baud, patience=patience, parameters=parameters, names=names
             )
-            serve(device, wiring, endpoints=endpoints, told=told)
+            run_edge(device, options, endpoints=endpoints, metrics=metrics)
     except AiraError as error:
         fail(error)

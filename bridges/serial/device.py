@@ -1,4 +1,4 @@
-"""A device as its agent's code sees it, over the mesh: call it and know how that ended, hear what it says."""
+"""A device from the view of its agent's code: call it over the mesh, and listen to what it publishes."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import msgspec
 import zenoh
 
-from bridges.serial.device_id import PRESENT, DeviceId
-from bridges.serial.dialect import Ending
-from bridges.serial.edge import PATIENCE
-from bridges.serial.errors import REASONS, CallFailed, CallInDoubt, CallNotDone
+from bridges.serial.calls import PATIENCE
+from bridges.serial.dialect import CallStatus
+from bridges.serial.errors import CALL_ERRORS, CallFailed, CallInDoubt, CallNotDone
+from bridges.serial.naming import PRESENT, DeviceId
 from mesh.network import Pump
+from mesh.retry import Backoff, RetryPolicy
 from schemas import LiabilityTopicKey, payload_type
 from schemas.errors import InvalidPayload
 from schemas.payloads import Empty, decode_value, encode_value
@@ -24,10 +25,10 @@ if TYPE_CHECKING:
     from mesh.agent import Agent
     from mesh.work.job import Job
 
-LOOK: Final = 0.25
-"""Seconds between two looks for a device that is not present."""
+PRESENCE_POLL: Final = RetryPolicy(initial=0.25, factor=1.0, ceiling=0.25, jitter=0.0)
+"""A device that is plugged in should be found at once, and asking for its token costs little: so no backoff."""
 GRACE: Final = 5.0
-"""Seconds beyond a call's own time in which its edge agent has to say how it ended."""
+"""Seconds beyond the timeout of a call in which its edge agent has to report how it ended."""
 
 
 class _Failure(msgspec.Struct, frozen=True):
@@ -38,23 +39,23 @@ class _Failure(msgspec.Struct, frozen=True):
 
 
 @dataclass(frozen=True)
-class Answer:
-    """How a call ended well, and what the device answered (None for nothing).
+class CallReply:
+    """The outcome of a successful call: the value that the device returned (None for nothing), and its status.
 
-    `ending` says what is known: `DONE`, that the device has done it, once; `READ`, from a rosserial board, that it has
-    read on after the message, which it skips silently if it was damaged on the line.
+    `DONE`: the device confirmed that it did it, once. `READ`: a rosserial board read on after the message, but it skips
+    a message that was damaged on the line silently.
     """
 
     value: Any
-    ending: Ending
+    status: CallStatus
 
 
 class Device:
     """The device `name` of a running agent, on whatever machine its `aira edge` runs.
 
-    A call waits at most `patience` seconds for the device to be there and to do it. `in_doubt` says what becomes of a
-    call of which nobody knows whether it was done, since the device was restarted meanwhile: `fail`, or `again` for
-    what does no harm when it is done twice.
+    A call waits at most `patience` seconds for the device to be present and to finish. `in_doubt` says what happens
+    when the device was restarted during a call, so that nobody knows whether it did it: `fail`, or `again` to repeat
+    calls that do no harm when done twice.
     """
 
     def __init__(
@@ -64,40 +65,43 @@ class Device:
         *,
         patience: float = PATIENCE,
         in_doubt: Literal["fail", "again"] = "fail",
+        presence_poll: RetryPolicy = PRESENCE_POLL,
     ) -> None:
         self._agent = agent
         self.name = name
         self._patience = patience
         self._in_doubt = in_doubt
+        self._presence_poll = presence_poll
 
-    async def call(self, topic: str, message: object = Empty(), *, job: Job | None = None) -> Answer:
-        """Have the device do something; returns when it is done. With a `job` both are in its recording.
+    async def call(self, topic: str, message: object = Empty(), *, job: Job | None = None) -> CallReply:
+        """Call a topic of the device, and return when it is done. With a `job`, its recording has message and answer.
 
-        `message` is what `Job.publish` takes. Raises `CallNotDone` (it certainly was not), `CallRefused` (the device
-        said no, or can't), `CallInDoubt`, and never takes longer than `patience` and a few seconds. Cancelling stops
-        the waiting, not the device.
+        `message` is anything that `Job.publish` accepts. Takes at most `patience` and a few seconds. Raises
+        `CallNotDone` (it certainly was not done), `CallRefused` (the device refused it, or can't do it) and
+        `CallInDoubt` (it may have been done). Cancelling stops the waiting, not the device.
         """
         payload, kind = encode_value(message)
         key = self._key(topic, job)
-        until = time.monotonic() + self._patience
+        deadline = time.monotonic() + self._patience
         while True:
-            await self._until_present(topic, until)
+            await self._wait_until_present(topic, deadline)
             try:
-                return await self._call(topic, key, payload, kind.zenoh_encoding, max(0.0, until - time.monotonic()))
+                seconds = max(0.0, deadline - time.monotonic())
+                return await self._query(topic, key, payload, kind.zenoh_encoding, seconds)
             except CallInDoubt:
-                if self._in_doubt == "fail" or time.monotonic() >= until:
+                if self._in_doubt == "fail" or time.monotonic() >= deadline:
                     raise
 
     async def is_present(self) -> bool:
         """Whether the device is plugged in and answers."""
-        return await asyncio.to_thread(self._look)
+        return await asyncio.to_thread(self._has_token)
 
     def listen(self, topic: str) -> Pump[Any]:
-        """What the device says on a topic outside any job: `async with device.listen("/x") as said`, then iterate.
+        """What the device publishes on a topic outside any job: `async with device.listen("/x") as messages`.
 
         Messages are decoded; those that are not of their type are left out.
         """
-        return Pump(self._session, self._device_id.key(topic), _decoded)
+        return Pump(self._session, self._device_id.key(topic), _decode)
 
     @property
     def _device_id(self) -> DeviceId:
@@ -112,44 +116,44 @@ class Device:
             return self._device_id.key(topic)
         return str(LiabilityTopicKey(self._agent.address, job.liability.address, topic))
 
-    def _look(self) -> bool:
+    def _has_token(self) -> bool:
         replies = self._session.liveliness().get(self._device_id.key(PRESENT), timeout=GRACE)
         return any(reply.ok is not None for reply in replies)
 
-    async def _until_present(self, topic: str, until: float) -> None:
+    async def _wait_until_present(self, topic: str, deadline: float) -> None:
+        backoff = Backoff(self._presence_poll)
         while not await self.is_present():
-            if time.monotonic() >= until:
-                raise CallNotDone(topic, "absent", f"the device {self.name} was not there for {self._patience:g} s")
-            await asyncio.sleep(LOOK)
+            if time.monotonic() >= deadline or not await backoff.wait():
+                raise CallNotDone(topic, "absent", f"the device {self.name} was absent for {self._patience:g} s")
 
-    async def _call(self, topic: str, key: str, payload: bytes, encoding: str, seconds: float) -> Answer:
-        asking = zenoh.CancellationToken()
-        ask = partial(self._session.get, payload=payload, encoding=encoding, timeout=seconds + GRACE)
+    async def _query(self, topic: str, key: str, payload: bytes, encoding: str, seconds: float) -> CallReply:
+        token = zenoh.CancellationToken()
+        get = partial(self._session.get, payload=payload, encoding=encoding, timeout=seconds + GRACE)
         selector = f"{key}?timeout={seconds:.3f};device={self.name}"
         try:
-            reply = await asyncio.to_thread(lambda: next(iter(ask(selector, cancellation_token=asking)), None))
+            reply = await asyncio.to_thread(lambda: next(iter(get(selector, cancellation_token=token)), None))
         finally:
-            asking.cancel()  # type: ignore[no-untyped-call]
+            token.cancel()  # type: ignore[no-untyped-call]
         if reply is None:
-            raise CallInDoubt(topic, "doubt", "the device's edge agent ended before it said how it went")
+            raise CallInDoubt(topic, "doubt", "the device's edge agent stopped before it reported the outcome")
         if reply.ok is None:
-            raise _failed(topic, b"" if reply.err is None else reply.err.payload.to_bytes())
-        told = reply.ok.attachment
-        ending = Ending.READ if told is not None and told.to_string() == Ending.READ.value else Ending.DONE
+            raise _error_of(topic, b"" if reply.err is None else reply.err.payload.to_bytes())
+        status = reply.ok.attachment
+        is_read = status is not None and status.to_string() == CallStatus.READ.value
         value = decode_value(reply.ok.payload.to_bytes(), payload_type(str(reply.ok.encoding)))
-        return Answer(value if value != b"" else None, ending)
+        return CallReply(value if value != b"" else None, CallStatus.READ if is_read else CallStatus.DONE)
 
 
-def _decoded(sample: zenoh.Sample) -> Any:
+def _decode(sample: zenoh.Sample) -> Any:
     try:
         return decode_value(sample.payload.to_bytes(), payload_type(str(sample.encoding)))
     except InvalidPayload:
         return None
 
 
-def _failed(topic: str, payload: bytes) -> CallFailed:
+def _error_of(topic: str, payload: bytes) -> CallFailed:
     try:
         failure = msgspec.json.decode(payload, type=_Failure)
-        return REASONS[failure.reason](topic, failure.reason, failure.detail)
+        return CALL_ERRORS[failure.reason](topic, failure.reason, failure.detail)
     except (msgspec.DecodeError, UnicodeDecodeError, KeyError):
         return CallInDoubt(topic, "doubt", "no answer came in time")

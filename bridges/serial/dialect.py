@@ -1,40 +1,47 @@
-"""What both links have in common: a dialect is the host's side of a protocol, without a port and without a clock.
+"""The interface of a protocol on a serial line, and the protocols that are installed.
 
-A dialect is told what arrives and what time it is, and says what to send and what has happened. Times are seconds of
-any clock that only goes forward.
+A dialect is the host's side of a protocol, without a port and without a clock: `SerialLine` feeds it bytes and the
+time, sends what `outgoing` returns, and delivers its `events`. Times are seconds of any monotonic clock.
+
+A package adds a dialect by an entry point of the group `aira.dialects`: the name is what users type after `--protocol`,
+the value names a subclass of `Dialect`.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
-from bridges.serial.errors import BoardBusy
+from bridges.serial.errors import BoardBusy, UnknownDialect
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from schemas.payloads import PayloadType
 
-QUEUED: Final = 256
-"""Commands that wait for a board at most; more are refused."""
+ENTRY_POINTS: Final = "aira.dialects"
+QUEUE_SIZE: Final = 256
+"""The most commands that wait for a board; further ones are rejected."""
 
 
 class Flow(Enum):
-    """Which way a topic goes, as the board sees it."""
+    """The direction of a topic, as the board sees it."""
 
-    SAYS = "says"
-    """The board publishes it."""
-    HEARS = "hears"
+    PUBLISHES = "says"
+    """The board publishes messages on it."""
+    SUBSCRIBES = "hears"
     """The board takes commands on it."""
     SERVES = "serves"
-    """The board answers requests on it."""
-    ASKS = "asks"
-    """The board asks, and somebody in the mesh answers."""
+    """The board answers requests on it: a service."""
+    REQUESTS = "asks"
+    """The board sends requests, which the mesh answers."""
 
 
 @dataclass(frozen=True)
 class BoardTopic:
-    """A topic that the board has announced: `name` as in ROS with its leading `/`, and the type of its messages."""
+    """A topic that the board has announced: its name with the leading `/` of ROS, and the type of its messages."""
 
     name: str
     flow: Flow
@@ -43,21 +50,21 @@ class BoardTopic:
 
 
 @dataclass(frozen=True)
-class About:
-    """What a board says of itself; a rosserial one says only its topics."""
+class DeviceInfo:
+    """What a board reports about itself; a rosserial board reports only its topics."""
 
     name: str
     version: str
     topics: tuple[BoardTopic, ...]
 
     def find(self, name: str, *flows: Flow) -> BoardTopic | None:
-        """The topic of that name which goes one of these ways."""
+        """The topic of that name with one of these directions."""
         return next((topic for topic in self.topics if topic.name == name and topic.flow in flows), None)
 
 
 @dataclass(eq=False)
 class Command:
-    """A message for the board, as a payload of its topic's type. `deadline`: not to be begun after it."""
+    """A message for the board, as a payload of its topic's type. It is not sent after `deadline`."""
 
     topic: str
     payload: bytes
@@ -66,46 +73,46 @@ class Command:
     """Whether any of it may have reached the board."""
 
 
-class Ending(Enum):
-    """What is known of a command at its end."""
+class CallStatus(Enum):
+    """What is known about a command at its end."""
 
     DONE = "done"
-    """The board says that it has done it; once."""
+    """The board confirmed that it did it, once."""
     READ = "read"
-    """The board read on after it. It says no more than that: a message that was damaged is skipped silently."""
+    """The board read on after it. It confirms no more: a message damaged on the line is skipped silently."""
     FAILED = "failed"
     """It was not done, or nobody knows; see the reason."""
 
 
 @dataclass(frozen=True)
-class Ready:
-    """The board is there and has said what it is."""
+class BoardReady:
+    """A board answers and has reported what it is."""
 
-    about: About
-
-
-@dataclass(frozen=True)
-class Gone:
-    """The board that was ready is there no more: it was unplugged, restarted, or fell silent."""
-
-    why: str
+    info: DeviceInfo
 
 
 @dataclass(frozen=True)
-class Said:
-    """The board published a message, or (`Flow.ASKS`) asks something, to be answered by `Dialect.answer`."""
+class BoardLost:
+    """The board that was ready was unplugged, restarted, or stopped answering."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class MessageReceived:
+    """The board published a message, or (`Flow.REQUESTS`) sent a request; `Dialect.respond` answers it."""
 
     topic: BoardTopic
     payload: bytes
 
 
 @dataclass(frozen=True)
-class Ended:
-    """A command has come to its end. `payload` is what the board answered; of the failed ones `reason` is a word of
-    `errors.REASONS` and `detail` a sentence."""
+class CommandFinished:
+    """A command has ended. `payload`, of type `type`, is the board's answer; a failed command has a `reason` (a key of
+    `errors.CALL_ERRORS`) and a sentence, `detail`."""
 
     command: Command
-    ending: Ending
+    status: CallStatus
     payload: bytes = b""
     type: PayloadType | None = None
     reason: str = ""
@@ -113,121 +120,131 @@ class Ended:
 
 
 @dataclass(frozen=True)
-class Logged:
+class BoardLogged:
     """The board wrote to its log; `level` is one of Python's logging levels."""
 
     level: int
     text: str
 
 
-Happening = Ready | Gone | Said | Ended | Logged
+LineEvent = BoardReady | BoardLost | MessageReceived | CommandFinished | BoardLogged
 
 
 @dataclass
-class Counters:
-    """What went over a line, and what did not."""
+class LineCounters:
+    """Frames and bytes on a line since it was created."""
 
     received: int = 0
     """Whole frames from the board."""
     damaged: int = 0
-    """Frames of the board whose check did not hold."""
+    """Frames of the board with a wrong checksum."""
     refused: int = 0
-    """Whole frames of the board that can't be what they claim to be."""
+    """Whole frames of the board that can't be decoded."""
     noise: int = 0
     """Bytes that belong to no frame."""
     missed: int = 0
-    """Messages of the board that are missing in their counting (own frames only)."""
+    """Messages of the board that are missing in its sequence numbers (own frames only)."""
     sent: int = 0
     """Frames to the board, repetitions included."""
     repeated: int = 0
-    """Frames sent once more, since nothing was heard of the first."""
+    """Frames sent again because no answer came."""
     stray: int = 0
-    """Answers of the board to what nobody asked (any more)."""
+    """Frames of the board that answer no pending request, or are on a topic that it has not announced."""
 
 
-class Dialect(Protocol):
-    """The host's side of a protocol. Nothing blocks, nothing waits; all methods are called on one thread."""
+class Dialect(ABC):
+    """The host's side of a protocol. Nothing blocks; all methods are called on one thread."""
 
-    counters: Counters
+    info: DeviceInfo | None = None
+    """What the board has reported about itself; None while it is not ready."""
+
+    def __init__(self, *, baud: int, parameters: Mapping[str, object] | None = None) -> None:
+        """`baud` is the speed of the line in bits per second, `parameters` are values that firmware may request."""
+        self.counters = LineCounters()
+        self._baud = baud
+        self._parameters = dict(parameters or {})
+        self._queue: list[Command] = []
+        self._events: list[LineEvent] = []
+        self._out = bytearray()
+        self._is_open = False
 
     @property
-    def about(self) -> About | None:
-        """What the board has said of itself; None while it is not ready."""
+    @abstractmethod
+    def next_tick(self) -> float:
+        """When `tick` has to be called at the latest; infinity for never."""
 
-    @property
-    def due(self) -> float:
-        """When `pass_time` has to be called at the latest; infinity for never."""
-
+    @abstractmethod
     def opened(self, now: float) -> None:
-        """The line is open."""
+        """The line was opened."""
 
+    @abstractmethod
     def closed(self, now: float) -> None:
-        """The line is closed, by us or by the cable; what waits for the board goes on waiting."""
+        """The line was closed, by us or by a pulled cable. Queued commands stay queued."""
 
+    @abstractmethod
     def receive(self, data: bytes, now: float) -> None:
-        """These bytes have come."""
+        """These bytes have arrived."""
 
-    def pass_time(self, now: float) -> None:
-        """It is `now`."""
+    @abstractmethod
+    def tick(self, now: float) -> None:
+        """The time is `now`: give up what is late, repeat what was not answered."""
 
+    @abstractmethod
     def submit(self, command: Command, now: float) -> None:
-        """Have the board do something, in its turn; the end is told by `Ended`. Raises `UnfitMessage`, `BoardBusy`."""
+        """Queue a command; `CommandFinished` reports its end. Raises `InvalidBoardMessage`, `BoardBusy`."""
 
-    def answer(self, topic: BoardTopic, payload: bytes, now: float) -> None:
-        """Answer what the board asked."""
+    @abstractmethod
+    def respond(self, topic: BoardTopic, payload: bytes, now: float) -> None:
+        """Answer a request of the board."""
 
     def outgoing(self) -> bytes:
-        """What to send now, once."""
+        """The bytes to send now; each is returned once."""
+        data = bytes(self._out)
+        self._out.clear()
+        return data
 
-    def happenings(self) -> list[Happening]:
-        """What has happened since the last call, in order."""
-
-
-class Waiting:
-    """The commands that wait for their turn."""
-
-    def __init__(self) -> None:
-        self._commands: list[Command] = []
-
-    def add(self, command: Command) -> None:
-        """Put it at the end. Raises `BoardBusy` if too many wait."""
-        if len(self._commands) >= QUEUED:
-            raise BoardBusy(command.topic, QUEUED)
-        self._commands.append(command)
-
-    def take(self) -> Command | None:
-        """The next one, or None."""
-        return self._commands.pop(0) if self._commands else None
-
-    def expired(self, now: float) -> list[Command]:
-        """Take out those whose deadline has passed."""
-        late = [command for command in self._commands if command.deadline <= now]
-        self._commands = [command for command in self._commands if command.deadline > now]
-        return late
+    def events(self) -> list[LineEvent]:
+        """The events since the last call, in order."""
+        events, self._events = self._events, []
+        return events
 
     @property
-    def due(self) -> float:
-        """When the first of them expires."""
-        return min((command.deadline for command in self._commands), default=float("inf"))
+    def _next_expiry(self) -> float:
+        """When the first queued command expires."""
+        return min((command.deadline for command in self._queue), default=float("inf"))
 
+    def _enqueue(self, command: Command) -> None:
+        """Append a command. Raises `BoardBusy` if the queue is full."""
+        if len(self._queue) >= QUEUE_SIZE:
+            raise BoardBusy(command.topic, QUEUE_SIZE)
+        self._queue.append(command)
 
-class Host:
-    """What the host's side of any protocol has: commands that wait for their turn, and what has happened."""
-
-    def __init__(self) -> None:
-        self.counters = Counters()
-        self._waiting = Waiting()
-        self._happened: list[Happening] = []
-
-    def happenings(self) -> list[Happening]:
-        """What has happened since the last call, in order."""
-        happened, self._happened = self._happened, []
-        return happened
-
-    def _expire(self, now: float) -> None:
-        """Give up the commands that have waited too long."""
-        for command in self._waiting.expired(now):
-            self._fail(command, "expired", "the board was not there, or busy with others before it")
+    def _expire_queued(self, now: float) -> None:
+        """Fail the commands that have waited too long."""
+        late = [command for command in self._queue if command.deadline <= now]
+        self._queue = [command for command in self._queue if command.deadline > now]
+        for command in late:
+            self._fail(command, "expired", "the board was absent, or busy with earlier commands")
 
     def _fail(self, command: Command, reason: str, detail: str) -> None:
-        self._happened.append(Ended(command, Ending.FAILED, reason=reason, detail=detail))
+        self._events.append(CommandFinished(command, CallStatus.FAILED, reason=reason, detail=detail))
+
+
+def dialect_names() -> list[str]:
+    """The names of the installed dialects."""
+    return sorted(_entry_points())
+
+
+def load_dialect(name: str) -> type[Dialect]:
+    """The installed dialect of that name, imported now. Raises `UnknownDialect`."""
+    installed = _entry_points()
+    if name not in installed:
+        raise UnknownDialect(name, sorted(installed))
+    dialect: type[Dialect] = installed[name].load()
+    return dialect
+
+
+def _entry_points() -> dict[str, Any]:
+    from importlib.metadata import entry_points  # takes 30 ms, which only those who choose a dialect pay
+
+    return {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}

@@ -1,12 +1,12 @@
-"""The edge agent: a board's topics as keys of its agent, and what is put or asked there brought to the board.
+"""The edge agent: a board's topics as keys of its agent, and what is put or queried there brought to the board.
 
-Outside a job a topic is `aira/agent/{address}/device/{device}/{topic}`; what belongs to a job goes over the liability's
-topics, where it becomes part of the recording. A put is a command of which nobody hears again; a query is a call, and
-its reply says how it ended. The board is present as long as its liveliness token is, on the device's topic `/present`.
+Outside a job a topic is `aira/agent/{address}/device/{device}/{topic}`; what belongs to a job uses the liability's
+topics and becomes part of the recording. A put is a command without a reply; a query is a call, whose reply reports how
+it ended. While the board answers, its liveliness token is on the device's topic `/present`.
 
-Of several devices of an agent that have a topic of the same name, a call reaches the one that it names (the parameter
-`device`), a command in a job all of them: who wants it otherwise gives their topics other names. What an edge agent
-itself says is never a command for another one.
+If several devices of an agent have a topic of the same name, a call reaches the one that its parameter `device` names,
+and a command in a job reaches all of them: rename the topics of one to avoid that. An edge agent marks everything that
+it puts, so that no other one takes it for a command.
 """
 
 from __future__ import annotations
@@ -19,17 +19,15 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 import zenoh
 
-from bridges.serial.converting import converted
-from bridges.serial.device_id import ABOUT, PRESENT, DeviceId
-from bridges.serial.dialect import BoardTopic, Command, Ended, Ending, Flow, Gone, Logged, Ready, Said
-from bridges.serial.errors import BoardBusy, UnfitMessage
-from bridges.serial.jobs import Jobs
-from bridges.serial.line import Line
-from bridges.serial.names import Names
-from bridges.serial.replying import is_meant_for, patience_of, refuse, reply
-from bridges.serial.tally import Tally
+from bridges.serial import dialect as events
+from bridges.serial.calls import PATIENCE, JobTracker, convert, is_for_device, reply, reply_failure, timeout_of
+from bridges.serial.dialect import BoardTopic, CallStatus, Command, Flow
+from bridges.serial.errors import BoardBusy, InvalidBoardMessage
+from bridges.serial.line import SerialLine
+from bridges.serial.metrics import EdgeCounters
+from bridges.serial.naming import ABOUT, PRESENT, DeviceId, TopicNames
 from mesh.errors import InvalidKey
-from mesh.telemetry.context import liability_context
+from mesh.telemetry.context import liability_context, log_event
 from schemas.key_chunks import topic_chunks
 from schemas.keys import DeviceTopicKey, LiabilityTopicKey, event_selector, parse_key
 from schemas.payloads import STRING, String, payload_type
@@ -37,24 +35,22 @@ from schemas.payloads import STRING, String, payload_type
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from bridges.serial.dialect import About, Dialect, Happening
-    from bridges.serial.ports import PortName
+    from bridges.serial.dialect import DeviceInfo, Dialect, LineEvent
+    from bridges.serial.line import PortName
     from schemas.payloads import PayloadType
 
 log = logging.getLogger(__name__)
 
-PATIENCE: Final = 30.0
-"""Seconds for which a command waits for a board that is not there, or busy."""
-TOLD: Final = b"told"
-"""What is attached to all that an edge agent puts."""
+PUT_BY_EDGE: Final = b"told"
+"""The attachment of everything that an edge agent puts."""
 
 
 class Edge:
     """A board in the mesh, on an open session: `Edge(session, device, port, dialect, baud=57600).run()`.
 
-    `patience` is for how many seconds a command waits for a board that is not there, or busy; `names` are what the
-    board's topics are called in the mesh. `run` serves until `stop` is called from another thread; it takes a thread of
-    its own and no event loop. Raises `InvalidKey` for a device that can't be named.
+    A command waits at most `patience` seconds for a board that is absent or busy; `names` maps the board's topics to
+    their names in the mesh. `run` blocks its thread until `stop` is called from another one; it needs no event loop.
+    Raises `InvalidKey` for a device whose name or agent is invalid.
     """
 
     def __init__(
@@ -66,220 +62,221 @@ class Edge:
         *,
         baud: int,
         patience: float = PATIENCE,
-        names: Names | None = None,
+        names: TopicNames | None = None,
     ) -> None:
         self._session = session
         self._device = device
-        self._names = names or Names()
+        self._names = names or TopicNames()
         self._patience = patience
-        self._jobs = Jobs()
-        self._line = Line(port, dialect, baud=baud, deliver=self._deliver)
-        self.tally = Tally(self._line)
-        self._asked: dict[Command, zenoh.Query] = {}
+        self._jobs = JobTracker()
+        self._line = SerialLine(port, dialect, baud=baud, on_event=self._on_event)
+        self.counters = EdgeCounters(self._line)
+        self._queries: dict[Command, zenoh.Query] = {}
         self._declared: dict[str, list[Any]] = {}
         self._token: Any = None
-        self._named: dict[BoardTopic, str] = {}
-        self._topics: dict[str, BoardTopic] = {}
+        self._name_of: dict[BoardTopic, str] = {}
+        self._commandable: dict[str, BoardTopic] = {}
         device.key(PRESENT)
 
     def run(self) -> None:
         """Serve until `stop`."""
-        events: Any = self._session.declare_subscriber(event_selector(self._device.agent), self._heard_event)
-        about: Any = self._session.declare_queryable(self._device.key(ABOUT), self._asked_about)
+        subscriber: Any = self._session.declare_subscriber(event_selector(self._device.agent), self._on_job_event)
+        about: Any = self._session.declare_queryable(self._device.key(ABOUT), self._on_about_query)
         try:
             self._line.run()
         finally:
-            for query in self._asked.values():
+            for query in self._queries.values():
                 query.drop()  # type: ignore[no-untyped-call]
             if not self._session.is_closed():
-                for declared in (events, about, *(each for several in self._declared.values() for each in several)):
+                for declared in (subscriber, about, *(each for several in self._declared.values() for each in several)):
                     declared.undeclare()
-                self._be_absent()
+                self._withdraw_token()
 
     def stop(self) -> None:
-        """End `run`; from any thread, and from a signal's handler."""
+        """End `run`; from any thread, and from a signal handler."""
         self._line.stop()
 
-    def _deliver(self, happening: Happening) -> None:
+    def _on_event(self, event: LineEvent) -> None:
         with liability_context(self._jobs.current):
-            self._take(happening)
+            match event:
+                case events.BoardReady(info):
+                    self._board_ready(info)
+                case events.BoardLost(reason):
+                    self.counters.count_loss()
+                    log.warning("the board is absent: %s", reason, extra=log_event("board-lost", reason=reason))
+                    self._record_connection(f"absent: {reason}")
+                    self._withdraw_token()
+                case events.MessageReceived(topic, payload):
+                    self._publish(topic, payload)
+                case events.CommandFinished():
+                    self._finish(event)
+                case events.BoardLogged(level, text):
+                    log.log(level, "the board says: %s", text, extra=log_event("board-logged"))
 
-    def _take(self, happening: Happening) -> None:
-        match happening:
-            case Ready(about):
-                self._serve(about)
-            case Gone(why):
-                self.tally.board_lost()
-                log.warning("the board is absent: %s", why)
-                self._note(f"absent: {why}")
-                self._be_absent()
-            case Said(topic, payload):
-                self._said(topic, payload)
-            case Ended():
-                self._ended(happening)
-            case Logged(level, text):
-                log.log(level, "the board says: %s", text)
-
-    def _serve(self, about: About) -> None:
-        """The board is there: have its topics in the mesh, and show that it is present."""
-        self._named = dict(self._usable(about))
-        heard = [topic for topic in self._named if topic.flow in (Flow.HEARS, Flow.SERVES)]
-        self._topics = {self._named[topic]: topic for topic in reversed(heard)}
-        for topic in heard:
-            if self._topics[self._named[topic]] != topic:
+    def _board_ready(self, info: DeviceInfo) -> None:
+        """Declare the board's topics in the mesh, and its presence."""
+        self._name_of = dict(self._valid_names(info))
+        accepting = [topic for topic in self._name_of if topic.flow in (Flow.SUBSCRIBES, Flow.SERVES)]
+        self._commandable = {self._name_of[topic]: topic for topic in reversed(accepting)}
+        for topic in accepting:
+            if self._commandable[name := self._name_of[topic]] != topic:
+                shadowed = log_event("topic-shadowed", topic=topic.name, name=name)
                 log.warning(
-                    "%s is another topic of the board already, so nothing reaches %s", self._named[topic], topic.name
+                    "%s is the name of another topic of the board; nothing reaches %s", name, topic.name, extra=shadowed
                 )
-        for name in self._declared.keys() - self._topics.keys():
+        for name in self._declared.keys() - self._commandable.keys():
             for declared in self._declared.pop(name):
                 declared.undeclare()
-        for name in self._topics.keys() - self._declared.keys():
+        for name in self._commandable.keys() - self._declared.keys():
             self._declared[name] = self._declare(name)
-        self._note("present")
+        self._record_connection("present")
         if self._token is None:
             self._token = self._session.liveliness().declare_token(self._device.key(PRESENT))
-        topics = ", ".join(self._named.values()) or "no topics"
-        log.info("the board %s %s is present: %s", about.name, about.version, topics)
+        topics = ", ".join(self._name_of.values()) or "no topics"
+        ready = log_event("board-ready", name=info.name, version=info.version, topics=topics)
+        log.info("the board %s %s is present: %s", info.name, info.version, topics, extra=ready)
 
-    def _usable(self, about: About) -> Iterator[tuple[BoardTopic, str]]:
-        """The board's topics, each with its name in the mesh."""
-        for topic in about.topics:
+    def _valid_names(self, info: DeviceInfo) -> Iterator[tuple[BoardTopic, str]]:
+        """The board's topics with their names in the mesh; those without a valid one are left out."""
+        for topic in info.topics:
             try:
                 yield topic, topic_chunks(self._names.of(topic.name))
             except InvalidKey as error:
-                log.warning("topic %s of the board is not used: %s", topic.name, error)
+                rejected = log_event("topic-rejected", topic=topic.name)
+                log.warning("topic %s of the board is not used: %s", topic.name, error, extra=rejected)
 
     def _declare(self, name: str) -> list[Any]:
-        """Hear commands and calls on a topic, within jobs and outside."""
-        keys = self._device.keys_of(name)
+        """Subscribe to commands and calls on a topic, in jobs and outside."""
+        keys = self._device.command_keys(name)
         return [
-            *(self._session.declare_subscriber(key, self._heard_command) for key in keys),
-            *(self._session.declare_queryable(key, self._heard_call) for key in keys),
+            *(self._session.declare_subscriber(key, self._on_command) for key in keys),
+            *(self._session.declare_queryable(key, self._on_call) for key in keys),
         ]
 
-    def _be_absent(self) -> None:
+    def _withdraw_token(self) -> None:
         token, self._token = self._token, None
         if token is not None:
             token.undeclare()
 
-    def _heard_event(self, sample: zenoh.Sample) -> None:
-        self._line.do(partial(self._jobs.take_event, str(sample.key_expr)))
+    # Zenoh's callbacks run on its threads, and pass their work to the line's thread.
 
-    def _heard_command(self, sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.PUT and not _is_told(sample):
+    def _on_job_event(self, sample: zenoh.Sample) -> None:
+        self._line.call_soon(partial(self._jobs.handle_event, str(sample.key_expr)))
+
+    def _on_command(self, sample: zenoh.Sample) -> None:
+        by_edge = sample.attachment is not None and sample.attachment.to_bytes() == PUT_BY_EDGE
+        if sample.kind == zenoh.SampleKind.PUT and not by_edge:
             given = payload_type(str(sample.encoding))
-            self._line.do(partial(self._command, str(sample.key_expr), sample.payload.to_bytes(), given))
+            self._line.call_soon(partial(self._command, str(sample.key_expr), sample.payload.to_bytes(), given))
+
+    def _on_call(self, query: zenoh.Query) -> None:
+        self._line.call_soon(partial(self._call, query))
+
+    def _on_about_query(self, query: zenoh.Query) -> None:
+        self._line.call_soon(partial(self._reply_about, query))
 
     def _command(self, key: str, payload: bytes, given: PayloadType) -> None:
-        topic, job = self._place(key)
+        topic, job = self._topic_of(key)
         if topic is None:
             return
         now = time.monotonic()
-        payload = converted(payload, given, topic.type)
+        payload = convert(payload, given, topic.type)
         try:
             self._line.dialect.submit(Command(topic.name, payload, now + self._patience), now)
-        except (UnfitMessage, BoardBusy) as error:
+        except (InvalidBoardMessage, BoardBusy) as error:
             with liability_context(job):
-                log.warning("%s", error)
-
-    def _heard_call(self, query: zenoh.Query) -> None:
-        self._line.do(partial(self._call, query))
+                log.warning("%s", error, extra=log_event("command-rejected", topic=topic.name, code=error.code))
 
     def _call(self, query: zenoh.Query) -> None:
-        """A call, which is answered at its end."""
+        """Submit a call; `_finish` replies to it."""
         key = str(query.key_expr)
-        topic, job = self._place(key) if is_meant_for(query, self._device.name) else (None, "")
+        topic, job = self._topic_of(key) if is_for_device(query, self._device.name) else (None, "")
         if topic is None:
             query.drop()  # type: ignore[no-untyped-call]
             return
         payload = b"" if query.payload is None else query.payload.to_bytes()
-        payload = converted(payload, payload_type(str(query.encoding or "")), topic.type)
+        payload = convert(payload, payload_type(str(query.encoding or "")), topic.type)
         now = time.monotonic()
-        command = Command(topic.name, payload, now + patience_of(query, self._patience))
+        command = Command(topic.name, payload, now + timeout_of(query, self._patience))
         try:
             self._line.dialect.submit(command, now)
-        except (UnfitMessage, BoardBusy) as error:
+        except (InvalidBoardMessage, BoardBusy) as error:
             reason = "full" if isinstance(error, BoardBusy) else "unfit"
-            self.tally.ended(reason)
-            refuse(query, reason, str(error))
+            self.counters.count_outcome(reason)
+            reply_failure(query, reason, str(error))
             return
-        self._asked[command] = query
+        self._queries[command] = query
         if job:
             self._put(key, payload, topic.type)
 
-    def _place(self, key: str) -> tuple[BoardTopic | None, str]:
-        """The topic that a key names, and the job if it is one of a job; which is now the one that goes on."""
+    def _topic_of(self, key: str) -> tuple[BoardTopic | None, str]:
+        """The topic that a key names, and its job if it has one; that job becomes the current one."""
         try:
             parsed = parse_key(key)
         except InvalidKey as error:
-            log.info("%s", error)
+            log.info("%s", error, extra=log_event("key-ignored", key=key))
             return None, ""
-        if not isinstance(parsed, LiabilityTopicKey | DeviceTopicKey) or parsed.topic not in self._topics:
+        if not isinstance(parsed, LiabilityTopicKey | DeviceTopicKey) or parsed.topic not in self._commandable:
             return None, ""
-        topic = self._topics[parsed.topic]
+        topic = self._commandable[parsed.topic]
         if isinstance(parsed, DeviceTopicKey):
             return topic, ""
         self._jobs.begin(parsed.liability)
         return topic, parsed.liability
 
-    def _said(self, topic: BoardTopic, payload: bytes) -> None:
-        if (name := self._named.get(topic)) is None:
+    def _publish(self, topic: BoardTopic, payload: bytes) -> None:
+        """Put a board's message on its topic of the current job, or of the device; or forward its request."""
+        if (name := self._name_of.get(topic)) is None:
             return
-        if topic.flow is Flow.ASKS:
-            self._ask(topic, self._device.key(name), payload)
+        if topic.flow is Flow.REQUESTS:
+            self._request(topic, self._device.key(name), payload)
             return
         job = self._jobs.current
-        key = self._device.key_of_job(job, name) if job else self._device.key(name)
+        key = self._device.job_key(job, name) if job else self._device.key(name)
         self._put(key, payload, topic.type)
 
-    def _ask(self, topic: BoardTopic, key: str, payload: bytes) -> None:
-        """The board asks; what is answered in the mesh reaches it."""
+    def _request(self, topic: BoardTopic, key: str, payload: bytes) -> None:
+        """Query the mesh for the board, which gets each answer."""
 
-        def answered(said: zenoh.Reply) -> None:
-            if said.ok is not None:
-                answer = said.ok.payload.to_bytes()
-                self._line.do(lambda: self._line.dialect.answer(topic, answer, time.monotonic()))
+        def on_reply(answer: zenoh.Reply) -> None:
+            if answer.ok is not None:
+                data = answer.ok.payload.to_bytes()
+                self._line.call_soon(lambda: self._line.dialect.respond(topic, data, time.monotonic()))
 
-        self._session.get(key, answered, payload=payload)
+        self._session.get(key, on_reply, payload=payload)
 
-    def _note(self, text: str) -> None:
-        """Have the recording of the job that goes on, if there is one, say what became of the device."""
+    def _record_connection(self, text: str) -> None:
+        """Add a loss or return of the device to the recording of the current job, if there is one."""
         if self._jobs.current:
-            self._put(self._device.cable(self._jobs.current), String(text).encode(), STRING)
+            self._put(self._device.connection_key(self._jobs.current), String(text).encode(), STRING)
 
-    def _ended(self, ended: Ended) -> None:
-        query = self._asked.pop(ended.command, None)
-        self.tally.ended(ended.reason or ended.ending.value)
-        if ended.ending is Ending.FAILED:
-            log.warning("%s: %s (%s)", ended.command.topic, ended.detail, ended.reason)
+    def _finish(self, finished: events.CommandFinished) -> None:
+        query = self._queries.pop(finished.command, None)
+        self.counters.count_outcome(finished.reason or finished.status.value)
+        if finished.status is CallStatus.FAILED:
+            failed = log_event("command-failed", topic=finished.command.topic, reason=finished.reason)
+            log.warning("%s: %s (%s)", finished.command.topic, finished.detail, finished.reason, extra=failed)
         if query is not None:
-            reply(query, ended)
+            reply(query, finished)
 
-    def _asked_about(self, query: zenoh.Query) -> None:
-        self._line.do(partial(self._tell_about, query))
-
-    def _tell_about(self, query: zenoh.Query) -> None:
-        about, dialect = self._line.dialect.about, self._line.dialect
+    def _reply_about(self, query: zenoh.Query) -> None:
+        info = self._line.dialect.info
         facts = {
-            "name": about.name if about is not None else "",
-            "version": about.version if about is not None else "",
-            "present": about is not None,
+            "name": info.name if info is not None else "",
+            "version": info.version if info is not None else "",
+            "present": info is not None,
             "port": str(self._line.name),
             "job": self._jobs.current,
             "topics": [
                 {"name": name, "flow": topic.flow.value, "type": topic.type.schema_name or topic.type.encoding}
-                for topic, name in self._named.items()
+                for topic, name in self._name_of.items()
             ],
-            "counters": vars(dialect.counters),
+            "counters": vars(self._line.dialect.counters),
         }
         with query:
             query.reply(str(query.key_expr), msgspec.json.encode(facts), encoding="application/json")
 
     def _put(self, key: str, payload: bytes, kind: PayloadType) -> None:
         drop = zenoh.CongestionControl.DROP
-        self._session.put(key, payload, encoding=kind.zenoh_encoding, attachment=TOLD, congestion_control=drop)
-
-
-def _is_told(sample: zenoh.Sample) -> bool:
-    """Whether an edge agent tells what a device has said, or was called to do: that is no command."""
-    return sample.attachment is not None and sample.attachment.to_bytes() == TOLD
+        encoding = kind.zenoh_encoding
+        self._session.put(key, payload, encoding=encoding, attachment=PUT_BY_EDGE, congestion_control=drop)

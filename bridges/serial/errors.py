@@ -1,18 +1,23 @@
-"""What can go wrong between the mesh and a device."""
+"""Errors of serial lines and of calls to devices."""
 
 from __future__ import annotations
 
-from mesh.errors import AiraError, ConfigurationError, InputError, RemoteError
+from typing import TYPE_CHECKING, Final
+
+from mesh.errors import AiraError, InputError, RemoteError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 
 class LineError(RemoteError):
-    """The serial line, or what is at its other end, does not do what it should."""
+    """A serial port can't be opened, read or written."""
 
     code = "line-error"
 
 
 class PortMissing(LineError):
-    """There is no such port now; it may be plugged in later."""
+    """The port does not exist now; the board may be plugged in later."""
 
     code = "port-missing"
 
@@ -21,10 +26,24 @@ class PortMissing(LineError):
         self.port = port
 
 
-class UnfitMessage(InputError):
-    """A message can't be sent to the board: the wrong type, too long for its buffer or for its line."""
+class UnknownDialect(InputError):
+    """No installed package provides a dialect of that name."""
 
-    code = "unfit-message"
+    code = "unknown-dialect"
+
+    def __init__(self, name: str, known: Sequence[str]) -> None:
+        super().__init__(
+            f"there is no dialect {name!r}; installed: {', '.join(known) or 'none'}",
+            hint="choose an installed one, or (re)install the package that provides it",
+        )
+        self.name = name
+        self.known = tuple(known)
+
+
+class InvalidBoardMessage(InputError):
+    """A message can't be sent to the board: wrong type, unknown topic, or too long for its buffer or the line."""
+
+    code = "invalid-board-message"
 
     def __init__(self, topic: str, why: str) -> None:
         super().__init__(f"a message for {topic} can't be sent: {why}")
@@ -32,18 +51,18 @@ class UnfitMessage(InputError):
 
 
 class BoardBusy(RemoteError):
-    """More commands wait for the board than are kept."""
+    """The queue of commands for the board is full."""
 
     code = "board-busy"
 
     def __init__(self, topic: str, waiting: int) -> None:
-        super().__init__(f"a message for {topic} is not sent: {waiting} commands wait for the board already")
+        super().__init__(f"a message for {topic} was not sent: {waiting} commands are already waiting for the board")
         self.topic = topic
         self.waiting = waiting
 
 
 class CallFailed(AiraError):
-    """A call of a device did not end well; `reason` is a short machine-readable word, one of `REASONS`."""
+    """A call to a device failed; `reason` is a short word for programs, a key of `CALL_ERRORS`."""
 
     code = "call-failed"
 
@@ -55,24 +74,24 @@ class CallFailed(AiraError):
 
 
 class CallRefused(CallFailed):
-    """The device, or the edge agent before it, has not done it, and would not do it the next time either."""
+    """The device or its edge agent refused the call, and would refuse it again."""
 
     code = "call-refused"
 
 
 class CallNotDone(CallFailed):
-    """The device has certainly not done it: it was not there, or other calls were before it. Trying again is safe."""
+    """The device certainly did not do it: it was absent, or busy with earlier calls. It is safe to try again."""
 
     code = "call-not-done"
 
 
 class CallInDoubt(CallFailed):
-    """Nobody knows whether the device has done it: it was restarted or unplugged before it said so."""
+    """It is not known whether the device did it: it was restarted or unplugged before it answered."""
 
     code = "call-in-doubt"
 
 
-REASONS: dict[str, type[CallFailed]] = {
+CALL_ERRORS: Final[dict[str, type[CallFailed]]] = {
     "refused": CallRefused,
     "unfit": CallRefused,
     "absent": CallNotDone,
@@ -80,17 +99,4 @@ REASONS: dict[str, type[CallFailed]] = {
     "full": CallNotDone,
     "doubt": CallInDoubt,
 }
-"""The machine-readable reasons for which a call ends without having been done, and the error that each is."""
-
-__all__ = [
-    "REASONS",
-    "BoardBusy",
-    "CallFailed",
-    "CallInDoubt",
-    "CallNotDone",
-    "CallRefused",
-    "ConfigurationError",
-    "LineError",
-    "PortMissing",
-    "UnfitMessage",
-]
+"""The reasons for which a call fails, as they travel, and the error of each."""

@@ -14,8 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from bridges.serial.errors import ConfigurationError
-from mesh.errors import AiraError, InputError
+from mesh.errors import AiraError, ConfigurationError, InputError
 from mesh.running import fail
 
 if TYPE_CHECKING:
@@ -37,24 +36,24 @@ FLAGS: Final = (
 )
 CXX_FLAGS: Final = ("-std=gnu++11", "-fno-exceptions", "-fno-threadsafe-statics", "-fpermissive")
 FUNCTION: Final = re.compile(r"^(?!static|inline)([A-Za-z_][\w:<>*& ]*\s[*&]?\w+\([^;{}()]*\))\s*\{", re.MULTILINE)
-"""The head of a function at the beginning of a line, for which the Arduino IDE makes a prototype."""
+"""The head of a function at the beginning of a line; the Arduino IDE generates a prototype for it."""
 
 
-class SketchBroken(InputError):
-    """A sketch does not compile; the text has what the compiler says."""
+class CompilationFailed(InputError):
+    """A sketch does not compile; the text has the compiler's output."""
 
-    code = "sketch-broken"
+    code = "compilation-failed"
 
 
 def compile_sketch(sketch: Path, elf: Path, *, libraries: Sequence[Path] = (), defines: Sequence[str] = ()) -> Path:
     """Compile the sketch in the folder `sketch` into `elf`, for an Uno. `defines` are as for the compiler's `-D`,
     `libraries` are folders of Arduino libraries.
 
-    Raises `SketchBroken`, and `ConfigurationError` where the tools are not installed.
+    Raises `CompilationFailed`, and `ConfigurationError` if the tools are not installed.
     """
     source = sketch / f"{sketch.name}.ino"
     if not source.is_file():
-        raise InputError(f"{sketch} is no sketch: it has no {source.name}")
+        raise InputError(f"{sketch} is not a sketch: {source.name} is missing")
     if not CORE.is_dir():
         raise ConfigurationError("the Arduino core is not installed", hint="install gcc-avr avr-libc arduino-core-avr")
     includes = [CORE / "cores/arduino", CORE / "variants/standard", sketch]
@@ -68,7 +67,7 @@ def compile_sketch(sketch: Path, elf: Path, *, libraries: Sequence[Path] = (), d
         sources = [generated, *sorted(core.glob("*.c")), *sorted(core.glob("*.cpp")), *sorted(core.glob("*.S"))]
         with ThreadPoolExecutor(2) as workers:
             main, *rest = workers.map(lambda source: _object(source, Path(folder), flags), sources)
-        # An archive, as the Arduino IDE makes it: what the sketch does not use of the core stays out.
+        # An archive, as the Arduino IDE makes it, leaves out the parts of the core that the sketch does not use.
         archive = Path(folder) / "core.a"
         _run("avr-gcc-ar", "rcs", archive, *rest)
         _run("avr-gcc", *FLAGS, "-Wl,--gc-sections", "-fuse-linker-plugin", main, archive, "-lm", "-o", elf)
@@ -76,7 +75,7 @@ def compile_sketch(sketch: Path, elf: Path, *, libraries: Sequence[Path] = (), d
 
 
 def as_cpp(sketch: str, source: Path) -> str:
-    """What the Arduino IDE makes of a sketch: C++, in which functions may be used before they are defined."""
+    """The C++ that the Arduino IDE generates from a sketch: functions may be used before they are defined."""
     first = FUNCTION.search(sketch)
     at = first.start() if first else len(sketch)
     prototypes = "".join(f"{head};\n" for head in FUNCTION.findall(sketch) if "aira::" not in head)
@@ -85,7 +84,7 @@ def as_cpp(sketch: str, source: Path) -> str:
 
 
 def size_of(elf: Path) -> tuple[int, int]:
-    """Bytes of flash and of RAM that a firmware takes, the stack not counted."""
+    """The bytes of flash and of RAM that a firmware uses, without the stack."""
     words = _run("avr-size", "-A", elf)
     sizes = {name: int(size) for name, size in re.findall(r"^\.(\w+)\s+(\d+)", words, re.MULTILINE)}
     return sizes["text"] + sizes.get("data", 0), sizes.get("data", 0) + sizes.get("bss", 0) + sizes.get("noinit", 0)
@@ -107,7 +106,7 @@ def _run(*command: str | Path) -> str:
     except FileNotFoundError:
         raise ConfigurationError(f"{command[0]} is not installed", hint="install gcc-avr and avr-libc") from None
     if done.returncode:
-        raise SketchBroken(f"{command[0]} fails:\n{done.stderr.strip()}")
+        raise CompilationFailed(f"{command[0]} failed:\n{done.stderr.strip()}")
     return done.stdout
 
 

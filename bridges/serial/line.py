@@ -1,54 +1,147 @@
-"""A dialect on a real port: one thread that waits for the port, the bytes, the time and other threads' wishes."""
+"""A serial port, and the line on it: one thread that waits for the port, bytes, time and requests of other threads."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
+import os
+import re
 import select
 import socket
+import termios
 import time
+from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, Final
 
+import serial
+
 from bridges.serial.errors import LineError, PortMissing
-from bridges.serial.ports import Port
+from mesh.errors import InputError
+from mesh.telemetry.context import log_event
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
-    from bridges.serial.dialect import Dialect, Happening
-    from bridges.serial.ports import PortName
+    from bridges.serial.dialect import Dialect, LineEvent
 
 log = logging.getLogger(__name__)
 
-STRANGE: Final = 5.0
-"""Seconds on an open port without a board that answers, after which that is said."""
-LOOKED_FOR: Final = 0.25
-"""Seconds between two looks for a port that is not there."""
+USB: Final = re.compile(r"usb:(?P<vendor>[0-9a-fA-F]{4}):(?P<product>[0-9a-fA-F]{4})(?::(?P<serial>.+))?")
+READ_SIZE: Final = 4096
+SILENCE: Final = 5.0
+"""Seconds on an open port without an answer of a board, after which a warning is logged."""
+PORT_POLL: Final = 0.25
+"""Seconds between two attempts to find a port that is not plugged in."""
 
 
-class Line:
-    """The line to one board. `run` serves it on the thread that calls it, until `stop`; `deliver` gets what happens.
+class PortName:
+    """The name of a port: a path (also one under /dev/serial/by-id), or `usb:VENDOR:PRODUCT[:SERIAL]` in hex.
 
-    `deliver` and all that is handed to `do` are called on that thread, one after the other. Nothing raises but what
-    they raise: a port that is not there, or that goes away, is waited for.
+    A path may change when a board is plugged in again; a by-id path and a USB id do not. Raises `InputError`.
     """
 
-    def __init__(self, name: PortName, dialect: Dialect, *, baud: int, deliver: Callable[[Happening], None]) -> None:
+    def __init__(self, text: str) -> None:
+        self.text = text
+        self._usb = USB.fullmatch(text)
+        if self._usb is None and not text.startswith("/"):
+            raise InputError(
+                f"{text!r} names no serial port", hint="give a path, /dev/ttyACM0, or a USB id, usb:2341:0043"
+            )
+
+    def __str__(self) -> str:
+        return self.text
+
+    def find(self) -> Path:
+        """Where the port is now. Raises `PortMissing`."""
+        if self._usb is None:
+            path = Path(self.text)
+            if not path.exists():
+                raise PortMissing(self.text, "there is no such file")
+            return path
+        vendor, product = int(self._usb["vendor"], 16), int(self._usb["product"], 16)
+        for port in _usb_ports():
+            same = (port.vid, port.pid) == (vendor, product)
+            if same and self._usb["serial"] in (None, port.serial_number):
+                return Path(port.device)
+        raise PortMissing(self.text, "no such device is plugged in")
+
+
+class SerialPort:
+    """An open port, locked for this process. Raises `PortMissing`, or `LineError` if it can't be used."""
+
+    def __init__(self, path: Path, *, baud: int) -> None:
+        self.path = path
+        try:
+            self._serial = serial.Serial(str(path), baud, timeout=0, exclusive=True)
+        except (OSError, ValueError) as error:  # pyserial's errors are OSErrors
+            if not path.exists():
+                raise PortMissing(str(path), "it was unplugged") from None
+            raise LineError(f"can't open {path} at {baud} baud: {_reason(error)}") from None
+
+    def fileno(self) -> int:
+        """The file descriptor, for select."""
+        return int(self._serial.fileno())
+
+    def read(self) -> bytes:
+        """The bytes that have arrived; call it when select reports the port. Raises `LineError` if it was unplugged."""
+        try:
+            data = os.read(self.fileno(), READ_SIZE)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            raise LineError(f"{self.path} is unplugged: {error.strerror}") from None
+        if not data:
+            raise LineError(f"{self.path} is unplugged")
+        return data
+
+    def write(self, data: bytes) -> int:
+        """Write without blocking; returns the number of bytes written. Raises `LineError`."""
+        try:
+            return os.write(self.fileno(), data)
+        except BlockingIOError:
+            return 0
+        except OSError as error:
+            raise LineError(f"{self.path} is unplugged: {error.strerror}") from None
+
+    def close(self) -> None:
+        """Close the port."""
+        with contextlib.suppress(OSError):  # a port that was unplugged can't be closed properly
+            self._serial.close()
+
+
+class SerialLine:
+    """The line to one board. `run` serves it on the calling thread until `stop`; `on_event` receives its events.
+
+    `on_event` and everything passed to `call_soon` run on that thread, one after the other. `run` raises only what they
+    raise: it waits for a port that is missing or was unplugged.
+    """
+
+    def __init__(
+        self,
+        name: PortName,
+        dialect: Dialect,
+        *,
+        baud: int,
+        on_event: Callable[[LineEvent], None],
+        poll: float = PORT_POLL,
+    ) -> None:
         self.name = name
         self.dialect = dialect
         self._baud = baud
-        self._deliver = deliver
-        self._wishes: SimpleQueue[Callable[[], object]] = SimpleQueue()
-        self._woken, self._wake = socket.socketpair()
-        self._wake.setblocking(False)
+        self._on_event = on_event
+        self._poll = poll
+        self._tasks: SimpleQueue[Callable[[], object]] = SimpleQueue()
+        self._woken, self._waker = socket.socketpair()
+        self._waker.setblocking(False)
         self._stopping = False
-        self._port: Port | None = None
-        self._backlog = bytearray()
-        self._look = 0.0
-        self._complaint = ""
-        self._strange = float("inf")
-        self._bytes = 0
+        self._port: SerialPort | None = None
+        self._unsent = bytearray()
+        self._next_attempt = 0.0
+        self._last_error = ""
+        self._silence_ends = float("inf")
+        self._bytes_received = 0
         self.openings = 0
         """How often the port was opened."""
 
@@ -57,109 +150,135 @@ class Line:
         """Whether the port is open."""
         return self._port is not None
 
-    def do(self, wish: Callable[[], object]) -> None:
-        """Have something done on the line's thread soon; from any thread."""
-        self._wishes.put(wish)
-        self._rouse()
+    def call_soon(self, task: Callable[[], object]) -> None:
+        """Run something on the line's thread soon; from any thread."""
+        self._tasks.put(task)
+        self._wake()
 
     def stop(self) -> None:
-        """End `run`; from any thread, and from a signal's handler."""
+        """End `run`; from any thread, and from a signal handler."""
         self._stopping = True
-        self._rouse()
+        self._wake()
 
     def run(self) -> None:
         """Serve until `stop`; once."""
         try:
             while not self._stopping:
                 try:
-                    self._serve()
+                    self._serve_once()
                 except LineError as error:
-                    self._lose(error)
-                for happening in self.dialect.happenings():
-                    self._deliver(happening)
+                    self._close_port(error)
+                for event in self.dialect.events():
+                    self._on_event(event)
         finally:
             if self._port is not None:
                 self._port.close()
             self._woken.close()
-            self._wake.close()
+            self._waker.close()
 
-    def _rouse(self) -> None:
-        with contextlib.suppress(OSError):  # full, and so roused already; or closed, and nobody is there any more
-            self._wake.send(b"!")
+    def _wake(self) -> None:
+        with contextlib.suppress(OSError):  # the buffer is full, so it wakes anyway; or `run` has ended
+            self._waker.send(b"!")
 
-    def _serve(self) -> None:
-        """One turn: wait for something, and see to it."""
+    def _serve_once(self) -> None:
+        """Wait for something, and handle it."""
         now = time.monotonic()
-        if self._port is None and self._look <= now:
-            self._open(now)
-        self._backlog += self.dialect.outgoing()
-        if self._port is not None and self._backlog:
-            del self._backlog[: self._port.write(bytes(self._backlog))]
+        if self._port is None and self._next_attempt <= now:
+            self._open_port(now)
+        self._unsent += self.dialect.outgoing()
+        if self._port is not None and self._unsent:
+            del self._unsent[: self._port.write(bytes(self._unsent))]
         if self._wait():
             assert self._port is not None
-            self._receive(self._port.read())
+            data = self._port.read()
+            self._bytes_received += len(data)
+            self.dialect.receive(data, time.monotonic())
+        self._run_tasks()
+        now = time.monotonic()
+        if self.dialect.next_tick <= now:
+            self.dialect.tick(now)
+        if self._silence_ends <= now:
+            self._warn_of_silence()
+
+    def _run_tasks(self) -> None:
         while True:
             try:
-                wish = self._wishes.get_nowait()
+                task = self._tasks.get_nowait()
             except Empty:
-                break
-            wish()
-        now = time.monotonic()
-        if self.dialect.due <= now:
-            self.dialect.pass_time(now)
-        if self._strange <= now:
-            self._wonder()
-
-    def _receive(self, data: bytes) -> None:
-        self._bytes += len(data)
-        self.dialect.receive(data, time.monotonic())
-
-    def _wonder(self) -> None:
-        """Nobody has answered for a while on an open port: say so once, with what may be wrong."""
-        self._strange = float("inf")
-        if self.dialect.about is None:
-            came = f"{self._bytes} bytes have come, which make no sense" if self._bytes else "nothing has come"
-            log.warning(
-                "no board answers on %s at %d baud (%s): do --baud and --protocol fit the firmware?",
-                self.name,
-                self._baud,
-                came,
-            )
+                return
+            task()
 
     def _wait(self) -> bool:
-        """Wait; whether bytes have come."""
-        due = min(self.dialect.due, self._strange if self._port is not None else self._look)
+        """Wait for bytes, a task or the next tick; returns whether bytes have arrived."""
+        due = min(self.dialect.next_tick, self._silence_ends if self._port is not None else self._next_attempt)
         timeout = None if due == float("inf") else max(0.0, due - time.monotonic())
-        if not self._wishes.empty():
+        if not self._tasks.empty():
             timeout = 0.0
         readable: list[Any] = [self._woken] if self._port is None else [self._woken, self._port]
-        writable = [self._port] if self._port is not None and self._backlog else []
+        writable = [self._port] if self._port is not None and self._unsent else []
         ready, _, _ = select.select(readable, writable, [], timeout)
         if self._woken in ready:
-            self._woken.recv(4096)
+            self._woken.recv(READ_SIZE)
         return self._port is not None and self._port in ready
 
-    def _open(self, now: float) -> None:
-        self._look = now + LOOKED_FOR
+    def _warn_of_silence(self) -> None:
+        """Warn once if the port is open but no board has answered, with the likely reasons."""
+        self._silence_ends = float("inf")
+        if self.dialect.info is None:
+            seen = f"{self._bytes_received} bytes arrived that can't be decoded" if self._bytes_received else "no bytes"
+            log.warning(
+                "no board answers on %s at %d baud (%s): do --baud and --protocol match the firmware?",
+                self.name,
+                self._baud,
+                seen,
+                extra=log_event("board-silent", port=self.name, baud=self._baud, bytes=self._bytes_received),
+            )
+
+    def _open_port(self, now: float) -> None:
+        self._next_attempt = now + self._poll
         try:
-            self._port = Port(self.name.find(), baud=self._baud)
+            self._port = SerialPort(self.name.find(), baud=self._baud)
         except LineError as error:
-            if str(error) != self._complaint:
-                self._complaint = str(error)
-                log.log(logging.INFO if isinstance(error, PortMissing) else logging.WARNING, "%s; waiting", error)
+            if str(error) != self._last_error:
+                self._last_error = str(error)
+                level = logging.INFO if isinstance(error, PortMissing) else logging.WARNING
+                log.log(
+                    level, "%s; waiting", error, extra=log_event("port-unavailable", port=self.name, code=error.code)
+                )
             return
-        self._complaint = ""
+        self._last_error = ""
         self.openings += 1
-        self._backlog.clear()
-        log.info("%s is open at %d baud", self.name, self._baud)
-        self._strange, self._bytes = time.monotonic() + STRANGE, 0
+        self._unsent.clear()
+        opened = log_event("port-opened", port=self.name, baud=self._baud)
+        log.info("%s is open at %d baud", self.name, self._baud, extra=opened)
+        self._silence_ends, self._bytes_received = time.monotonic() + SILENCE, 0
         self.dialect.opened(time.monotonic())
 
-    def _lose(self, error: LineError) -> None:
-        log.warning("%s", error)
+    def _close_port(self, error: LineError) -> None:
+        log.warning("%s", error, extra=log_event("port-lost", port=self.name, code=error.code))
         if self._port is not None:
             self._port.close()
             self._port = None
-        self._backlog.clear()
-        self._look = 0.0
+        self._unsent.clear()
+        self._next_attempt = 0.0
         self.dialect.closed(time.monotonic())
+
+
+def _reason(error: OSError | ValueError) -> str:
+    """Why a port can't be opened, in short."""
+    below = error.__context__
+    number = below.args[0] if isinstance(below, termios.error) else getattr(error, "errno", None)
+    match number:
+        case errno.EACCES | errno.EPERM:
+            return "no permission; on Debian, be in the group dialout"
+        case errno.EAGAIN | errno.EBUSY:
+            return "another process uses it"
+        case errno.ENOTTY | errno.EISDIR | errno.ENODEV:
+            return "it is no serial port"
+    return os.strerror(number) if number else str(error)
+
+
+def _usb_ports() -> Iterable[serial.tools.list_ports_common.ListPortInfo]:
+    from serial.tools import list_ports  # reads /sys, which a path does not need
+
+    return list_ports.comports()

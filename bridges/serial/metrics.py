@@ -1,7 +1,9 @@
-"""The figures and the health of an edge agent. Asked for on other threads than that of its line."""
+"""The counters, metrics and health of an edge agent. Counters change on the line's thread and are read on any."""
 
 from __future__ import annotations
 
+from collections import Counter
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from mesh.telemetry.health import STARTING, Health, health_metrics
@@ -13,34 +15,76 @@ if TYPE_CHECKING:
 
     import zenoh
 
+    from bridges.serial.dialect import LineCounters
     from bridges.serial.edge import Edge
-    from bridges.serial.tally import EdgeStatistics
+    from bridges.serial.line import SerialLine
+
+
+@dataclass(frozen=True, kw_only=True)
+class EdgeStatistics:
+    """What went over a line, the outcomes of commands and calls (`done`, `read`, or the reason of a failure), and the
+    state of the line. `openings` counts how often the port was opened: once, and after each loss."""
+
+    line: LineCounters
+    calls: Mapping[str, int]
+    openings: int
+    board_losses: int
+    line_is_open: bool
+    board_is_present: bool
+
+
+class EdgeCounters:
+    """The counters of one edge agent."""
+
+    def __init__(self, line: SerialLine) -> None:
+        self._line = line
+        self._outcomes: Counter[str] = Counter()
+        self._board_losses = 0
+
+    def count_outcome(self, outcome: str) -> None:
+        """Count a finished command or call: `done`, `read`, or the reason of its failure."""
+        self._outcomes[outcome] += 1
+
+    def count_loss(self) -> None:
+        """Count the loss of a board that was present."""
+        self._board_losses += 1
+
+    def statistics(self) -> EdgeStatistics:
+        """The counts now."""
+        return EdgeStatistics(
+            line=replace(self._line.dialect.counters),
+            calls=dict(self._outcomes),
+            openings=self._line.openings,
+            board_losses=self._board_losses,
+            line_is_open=self._line.is_open,
+            board_is_present=self._line.dialect.info is not None,
+        )
 
 
 class EdgeMetrics:
-    """Of an edge agent that may not have begun yet."""
+    """The metrics and health of an edge agent, also before it has started."""
 
     def __init__(self) -> None:
-        self._begun: tuple[Edge, zenoh.Session] | None = None
+        self._started: tuple[Edge, zenoh.Session] | None = None
 
-    def begin(self, edge: Edge, session: zenoh.Session) -> None:
-        """These are what is told of from now on."""
-        self._begun = edge, session
+    def attach(self, edge: Edge, session: zenoh.Session) -> None:
+        """Report this edge agent from now on."""
+        self._started = edge, session
 
     def families(self) -> Iterable[MetricFamily]:
-        """The figures now."""
-        figures = () if self._begun is None else families_of(self._begun[0].tally.statistics())
-        return (*figures, health_metrics(self._parts()))
+        """The metrics now."""
+        families = () if self._started is None else families_of(self._started[0].counters.statistics())
+        return (*families, health_metrics(self._parts()))
 
     def health(self) -> Health:
         """The state of its parts now."""
         return Health.of(self._parts())
 
     def _parts(self) -> Mapping[str, str]:
-        if self._begun is None:
+        if self._started is None:
             return {"start": STARTING}
-        edge, session = self._begun
-        now = edge.tally.statistics()
+        edge, session = self._started
+        now = edge.counters.statistics()
         linked = not session.is_closed() and bool(session.info.routers_zid())
         return {
             "channel": ALIVE if linked else "waits for a router",
@@ -50,7 +94,7 @@ class EdgeMetrics:
 
 
 def families_of(now: EdgeStatistics) -> tuple[MetricFamily, ...]:
-    """The figures of one edge agent."""
+    """The metrics of one edge agent."""
     line = now.line
     directions = {"in": line.received, "out": line.sent}
     faults = {

@@ -19,7 +19,7 @@ async def offer(demand: Verified[Demand]) -> None:
 @agent.on("/blink")
 async def blink(job: Job, message: object) -> None:
     answer = await board.call("/blink_led", job=job)
-    print(f"the lamp has blinked ({answer.ending.value})", flush=True)
+    print(f"the lamp has blinked ({answer.status.value})", flush=True)
 
 
 if __name__ == "__main__":

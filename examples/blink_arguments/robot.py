@@ -23,7 +23,7 @@ async def blink(job: Job, colour: String) -> None:
     if colour.data not in LAMPS:
         raise JobFailed(f"there is no {colour.data} lamp")
     answer = await board.call("/blink_led", colour, job=job)
-    print(f"the {colour.data} lamp has blinked ({answer.ending.value})", flush=True)
+    print(f"the {colour.data} lamp has blinked ({answer.status.value})", flush=True)
 
 
 if __name__ == "__main__":

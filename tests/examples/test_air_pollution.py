@@ -35,7 +35,7 @@ def test_who_asks_for_nothing_is_told_what_the_sensors_measure(
         Serving(*AIRA, "watch", "--readings", says="watching", variables=watching) as watch,
     ):
         for channel, volts in enumerate(VOLTS.values()):
-            uno.apply(channel, int(volts * 1000))
+            uno.set_voltage(channel, int(volts * 1000))
         person = EXAMPLES / "air_pollution" / "person.py"
         done = run(sys.executable, person, "--times", "2", "--out", out, **as_role("person", market))
         shown = "reading    /measurements  "

@@ -7,14 +7,13 @@ import threading
 import time
 from typing import TYPE_CHECKING, Self, TypeVar
 
-from bridges.serial.dialect import Command, Ended, Ending, Ready
-from bridges.serial.errors import UnfitMessage
-from bridges.serial.line import Line
-from bridges.serial.ports import PortName
+from bridges.serial.dialect import BoardReady, CallStatus, Command, CommandFinished
+from bridges.serial.errors import InvalidBoardMessage
+from bridges.serial.line import PortName, SerialLine
 
 if TYPE_CHECKING:
     from bridges.serial.boards import SimulatedBoard
-    from bridges.serial.dialect import Dialect, Happening
+    from bridges.serial.dialect import Dialect, LineEvent
 
 SECONDS = 60.0
 
@@ -26,14 +25,14 @@ class Talk:
 
     def __init__(self, board: SimulatedBoard, dialect: Dialect, *, baud: int) -> None:
         self.dialect = dialect
-        self.happened: list[Happening] = []
-        self._arrived: queue.SimpleQueue[Happening] = queue.SimpleQueue()
-        self.line = Line(PortName(str(board.port)), dialect, baud=baud, deliver=self._arrived.put)
+        self.happened: list[LineEvent] = []
+        self._arrived: queue.SimpleQueue[LineEvent] = queue.SimpleQueue()
+        self.line = SerialLine(PortName(str(board.port)), dialect, baud=baud, on_event=self._arrived.put)
         self._thread = threading.Thread(target=self.line.run, name="line", daemon=True)
 
     def __enter__(self) -> Self:
         self._thread.start()
-        self.next(Ready)
+        self.next(BoardReady)
         return self
 
     def __exit__(self, *exc_info: object) -> None:
@@ -55,18 +54,18 @@ class Talk:
     def submit(self, topic: str, payload: bytes = b"", *, seconds: float = SECONDS) -> Command:
         """Have the board do something, in its turn."""
         command = Command(topic, payload, time.monotonic() + seconds)
-        self.line.do(lambda: self._submit(command))
+        self.line.call_soon(lambda: self._submit(command))
         return command
 
     def _submit(self, command: Command) -> None:
         try:
             self.dialect.submit(command, time.monotonic())
-        except UnfitMessage as error:
-            self._arrived.put(Ended(command, Ending.FAILED, reason="unfit", detail=str(error)))
+        except InvalidBoardMessage as error:
+            self._arrived.put(CommandFinished(command, CallStatus.FAILED, reason="unfit", detail=str(error)))
 
-    def call(self, topic: str, payload: bytes = b"") -> Ended:
+    def call(self, topic: str, payload: bytes = b"") -> CommandFinished:
         """Have the board do something, and wait for the end of it."""
         command = self.submit(topic, payload)
-        while (ended := self.next(Ended)).command is not command:
+        while (ended := self.next(CommandFinished)).command is not command:
             pass
         return ended

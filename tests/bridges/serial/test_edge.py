@@ -14,7 +14,7 @@ import msgspec
 import pytest
 
 from bridges.serial.device import Device
-from bridges.serial.dialect import Ending
+from bridges.serial.dialect import CallStatus
 from bridges.serial.errors import CallInDoubt, CallNotDone, CallRefused
 from schemas import String
 from tests.support.boards import COUNTER, ROSSERIAL_ECHO, board, edge
@@ -46,7 +46,7 @@ async def test_a_call_over_the_mesh_comes_back_with_what_the_board_answered(plac
         async with place.agent("robot") as robot:
             device = Device(robot)
             answer = await device.call("/add", 5)
-            assert (answer.value, answer.ending) == (5, Ending.DONE)
+            assert (answer.value, answer.status) == (5, CallStatus.DONE)
             with pytest.raises(CallRefused, match="that is no integer"):
                 await device.call("/add", "five")
             with pytest.raises(CallRefused, match=r"1\d\d bytes"):
@@ -108,15 +108,17 @@ async def test_two_boards_of_two_agents_do_not_hear_each_other(place: Place) -> 
         async with place.agent("robot") as robot, place.agent("person") as person:
             assert (await Device(robot).call("/add", 5)).value == 5
             told = await Device(person).call("/hear", String("hello"))
-            assert (told.value, told.ending) == (None, Ending.READ)
-            assert (await Device(person).call("/twice", b"")).ending is Ending.DONE
+            assert (told.value, told.status) == (None, CallStatus.READ)
+            assert (await Device(person).call("/twice", b"")).status is CallStatus.DONE
             with pytest.raises((CallRefused, CallInDoubt)):
                 await Device(robot, patience=2.0).call("/hear", String("hello"))
 
 
 def test_an_edge_agent_imports_no_chain_and_no_event_loop() -> None:
     code = (
-        "import sys, bridges.serial.cli, bridges.serial.serving, bridges.serial.calling, bridges.serial.rosserial;"
+        "import sys, bridges.serial.cli, bridges.serial.process, bridges.serial.metrics;"
+        "from bridges.serial.dialect import dialect_names, load_dialect;"
+        "[load_dialect(name) for name in dialect_names()];"
         "print(sorted({'web3', 'eth_account', 'eth_abi', 'asyncio', 'aiohttp', 'mcap'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -1,4 +1,4 @@
-"""Jobs that boards do: what reaches which board, and what the recordings have of it."""
+"""JobTracker that boards do: what reaches which board, and what the recordings have of it."""
 
 from __future__ import annotations
 

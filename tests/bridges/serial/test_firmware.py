@@ -10,12 +10,21 @@ import time
 import pytest
 
 from bridges.serial.boards import SimulatedBoard
-from bridges.serial.calling import CallingDialect
-from bridges.serial.dialect import Counters, Ended, Ending, Flow, Gone, Logged, Ready, Said
+from bridges.serial.dialect import (
+    BoardLogged,
+    BoardLost,
+    BoardReady,
+    CallStatus,
+    CommandFinished,
+    Flow,
+    LineCounters,
+    MessageReceived,
+)
 from bridges.serial.firmware import size_of
-from bridges.serial.frames import Deframer, Frame, Kind, encode
-from bridges.serial.ports import Port
-from bridges.serial.rosserial import RosserialDialect
+from bridges.serial.frames import Frame, FrameDecoder, FrameKind, encode_frame
+from bridges.serial.frames_dialect import FramesDialect
+from bridges.serial.line import SerialPort
+from bridges.serial.rosserial_dialect import RosserialDialect
 from schemas.payloads import String
 from tests.support.boards import COUNTER, ECHO, ROSSERIAL_ECHO, board, firmware
 from tests.support.lines import Talk
@@ -26,7 +35,7 @@ FLASH, RAM = 3000, 500
 
 
 def calling(uno: SimulatedBoard) -> Talk:
-    return Talk(uno, CallingDialect(baud=BAUD, session=1234), baud=BAUD)
+    return Talk(uno, FramesDialect(baud=BAUD, session=1234), baud=BAUD)
 
 
 def rosserial(uno: SimulatedBoard) -> Talk:
@@ -41,10 +50,10 @@ def test_an_echo_takes_little_of_an_uno() -> None:
 
 def test_a_thousand_calls_are_done_once_each_over_a_line_that_damages_one_byte_in_a_hundred() -> None:
     with board(COUNTER) as uno, calling(uno) as talk:
-        uno.disturb(0.01, seed=3)
+        uno.add_noise(0.01, seed=3)
         for number in range(1, 1001):
             ended = talk.call("/add", b"1")
-            assert (ended.ending, ended.payload) == (Ending.DONE, str(number).encode())
+            assert (ended.status, ended.payload) == (CallStatus.DONE, str(number).encode())
         assert talk.dialect.counters.damaged > 0
         assert talk.dialect.counters.repeated > 0
 
@@ -53,7 +62,7 @@ def test_values_of_all_types_cross_both_ways() -> None:
     with board(COUNTER) as uno, calling(uno) as talk:
         for given in (b'[-70000,-1.5,true,"abc"]', b'[200,0.25,false,""]', b'[-5,1e+30,true,"0123456789"]'):
             ended = talk.call("/values", given)
-            assert ended.ending is Ending.DONE
+            assert ended.status is CallStatus.DONE
             integer, real, *rest = _json(given)
             told = _json(ended.payload)
             assert [told[0], *told[2:]] == [integer, *rest]
@@ -66,7 +75,7 @@ def test_a_call_that_takes_long_is_done_once_and_events_say_so() -> None:
     with board(COUNTER) as uno, calling(uno) as talk:
         assert talk.call("/slow", b"5").payload == b"5"
         assert talk.call("/sum").payload == b"5"
-        assert [each.payload for each in talk.happened if isinstance(each, Said)] == [b"5"]
+        assert [each.payload for each in talk.happened if isinstance(each, MessageReceived)] == [b"5"]
 
 
 def test_a_call_during_which_the_board_reads_nothing_is_done_once_and_the_next_one_too() -> None:
@@ -79,12 +88,12 @@ def test_a_call_during_which_the_board_reads_nothing_is_done_once_and_the_next_o
 def test_a_board_that_runs_on_while_the_cable_is_out_finishes_the_call_once() -> None:
     with board(COUNTER) as uno, calling(uno) as talk:
         talk.submit("/slow", b"5")
-        talk.next(Said)
+        talk.next(MessageReceived)
         uno.unplug()
-        talk.next(Gone)
+        talk.next(BoardLost)
         uno.plug()
-        ended = talk.next(Ended)
-        assert (ended.ending, ended.payload) == (Ending.DONE, b"5")
+        ended = talk.next(CommandFinished)
+        assert (ended.status, ended.payload) == (CallStatus.DONE, b"5")
         assert talk.call("/sum").payload == b"5"
 
 
@@ -92,25 +101,25 @@ def test_a_call_during_which_the_board_is_reset_is_in_doubt_and_later_ones_are_d
     with board(COUNTER) as uno, calling(uno) as talk:
         talk.submit("/slow", b"5")
         talk.submit("/add", b"2")
-        talk.next(Said)
+        talk.next(MessageReceived)
         uno.reset()
-        assert talk.next(Ended).reason == "doubt"
-        ended = talk.next(Ended)
-        assert (ended.ending, ended.payload) == (Ending.DONE, b"2")
+        assert talk.next(CommandFinished).reason == "doubt"
+        ended = talk.next(CommandFinished)
+        assert (ended.status, ended.payload) == (CallStatus.DONE, b"2")
 
 
 def test_a_board_that_nobody_has_opened_a_session_with_takes_no_call() -> None:
-    line = Deframer(Counters())
+    line = FrameDecoder(LineCounters())
     with board(COUNTER) as uno:
-        port = Port(uno.port, baud=BAUD)
-        uno.wait_until(lambda: "opened" in uno.said, what="the opening")
-        port.write(b"\0" + encode(Frame(Kind.CALL, 1, 0, b"\x05")))
+        port = SerialPort(uno.port, baud=BAUD)
+        uno.wait_until(lambda: "opened" in uno.output, what="the opening")
+        port.write(b"\0" + encode_frame(Frame(FrameKind.CALL, 1, 0, b"\x05")))
         frames: list[Frame] = []
         while not any(frame.sequence == 1 for frame in frames):
             assert select.select([port], [], [], 30)[0]
             frames += line.feed(port.read())
         port.close()
-        assert frames[-1].kind is Kind.BOARD
+        assert frames[-1].kind is FrameKind.BOARD
         with calling(uno) as talk:
             assert talk.call("/sum").payload == b"0"
 
@@ -130,75 +139,75 @@ def test_rosserial_commands_queue_here_and_all_of_them_run() -> None:
     with board(ROSSERIAL_ECHO) as uno, rosserial(uno) as talk:
         for _ in range(12):
             talk.submit("/work")
-        assert [talk.next(Ended).ending for _ in range(12)] == [Ending.READ] * 12
+        assert [talk.next(CommandFinished).status for _ in range(12)] == [CallStatus.READ] * 12
         uno.wait_until(lambda: flashes(uno) == [True, False] * 12, what="twelve flashes")
 
 
 def test_rosserial_services_parameters_and_logs_are_spoken() -> None:
     with board(ROSSERIAL_ECHO) as uno, rosserial(uno) as talk:
-        assert talk.call("/twice").ending is Ending.DONE
+        assert talk.call("/twice").status is CallStatus.DONE
         talk.submit("/ask")
-        assert talk.next(Said).payload == String("loud").encode()
-        assert talk.next(Logged).text == "asked"
+        assert talk.next(MessageReceived).payload == String("loud").encode()
+        assert talk.next(BoardLogged).text == "asked"
 
 
 def test_what_a_rosserial_board_asks_is_answered() -> None:
     with board(ROSSERIAL_ECHO) as uno, rosserial(uno) as talk:
         talk.submit("/inquire")
-        asked = talk.next(Said)
+        asked = talk.next(MessageReceived)
         assert (asked.topic.name, asked.topic.flow, asked.payload) == (
             "/weather",
-            Flow.ASKS,
+            Flow.REQUESTS,
             String("how is it?").encode(),
         )
         answer = String("it rains").encode()
-        talk.line.do(lambda: talk.dialect.answer(asked.topic, answer, time.monotonic()))
-        assert talk.next(Said).payload == answer
+        talk.line.call_soon(lambda: talk.dialect.respond(asked.topic, answer, time.monotonic()))
+        assert talk.next(MessageReceived).payload == answer
 
 
 def test_what_a_rosserial_board_sends_on_an_id_that_it_has_not_announced_is_counted_and_its_logs_are_text() -> None:
     with board(ROSSERIAL_ECHO) as uno, rosserial(uno) as talk:
         talk.submit("/garble")
-        logged = talk.next(Logged)
+        logged = talk.next(BoardLogged)
         assert (logged.level, logged.text) == (logging.ERROR, "\ufffd(hot\ufffd")
         assert talk.dialect.counters.stray == 1
-        assert talk.call("/hear", String("still here").encode()).ending is Ending.READ
+        assert talk.call("/hear", String("still here").encode()).status is CallStatus.READ
 
 
 def test_a_message_that_a_rosserial_board_has_not_announced_never_reaches_it() -> None:
     with board(ROSSERIAL_ECHO) as uno, rosserial(uno) as talk:
         refused = talk.call("/unknown", b"")
-        assert (refused.ending, refused.reason) == (Ending.FAILED, "unfit")
-        assert talk.call("/hear", String("still here").encode()).ending is Ending.READ
+        assert (refused.status, refused.reason) == (CallStatus.FAILED, "unfit")
+        assert talk.call("/hear", String("still here").encode()).status is CallStatus.READ
 
 
 def test_the_longest_string_reaches_a_rosserial_board() -> None:
     with board(ROSSERIAL_ECHO) as uno, rosserial(uno) as talk:
         longest = String("x" * 111).encode()
         talk.submit("/hear", longest)
-        assert talk.next(Said).payload == longest
+        assert talk.next(MessageReceived).payload == longest
         assert talk.call("/hear", String("x" * 112).encode()).reason == "unfit"
 
 
 def test_a_rosserial_board_that_was_reset_is_found_again() -> None:
     with board(ROSSERIAL_ECHO) as uno, rosserial(uno) as talk:
         uno.unplug()
-        talk.next(Gone)
+        talk.next(BoardLost)
         uno.reset()
         uno.plug()
-        talk.next(Ready)
-        assert talk.call("/hear", String("again").encode()).ending is Ending.READ
+        talk.next(BoardReady)
+        assert talk.call("/hear", String("again").encode()).status is CallStatus.READ
 
 
 def test_no_damaged_message_of_a_rosserial_board_is_taken_for_a_whole_one() -> None:
     with board(ROSSERIAL_ECHO) as uno, rosserial(uno) as talk:
-        uno.disturb(0.01, seed=5)
+        uno.add_noise(0.01, seed=5)
         texts = [String(f"message {number:03}").encode() for number in range(100)]
         for text in texts:
             talk.submit("/hear", text)
         for _ in texts:
-            talk.next(Ended)
-        said = [each.payload for each in talk.happened if isinstance(each, Said)]
+            talk.next(CommandFinished)
+        said = [each.payload for each in talk.happened if isinstance(each, MessageReceived)]
         assert set(said) <= set(texts)
         assert len(said) > 10
         assert talk.dialect.counters.damaged > 0

@@ -1,281 +1,158 @@
-"""rosserial from the host's side, with a board that the test plays and a clock that it sets."""
-
 from __future__ import annotations
 
 import logging
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from bridges.serial.dialect import Command, Counters, Ended, Ending, Flow, Gone, Logged, Ready, Said
-from bridges.serial.errors import UnfitMessage
-from bridges.serial.rosserial import LOST, QUESTIONS, SETTLED, RosserialDialect
-from bridges.serial.roswire import (
-    CLIENT_PUBLISHER,
-    CLIENT_SUBSCRIBER,
-    LOG,
-    PARAMETER,
+from bridges.serial.dialect import LineCounters
+from bridges.serial.rosserial import (
+    ASK_TOPICS,
     PUBLISHER,
-    SERVER_PUBLISHER,
-    SERVER_SUBSCRIBER,
-    SUBSCRIBER,
-    TIME,
-    Deframer,
-    Message,
-    encode,
+    STOP,
+    MalformedMessage,
+    RosserialDecoder,
+    RosserialMessage,
+    decode_log,
+    decode_parameter_name,
+    decode_topic_info,
+    encode_message,
+    encode_parameter,
+    encode_time,
+    longest_frame,
 )
+from bridges.serial.rosserial_topics import known_type
+from schemas.errors import InvalidPayload
 from schemas.payloads import String
 
-STRING_MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
-EMPTY_MD5 = "d41d8cd98f00b204e9800998ecf8427e"
-NOW = 1000.5
+messages = st.builds(RosserialMessage, st.integers(0, 0xFFFF), st.binary(max_size=300))
 
 
 def text(value: str) -> bytes:
     return len(value).to_bytes(4, "little") + value.encode()
 
 
-def info(topic: int, name: str, kind: str, md5: str, *, buffer: int = 280) -> bytes:
-    return topic.to_bytes(2, "little") + text(name) + text(kind) + text(md5) + buffer.to_bytes(4, "little")
+@pytest.mark.parametrize(
+    ("message", "line"),
+    [
+        (RosserialMessage(PUBLISHER), "ff fe 00 00 ff 00 00 ff"),
+        (RosserialMessage(100), "ff fe 00 00 ff 64 00 9b"),
+        (RosserialMessage(125, String("abc").encode()), "ff fe 07 00 f8 7d 00 03 00 00 00 61 62 63 59"),
+        (RosserialMessage(STOP), "ff fe 00 00 ff 0b 00 f4"),
+    ],
+)
+def test_messages_are_the_bytes_of_rosserial(message: RosserialMessage, line: str) -> None:
+    assert encode_message(message).hex(" ") == line
+    assert RosserialDecoder(LineCounters()).feed(bytes.fromhex(line)) == [message]
 
 
-CHATTER = (PUBLISHER, info(125, "chatter", "std_msgs/String", STRING_MD5))
-BLINK = (SUBSCRIBER, info(100, "blink_led", "std_msgs/Empty", EMPTY_MD5))
-HEAR = (SUBSCRIBER, info(101, "hear", "std_msgs/String", STRING_MD5))
-TOPICS = (CHATTER, BLINK, HEAR)
+def test_the_question_for_topics_is_an_empty_message() -> None:
+    assert encode_message(RosserialMessage(PUBLISHER)) == ASK_TOPICS
 
 
-class Bench:
-    """The dialect, and what a board would do."""
-
-    def __init__(self, *, baud: int = 57_600) -> None:
-        self.now = 100.0
-        self.dialect = RosserialDialect(baud=baud, parameters={"rate": 7}, clock=lambda: NOW)
-        self._line = Deframer(Counters())
-
-    def heard(self) -> list[Message]:
-        """What the host has sent."""
-        return self._line.feed(self.dialect.outgoing())
-
-    def say(self, topic: int, data: bytes = b"") -> None:
-        """A message of the board's."""
-        self.dialect.receive(encode(Message(topic, data)), self.now)
-
-    def announce(self, *topics: tuple[int, bytes]) -> None:
-        """What a board says when it is asked for its topics."""
-        self.say(TIME)
-        for kind, data in topics:
-            self.say(kind, data)
-
-    def after(self, seconds: float) -> list[Message]:
-        """Let time pass; what the host sends."""
-        self.now += seconds
-        self.dialect.pass_time(self.now)
-        return self.heard()
-
-    def command(self, topic: str = "/blink_led", payload: bytes = b"", seconds: float = 60.0) -> Command:
-        """A new command."""
-        command = Command(topic, payload, self.now + seconds)
-        self.dialect.submit(command, self.now)
-        return command
+@given(st.lists(messages, max_size=4), st.integers(1, 50))
+def test_messages_are_found_again_in_pieces_of_any_size(sent: list[RosserialMessage], size: int) -> None:
+    line = b"".join(map(encode_message, sent))
+    decoder = RosserialDecoder(LineCounters())
+    found = [each for start in range(0, len(line), size) for each in decoder.feed(line[start : start + size])]
+    assert found == sent
 
 
-def ready(*topics: tuple[int, bytes], baud: int = 57_600) -> Bench:
-    """A board with these topics, known and ready."""
-    bench = Bench(baud=baud)
-    bench.dialect.opened(bench.now)
-    bench.announce(*(topics or TOPICS))
-    bench.after(SETTLED)
-    [happening] = bench.dialect.happenings()
-    assert isinstance(happening, Ready)
-    bench.heard()
-    return bench
+@given(messages, st.integers(1, 4))
+def test_a_message_right_after_a_beginning_that_has_no_end_is_found(message: RosserialMessage, cut: int) -> None:
+    cut_off = encode_message(RosserialMessage(200, b"x" * 4))[:cut]
+    assert RosserialDecoder(LineCounters()).feed(cut_off + encode_message(message)) == [message]
 
 
-def test_a_board_that_is_starting_is_asked_again_and_again() -> None:
-    bench = Bench()
-    bench.dialect.opened(bench.now)
-    assert bench.heard() == [Message(PUBLISHER)]
-    assert [bench.after(0.6) for _ in range(3)] == [[Message(PUBLISHER)]] * 3
+@given(st.integers(0, 14), st.integers(1, 255))
+def test_no_single_damaged_byte_of_a_string_passes(place: int, difference: int) -> None:
+    line = bytearray(encode_message(RosserialMessage(125, String("abc").encode())))
+    line[place] ^= difference
+    counters = LineCounters()
+    assert RosserialDecoder(counters).feed(bytes(line) + bytes(400)) == []
+    assert counters.noise > 0
 
 
-def test_topics_are_known_when_no_more_are_announced() -> None:
-    about = ready().dialect.about
-    assert about is not None
-    assert [(each.name, each.flow, each.id) for each in about.topics] == [
-        ("/chatter", Flow.SAYS, 125),
-        ("/blink_led", Flow.HEARS, 100),
-        ("/hear", Flow.HEARS, 101),
-    ]
+def test_a_stray_ff_before_a_message_is_noise_of_one_byte() -> None:
+    counters = LineCounters()
+    assert RosserialDecoder(counters).feed(b"\xff" + encode_message(RosserialMessage(100))) == [RosserialMessage(100)]
+    assert counters.noise == 1
 
 
-def test_the_time_is_answered_at_once() -> None:
-    bench = ready()
-    bench.say(TIME)
-    assert bench.heard() == [Message(TIME, (1000).to_bytes(4, "little") + (500_000_000).to_bytes(4, "little"))]
-
-
-def test_a_topic_with_another_md5_or_an_impossible_id_or_name_is_not_used(caplog: pytest.LogCaptureFixture) -> None:
-    wrong = (
-        (SUBSCRIBER, info(102, "other", "std_msgs/String", EMPTY_MD5)),
-        (SUBSCRIBER, info(5, "low", "std_msgs/Empty", EMPTY_MD5)),
-        (SUBSCRIBER, info(103, "a b", "std_msgs/Empty", EMPTY_MD5)),
+def test_a_board_that_announces_is_read() -> None:
+    data = (125).to_bytes(2, "little") + text("chatter") + text("std_msgs/String") + text("992ce8a1") + b"\x18\x01\0\0"
+    info = decode_topic_info(data)
+    assert (info.id, info.name, info.type, info.md5, info.buffer) == (
+        125,
+        "chatter",
+        "std_msgs/String",
+        "992ce8a1",
+        280,
     )
-    with caplog.at_level(logging.WARNING):
-        bench = ready(*TOPICS, *wrong)
-    assert bench.dialect.about is not None
-    assert len(bench.dialect.about.topics) == len(TOPICS)
-    assert len(caplog.records) == len(wrong)
+    for cut in range(len(data)):
+        with pytest.raises(MalformedMessage):
+            decode_topic_info(data[:cut])
+    with pytest.raises(MalformedMessage):
+        decode_topic_info(data + b"x")
 
 
-def test_a_command_goes_with_the_question_that_shows_when_it_was_read() -> None:
-    bench = ready()
-    command = bench.command()
-    assert bench.heard() == [Message(100), Message(PUBLISHER)]
-    bench.announce(*TOPICS)
-    [ended] = bench.dialect.happenings()
-    assert isinstance(ended, Ended)
-    assert (ended.command, ended.ending) == (command, Ending.READ)
+def test_a_log_line_that_is_no_text_is_told_all_the_same() -> None:
+    assert decode_log(b"\x02" + text("hot")) == (logging.WARNING, "hot")
+    assert decode_log(b"\x03\x02\0\0\0\xff\xfe") == (logging.ERROR, "\ufffd\ufffd")
+    assert decode_log(b"") == (logging.INFO, "")
 
 
-def test_the_next_command_waits_until_the_board_has_answered_all() -> None:
-    bench = ready()
-    bench.command()
-    bench.command("/hear", String("next").encode())
-    bench.heard()
-    assert bench.after(0.1) == []
-    bench.say(*CHATTER)
-    assert bench.heard() == []
-    bench.say(*BLINK)
-    bench.say(*HEAR)
-    assert bench.heard()[0] == Message(101, String("next").encode())
+def test_the_time_is_seconds_and_nanoseconds() -> None:
+    assert encode_time(1.5).data == (1).to_bytes(4, "little") + (500_000_000).to_bytes(4, "little")
 
 
-def test_answers_to_repeated_questions_do_not_let_the_command_after_the_next_out() -> None:
-    bench = ready()
-    for number in range(3):
-        bench.command("/hear", String(str(number)).encode())
-    bench.heard()
-    assert bench.after(0.3) == [Message(PUBLISHER)]
-    bench.announce(*TOPICS)
-    assert Message(101, String("1").encode()) not in bench.heard()
-    bench.announce(*TOPICS)
-    assert Message(101, String("1").encode()) in bench.heard()
-    assert bench.after(0.1) == []
+@pytest.mark.parametrize(
+    ("value", "data"),
+    [
+        (7, "01000000 07000000 00000000 00000000"),
+        (-1, "01000000 ffffffff 00000000 00000000"),
+        (0.5, "00000000 01000000 0000003f 00000000"),
+        ("ab", "00000000 00000000 01000000 02000000 6162"),
+        ([1, 0.5], "00000000 02000000 0000803f 0000003f 00000000"),
+        (None, "00000000 00000000 00000000"),
+    ],
+)
+def test_parameters_are_lists_of_integers_floats_and_texts(value: object, data: str) -> None:
+    assert encode_parameter(value).data == bytes.fromhex(data)
 
 
-def test_questions_behind_one_command_do_not_fill_the_board() -> None:
-    bench = ready()
-    bench.command()
-    sent = bench.heard()
-    for _ in range(50):
-        sent += bench.after(1.0)
-    assert sent.count(Message(PUBLISHER)) <= QUESTIONS
-    assert sum(len(encode(message)) for message in sent) <= 64
+def test_a_parameter_is_asked_for_by_name() -> None:
+    assert decode_parameter_name(text("~rate")) == "~rate"
+    with pytest.raises(MalformedMessage):
+        decode_parameter_name(b"\x05\0\0\0ab")
 
 
-@pytest.mark.parametrize(("baud", "most"), [(57_600, 111), (115_200, 220)])
-def test_what_the_line_does_not_carry_in_time_is_never_sent(baud: int, most: int) -> None:
-    bench = ready(baud=baud)
-    bench.command("/hear", String("x" * most).encode())
-    with pytest.raises(UnfitMessage):
-        bench.command("/hear", String("x" * (most + 1)).encode())
+@pytest.mark.parametrize(("baud", "characters"), [(57_600, 111), (115_200, 220)])
+def test_the_longest_string_is_what_a_board_was_seen_to_take(baud: int, characters: int) -> None:
+    assert len(encode_message(RosserialMessage(100, String("x" * characters).encode()))) == longest_frame(baud)
 
 
-def test_what_is_beyond_the_boards_buffer_or_its_topics_or_their_type_is_never_sent() -> None:
-    bench = ready((SUBSCRIBER, info(100, "small", "std_msgs/String", STRING_MD5, buffer=8)))
-    bench.command("/small", String("four").encode())
-    bench.heard()
-    for topic, payload in (("/small", String("fiver").encode()), ("/small", b"four"), ("/unknown", b"")):
-        with pytest.raises(UnfitMessage):
-            bench.command(topic, payload)
-    assert bench.heard() == []
+def test_the_types_have_the_md5_sums_of_ros() -> None:
+    sums = {
+        "std_msgs/Empty": "d41d8cd98f00b204e9800998ecf8427e",
+        "std_msgs/String": "992ce8a1687cec8c8bd883ec73ca41d1",
+        "std_msgs/Bool": "8b94c1b53db61fb6aed406028ad6332a",
+    }
+    for name, digest in sums.items():
+        known = known_type(name)
+        assert known is not None
+        assert known.md5 == digest
+    assert known_type("sensor_msgs/Range") is None
 
 
-def test_commands_wait_for_a_board_that_is_not_there_and_expire() -> None:
-    bench = Bench()
-    bench.command(seconds=5.0)
-    later = bench.command("/hear", String("later").encode(), seconds=60.0)
-    bench.now += 6.0
-    bench.dialect.pass_time(bench.now)
-    [ended] = bench.dialect.happenings()
-    assert isinstance(ended, Ended)
-    assert ended.reason == "expired"
-    bench.dialect.opened(bench.now)
-    bench.announce(*TOPICS)
-    assert bench.after(SETTLED)[:0] == []
-    assert later.begun
-
-
-def test_a_board_that_goes_away_leaves_its_command_in_doubt() -> None:
-    bench = ready()
-    bench.command()
-    bench.dialect.closed(bench.now)
-    ended, gone = bench.dialect.happenings()
-    assert isinstance(ended, Ended)
-    assert ended.reason == "doubt"
-    assert isinstance(gone, Gone)
-
-
-def test_a_silent_board_is_asked_for_its_topics_and_then_gone() -> None:
-    bench = ready()
-    assert bench.after(3.5) == [Message(PUBLISHER)]
-    bench.after(LOST)
-    assert [type(each) for each in bench.dialect.happenings()] == [Gone]
-
-
-def test_what_the_board_says_is_told_if_it_is_of_its_type() -> None:
-    bench = ready()
-    bench.say(125, String("hi").encode())
-    bench.say(125, b"\x09\0\0\0hi")
-    bench.say(126, b"")
-    [said] = bench.dialect.happenings()
-    assert isinstance(said, Said)
-    assert said.payload == String("hi").encode()
-    assert (bench.dialect.counters.refused, bench.dialect.counters.stray) == (1, 1)
-
-
-def test_parameters_are_answered_and_logs_told() -> None:
-    bench = ready()
-    bench.say(PARAMETER, text("~rate"))
-    bench.say(PARAMETER, text("other"))
-    assert [message.data[0] for message in bench.heard()] == [1, 0]
-    bench.say(LOG, b"\x02" + text("hot"))
-    assert bench.dialect.happenings() == [Logged(logging.WARNING, "hot")]
-
-
-def test_a_service_of_the_board_is_a_call_with_an_answer_and_needs_no_question_behind_it() -> None:
-    trigger = "937c9679a518e3a18d831e57125ea522"
-    bench = ready(
-        (SERVER_PUBLISHER, info(125, "open", "std_srvs/Trigger", trigger)),
-        (SERVER_SUBSCRIBER, info(100, "open", "std_srvs/Trigger", EMPTY_MD5)),
-    )
-    bench.command("/open")
-    assert bench.heard() == [Message(100)]
-    bench.say(125, b"\x01\0\0\0\0")
-    [ended] = bench.dialect.happenings()
-    assert isinstance(ended, Ended)
-    assert (ended.ending, ended.payload) == (Ending.DONE, b"\x01\0\0\0\0")
-
-
-def test_what_the_board_asks_is_told_and_the_answer_sent() -> None:
-    bench = ready(
-        (CLIENT_PUBLISHER, info(125, "weather", "std_srvs/Empty", EMPTY_MD5)),
-        (CLIENT_SUBSCRIBER, info(100, "weather", "std_srvs/Empty", EMPTY_MD5, buffer=4)),
-    )
-    bench.say(125, b"?")
-    [said] = bench.dialect.happenings()
-    assert isinstance(said, Said)
-    assert (said.topic.flow, said.payload) == (Flow.ASKS, b"?")
-    bench.dialect.answer(said.topic, b"rain", bench.now)
-    bench.dialect.answer(said.topic, b"sunshine", bench.now)
-    assert bench.heard() == [Message(100, b"rain")]
-
-
-def test_other_topics_than_before_are_another_board() -> None:
-    bench = ready()
-    bench.say(SUBSCRIBER, info(101, "hear", "std_msgs/Empty", EMPTY_MD5))
-    bench.after(SETTLED)
-    gone, again = bench.dialect.happenings()
-    assert isinstance(gone, Gone)
-    assert isinstance(again, Ready)
-    assert [topic.name for topic in again.about.topics] == ["/hear"]
+def test_a_payload_of_the_wrong_length_is_none_of_its_type() -> None:
+    number, string = known_type("std_msgs/UInt16"), known_type("std_msgs/String")
+    assert number is not None
+    assert string is not None
+    number.check(b"\0\0")
+    string.check(String("ä").encode())
+    with pytest.raises(InvalidPayload):
+        number.check(b"\0")
+    with pytest.raises(InvalidPayload):
+        string.check(b"\x02\0\0\0a")

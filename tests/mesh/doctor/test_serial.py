@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from bridges.serial import check
-from bridges.serial.ports import Port
+from bridges.serial.line import SerialPort
 from mesh.doctor import DoctorContext
 from mesh.doctor.context import SerialSettings
 from mesh.settings import Settings
@@ -75,7 +75,7 @@ def test_a_port_without_permission_is_named_with_its_group_and_the_cure(silent: 
 
 
 def test_a_port_that_another_program_uses_is_told_from_a_forbidden_one(silent: str) -> None:
-    port = Port(Path(silent), baud=57_600)
+    port = SerialPort(Path(silent), baud=57_600)
     try:
         done = run(sys.executable, "-c", LOOK, silent)
     finally:

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import pytest
 
 from bridges.ipfs.metrics import Standing, bridge_families, content_families
-from bridges.serial.dialect import Counters
-from bridges.serial.metrics import families_of
-from bridges.serial.tally import EdgeStatistics
+from bridges.serial.dialect import LineCounters
+from bridges.serial.metrics import EdgeStatistics, families_of
 from mesh.market.provider import Provider, ProviderProcess
 from mesh.network import Endpoints, Network
 from mesh.telemetry.health import health_metrics
@@ -54,7 +53,7 @@ class Known(NamedTuple):
 def edge_families() -> tuple[MetricFamily, ...]:
     return families_of(
         EdgeStatistics(
-            line=Counters(),
+            line=LineCounters(),
             calls={"done": 1},
             openings=1,
             board_losses=0,
@@ -161,7 +160,7 @@ def panels() -> list[dict[str, Any]]:
 
 def test_the_dashboard_has_its_rows_and_no_two_panels_in_one_place() -> None:
     rows = [panel["title"] for panel in panels() if panel["type"] == "row"]
-    assert rows == ["Health", "Market", "Jobs", "Money", "Network", "Devices", "Bridge"]
+    assert rows == ["Health", "Market", "JobTracker", "Money", "Network", "Devices", "Bridge"]
     assert len({panel["id"] for panel in panels()}) == len(panels())
     taken: set[tuple[int, int]] = set()
     for panel in panels():

@@ -162,7 +162,7 @@ print(sorted(name for name in names if name in sys.modules))
         ("import mesh.market.provider", ""),
         ("import mesh.cli.provider, mesh.cli.router, mesh.cli.up", ""),
         (
-            "from bridges.serial.serving import telling\nwith telling(''): import bridges.serial.edge",
+            "from bridges.serial.process import serve_metrics\nwith serve_metrics(''): import bridges.serial.edge",
             '"web3", "aiohttp"',
         ),
     ],

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from bridges.serial.jobs import Jobs
+from bridges.serial.calls import JobTracker
 
 AGENT = "0x" + "11" * 20
 FIRST, SECOND = "0x" + "22" * 20, "0x" + "33" * 20
@@ -11,29 +11,29 @@ def event(liability: str, name: str) -> str:
 
 
 def test_the_first_job_that_is_ready_goes_on_until_it_is_complete() -> None:
-    jobs = Jobs()
+    jobs = JobTracker()
     assert jobs.current == ""
     for liability in (FIRST, SECOND):
-        jobs.take_event(event(liability, "incoming"))
-        jobs.take_event(event(liability, "ready"))
+        jobs.handle_event(event(liability, "incoming"))
+        jobs.handle_event(event(liability, "ready"))
     assert jobs.current == FIRST
-    jobs.take_event(event(FIRST, "complete"))
+    jobs.handle_event(event(FIRST, "complete"))
     assert jobs.current == SECOND
-    jobs.take_event(event(SECOND, "finalized"))
+    jobs.handle_event(event(SECOND, "finalized"))
     assert jobs.current == ""
 
 
 def test_a_command_of_another_job_makes_that_the_one_that_goes_on() -> None:
-    jobs = Jobs()
-    jobs.take_event(event(FIRST, "ready"))
+    jobs = JobTracker()
+    jobs.handle_event(event(FIRST, "ready"))
     jobs.begin(SECOND)
     assert jobs.current == SECOND
-    jobs.take_event(event(SECOND, "complete"))
+    jobs.handle_event(event(SECOND, "complete"))
     assert jobs.current == FIRST
 
 
 def test_what_is_no_event_changes_nothing() -> None:
-    jobs = Jobs()
+    jobs = JobTracker()
     for key in ("aira/x", event(FIRST, "objective/ready"), event("robot", "ready")):
-        jobs.take_event(key)
+        jobs.handle_event(key)
     assert jobs.current == ""

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from bridges.serial.errors import LineError, PortMissing
-from bridges.serial.ports import Port, PortName
+from bridges.serial.line import PortName, SerialPort
 from mesh.errors import InputError
 
 if TYPE_CHECKING:
@@ -37,16 +37,16 @@ def test_a_file_that_is_no_terminal_is_refused(tmp_path: Path) -> None:
     path.touch()
     for each in (path, tmp_path):
         with pytest.raises(LineError, match=r"it is no serial port$"):
-            Port(each, baud=57_600)
+            SerialPort(each, baud=57_600)
 
 
 def test_a_port_is_for_one_process_alone_and_tells_when_it_is_pulled_out(tmp_path: Path) -> None:
     master, slave = os.openpty()
     path = PortName(os.ttyname(slave)).find()
     os.close(slave)
-    port = Port(path, baud=57_600)
+    port = SerialPort(path, baud=57_600)
     with pytest.raises(LineError, match=r"another process uses it$"):
-        Port(path, baud=57_600)
+        SerialPort(path, baud=57_600)
     assert port.write(b"abc") == 3
     assert os.read(master, 10) == b"abc"
     os.write(master, b"xyz")

@@ -5,10 +5,20 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from bridges.serial.calling import LOST, CallingDialect
-from bridges.serial.dialect import QUEUED, Command, Counters, Ended, Ending, Flow, Gone, Ready, Said
-from bridges.serial.errors import BoardBusy, UnfitMessage
-from bridges.serial.frames import BOARD_ID, Deframer, Frame, Kind, encode
+from bridges.serial.dialect import (
+    QUEUE_SIZE,
+    BoardLost,
+    BoardReady,
+    CallStatus,
+    Command,
+    CommandFinished,
+    Flow,
+    LineCounters,
+    MessageReceived,
+)
+from bridges.serial.errors import BoardBusy, InvalidBoardMessage
+from bridges.serial.frames import BOARD_ID, Frame, FrameDecoder, FrameKind, encode_frame
+from bridges.serial.frames_dialect import LOST, FramesDialect
 
 SESSION = 7
 TOPICS = ([True, "/echo", "json"], [False, "said", "std_msgs/String"], [True, "/lamp", "std_msgs/Empty"])
@@ -19,9 +29,9 @@ class Bench:
 
     def __init__(self) -> None:
         self.now = 100.0
-        self.dialect = CallingDialect(baud=57_600, session=SESSION)
+        self.dialect = FramesDialect(baud=57_600, session=SESSION)
         self.session = 0
-        self._line = Deframer(Counters())
+        self._line = FrameDecoder(LineCounters())
 
     def open(self) -> None:
         """Open the line and answer all the questions by which a host gets to know a board."""
@@ -34,26 +44,26 @@ class Bench:
         """What the host has sent."""
         return self._line.feed(self.dialect.outgoing())
 
-    def say(self, kind: Kind, sequence: int, topic: int, payload: bytes = b"") -> None:
+    def say(self, kind: FrameKind, sequence: int, topic: int, payload: bytes = b"") -> None:
         """A frame of the board's."""
-        self.dialect.receive(encode(Frame(kind, sequence, topic, payload)), self.now)
+        self.dialect.receive(encode_frame(Frame(kind, sequence, topic, payload)), self.now)
 
     def introduce(self, frame: Frame) -> None:
         """The board's answer to a question."""
         match frame.kind, frame.id:
-            case Kind.ASK, id if id == BOARD_ID:
+            case FrameKind.ASK, id if id == BOARD_ID:
                 about = msgspec.msgpack.encode([1, "echo", "1.0", self.session, len(TOPICS)])
-                self.say(Kind.BOARD, frame.sequence, BOARD_ID, about)
-            case Kind.ASK, topic:
-                self.say(Kind.TOPIC, frame.sequence, topic, msgspec.msgpack.encode(TOPICS[topic]))
-            case Kind.OPEN, _:
+                self.say(FrameKind.BOARD, frame.sequence, BOARD_ID, about)
+            case FrameKind.ASK, topic:
+                self.say(FrameKind.TOPIC, frame.sequence, topic, msgspec.msgpack.encode(TOPICS[topic]))
+            case FrameKind.OPEN, _:
                 self.session = int.from_bytes(frame.payload, "little")
-                self.say(Kind.OPENED, frame.sequence, BOARD_ID)
+                self.say(FrameKind.OPENED, frame.sequence, BOARD_ID)
 
     def after(self, seconds: float) -> list[Frame]:
         """Let time pass; what the host sends."""
         self.now += seconds
-        self.dialect.pass_time(self.now)
+        self.dialect.tick(self.now)
         return self.heard()
 
     def call(self, topic: str = "/echo", payload: bytes = b"1", seconds: float = 30.0) -> Command:
@@ -62,9 +72,9 @@ class Bench:
         self.dialect.submit(command, self.now)
         return command
 
-    def ended(self) -> list[Ended]:
+    def ended(self) -> list[CommandFinished]:
         """The calls that have come to their end."""
-        return [each for each in self.dialect.happenings() if isinstance(each, Ended)]
+        return [each for each in self.dialect.events() if isinstance(each, CommandFinished)]
 
 
 @pytest.fixture
@@ -72,20 +82,20 @@ def bench() -> Bench:
     """A board that is known and ready."""
     bench = Bench()
     bench.open()
-    bench.dialect.happenings()
+    bench.dialect.events()
     return bench
 
 
 def test_a_board_says_what_it_is() -> None:
     bench = Bench()
     bench.open()
-    [ready] = bench.dialect.happenings()
-    assert isinstance(ready, Ready)
-    assert (ready.about.name, ready.about.version) == ("echo", "1.0")
-    assert [(each.name, each.flow) for each in ready.about.topics] == [
-        ("/echo", Flow.HEARS),
-        ("/said", Flow.SAYS),
-        ("/lamp", Flow.HEARS),
+    [ready] = bench.dialect.events()
+    assert isinstance(ready, BoardReady)
+    assert (ready.info.name, ready.info.version) == ("echo", "1.0")
+    assert [(each.name, each.flow) for each in ready.info.topics] == [
+        ("/echo", Flow.SUBSCRIBES),
+        ("/said", Flow.PUBLISHES),
+        ("/lamp", Flow.SUBSCRIBES),
     ]
     assert bench.session == SESSION
 
@@ -102,11 +112,11 @@ def test_questions_are_asked_again_until_they_are_answered() -> None:
 def test_a_call_ends_with_what_the_board_answers(bench: Bench) -> None:
     command = bench.call(payload=b'{"a":[1,2.5]}')
     [frame] = bench.heard()
-    assert (frame.kind, frame.id) == (Kind.CALL, 0)
+    assert (frame.kind, frame.id) == (FrameKind.CALL, 0)
     assert msgspec.msgpack.decode(frame.payload) == {"a": [1, 2.5]}
-    bench.say(Kind.DONE, frame.sequence, 0, msgspec.msgpack.encode("well"))
+    bench.say(FrameKind.DONE, frame.sequence, 0, msgspec.msgpack.encode("well"))
     [ended] = bench.ended()
-    assert (ended.command, ended.ending, ended.payload) == (command, Ending.DONE, b'"well"')
+    assert (ended.command, ended.status, ended.payload) == (command, CallStatus.DONE, b'"well"')
 
 
 def test_a_call_that_is_not_answered_is_repeated_as_the_same(bench: Bench) -> None:
@@ -120,7 +130,7 @@ def test_one_call_is_under_way_at_a_time(bench: Bench) -> None:
     bench.call(payload=b"1")
     bench.call(payload=b"2")
     [first] = bench.heard()
-    bench.say(Kind.DONE, first.sequence, 0)
+    bench.say(FrameKind.DONE, first.sequence, 0)
     [second] = bench.heard()
     assert (second.payload, second.sequence) == (b"\x02", (first.sequence + 1) % 16)
 
@@ -128,11 +138,11 @@ def test_one_call_is_under_way_at_a_time(bench: Bench) -> None:
 def test_a_late_answer_to_an_earlier_call_is_not_the_answer_to_this_one(bench: Bench) -> None:
     bench.call(payload=b"1")
     [first] = bench.heard()
-    bench.say(Kind.DONE, first.sequence, 0)
+    bench.say(FrameKind.DONE, first.sequence, 0)
     bench.call(payload=b"2")
     bench.heard()
     bench.ended()
-    bench.say(Kind.DONE, first.sequence, 0)
+    bench.say(FrameKind.DONE, first.sequence, 0)
     assert bench.ended() == []
     assert bench.dialect.counters.stray == 1
 
@@ -140,9 +150,9 @@ def test_a_late_answer_to_an_earlier_call_is_not_the_answer_to_this_one(bench: B
 def test_what_the_board_refuses_is_told_with_its_reason(bench: Bench) -> None:
     bench.call()
     [frame] = bench.heard()
-    bench.say(Kind.FAILED, frame.sequence, 0, msgspec.msgpack.encode("too hot"))
+    bench.say(FrameKind.FAILED, frame.sequence, 0, msgspec.msgpack.encode("too hot"))
     [ended] = bench.ended()
-    assert (ended.ending, ended.reason, ended.detail) == (Ending.FAILED, "refused", "too hot")
+    assert (ended.status, ended.reason, ended.detail) == (CallStatus.FAILED, "refused", "too hot")
 
 
 def test_a_restart_leaves_the_call_under_way_in_doubt_and_the_next_one_waits(bench: Bench) -> None:
@@ -150,13 +160,13 @@ def test_a_restart_leaves_the_call_under_way_in_doubt_and_the_next_one_waits(ben
     bench.call(payload=b"2")
     bench.heard()
     bench.session = 0
-    bench.say(Kind.BOARD, 0, BOARD_ID, msgspec.msgpack.encode([1, "echo", "1.0", 0, len(TOPICS)]))
-    happened = bench.dialect.happenings()
-    assert [type(each) for each in happened] == [Ended, Gone]
-    assert isinstance(happened[0], Ended)
+    bench.say(FrameKind.BOARD, 0, BOARD_ID, msgspec.msgpack.encode([1, "echo", "1.0", 0, len(TOPICS)]))
+    happened = bench.dialect.events()
+    assert [type(each) for each in happened] == [CommandFinished, BoardLost]
+    assert isinstance(happened[0], CommandFinished)
     assert happened[0].reason == "doubt"
     frames = bench.heard()
-    while frames and frames[0].kind is not Kind.CALL:
+    while frames and frames[0].kind is not FrameKind.CALL:
         bench.introduce(frames[0])
         frames = bench.heard()
     assert frames[0].payload == b"\x02"
@@ -168,10 +178,10 @@ def test_a_board_that_ran_on_while_the_cable_was_out_is_asked_for_the_same_call(
     bench.dialect.closed(bench.now)
     bench.after(5.0)
     bench.open()
-    assert [type(each) for each in bench.dialect.happenings()] == [Gone, Ready]
+    assert [type(each) for each in bench.dialect.events()] == [BoardLost, BoardReady]
     bench.after(1.0)
-    bench.say(Kind.DONE, call.sequence, 0)
-    assert [ended.ending for ended in bench.ended()] == [Ending.DONE]
+    bench.say(FrameKind.DONE, call.sequence, 0)
+    assert [ended.status for ended in bench.ended()] == [CallStatus.DONE]
 
 
 def test_a_call_that_was_never_begun_expires_and_one_that_was_is_in_doubt(bench: Bench) -> None:
@@ -186,7 +196,7 @@ def test_after_a_call_in_doubt_a_new_session_begins_so_that_its_number_is_no_oth
     bench.heard()
     frames = bench.after(2.0)
     bench.call(payload=b"2")
-    while frames and frames[-1].kind is not Kind.CALL:
+    while frames and frames[-1].kind is not FrameKind.CALL:
         bench.introduce(frames[-1])
         frames = bench.heard()
     assert bench.session == SESSION + 1
@@ -196,7 +206,7 @@ def test_after_a_call_in_doubt_a_new_session_begins_so_that_its_number_is_no_oth
 def test_a_board_at_work_is_asked_seldom(bench: Bench) -> None:
     bench.call()
     [frame] = bench.heard()
-    bench.say(Kind.TAKEN, frame.sequence, 0)
+    bench.say(FrameKind.TAKEN, frame.sequence, 0)
     assert bench.after(0.2) == []
     assert bench.after(0.1) == [frame]
 
@@ -204,21 +214,21 @@ def test_a_board_at_work_is_asked_seldom(bench: Bench) -> None:
 def test_a_silent_board_is_asked_and_then_gone(bench: Bench) -> None:
     assert [frame.id for frame in bench.after(2.5)] == [BOARD_ID]
     bench.after(LOST)
-    assert [type(each) for each in bench.dialect.happenings()] == [Gone]
+    assert [type(each) for each in bench.dialect.events()] == [BoardLost]
 
 
 def test_events_arrive_and_gaps_in_them_are_counted(bench: Bench) -> None:
     for sequence in (14, 15, 2):
-        bench.say(Kind.EVENT, sequence, 1, msgspec.msgpack.encode("hi"))
-    said = [each for each in bench.dialect.happenings() if isinstance(each, Said)]
+        bench.say(FrameKind.EVENT, sequence, 1, msgspec.msgpack.encode("hi"))
+    said = [each for each in bench.dialect.events() if isinstance(each, MessageReceived)]
     assert [each.payload for each in said] == [b"\x02\0\0\0hi"] * 3
     assert bench.dialect.counters.missed == 2
 
 
 def test_an_event_that_is_not_of_its_type_is_counted_and_not_told(bench: Bench) -> None:
-    bench.say(Kind.EVENT, 0, 1, msgspec.msgpack.encode(5))
-    bench.say(Kind.EVENT, 1, 0, b"")
-    assert bench.dialect.happenings() == []
+    bench.say(FrameKind.EVENT, 0, 1, msgspec.msgpack.encode(5))
+    bench.say(FrameKind.EVENT, 1, 0, b"")
+    assert bench.dialect.events() == []
     assert (bench.dialect.counters.refused, bench.dialect.counters.stray) == (1, 1)
 
 
@@ -227,7 +237,7 @@ def test_what_does_not_fit_is_never_sent(bench: Bench) -> None:
     bench.call(payload=b"{")
     bench.call("/lamp", b"1")
     assert [ended.reason for ended in bench.ended()] == ["unfit"] * 3
-    with pytest.raises(UnfitMessage):
+    with pytest.raises(InvalidBoardMessage):
         bench.call("/said")
     assert bench.heard() == []
 
@@ -237,13 +247,13 @@ def test_a_board_that_makes_no_sense_is_not_taken_for_one(payload: bytes) -> Non
     bench = Bench()
     bench.dialect.opened(bench.now)
     [ask] = bench.heard()
-    bench.say(Kind.BOARD, ask.sequence, BOARD_ID, payload)
-    assert bench.dialect.happenings() == []
+    bench.say(FrameKind.BOARD, ask.sequence, BOARD_ID, payload)
+    assert bench.dialect.events() == []
     assert bench.dialect.counters.refused == 1
 
 
 def test_calls_beyond_those_that_are_kept_are_refused_and_none_of_the_others_is_lost(bench: Bench) -> None:
-    for _ in range(QUEUED + 1):  # one is under way
+    for _ in range(QUEUE_SIZE + 1):  # one is under way
         bench.call()
     with pytest.raises(BoardBusy):
         bench.call()

@@ -1,0 +1,126 @@
+"""The process of `aira edge`: a session, a line, and signals; no event loop."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from bridges.serial.dialect import load_dialect
+from bridges.serial.edge import Edge
+from bridges.serial.line import PortName
+from bridges.serial.naming import LOG, PRESENT
+from mesh.cli.output import announce
+from mesh.errors import AiraError
+from mesh.network.connecting import SessionOpening
+from mesh.running import INTERRUPTED
+from mesh.starting import file_delays
+from mesh.telemetry.context import LogSource
+from mesh.telemetry.logs import LogService, set_process_source
+from schemas.address import parse_address
+from schemas.logs import ReadLogs
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    import zenoh
+
+    from bridges.serial.metrics import EdgeMetrics
+    from bridges.serial.naming import DeviceId, TopicNames
+    from mesh.network.endpoints import Endpoints
+    from mesh.settings import Settings
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EdgeOptions:
+    """How a board is reached, and the protocol that it speaks.
+
+    `baud` is in bits per second, `patience` in seconds; `parameters` are values that firmware may request.
+    """
+
+    port: str
+    protocol: str
+    baud: int
+    patience: float
+    parameters: Mapping[str, object]
+    names: TopicNames
+
+
+def wait_for_files(settings: Settings) -> None:
+    """Wait for the files that the settings name, if they say so. On the main thread, like `run_edge`."""
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(INTERRUPTED))
+    for delay in file_delays(settings):
+        time.sleep(delay)
+
+
+@contextmanager
+def serve_metrics(listen: str) -> Iterator[EdgeMetrics | None]:
+    """Serve metrics and health at `listen` (HOST:PORT); nothing if it is empty.
+
+    Raises `ConfigurationError`. The server is imported only if it is used.
+    """
+    if not listen:
+        yield None
+        return
+    from bridges.serial.metrics import EdgeMetrics
+    from mesh.telemetry.serving import open_server
+
+    metrics = EdgeMetrics()
+    with open_server(listen, metrics.families, metrics.health):
+        yield metrics
+
+
+def run_edge(
+    device: DeviceId, options: EdgeOptions, *, endpoints: Endpoints, metrics: EdgeMetrics | None = None
+) -> None:
+    """Serve a board until Ctrl-C or SIGTERM. On the main thread of a process of its own.
+
+    Raises `NetworkUnavailable`, `UnknownDialect`, `InputError` for an invalid port name, `InvalidKey` for an invalid
+    device.
+    """
+    name = PortName(options.port)
+    dialect = load_dialect(options.protocol)(baud=options.baud, parameters=options.parameters)
+    device.key(PRESENT)
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(INTERRUPTED))
+    with SessionOpening(endpoints).run() as session:
+        edge = Edge(session, device, name, dialect, baud=options.baud, patience=options.patience, names=options.names)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda number, frame: edge.stop())
+        words = f"edge of {device.agent}: {device.name} on {name}, {options.protocol}, Zenoh id {session.zid()}"
+        if metrics is not None:
+            metrics.attach(edge, session)
+        set_process_source(LogSource("edge", parse_address(device.agent)))
+        announce(log, "edge-started", words, device=device.name)
+        with answer_log_queries(session, device):
+            edge.run()
+
+
+@contextmanager
+def answer_log_queries(session: zenoh.Session, device: DeviceId) -> Iterator[None]:
+    """Answer queries for this process's log on a topic of the device, as an edge agent has no services of its own."""
+    key, service = device.key(LOG), LogService("edge", "")
+
+    def on_query(query: zenoh.Query) -> None:  # on a thread of Zenoh's; the log is in memory
+        with query:
+            try:
+                payload = b"{}" if query.payload is None else query.payload.to_bytes()
+                answer = service.read(ReadLogs.decode(payload)).encode()
+            except AiraError as error:
+                query.reply_err(msgspec.json.encode({"error": str(error), "hint": error.hint}))
+            else:
+                query.reply(key, answer, encoding="application/json")
+
+    queryable: Any = session.declare_queryable(key, on_query)
+    try:
+        yield
+    finally:
+        if not session.is_closed():
+            queryable.undeclare()
