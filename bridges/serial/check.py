@@ -70,8 +70,7 @@ def check_board(settings: SerialSettings, *, timeout: float = ANSWER_TIMEOUT) ->
     others = " or ".join(f"--protocol {name}" for name in dialect_names() if name != settings.protocol)
     return failed(
         f"no board answers in {settings.protocol} at {settings.baud:,} baud",
-        hint=f"is the firmware loaded, does --baud fit it, and does it speak {settings.protocol}?"
-        f" else {others}",
+        hint=f"is the firmware loaded, does --baud fit it, and does it speak {settings.protocol}? else {others}",
     )
 
 
