@@ -16,7 +16,7 @@ from mesh.background import Background
 from mesh.demo.lamp import write_objective
 from mesh.devchain import EmbeddedChain
 from mesh.devchain.anvil import find_anvil, serve_anvil
-from mesh.devchain.market import found_market
+from mesh.devchain.development import deploy_market
 from mesh.market.provider import Provider
 from mesh.network import Channel, Endpoints, Network
 from mesh.settings import Settings
@@ -27,7 +27,7 @@ from schemas import cid_of_bytes
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from mesh.devchain.market import Market
+    from mesh.devchain.development import DevelopmentMarket
     from schemas import Demand, Verified
 
 MODEL: Final = cid_of_bytes(b"what the robot of the benchmark can do")
@@ -116,17 +116,17 @@ def jobs_a_minute(count: int, at_once: int) -> dict[str, dict[str, float] | str]
 
 
 @asynccontextmanager
-async def embedded() -> AsyncIterator[tuple[Any, Market]]:
+async def embedded() -> AsyncIterator[tuple[Any, DevelopmentMarket]]:
     """A market on an embedded chain, in this process."""
     async with EmbeddedChain() as node:
-        yield node.provider, await found_market(node.provider, node.funded_keys)
+        yield node.provider, await deploy_market(node.provider, node.funded_keys)
 
 
 @asynccontextmanager
-async def on_anvil(program: Path) -> AsyncIterator[tuple[Any, Market]]:
+async def on_anvil(program: Path) -> AsyncIterator[tuple[Any, DevelopmentMarket]]:
     """A market on an anvil that mines each transaction at once."""
     async with serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=None) as node:
-        yield node.url, await found_market(node.url, node.funded_keys)
+        yield node.url, await deploy_market(node.url, node.funded_keys)
 
 
 async def _jobs(endpoint: str, place: Any, count: int, at_once: int) -> dict[str, float]:
@@ -163,7 +163,9 @@ async def _jobs(endpoint: str, place: Any, count: int, at_once: int) -> dict[str
     }
 
 
-async def _agent(stack: AsyncExitStack, endpoint: str, node: Any, market: Market, role: str, folder: Path) -> Agent:
+async def _agent(
+    stack: AsyncExitStack, endpoint: str, node: Any, market: DevelopmentMarket, role: str, folder: Path
+) -> Agent:
     settings = Settings(
         connect=(endpoint,),
         data_dir=str(folder / role),

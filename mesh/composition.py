@@ -44,7 +44,7 @@ def chain_of(settings: ChainSettings, account: Account | None) -> Chain:
             reorg_depth=settings.reorg_depth,
         ),
         fees=FeePolicy(ceiling=round(settings.max_fee_gwei * GWEI)),
-        journal=settings.state_directory / "transactions",
+        transactions=settings.state_directory / "transactions",
     )
 
 

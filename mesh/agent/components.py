@@ -132,5 +132,5 @@ async def _channel_of(lighthouse: str, network: Network, *, chain: Chain, clock:
 async def _name_of(chain: Chain) -> str:
     """What tells this chain from all others: a development chain that is started anew has the number of the old one,
     and the same addresses for other contracts."""
-    block = await chain.node.web3.eth.get_block(min(1, await chain.block_number()))
-    return f"{chain.chain_id}-{bytes(block['hash']).hex()[:8]}"
+    block_hash = await chain.node.block_hash(min(1, await chain.block_number()))
+    return f"{chain.chain_id}-{block_hash.hex()[:8]}"

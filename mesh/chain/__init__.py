@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from mesh.chain.accounts import (
     Account,
+    KeyfileError,
     SignedTransaction,
+    WrongPassword,
     copy_keyfile,
     keyfile_address,
     new_private_key,
@@ -21,7 +23,6 @@ from mesh.chain.errors import (
     InsufficientFunds,
     InsufficientTokens,
     InvalidName,
-    KeyfileError,
     NoAccount,
     NoContracts,
     NodeUnreachable,
@@ -34,7 +35,6 @@ from mesh.chain.errors import (
     TransactionTimeout,
     UnknownName,
     WrongChain,
-    WrongPassword,
 )
 from mesh.chain.events import (
     Approval,
@@ -47,15 +47,15 @@ from mesh.chain.events import (
     Online,
     Transfer,
 )
-from mesh.chain.fees import GWEI, FeePolicy
 from mesh.chain.following import BlockEvents, History, Reorganisation
+from mesh.chain.liabilities import Created, RefundState, Settled
 from mesh.chain.names import namehash
-from mesh.chain.node import Node
-from mesh.chain.records import Created, LighthouseState, RefundState, Settled
+from mesh.chain.node import BlockHeader, Node
+from mesh.chain.policy import GWEI, FeePolicy, Timing
 from mesh.chain.recursion import restrain_recursion
-from mesh.chain.timing import Timing
 from mesh.chain.tokens import Token
 from mesh.chain.transactions import Receipt, TransactionSender
+from mesh.chain.versions import LighthouseState
 
 restrain_recursion()
 
@@ -65,6 +65,7 @@ __all__ = [
     "Account",
     "Approval",
     "BlockEvents",
+    "BlockHeader",
     "Chain",
     "ChainEvent",
     "ChainWentBack",

@@ -15,13 +15,35 @@ from coincurve import PrivateKey
 from eth_account import Account as EthAccount
 from eth_keyfile.keyfile import create_keyfile_json, decode_keyfile_json
 
-from mesh.chain.errors import KeyfileError, WrongPassword
-from mesh.errors import InputError
+from mesh.errors import ConfigurationError, InputError
 from schemas.address import parse_address
 from schemas.signing import Signer
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+
+class KeyfileError(ConfigurationError):
+    """A keyfile or its password file can't be read or written, or is no Web3 secret storage."""
+
+    code = "keyfile-error"
+
+    def __init__(self, path: object, why: str, *, hint: str = "") -> None:
+        super().__init__(f"{path}: {why}", hint=hint)
+        self.path = str(path)
+
+
+class WrongPassword(KeyfileError):
+    """The password does not open the keyfile."""
+
+    code = "wrong-password"
+
+    def __init__(self, keyfile: object, password_file: object) -> None:
+        super().__init__(
+            keyfile,
+            f"the password in {password_file} does not open it",
+            hint="one line with the password; a line break at its end does not count",
+        )
 
 
 class SignedTransaction(NamedTuple):

@@ -10,6 +10,10 @@ from typing import Any, Final
 
 NAMES: Final = ("ENSRegistry", "Resolver", "XRT", "Factory", "Lighthouse", "Liability")
 
+PUSH32: Final = 0x7F
+WORD: Final = 32
+"""Bytes of an immutable, which the constructor writes into the code behind a `PUSH32`."""
+
 
 @dataclass(frozen=True, slots=True)
 class Artifact:
@@ -34,3 +38,25 @@ def load_artifact(name: str) -> Artifact:
 def signature_of(entry: dict[str, Any]) -> str:
     """The canonical signature of a function, event or error of an ABI: `name(type,type)`."""
     return f"{entry['name']}({','.join(member['type'] for member in entry['inputs'])})"
+
+
+def is_code_of(name: str, code: bytes) -> bool:
+    """Whether deployed code is that of an artifact, its immutables aside."""
+    runtime = load_artifact(name).runtime
+    if len(code) != len(runtime):
+        return False
+    at = 0
+    while at < len(runtime):
+        if code[at] == runtime[at]:
+            at += 1
+        elif _is_immutable(runtime, at):
+            at = runtime.rindex(PUSH32, 0, at + 1) + 1 + WORD
+        else:
+            return False
+    return True
+
+
+def _is_immutable(runtime: bytes, at: int) -> bool:
+    """Whether a byte is in a word of zeros that is pushed: the place of an immutable."""
+    start = runtime.rfind(PUSH32, max(0, at - WORD), at) + 1
+    return start > 0 and at < start + WORD and not any(runtime[start : start + WORD])

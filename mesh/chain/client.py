@@ -6,6 +6,7 @@ from contextlib import AsyncExitStack
 from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
+from mesh.chain.artifacts import is_code_of
 from mesh.chain.contracts import Contracts
 from mesh.chain.errors import NoContracts, UnknownName
 from mesh.chain.following import NODE_ERRORS, follow, retrying
@@ -26,11 +27,10 @@ if TYPE_CHECKING:
     from typing import Self
 
     from mesh.chain.accounts import Account
-    from mesh.chain.fees import FeePolicy
     from mesh.chain.following import BlockEvents, History
-    from mesh.chain.provider import Endpoint
-    from mesh.chain.timing import Timing
-    from mesh.chain.versions import Kind
+    from mesh.chain.policy import FeePolicy, Timing
+    from mesh.chain.versions import ContractKind
+    from mesh.chain.web3_provider import Endpoint
     from mesh.errors import AiraError
     from mesh.outage_log import OutageLog
 
@@ -43,8 +43,8 @@ class Chain:
     `contracts` says whether they are this project's (`"mesh"`, which read both generations of orders) or the
     originals (`"original"`) of a `generation`; the generation also names the root under which names are looked up.
     `ens` is the address of the ENS registry (empty: the public or a development chain's); `factory` and `xrt` are
-    names or addresses, empty for those under that root. `timing`, `fees` and `journal` are the node's (see `Node`);
-    a given node has its own.
+    names or addresses, empty for those under that root. `timing`, `fees` and `transactions` are for the node (see
+    `Node`), unless a node is given.
 
     Amounts are ints: wei for ETH, wn for XRT, a token's smallest unit otherwise. Addresses are EIP-55; where a
     lighthouse, token or account is asked for, an ENS name does as well.
@@ -65,16 +65,18 @@ class Chain:
         factory: str = "",
         xrt: str = "",
         generation: int = 3,
-        contracts: Kind = "mesh",
+        contracts: ContractKind = "mesh",
         timing: Timing | None = None,
         fees: FeePolicy | None = None,
-        journal: Path | None = None,
+        transactions: Path | None = None,
     ) -> None:
         self.account = account
         self.generation = generation
         self._owns_node = not isinstance(endpoint, Node)
         self.node = (
-            endpoint if isinstance(endpoint, Node) else Node(endpoint, timing=timing, fees=fees, journal=journal)
+            endpoint
+            if isinstance(endpoint, Node)
+            else Node(endpoint, timing=timing, fees=fees, transactions=transactions)
         )
         self._ens = ens
         self._factory_name = factory or f"factory.{generation}.robonomics.eth"
@@ -136,6 +138,13 @@ class Chain:
     def liabilities(self) -> Liabilities:
         """Liabilities, and the orders that they are created from."""
         return Liabilities(self._opened())
+
+    async def has_mesh_contracts(self) -> bool:
+        """Whether factory and token have the code that this project's sources compile to."""
+        for name, address in (("Factory", self.factory), ("XRT", self.xrt)):
+            if not is_code_of(name, await self.node.code(address)):
+                return False
+        return True
 
     async def block_number(self) -> int:
         """Number of the latest block."""

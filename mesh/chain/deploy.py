@@ -6,7 +6,6 @@ from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from mesh.chain.artifacts import load_artifact
 from mesh.chain.events import lighthouse_created
 from mesh.chain.names import GENERATIONS, namehash
 from mesh.chain.node import Node
@@ -18,8 +17,8 @@ if TYPE_CHECKING:
     from web3.contract.async_contract import AsyncContractFunction
 
     from mesh.chain.accounts import Account
-    from mesh.chain.provider import Endpoint
     from mesh.chain.transactions import Receipt
+    from mesh.chain.web3_provider import Endpoint
 
 WN: Final = 1
 XRT: Final = 10**9 * WN
@@ -107,10 +106,7 @@ class _Deployer:
         )
 
     async def _create(self, name: str, *arguments: Any) -> str:
-        artifact = load_artifact(name)
-        contract = self._node.web3.eth.contract(abi=artifact.abi, bytecode=artifact.bytecode)
-        data = contract.constructor(*arguments).data_in_transaction
-        receipt = await self._sender.send(to=None, data=bytes.fromhex(data[2:]))
+        receipt = await self._sender.send(to=None, data=self._node.creation_code(name, *arguments))
         assert receipt.contract is not None
         self._gas_used += receipt.gas_used
         return receipt.contract

@@ -1,9 +1,41 @@
-"""What can go wrong on the chain, by whose fault it is. Every error is one line, with a hint where one helps."""
+"""The errors of the chain."""
 
 from __future__ import annotations
 
-from mesh.chain.refusals import HINTS
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final
+
 from mesh.errors import ChainError, ConfigurationError, InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+METHOD_NOT_FOUND: Final = -32601
+"""The JSON-RPC code of a method that the node does not have."""
+
+REVERT_HINTS: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "ERC20InsufficientAllowance": "approve the spender for that amount first",
+        "ERC20InsufficientBalance": "send the account the missing tokens, or lower the amount",
+        "ERC20InvalidReceiver": "check the address that the tokens are to go to",
+        "DeadlineReached": "the order has expired; sign a new one with a later deadline",
+        "OrderUsed": "an order makes one contract only; sign a new one",
+        "WrongSigner": "the signature is another account's than the first address says, or of other terms",
+        "InvalidSignature": "a signature is 65 bytes with v 27 or 28 and a low s",
+        "NotAProvider": "stake on the lighthouse first: only its providers may send to it",
+        "NotTheValidator": "the contract names a validator, and only that account can finalize it",
+        "AlreadyFinalized": "it has ended; its record says how",
+        "RefundTooEarly": "wait for that block: until then the promisor may bring a result",
+        "NameTaken": "choose another name",
+        "InvalidName": "a name is one label of a to z, 0 to 9 and -, of 32 characters at most",
+        "InvalidStake": "the minimal stake is at least 1 wn",
+        "InvalidTimeout": "the timeout is at least 1 block",
+        "StakeTooSmall": "stake the lighthouse's minimum at least",
+        "InsufficientStake": "no more can be withdrawn than was staked",
+        "OutOfGas": "the contract's state has changed since it was asked; send it again",
+    }
+)
+"""What to do when a contract refuses, by the name of its custom error (`Reverted.reason`)."""
 
 
 class NodeUnreachable(ChainError):
@@ -169,7 +201,7 @@ class Reverted(ChainError):
     ) -> None:
         shown = ", ".join(_show(argument) for argument in arguments)
         said = f"the contract refused: {reason or 'no reason given'}" + (f" ({shown})" if shown else "")
-        super().__init__(said, hint=HINTS.get(reason, ""))
+        super().__init__(said, hint=REVERT_HINTS.get(reason, ""))
         self.reason = reason
         self.arguments = arguments
         self.data = data
@@ -230,29 +262,6 @@ class NoAccount(ConfigurationError):
 
     def __init__(self) -> None:
         super().__init__("this needs an account", hint="set keyfile and keyfile_password_file")
-
-
-class KeyfileError(ConfigurationError):
-    """A keyfile or its password file can't be read or written, or is no Web3 secret storage."""
-
-    code = "keyfile-error"
-
-    def __init__(self, path: object, why: str, *, hint: str = "") -> None:
-        super().__init__(f"{path}: {why}", hint=hint)
-        self.path = str(path)
-
-
-class WrongPassword(KeyfileError):
-    """The password does not open the keyfile."""
-
-    code = "wrong-password"
-
-    def __init__(self, keyfile: object, password_file: object) -> None:
-        super().__init__(
-            keyfile,
-            f"the password in {password_file} does not open it",
-            hint="one line with the password; a line break at its end does not count",
-        )
 
 
 class InvalidName(InputError):

@@ -43,8 +43,8 @@ import msgspec
 
 from mesh.chain.errors import ChainWentBack, NoContracts, NodeUnreachable, ReorganisedTooDeep, RequestRefused
 from mesh.chain.events import EVENT_CLASSES, ChainEvent
-from mesh.chain.reader import Head, RangeReader, ReplacedWhileReading, SeenBlock, read_block, read_head
-from mesh.chain.timing import REORG_DEPTH
+from mesh.chain.policy import REORG_DEPTH
+from mesh.chain.reader import RangeReader, ReplacedWhileReading, SeenBlock
 from mesh.errors import ConfigurationError, InputError
 from mesh.outage_log import OutageLog
 from mesh.retry import Backoff
@@ -52,7 +52,7 @@ from mesh.retry import Backoff
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Awaitable, Callable
 
-    from mesh.chain.node import Node
+    from mesh.chain.node import BlockHeader, Node
     from mesh.chain.reader import ReadRange
     from mesh.errors import AiraError
 
@@ -203,7 +203,7 @@ class _Follower:
 
     async def read_to_head(self) -> AsyncGenerator[BlockEvents, None]:
         """What is new since the last call: first what the chain has replaced, then the blocks up to its head."""
-        head = await read_head(self._node)
+        head = await self._node.latest_header()
         if self.must_check_cursor:
             await self._check_cursor(head)
             self.must_check_cursor = False
@@ -223,7 +223,7 @@ class _Follower:
         except ReplacedWhileReading:
             pass  # the next call finds what was replaced
 
-    async def _check_cursor(self, head: Head) -> None:
+    async def _check_cursor(self, head: BlockHeader) -> None:
         """Raise `ChainWentBack` if the cursor is past the head, unless the node is a few blocks behind another."""
         if self.cursor <= head.number + 1:
             return
@@ -233,7 +233,7 @@ class _Follower:
                     return
         raise ChainWentBack(self.cursor, head.number)
 
-    async def _find_replaced(self, head: Head) -> Reorganisation | None:
+    async def _find_replaced(self, head: BlockHeader) -> Reorganisation | None:
         """What the chain has replaced of the history; None if it only grew, or is shorter. Raises as `follow` does."""
         known = [block for block in self._history.blocks if block.block_number <= head.number]
         for block in reversed(known):
@@ -245,18 +245,18 @@ class _Follower:
             raise ReorganisedTooDeep(known[0].block_number, head.number)
         return None
 
-    async def _remember_start(self, head: Head) -> None:
+    async def _remember_start(self, head: BlockHeader) -> None:
         """Remember the block before the first one that is read: what a reorganisation can go back to."""
         if not self._history.blocks and 0 < self.cursor <= head.number + 1:
-            before = await read_block(self._node, self.cursor - 1)
+            before = await self._node.header(self.cursor - 1)
             if before is not None:
                 self._history.remember(SeenBlock(before.number, before.hash, ()))
 
-    async def _is_on_chain(self, block: SeenBlock, head: Head) -> bool:
+    async def _is_on_chain(self, block: SeenBlock, head: BlockHeader) -> bool:
         """Whether the chain that ends at `head` has the block."""
         if block.block_number == head.number:
             return block.block_hash == head.hash
         if block.block_number == head.number - 1:
-            return block.block_hash == head.parent
-        now = await read_block(self._node, block.block_number)
+            return block.block_hash == head.parent_hash
+        now = await self._node.header(block.block_number)
         return now is not None and now.hash == block.block_hash

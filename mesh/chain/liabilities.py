@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from mesh.chain.errors import NoContracts, NotALiability
 from mesh.chain.events import NewLiability, liability_created, xrt_minted
 from mesh.chain.following import retrying
 from mesh.chain.reader import list_created
-from mesh.chain.records import Created, RefundState, Settled, read_liability
+from schemas.address import parse_address
+from schemas.cid import format_cid
+from schemas.records import Liability
 from schemas.signing import recover
 from schemas.wire import cancellation_hash, order_abi
 
@@ -18,12 +21,68 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from mesh.chain.contracts import Contracts
+    from mesh.chain.node import Node
     from mesh.chain.transactions import Receipt
     from schemas.messages import Demand, Offer, Result
-    from schemas.records import Liability
+
+GETTERS: Final = (
+    "model",
+    "objective",
+    "result",
+    "promisee",
+    "promisor",
+    "lighthouse",
+    "lighthouseFee",
+    "token",
+    "cost",
+    "validator",
+    "validatorFee",
+    "isSuccess",
+    "isFinalized",
+)
 
 READ_AT_ONCE: Final = 8
 """Records that a listing asks a node for at the same time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Created:
+    """A liability that a transaction made, and the gas that it took, for so many wei."""
+
+    liability: str
+    tx: str
+    gas_used: int
+    wei: int
+
+
+@dataclass(frozen=True, slots=True)
+class Settled:
+    """The transaction that finalized or refunded a liability, and the gas that it took, for so many wei.
+
+    `minted` is the XRT (wn) that its sender was given for that.
+    """
+
+    tx: str
+    gas_used: int
+    wei: int
+    minted: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RefundState:
+    """Whether the promisee of a liability can be paid back, as of the block `block_number`."""
+
+    liability: str
+    block_number: int
+    refundable_from: int
+    """The first block in which anybody may have that done, if the liability has not ended by then."""
+
+    is_finalized: bool
+
+    @property
+    def is_refundable(self) -> bool:
+        """Whether a transaction in the next block could do it."""
+        return not self.is_finalized and self.block_number + 1 >= self.refundable_from
 
 
 class Liabilities:
@@ -182,6 +241,33 @@ class Liabilities:
     async def _is_finalized(self, address: str, block: int) -> bool:
         functions = self._contracts.node.contract("Liability", address).functions
         return bool(await self._contracts.node.read(functions.isFinalized(), block=block))
+
+
+async def read_liability(node: Node, address: str, *, block: int | None = None) -> Liability:
+    """The terms and the outcome of what is known to be a liability, as of one block (by default the latest).
+
+    Raises `NodeUnreachable`, and `NoContracts` for a block before it was made.
+    """
+    block = await node.block_number() if block is None else block
+    functions = node.contract("Liability", address).functions
+    values = await node.read_all((functions[getter]() for getter in GETTERS), block=block)
+    held: dict[str, Any] = dict(zip(GETTERS, values, strict=True))
+    return Liability(
+        address=address,
+        model=format_cid(held["model"]),
+        objective=format_cid(held["objective"]),
+        result=format_cid(held["result"]) if held["result"] else "",
+        promisee=parse_address(held["promisee"]),
+        promisor=parse_address(held["promisor"]),
+        lighthouse=parse_address(held["lighthouse"]),
+        lighthouse_fee=held["lighthouseFee"],
+        token=parse_address(held["token"]),
+        cost=held["cost"],
+        validator=parse_address(held["validator"]),
+        validator_fee=held["validatorFee"],
+        is_success=held["isSuccess"],
+        is_finalized=held["isFinalized"],
+    )
 
 
 def _signature_bytes(liability: str, given: str | bytes) -> bytes:

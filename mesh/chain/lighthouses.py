@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Sequence
 
     from mesh.chain.contracts import Contracts
-    from mesh.chain.records import LighthouseState
+    from mesh.chain.versions import LighthouseState
 
 
 class Lighthouses:

@@ -53,7 +53,7 @@ class ChainMetrics:
 
     async def measure(self) -> tuple[MetricFamily, ...]:
         """The figures now."""
-        counted = self._chain.node.tally.statistics()
+        counted = self._chain.node.metrics.statistics()
         fates = {fate.value: float(count) for fate, count in counted.transactions.items()}
         return (
             by_label(

@@ -94,7 +94,7 @@ class Names:
             parse_cid(name_or_cid)
             return name_or_cid
         name = parse_name(name_or_cid)
-        resolver = self._node.web3.eth.contract(self._node.checksum(await self._resolver(name)), abi=MULTIHASH_ABI)
+        resolver = self._node.contract_with_abi(await self._resolver(name), MULTIHASH_ABI)
         try:
             return format_cid(bytes(await self._node.read(resolver.functions.multihash(namehash(name)))))
         except (InvalidCid, Reverted):
@@ -124,7 +124,7 @@ async def find_registry(node: Node, ens: str) -> str:
     """
     candidates = (parse_address(ens),) if ens else (PUBLIC_REGISTRY, DEVELOPMENT_REGISTRY)
     for candidate in candidates:
-        if await node.web3.eth.get_code(node.checksum(candidate)):
+        if await node.code(candidate):
             return candidate
     raise NoContracts("ENS registry" + (f" at {ens}" if ens else ""), node.chain_id)
 

@@ -9,9 +9,7 @@ from contextlib import aclosing
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, cast
-
-from web3.exceptions import BlockNotFound
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from mesh.chain.errors import NodeUnreachable, RequestRefused
 from mesh.chain.events import ChainEvent, NewLiability, NewLighthouse, decode_log, topics_of
@@ -20,9 +18,7 @@ from schemas.address import parse_address
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Awaitable, Callable, Collection, Iterable, Sequence
 
-    from web3.types import BlockIdentifier, FilterParams
-
-    from mesh.chain.node import Node
+    from mesh.chain.node import BlockHeader, Node
 
 MAX_RANGE: Final = 2_000
 """Blocks in one request. Halved each time a node refuses, and grown by a quarter each time it answers."""
@@ -35,14 +31,6 @@ class SeenBlock:
     block_number: int
     block_hash: bytes
     events: tuple[ChainEvent, ...]
-
-
-class Head(NamedTuple):
-    """A block's place in the chain, as the chain is now."""
-
-    number: int
-    hash: bytes
-    parent: bytes
 
 
 class ReplacedWhileReading(Exception):
@@ -73,7 +61,7 @@ class RangeReader:
         self._read = read
         self._span = MAX_RANGE
 
-    async def read_to(self, first: int, head: Head) -> AsyncGenerator[SeenBlock, None]:
+    async def read_to(self, first: int, head: BlockHeader) -> AsyncGenerator[SeenBlock, None]:
         """The blocks with events from `first` to the head, and the last block of each request.
 
         The hash of a block without events is empty, but for the head's. Raises `NodeUnreachable`, `RequestRefused`,
@@ -120,26 +108,9 @@ async def read_created(node: Node, factory: str, first: int, last: int) -> list[
 async def list_created(node: Node, factory: str, from_block: int) -> list[NewLiability | NewLighthouse]:
     """What the factory created from a block to the latest one. Raises `NodeUnreachable`, `RequestRefused`."""
     ranges = RangeReader(node, partial(read_created, node, factory))
-    async with aclosing(ranges.read_to(from_block, await read_head(node))) as blocks:
+    async with aclosing(ranges.read_to(from_block, await node.latest_header())) as blocks:
         events = [event async for block in blocks for event in block.events]
     return [event for event in events if isinstance(event, NewLiability | NewLighthouse)]
-
-
-async def read_head(node: Node) -> Head:
-    """The latest block. Raises `NodeUnreachable`."""
-    head = await read_block(node, "latest")
-    if head is None:
-        raise NodeUnreachable(node.endpoint, "it has no blocks")
-    return head
-
-
-async def read_block(node: Node, identifier: BlockIdentifier) -> Head | None:
-    """A block; None if the chain does not have it."""
-    try:
-        block = await node.web3.eth.get_block(identifier)
-    except BlockNotFound:
-        return None
-    return Head(int(block["number"]), bytes(block["hash"]), bytes(block["parentHash"]))
 
 
 def _by_block(logs: Iterable[Any], last: int) -> list[SeenBlock]:
@@ -157,7 +128,7 @@ def _by_block(logs: Iterable[Any], last: int) -> list[SeenBlock]:
     return blocks
 
 
-def _with_hash_of(block: SeenBlock, head: Head) -> SeenBlock:
+def _with_hash_of(block: SeenBlock, head: BlockHeader) -> SeenBlock:
     if block.block_number != head.number or block.block_hash == head.hash:
         return block
     if block.block_hash:
@@ -169,4 +140,4 @@ async def _logs(node: Node, first: int, last: int, *, addresses: Collection[str]
     query: dict[str, Any] = {"fromBlock": first, "toBlock": last, "topics": [list(topics)]}
     if addresses:
         query["address"] = list(addresses)
-    return list(await node.web3.eth.get_logs(cast("FilterParams", query)))
+    return await node.logs(query)

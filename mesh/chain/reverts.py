@@ -14,12 +14,14 @@ from eth_abi.exceptions import DecodingError
 
 from mesh.chain.artifacts import NAMES, load_artifact, signature_of
 from mesh.chain.errors import Reverted
-from mesh.devchain.jsonrpc import REVERTED
 from schemas import keccak256
 from schemas.address import parse_address
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+REVERTED: Final = 3
+"""The JSON-RPC code that geth and anvil give to a call which the contract reverted."""
 
 PLAIN: Final = bytes.fromhex("08c379a0")
 """Selector of `Error(string)`, a revert with a text."""

@@ -111,7 +111,7 @@ class Tokens:
         """The bytes that an optional function of a token answers; none where it lacks the function."""
         call: Any = {"to": contract.address, "data": function._encode_transaction_data()}
         try:
-            return bytes(await self._contracts.node.web3.eth.call(call))
+            return await self._contracts.node.call(call)
         except (Reverted, BadFunctionCallOutput, NoContracts):
             return b""
 

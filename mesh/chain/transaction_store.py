@@ -1,8 +1,8 @@
-"""Sent transactions on disk: a file for each number of an account, held by the process that waits for it.
+"""Sent transactions on disk: a file for each nonce of an account, locked by the process that waits for it.
 
-A file's name is the number; making it is what reserves the number among all processes of the account. It is locked
-(flock) as long as its process lives and waits, so that what a process left behind can be told from what another one
-is busy with. Each line is one version of the transaction, written before it is sent.
+The name of a file is the nonce: creating it reserves the nonce among all processes of the account. It is locked
+(flock) while its process lives and waits, which tells what another process is busy with from what it left behind.
+Each line is one version of the transaction, written before it is sent.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import os
 import tempfile
 import time
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any, Final
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from mesh.chain.accounts import SignedTransaction
-from mesh.chain.pending import Pending
 from mesh.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -27,20 +27,60 @@ SUFFIX: Final = ".jsonl"
 UNFINISHED: Final = ".new"
 LOCK_ATTEMPTS: Final = 5
 LOCK_PAUSE: Final = 0.01
-"""Seconds between two attempts to lock an entry."""
+"""Seconds between two attempts to lock a file, which a reader holds for a moment only."""
+
+Effect: TypeAlias = tuple[str, str, int]
+"""What a transaction does: its recipient (empty: it deploys), its data (0x…) and its wei."""
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class PendingTransaction:
+    """A nonce of the account, and the transaction that was sent with it, in one or several versions.
+
+    The versions differ in their fees only; at most one of them is ever mined.
+    """
+
+    nonce: int
+    fields: dict[str, Any]
+    """Of the newest version, ready to be signed."""
+
+    versions: list[SignedTransaction]
+    sent_at: float = field(default_factory=time.time)
+    """When the first version was sent (Unix time, seconds)."""
+
+    is_watched: bool = True
+    """Whether a task of this process waits for it."""
+
+    locked: LockedEntry | None = None
+    """Its file in the store, while this process has it."""
+
+    @property
+    def newest(self) -> SignedTransaction:
+        """The version that was signed last."""
+        return self.versions[-1]
+
+    @property
+    def effect(self) -> Effect:
+        """What it does."""
+        return effect_of(self.fields)
+
+
+def effect_of(fields: dict[str, Any]) -> Effect:
+    """What a transaction with these fields does."""
+    return fields["to"] or "", fields["data"], fields["value"]
 
 
 class LockedEntry:
-    """One entry that this process has locked. All of it blocks for the time of a disk write."""
+    """The file of one transaction, locked by this process. Its methods block for the time of a disk write."""
 
     def __init__(self, path: Path, descriptor: int) -> None:
         self._path = path
         self._descriptor = descriptor
 
-    def append(self, entry: Pending) -> None:
-        """Add the entry's newest version."""
+    def append(self, entry: PendingTransaction) -> None:
+        """Write the newest version of the transaction."""
         with _on_disk(self._path):
-            # What was cut off, by a crash or a full disk, would make one unreadable line with the next.
+            # A line that a crash or a full disk cut off would make the next one unreadable too.
             end = os.pread(self._descriptor, os.fstat(self._descriptor).st_size, 0).rfind(b"\n") + 1
             os.ftruncate(self._descriptor, end)
             os.lseek(self._descriptor, end, os.SEEK_SET)
@@ -50,11 +90,11 @@ class LockedEntry:
             os.fsync(self._descriptor)
 
     def release(self) -> None:
-        """Leave the entry to whoever takes it up."""
+        """Unlock the file; another process may lock it."""
         os.close(self._descriptor)
 
     def remove(self) -> None:
-        """End the entry."""
+        """Delete the file, and unlock it."""
         try:
             with _on_disk(self._path):
                 self._path.unlink(missing_ok=True)
@@ -63,9 +103,9 @@ class LockedEntry:
 
 
 class TransactionStore:
-    """The folder of an account's entries on one chain. Raises `ConfigurationError` where it can't be written.
+    """The folder with an account's sent transactions on one chain. Raises `ConfigurationError` if it can't be written.
 
-    Not for network file systems, whose locks may not be seen by others.
+    Not for network file systems, whose locks other machines may not see.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -73,51 +113,53 @@ class TransactionStore:
         with _on_disk(folder / "x"):
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)
 
-    def add(self, entry: Pending) -> LockedEntry | None:
-        """Make the entry of a number and hold it; None if the number has one."""
+    def add(self, entry: PendingTransaction) -> LockedEntry | None:
+        """Create and lock the file of a nonce; None if it exists."""
         path = self._path(entry.nonce)
         with _on_disk(path):
             descriptor, unfinished = tempfile.mkstemp(suffix=UNFINISHED, dir=self._folder)
-        hold = LockedEntry(path, descriptor)
+        locked = LockedEntry(path, descriptor)
         try:
-            hold.append(entry)
+            locked.append(entry)
             with _on_disk(path):
                 fcntl.flock(descriptor, fcntl.LOCK_EX)
-                # The entry is whole and locked before others can see it.
+                # The file is complete and locked before others can see it.
                 if not _linked(unfinished, path):
-                    hold.release()
+                    locked.release()
                     return None
         except BaseException:
-            hold.release()
+            locked.release()
             raise
         finally:
-            with suppress(OSError):  # what was in the way is told already
+            with suppress(OSError):  # whatever is wrong with the disk was raised above
                 os.unlink(unfinished)
-        return hold
+        return locked
 
-    def hold(self, entry: Pending) -> LockedEntry | None:
-        """LockedEntry the entry that a number has; None if there is none, or another process holds it."""
+    def lock(self, entry: PendingTransaction) -> LockedEntry | None:
+        """Lock the file of a nonce; None if there is none, or another process has locked it."""
         path = self._path(entry.nonce)
         for attempt in range(LOCK_ATTEMPTS):
             with _on_disk(path):
-                descriptor = _locked(path, fcntl.LOCK_EX)
+                descriptor = lock_file(path, fcntl.LOCK_EX)
             if descriptor is not None:
                 return LockedEntry(path, descriptor)
             if attempt and not path.exists():
                 break
-            # A reader has it for a moment only.
             time.sleep(LOCK_PAUSE)
         return None
 
-    def read(self, mine: Collection[int]) -> tuple[list[Pending], frozenset[int]]:
-        """What nobody holds, and the numbers that other processes hold; `mine` are this one's, and left out."""
+    def read(self, mine: Collection[int]) -> tuple[list[PendingTransaction], frozenset[int]]:
+        """The transactions that no process has locked, and the nonces of those that others have.
+
+        `mine` are the nonces that this process has locked; they are left out.
+        """
         left, elsewhere = [], set()
         for path in sorted(self._folder.glob(f"*{SUFFIX}")):
             nonce = int(path.stem)
             if nonce in mine:
                 continue
             with _on_disk(path):
-                descriptor = _locked(path, fcntl.LOCK_SH)
+                descriptor = lock_file(path, fcntl.LOCK_SH)
             if descriptor is not None:
                 try:
                     with _on_disk(path):
@@ -132,9 +174,24 @@ class TransactionStore:
         return self._folder / f"{nonce:012}{SUFFIX}"
 
 
+def lock_file(path: Path, operation: int) -> int | None:
+    """Open a file and lock it by a `flock` operation; its descriptor, None if it is missing or locked by another."""
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_APPEND)
+    except FileNotFoundError:
+        return None
+    with suppress(BlockingIOError, FileNotFoundError):
+        fcntl.flock(descriptor, operation | fcntl.LOCK_NB)
+        # It may have been deleted and created again between opening and locking.
+        if os.stat(path).st_ino == os.fstat(descriptor).st_ino:
+            return descriptor
+    os.close(descriptor)
+    return None
+
+
 @contextmanager
 def _on_disk(path: Path) -> Iterator[None]:
-    """Work on the entry at `path`. Raises `ConfigurationError` where the disk does not let it."""
+    """Work on the file at `path`. Raises `ConfigurationError` if the disk refuses."""
     try:
         yield
     except OSError as error:
@@ -145,7 +202,7 @@ def _on_disk(path: Path) -> Iterator[None]:
 
 
 def _linked(unfinished: str, path: Path) -> bool:
-    """Give a whole entry its name; False when there is one of that name."""
+    """Give a complete file its name; False if the name is taken."""
     try:
         os.link(unfinished, path)
     except FileExistsError:
@@ -153,15 +210,14 @@ def _linked(unfinished: str, path: Path) -> bool:
     return True
 
 
-def _line(entry: Pending) -> bytes:
-    signed = entry.versions[-1]
+def _line(entry: PendingTransaction) -> bytes:
     fields = entry.fields | {"to": entry.fields["to"] or ""}
-    held = {"sentAt": entry.sent_at, "hash": signed.hash, "raw": signed.raw.hex(), "fields": fields}
-    return json.dumps(held).encode() + b"\n"
+    line = {"sentAt": entry.sent_at, "hash": entry.newest.hash, "raw": entry.newest.raw.hex(), "fields": fields}
+    return json.dumps(line).encode() + b"\n"
 
 
-def _parse(nonce: int, path: Path) -> Pending:
-    """The entry in a file. A last line that was cut off was not sent yet; the first one never is."""
+def _parse(nonce: int, path: Path) -> PendingTransaction:
+    """The transaction in a file. A last line that was cut off was not sent; the first line never is cut off."""
     lines: list[dict[str, Any]] = []
     with suppress(ValueError):
         for line in path.read_text(encoding="utf-8").splitlines():
@@ -170,19 +226,6 @@ def _parse(nonce: int, path: Path) -> Pending:
         raise ConfigurationError(f"{path} holds no sent transaction", hint="it is damaged; move it away")
     fields = lines[-1]["fields"] | {"to": lines[-1]["fields"]["to"] or b""}
     versions = [SignedTransaction(raw=bytes.fromhex(line["raw"]), hash=line["hash"]) for line in lines]
-    return Pending(nonce=nonce, fields=fields, versions=versions, sent_at=lines[0]["sentAt"], is_watched=False)
-
-
-def _locked(path: Path, how: int) -> int | None:
-    """The opened and locked file; None if there is none, or somebody has it."""
-    try:
-        descriptor = os.open(path, os.O_RDWR | os.O_APPEND)
-    except FileNotFoundError:
-        return None
-    with suppress(BlockingIOError, FileNotFoundError):
-        fcntl.flock(descriptor, how | fcntl.LOCK_NB)
-        # It may have been ended, and made again, between the opening and the lock.
-        if os.stat(path).st_ino == os.fstat(descriptor).st_ino:
-            return descriptor
-    os.close(descriptor)
-    return None
+    return PendingTransaction(
+        nonce=nonce, fields=fields, versions=versions, sent_at=lines[0]["sentAt"], is_watched=False
+    )

@@ -1,30 +1,32 @@
-"""Sending transactions: simulate, price, number, sign here, send raw, wait until mined.
+"""Sending transactions: simulate, price, number, sign, send, wait until mined.
 
-The node never sees a key. A transaction that the contract would refuse is not sent at all: the estimate of its gas is
-the simulation, and raises `Reverted`.
+The node never sees a key. A transaction that the contract would refuse is not sent: the estimate of its gas is the
+simulation, and raises `Reverted`. Waiting is in `mesh.chain.confirmation`.
 """
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import logging
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from mesh.chain.errors import InsufficientFunds, NodeUnreachable, RequestRefused, Reverted
-from mesh.chain.node_metrics import TransactionOutcome
-from mesh.chain.pending import Pending, PendingTransactions, effect_of
-from mesh.chain.submission import (
-    count_all,
-    count_mined,
+from mesh.chain.confirmation import (
+    Confirmation,
+    NonceLost,
     find_receipt,
     is_known,
-    is_number_taken,
+    is_nonce_taken,
     is_waiting_elsewhere,
     submit,
 )
-from mesh.chain.watching import NumberLost, Watch
+from mesh.chain.errors import FeeTooHigh, InsufficientFunds, NodeUnreachable, RequestRefused, Reverted
+from mesh.chain.node_metrics import TransactionOutcome
+from mesh.chain.transaction_store import PendingTransaction, effect_of
+from mesh.retry import Backoff, RetryPolicy
+from mesh.telemetry.context import log_event
 from schemas.address import parse_address
 
 if TYPE_CHECKING:
@@ -33,21 +35,24 @@ if TYPE_CHECKING:
 
     from mesh.chain.accounts import Account, SignedTransaction
     from mesh.chain.node import Node
+    from mesh.chain.pending import PendingTransactions
+    from mesh.chain.policy import Fees
+    from mesh.errors import ChainError
 
 log = logging.getLogger(__name__)
 
 GAS_MARGIN_PERCENT: Final = 20
-"""Gas given above the estimate: the state may move on until the transaction is mined. What is not used is kept."""
+"""Gas above the estimate: the state may change until the transaction is mined. Unused gas costs nothing."""
 
-NONCE_ATTEMPTS: Final = 25
-"""How often a number that another client took meanwhile is replaced."""
+NONCE_RETRY: Final = RetryPolicy(initial=0.0, ceiling=0.0, attempts=25)
+"""For a nonce that another client of the account used first: the next one is tried without waiting."""
 
 
 @dataclass(frozen=True, slots=True)
 class Receipt:
-    """A mined transaction that went through. `contract` is what it deployed, if anything; logs as web3 gives them.
+    """A mined transaction that succeeded. `contract` is what it deployed, if anything; `logs` as web3 gives them.
 
-    `wei` is what its gas has cost.
+    `wei` is what its gas cost.
     """
 
     tx: str
@@ -61,14 +66,14 @@ class Receipt:
 class TransactionSender:
     """Sends transactions of one account; safe to use from many tasks of one event loop at once.
 
-    Transactions of one account through one node are numbered one after another under a lock; with the node's journal,
-    so are those of all processes that share it. Without, other clients of the account get in each other's way, but
-    not lost.
+    Transactions of one account through one node are numbered one after another under a lock; with the node's
+    transaction folder, so are those of all processes that share it. Without it, other clients of the account may use
+    the same nonces: then a transaction is sent again with the next nonce.
 
-    A transaction whose outcome was not learned - its sender lost the node, gave up waiting or was cancelled, or its
-    process ended, where there is a journal - is kept. Sending the same again (to the same, with the same data and
-    value) takes it up instead of making a second one, as long as it is not mined, or not for longer than
-    `Timing.repeat_within`. One that the node has forgotten meanwhile gives its number to the next.
+    A transaction with an unknown outcome is kept: its sender lost the node, gave up waiting or was cancelled, or (with
+    a transaction folder) its process ended. Sending the same again (same recipient, data and value) continues with it
+    instead of sending a second one, unless it was mined more than `Timing.repeat_within` ago. The nonce of one that the
+    node has forgotten is used for the next.
     """
 
     def __init__(self, node: Node, account: Account) -> None:
@@ -80,116 +85,165 @@ class TransactionSender:
         return await self.send(to=function.address, data=bytes.fromhex(function._encode_transaction_data()[2:]))
 
     async def send(self, *, to: str | None, data: bytes, value: int = 0) -> Receipt:
-        """Send `data` and `value` (wei) to an address, or deploy `data` where `to` is None; wait until it is mined.
+        """Send `data` and `value` (wei) to an address, or deploy `data` if `to` is None; wait until it is mined.
 
         Raises `Reverted` (before anything is sent, or once it is mined and failed), `InsufficientFunds`, `FeeTooHigh`
         (nothing was sent), `TransactionTimeout`, `NodeUnreachable`, `RequestRefused`.
         """
-        outbox = self._node.outbox(self.account.address)
+        pending = self._node.pending_transactions(self.account.address)
         fields: dict[str, Any] = {"to": to or b"", "data": "0x" + data.hex(), "value": value}
         while True:
-            entry = await self._taken_up(outbox, fields) or await self._sent(outbox, fields)
+            entry = await self._sent_before(pending, fields) or await self._send_new(pending, fields)
             try:
-                signed, receipt = await Watch(self._node, self.account, outbox, entry).mined()
-                await outbox.forget(entry)
-            except NumberLost:
-                log.info("the number %d was another transaction's; sending with the next", entry.nonce)
-                await outbox.forget(entry)
-                self._node.tally.count(TransactionOutcome.LOST)
+                signed, receipt = await Confirmation(self._node, self.account, pending, entry).wait()
+                await pending.forget(entry)
+            except NonceLost:
+                log.info(
+                    "nonce %d was used by another transaction; sending with the next",
+                    entry.nonce,
+                    extra=log_event("transaction-nonce-lost", tx=entry.newest.hash, nonce=entry.nonce),
+                )
+                await pending.forget(entry)
+                self._node.metrics.count(TransactionOutcome.LOST)
                 continue
             finally:
-                outbox.abandon(entry)
-            went_through = receipt["status"] == 1
-            self._node.tally.count(TransactionOutcome.MINED if went_through else TransactionOutcome.FAILED)
-            self._node.tally.paid(gas_used=int(receipt["gasUsed"]), wei=_wei(receipt))
-            if not went_through:
-                raise await self._why_failed(entry.fields, receipt)
-            return _receipt(signed, receipt)
+                pending.abandon(entry)
+            return await self._outcome(entry, signed, receipt)
 
-    async def _taken_up(self, outbox: PendingTransactions, fields: dict[str, Any]) -> Pending | None:
-        """The transaction that was sent before to the same effect, and that nobody watches; None if there is none."""
-        async with outbox.lock:
-            await outbox.refresh()
-            if not outbox.abandoned:
-                return None
-            mined = await count_mined(self._node, self.account.address)
-            for entry in outbox.abandoned:
-                if entry.nonce < mined and entry.sent_at + self._node.timing.repeat_within < time.time():
-                    await outbox.forget(entry)
-                elif entry.effect == effect_of(fields) and await self._is_alive(entry) and await outbox.take_up(entry):
-                    log.info("the transaction %s was sent before; waiting for it", entry.versions[-1].hash)
-                    return entry
-        return None
-
-    async def _is_alive(self, entry: Pending) -> bool:
-        """Whether a transaction is mined or can be, once the node has it (again)."""
-        if await find_receipt(self._node, reversed(entry.versions)) is not None:
-            return True
-        try:
-            await submit(self._node, entry.versions[-1])
-        except RequestRefused:
-            return await is_known(self._node, entry.versions)
-        return True
-
-    async def _sent(self, outbox: PendingTransactions, fields: dict[str, Any]) -> Pending:
-        """The transaction, simulated, priced and sent."""
-        gas = await self._estimate(fields)
+    async def _send_new(self, pending: PendingTransactions, fields: dict[str, Any]) -> PendingTransaction:
+        """Simulate, price, number, sign and send a transaction."""
+        gas = await self._simulate(fields)
         limit = gas + gas * GAS_MARGIN_PERCENT // 100
-        fees = await self._node.fees.fees(self._node)
+        fees = await self._affordable_fees()
         complete = fields | fees.fields() | {"gas": limit, "chainId": self._node.chain_id}
-        async with outbox.lock:
-            return await self._send_numbered(outbox, complete)
+        async with pending.lock:
+            return await self._send_numbered(pending, complete)
 
-    async def _estimate(self, fields: dict[str, Any]) -> int:
-        """Gas in the state that the account's own pending transactions leave."""
+    async def _simulate(self, fields: dict[str, Any]) -> int:
+        """The gas that a transaction takes after the account's pending ones. Raises `Reverted` if it would fail."""
         try:
-            return int(await self._node.web3.eth.estimate_gas(self._call(fields), "pending"))
+            return await self._node.estimate_gas(self._call(fields))
         except RequestRefused as refused:
             await self._raise_if_poor(fields, refused)
             raise
         except Reverted:
-            self._node.tally.count(TransactionOutcome.REFUSED)
+            self._node.metrics.count(TransactionOutcome.REFUSED)
             raise
 
-    async def _send_numbered(self, outbox: PendingTransactions, fields: dict[str, Any]) -> Pending:
-        """Sign with the next number and send; again where another client was faster."""
-        refused_numbers: set[int] = set()
-        for attempt in range(1, NONCE_ATTEMPTS + 1):
-            nonce = await self._next_nonce(outbox, refused_numbers)
-            signed = self.account.sign_transaction(fields | {"nonce": nonce})
-            entry = Pending(nonce=nonce, fields=fields, versions=[signed])
-            if not await outbox.add(entry):
-                continue
+    async def _affordable_fees(self) -> Fees:
+        """What to offer now; waits up to `FeePolicy.patience` for the price to come down. Raises `FeeTooHigh`."""
+        policy, loop = self._node.fees, asyncio.get_running_loop()
+        until = loop.time() + policy.patience
+        while True:
             try:
-                await submit(self._node, signed)
-            except RequestRefused as refused:
-                await outbox.forget(entry)
-                await self._raise_if_poor(fields, refused)
-                if attempt == NONCE_ATTEMPTS or not is_number_taken(refused):
+                return policy.offer(await self._node.gas_market())
+            except FeeTooHigh:
+                if loop.time() >= until:
                     raise
-                if is_waiting_elsewhere(refused):
-                    refused_numbers.add(nonce)
-                log.debug("%s: the number %d was taken; trying the next", self.account.address, nonce)
-            except BaseException:
-                # It may have arrived.
-                outbox.abandon(entry)
-                raise
-            else:
-                self._node.tally.count(TransactionOutcome.SENT)
-                return entry
-        raise NodeUnreachable(self._node.endpoint, "other clients of the account take all its numbers")
+            await asyncio.sleep(self._node.timing.poll_interval)
 
-    async def _next_nonce(self, outbox: PendingTransactions, refused: set[int]) -> int:
-        """The first number that no transaction has, of those that the node knows and of those sent by us."""
-        await outbox.refresh()
-        counted = await count_all(self._node, self.account.address)
-        # A node behind a balancer may not have heard of what was just sent through another.
-        left = [entry.nonce for entry in outbox.abandoned if await self._is_waiting(entry, counted)]
-        taken = {*outbox.taken, *left, *refused}
-        return next(number for number in itertools.count(counted) if number not in taken)
+    async def _send_numbered(self, pending: PendingTransactions, fields: dict[str, Any]) -> PendingTransaction:
+        """Sign with the next nonce and send; again if another client was faster."""
+        refused_nonces: set[int] = set()
+        backoff = Backoff(NONCE_RETRY)
+        failure: ChainError = NodeUnreachable(self._node.endpoint, "other clients of the account take all its nonces")
+        while True:
+            nonce = await self._next_nonce(pending, refused_nonces)
+            signed = self.account.sign_transaction(fields | {"nonce": nonce})
+            entry = PendingTransaction(nonce=nonce, fields=fields, versions=[signed])
+            if await pending.add(entry):
+                try:
+                    await submit(self._node, signed)
+                except RequestRefused as refused:
+                    await pending.forget(entry)
+                    await self._raise_if_poor(fields, refused)
+                    if not is_nonce_taken(refused):
+                        raise
+                    if is_waiting_elsewhere(refused):
+                        refused_nonces.add(nonce)
+                    failure = refused
+                except BaseException:
+                    pending.abandon(entry)  # the node may have it
+                    raise
+                else:
+                    self._node.metrics.count(TransactionOutcome.SENT)
+                    return entry
+            log.debug("%s: nonce %d was taken; trying the next", self.account.address, nonce)
+            if not await backoff.wait():
+                raise failure
 
-    async def _is_waiting(self, entry: Pending, counted: int) -> bool:
-        return entry.nonce >= counted and await is_known(self._node, entry.versions)
+    async def _next_nonce(self, pending: PendingTransactions, refused: set[int]) -> int:
+        """The first nonce that no transaction has, neither of those that the node knows nor of those we sent."""
+        await pending.refresh()
+        counted = await self._node.transaction_count(self.account.address, pending=True)
+        # A node behind a load balancer may not know what was just sent through another.
+        waiting = [
+            entry.nonce
+            for entry in pending.abandoned
+            if entry.nonce >= counted and await is_known(self._node, entry.versions)
+        ]
+        taken = {*pending.taken, *waiting, *refused}
+        return next(nonce for nonce in itertools.count(counted) if nonce not in taken)
+
+    async def _sent_before(self, pending: PendingTransactions, fields: dict[str, Any]) -> PendingTransaction | None:
+        """The same transaction, sent before and waited for by nobody, if it is mined or can be."""
+        async with pending.lock:
+            await pending.refresh()
+            if not pending.abandoned:
+                return None
+            mined = await self._node.transaction_count(self.account.address)
+            for entry in pending.abandoned:
+                if entry.nonce < mined and entry.sent_at + self._node.timing.repeat_within < time.time():
+                    await pending.forget(entry)
+                elif (
+                    entry.effect == effect_of(fields) and await self._is_alive(entry) and await pending.take_over(entry)
+                ):
+                    log.info(
+                        "the transaction %s was sent before; waiting for it",
+                        entry.newest.hash,
+                        extra=log_event("transaction-resumed", tx=entry.newest.hash),
+                    )
+                    return entry
+        return None
+
+    async def _is_alive(self, entry: PendingTransaction) -> bool:
+        """Whether a transaction is mined, or can be now that the node has it (again)."""
+        if await find_receipt(self._node, reversed(entry.versions)) is not None:
+            return True
+        try:
+            await submit(self._node, entry.newest)
+        except RequestRefused:
+            return await is_known(self._node, entry.versions)
+        return True
+
+    async def _outcome(self, entry: PendingTransaction, signed: SignedTransaction, receipt: TxReceipt) -> Receipt:
+        """The receipt of a mined transaction. Raises `Reverted` if it failed."""
+        gas_used, contract = int(receipt["gasUsed"]), receipt["contractAddress"]
+        wei = gas_used * int(receipt["effectiveGasPrice"])
+        succeeded = receipt["status"] == 1
+        self._node.metrics.count(TransactionOutcome.MINED if succeeded else TransactionOutcome.FAILED)
+        self._node.metrics.paid(gas_used=gas_used, wei=wei)
+        if not succeeded:
+            why = await self._why_failed(entry.fields, receipt)
+            raise Reverted(why.reason, arguments=why.arguments, data=why.data, gas_used=gas_used, wei=wei)
+        return Receipt(
+            tx=signed.hash,
+            block_number=int(receipt["blockNumber"]),
+            gas_used=gas_used,
+            wei=wei,
+            contract=None if contract is None else parse_address(contract),
+            logs=tuple(receipt["logs"]),
+        )
+
+    async def _why_failed(self, fields: dict[str, Any], receipt: TxReceipt) -> Reverted:
+        """Why a mined transaction failed although its simulation succeeded: asked of the state after its block."""
+        try:
+            await self._node.call(self._call(fields), block=receipt["blockNumber"])
+        except Reverted as why:
+            return why
+        except RequestRefused as refused:
+            return Reverted(refused.detail)
+        return Reverted("OutOfGas" if receipt["gasUsed"] >= fields["gas"] else "")
 
     async def _raise_if_poor(self, fields: dict[str, Any], refused: RequestRefused) -> None:
         balance = await self._node.eth_balance(self.account.address)
@@ -197,35 +251,7 @@ class TransactionSender:
         if balance < needed:
             raise InsufficientFunds(self.account.address, balance=balance, needed=needed) from refused
 
-    async def _why_failed(self, fields: dict[str, Any], receipt: TxReceipt) -> Reverted:
-        """Why a mined transaction failed though its simulation went through: asked of the state after its block."""
-        gas_used, wei = int(receipt["gasUsed"]), _wei(receipt)
-        try:
-            await self._node.web3.eth.call(self._call(fields), receipt["blockNumber"])
-        except Reverted as why:
-            return Reverted(why.reason, arguments=why.arguments, data=why.data, gas_used=gas_used, wei=wei)
-        except RequestRefused as refused:
-            return Reverted(refused.detail, gas_used=gas_used, wei=wei)
-        return Reverted("OutOfGas" if gas_used >= fields["gas"] else "", gas_used=gas_used, wei=wei)
-
     def _call(self, fields: dict[str, Any]) -> TxParams:
         """The same as a call, without prices: a simulation is not paid for."""
         call = {"from": self.account.address, "data": fields["data"], "value": fields["value"]}
         return cast("TxParams", call | ({"to": fields["to"]} if fields["to"] else {}))
-
-
-def _receipt(signed: SignedTransaction, receipt: TxReceipt) -> Receipt:
-    contract = receipt["contractAddress"]
-    return Receipt(
-        tx=signed.hash,
-        block_number=int(receipt["blockNumber"]),
-        gas_used=int(receipt["gasUsed"]),
-        wei=_wei(receipt),
-        contract=None if contract is None else parse_address(contract),
-        logs=tuple(receipt["logs"]),
-    )
-
-
-def _wei(receipt: TxReceipt) -> int:
-    """What a mined transaction's gas has cost."""
-    return int(receipt["gasUsed"]) * int(receipt["effectiveGasPrice"])

@@ -7,11 +7,12 @@ originals themselves were not at hand: their versions are tested against our con
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 from mesh.chain.errors import NotOffered
-from mesh.chain.records import LighthouseState, lighthouse_state
 from mesh.errors import ConfigurationError, InvalidMessage
+from schemas.address import ZERO_ADDRESS, parse_address
 from schemas.cid import parse_cid
 
 if TYPE_CHECKING:
@@ -20,15 +21,15 @@ if TYPE_CHECKING:
     from mesh.chain.node import Node
     from schemas.messages import Order, Result
 
-Kind = Literal["mesh", "original"]
+ContractKind = Literal["mesh", "original"]
 """Ours, or what was there before."""
 
 AGREE: Final = True
 """A provider has no opinion of a result: only a validator, who finalizes himself, can disagree."""
 
 
-class Members(NamedTuple):
-    """What a lighthouse calls things, and how its turns are counted."""
+class LighthouseGetters(NamedTuple):
+    """The names of a lighthouse's getters, and how its turns are counted."""
 
     length: str
     at: str
@@ -37,14 +38,38 @@ class Members(NamedTuple):
     timeout_blocks: str
     keep_alive_block: str
     first: int
-    """The marker of the first member."""
+    """The marker of the first provider."""
 
 
-NAMES: Final = {
-    3: Members("membersLength", "members", "balances", "minimalFreeze", "timeoutBlocks", "keepaliveBlock", first=0),
-    5: Members("providersLength", "providers", "stakes", "minimalStake", "timeoutInBlocks", "keepAliveBlock", first=1),
+GETTERS: Final = {
+    3: LighthouseGetters(
+        "membersLength", "members", "balances", "minimalFreeze", "timeoutBlocks", "keepaliveBlock", first=0
+    ),
+    5: LighthouseGetters(
+        "providersLength", "providers", "stakes", "minimalStake", "timeoutInBlocks", "keepAliveBlock", first=1
+    ),
 }
 GAS_OF: Final = {3: "gasUtilizing", 5: "gasConsumedOf"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LighthouseState:
+    """A lighthouse as it stands: stakes in wn, times in blocks, heights as block numbers."""
+
+    address: str
+    minimal_stake: int
+    timeout_blocks: int
+    keep_alive_block: int
+    """The last block in which the provider whose turn it is sent something."""
+
+    quota: int
+    """Transactions that are left of the turn."""
+
+    current: str
+    """Whose turn it is; the zero address where nobody staked."""
+
+    stakes: dict[str, int]
+    """Providers in the order of their turns, with what each staked."""
 
 
 class ContractVersion:
@@ -100,7 +125,7 @@ class ContractVersion:
 
     async def state(self, lighthouse: str) -> LighthouseState:
         """The state of a lighthouse, as of one block. Raises `NoContracts` if there is none."""
-        return await lighthouse_state(self._node, lighthouse, NAMES[5], current="current")
+        return await lighthouse_state(self._node, lighthouse, GETTERS[5], current="current")
 
     async def is_turn(self, lighthouse: str, provider: str) -> bool:
         """Whether a provider may send in the next block."""
@@ -158,7 +183,7 @@ class OriginalContracts(ContractVersion):
         return bool(await self._node.read(self._factory.isHashConsumed(order_hash)))
 
     async def state(self, lighthouse: str) -> LighthouseState:
-        return await lighthouse_state(self._node, lighthouse, NAMES[self.generation], current="marker")
+        return await lighthouse_state(self._node, lighthouse, GETTERS[self.generation], current="marker")
 
     async def is_turn(self, lighthouse: str, provider: str) -> bool:
         """By the rule of the originals: who the marker is at, and anybody after a timeout of silence."""
@@ -171,9 +196,9 @@ class OriginalContracts(ContractVersion):
         return int(await self._node.read(gas_of(address))) > 0
 
 
-def contract_version(kind: Kind, node: Node, factory: str, generation: int) -> ContractVersion:
+def contract_version(kind: ContractKind, node: Node, factory: str, generation: int) -> ContractVersion:
     """The version of a kind. Raises `ConfigurationError`."""
-    if generation not in NAMES or kind not in ("mesh", "original"):
+    if generation not in GETTERS or kind not in ("mesh", "original"):
         raise ConfigurationError(
             f"there are no {kind} contracts of generation {generation}",
             hint='contracts are "mesh" or "original", generations 3 or 5',
@@ -184,3 +209,29 @@ def contract_version(kind: Kind, node: Node, factory: str, generation: int) -> C
 def result_arguments(result: Result) -> tuple[bytes, bool, bytes]:
     """A signed result as the contracts take it."""
     return parse_cid(result.result), result.success, bytes.fromhex(result.signature)
+
+
+async def lighthouse_state(node: Node, address: str, names: LighthouseGetters, *, current: str) -> LighthouseState:
+    """The state of a lighthouse, as of one block. Raises `NoContracts` if there is none, `NodeUnreachable`.
+
+    `current` is the getter of whose turn it is: of the provider's address, or of its place (`marker`).
+    """
+    block = await node.block_number()
+    functions = node.contract("Lighthouse", address).functions
+    count = await node.read(functions[names.length](), block=block)
+    found = await node.read_all((functions[names.at](index) for index in range(count)), block=block)
+    stakes = await node.read_all((functions[names.stake](provider) for provider in found), block=block)
+    getters = (names.minimal_stake, names.timeout_blocks, names.keep_alive_block, "quota", current)
+    values = await node.read_all((functions[getter]() for getter in getters), block=block)
+    minimal_stake, timeout_blocks, keep_alive_block, quota, whose = values
+    if current == "marker":
+        whose = found[(whose - names.first) % count] if count else ZERO_ADDRESS
+    return LighthouseState(
+        address=address,
+        minimal_stake=minimal_stake,
+        timeout_blocks=timeout_blocks,
+        keep_alive_block=keep_alive_block,
+        quota=quota,
+        current=parse_address(whose),
+        stakes={parse_address(provider): stake for provider, stake in zip(found, stakes, strict=True)},
+    )

@@ -107,7 +107,7 @@ async def _check_affordable(node: Node, account: Account) -> None:
     from mesh.chain import InsufficientFunds
 
     balance = await node.eth_balance(account.address)
-    needed = DEPLOYMENT_GAS * int(await node.web3.eth.gas_price)
+    needed = DEPLOYMENT_GAS * await node.gas_price()
     if balance < needed:
         raise InsufficientFunds(account.address, balance=balance, needed=needed)
 
@@ -189,15 +189,14 @@ async def _status(settings: Settings, as_json: bool) -> None:
 
 
 async def _node_facts(node: Node, account: str | None) -> dict[str, Any]:
-    block = await node.web3.eth.get_block("latest")
-    base_fee = block.get("baseFeePerGas")
+    block = await node.latest_header()
     return {
         "node": node.endpoint,
-        "client": printable(str(await node.web3.client_version)),
+        "client": printable(await node.client_version()),
         "chainId": node.chain_id,
-        "blockNumber": int(block["number"]),
-        "blockTime": int(block["timestamp"]),
-        "baseFee": None if base_fee is None else str(int(base_fee)),
+        "blockNumber": block.number,
+        "blockTime": block.timestamp,
+        "baseFee": None if block.base_fee is None else str(block.base_fee),
         "account": account,
         "wei": None if account is None else str(await node.eth_balance(account)),
     }
@@ -205,7 +204,6 @@ async def _node_facts(node: Node, account: str | None) -> dict[str, Any]:
 
 async def _contract_facts(chain: Chain, lighthouse: str, account: str | None) -> dict[str, Any]:
     from mesh.chain import UnknownName
-    from mesh.chain.recognition import is_ours
 
     try:
         address: str | None = await chain.names.lighthouse(lighthouse)
@@ -215,7 +213,7 @@ async def _contract_facts(chain: Chain, lighthouse: str, account: str | None) ->
         "ens": chain.ens,
         "factory": chain.factory,
         "xrt": chain.xrt,
-        "isOurCode": await is_ours(chain),
+        "isOurCode": await chain.has_mesh_contracts(),
         "lighthouse": address,
         "lighthouseName": lighthouse,
         "wn": None if account is None else str(await chain.tokens.balance(account)),

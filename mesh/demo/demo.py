@@ -15,7 +15,7 @@ from mesh.background import Background
 from mesh.chain import XRT
 from mesh.demo.lamp import BLINK_SECONDS, Lamp, write_objective
 from mesh.devchain import EmbeddedChain
-from mesh.devchain.market import ROLES, Market, found_market
+from mesh.devchain.development import ROLES, DevelopmentMarket, deploy_market
 from mesh.errors import ConfigurationError, InputError, RemoteError
 from mesh.market.provider import Provider
 from mesh.network import Endpoints, Network, free_endpoint
@@ -70,7 +70,7 @@ class Demo:
         self._match: Match | None = None
         self._success = False
         self._finalized = asyncio.Event()
-        self._market: Market
+        self._market: DevelopmentMarket
         self._person: Agent
 
     async def run(self) -> None:
@@ -115,7 +115,7 @@ class Demo:
         router = f"Zenoh router at {self._endpoint}, id {network.id}"
         self._narrator.event("market", "router", router, endpoint=self._endpoint, zid=network.id)
         node = await stack.enter_async_context(EmbeddedChain())
-        self._market = await found_market(node.provider, node.funded_keys)
+        self._market = await deploy_market(node.provider, node.funded_keys)
         self._report_contracts()
         await self._open_provider(stack, node.provider)
         await self._open_agent(stack, node.provider, "robot", folder)

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NoReturn
 
 from mesh.background import Background
-from mesh.devchain.anvil_state import STATE_SECONDS, keep_state, prepare_state, settle_state
+from mesh.devchain.anvil_state import STATE_SECONDS, copy_states, prepare_state, settle_state
 from mesh.errors import ConfigurationError, RemoteError
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ async def serve_anvil(
         tasks = await stack.enter_async_context(Background())
         tasks.start(node.watch(), "watch over anvil")
         if state is not None:
-            tasks.start(keep_state(state), "copies of the chain")
+            tasks.start(copy_states(state), "copies of the chain")
         yield node
 
 

@@ -1,4 +1,4 @@
-"""A chain to develop on, served to other processes, with keyfiles for who uses it."""
+"""A chain to develop on with a market on it, served to other processes, and keyfiles for its accounts."""
 
 from __future__ import annotations
 
@@ -6,38 +6,71 @@ import asyncio
 import secrets
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
-from mesh.chain import NoContracts, write_keyfile
-from mesh.devchain import serve_embedded
+from mesh.chain import (
+    XRT,
+    Account,
+    Chain,
+    Deployment,
+    DeploymentPlan,
+    NoContracts,
+    Node,
+    Timing,
+    deploy,
+    namehash,
+    write_keyfile,
+)
 from mesh.devchain.anvil import serve_anvil
-from mesh.devchain.anvil_state import founding
-from mesh.devchain.market import ROLES, Market, find_market, found_market
+from mesh.devchain.anvil_state import deploying
+from mesh.devchain.embedded import serve_embedded
 from mesh.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Sequence
     from pathlib import Path
 
-    from mesh.settings import Settings
+    from web3.providers.async_base import AsyncBaseProvider
+
+    from mesh.settings import StorageSettings
+
+ROLES: Final = ("provider", "robot", "person")
+"""The roles that have an account, in the order of the development chain's keys."""
+ALLOWANCE: Final = 1_000 * XRT
+"""What person and robot start with, wn."""
+STAKE: Final = 100 * XRT
+"""What the provider stakes, wn: a hundred transactions a turn."""
+TIMING: Final = Timing(poll_interval=0.1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DevelopmentMarket:
+    """The contracts on a development chain, and an account for each role."""
+
+    deployment: Deployment
+    accounts: dict[str, Account]
+
+    def chain(self, endpoint: str | AsyncBaseProvider, role: str) -> Chain:
+        """The chain as `role` uses it, not yet open."""
+        return Chain(endpoint, account=self.accounts[role], ens=self.deployment.ens, timing=TIMING)
 
 
 @dataclass(frozen=True, kw_only=True)
 class DevelopmentChain:
-    """A served chain: where it is, what is on it, and the folder of the keyfiles and their password."""
+    """A served chain: its address, the market on it, and the folder with the keyfiles and their password."""
 
     url: str
-    """JSON-RPC over HTTP; over a WebSocket it is at the same port."""
+    """JSON-RPC over HTTP; a WebSocket is served at the same port."""
 
     engine: str
-    """What runs it, for people to read."""
+    """The program that runs it, for people to read."""
 
-    market: Market
+    market: DevelopmentMarket
     keys: Path
 
     @property
     def ws_url(self) -> str:
-        """The same for clients that subscribe to events, e.g. `ws://127.0.0.1:8545`."""
+        """The address for clients that subscribe to events, e.g. `ws://127.0.0.1:8545`."""
         return self.url.replace("http", "ws", 1)
 
     def describe(self) -> str:
@@ -74,9 +107,51 @@ class DevelopmentChain:
         }
 
 
+async def deploy_market(endpoint: str | AsyncBaseProvider, keys: Sequence[bytes]) -> DevelopmentMarket:
+    """Deploy the contracts with the first of `keys`, give each role its tokens, and stake for the provider."""
+    accounts = _accounts_of(keys)
+    deployment = await deploy(endpoint, accounts["provider"], plan=DeploymentPlan(timeout_blocks=100))
+    market = DevelopmentMarket(deployment=deployment, accounts=accounts)
+    async with market.chain(endpoint, "provider") as chain:
+        for role in ("robot", "person"):
+            await chain.tokens.transfer(accounts[role].address, ALLOWANCE)
+        await chain.tokens.approve(deployment.lighthouse, STAKE)
+        await chain.lighthouses.refill(deployment.lighthouse, STAKE)
+    return market
+
+
+async def load_market(endpoint: str, keys: Sequence[bytes]) -> DevelopmentMarket | None:
+    """The market that an earlier `deploy_market` deployed with the same keys; None if they never sent anything.
+
+    Raises `NoContracts` for a chain that holds something else, or only a part of a market.
+    """
+    accounts = _accounts_of(keys)
+    provider = accounts["provider"]
+    async with Node(endpoint, timing=TIMING) as node:
+        if not await node.transaction_count(provider.address):
+            return None
+        async with Chain(node, account=provider) as chain:
+            root = namehash("3.robonomics.eth")
+            resolver = await node.read(node.contract("ENSRegistry", chain.ens).functions.resolver(root))
+            created = next(iter(await chain.lighthouses.list()), None)
+            if created is None or provider.address not in (await chain.lighthouses.get(created.lighthouse)).stakes:
+                raise NoContracts("lighthouse with a provider", chain.chain_id)
+            deployment = Deployment(
+                ens=chain.ens,
+                resolver=str(resolver),
+                xrt=chain.xrt,
+                factory=chain.factory,
+                lighthouse=created.lighthouse,
+                lighthouse_name=f"{created.name}.lighthouse.3.robonomics.eth",
+                block_number=await chain.block_number(),
+                gas_used=0,
+            )
+            return DevelopmentMarket(deployment=deployment, accounts=accounts)
+
+
 @asynccontextmanager
 async def serve_chain(
-    settings: Settings,
+    settings: StorageSettings,
     *,
     host: str,
     port: int,
@@ -84,23 +159,23 @@ async def serve_chain(
     anvil: Path | None = None,
     state: Path | None = None,
 ) -> AsyncIterator[DevelopmentChain]:
-    """Serve a chain with a market on it: by the program `anvil`, embedded without one. `block_time` in seconds.
+    """Serve a chain with a market on it: by the program `anvil`, embedded without one. `block_time` is in seconds.
 
-    Everything on it is gone at the end, unless anvil keeps it in the file `state`. Raises `ConfigurationError` when the
-    port is taken, the keyfiles can't be written or the state can't be used; `NodeEnded` when anvil ends by itself.
+    The chain is gone at the end, unless anvil keeps it in the file `state`. Raises `ConfigurationError` when the port
+    is taken, the keyfiles can't be written or the state can't be used; `NodeEnded` when anvil ends by itself.
     """
     keys = settings.state_directory / "development"
     async with AsyncExitStack() as stack:
         if anvil is None:
             served = await stack.enter_async_context(serve_embedded(host, port, block_time=block_time))
             url, funded, engine = served.url, served.node.funded_keys, "embedded"
-            market = await found_market(served.node.provider, funded)
+            market = await deploy_market(served.node.provider, funded)
         else:
             node = await stack.enter_async_context(
                 serve_anvil(anvil, host=host, port=port, block_time=block_time, state=state)
             )
             url, funded, engine = node.url, node.funded_keys, f"anvil ({anvil})"
-            market = await _market_of(node.url, funded, state)
+            market = await _load_or_deploy(node.url, funded, state)
         try:
             await asyncio.to_thread(_write_keyfiles, keys, funded)
         except OSError as error:
@@ -110,22 +185,26 @@ async def serve_chain(
         yield DevelopmentChain(url=url, engine=engine, market=market, keys=keys)
 
 
-async def _market_of(url: str, keys: tuple[bytes, ...], state: Path | None) -> Market:
-    """The market on a chain that may have one from an earlier time, founded where the chain is new."""
+async def _load_or_deploy(url: str, keys: tuple[bytes, ...], state: Path | None) -> DevelopmentMarket:
+    """The market of a chain that was loaded from `state`, or a newly deployed one if the chain is new."""
     try:
-        found = await find_market(url, keys)
+        market = await load_market(url, keys)
     except NoContracts:
         raise ConfigurationError(
-            f"the chain in {state} has no market on it, and is not new", hint="name another file, or remove it"
+            f"the chain in {state} is not new, but has no market", hint="name another file, or remove it"
         ) from None
-    if found is not None:
-        return found
-    with founding(state):
-        return await found_market(url, keys)
+    if market is not None:
+        return market
+    with deploying(state):
+        return await deploy_market(url, keys)
+
+
+def _accounts_of(keys: Sequence[bytes]) -> dict[str, Account]:
+    return {role: Account.from_key(key) for role, key in zip(ROLES, keys, strict=False)}
 
 
 def _write_keyfiles(folder: Path, private_keys: tuple[bytes, ...]) -> None:
-    """A keyfile a role under one random password. The keys are public knowledge: never use them on a real chain."""
+    """A keyfile per role under one random password. The keys are public knowledge: never use them on a real chain."""
     folder.mkdir(parents=True, exist_ok=True)
     password = folder / "password"
     if not password.exists():

@@ -18,7 +18,8 @@ from eth_tester import PyEVMBackend  # type: ignore[import-untyped]
 from eth_tester.exceptions import BlockNotFound  # type: ignore[import-untyped]
 from eth_utils.exceptions import ValidationError
 
-from mesh.devchain.jsonrpc import REVERTED, SERVER_ERROR, RpcError, to_json
+from mesh.chain.reverts import REVERTED
+from mesh.devchain.jsonrpc import SERVER_ERROR, RpcError, to_json
 
 if TYPE_CHECKING:
     from eth.abc import BlockHeaderAPI, ComputationAPI, SignedTransactionAPI

@@ -1,16 +1,20 @@
-"""JSON-RPC over HTTP and WebSocket in front of a provider, so that several processes share one embedded chain."""
+"""A JSON-RPC server over HTTP and WebSocket in front of a provider: several processes share one embedded chain."""
 
 from __future__ import annotations
 
+import asyncio
+import json
+import logging
 import os
-from typing import TYPE_CHECKING, Final
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Final
 
-from aiohttp import web
+from aiohttp import WSMsgType, web
 
-from mesh.devchain.dialogue import Dialogue
-from mesh.devchain.dispatch import Dispatcher
-from mesh.devchain.feed import Feed
+from mesh.devchain.jsonrpc import INVALID_PARAMS, Dispatcher, RpcError
+from mesh.devchain.subscriptions import Subscriptions
 from mesh.errors import ConfigurationError
+from mesh.telemetry.context import log_event
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable
@@ -19,22 +23,26 @@ if TYPE_CHECKING:
 
     from web3.providers.async_base import AsyncBaseProvider
 
+log = logging.getLogger(__name__)
+
 MAX_BODY_BYTES: Final = 4 * 1024 * 1024
 HEARTBEAT: Final = 30.0
-"""Seconds between two looks whether the other side of a WebSocket is still there."""
+"""Seconds between two pings of a WebSocket."""
+MAX_UNSENT: Final = 10_000
+"""Messages that wait for a client to read them; a client that falls further behind is disconnected."""
 LOOPBACK_NAMES: Final = frozenset({"127.0.0.1", "localhost", "[::1]", "::1"})
 
 
 class JsonRpcServer:
-    """Serves `provider` (any whose results are JSON, as the embedded chain's and web3's HTTP provider's are).
+    """Serves `provider` (any whose results are JSON, as those of the embedded chain and of web3's HTTP provider).
 
-    Requests come by POST or on a WebSocket, at the same address; a WebSocket also has `eth_subscribe`, of `newHeads`
-    and `logs`, and `eth_unsubscribe`.
+    Requests are sent by POST or over a WebSocket, at the same address; a WebSocket also has `eth_subscribe` (`newHeads`
+    and `logs`) and `eth_unsubscribe`.
 
-    It listens on loopback unless told otherwise. A browser's page may call it only from one of `allowed_origins`
-    (`"*"` for any); a loopback server also refuses requests that name another host, as a rebound DNS name would.
+    It listens on loopback by default. A web page may call it only from one of `allowed_origins` (`"*"` for any); a
+    loopback server also refuses requests that name another host, as after DNS rebinding.
 
-    Used with `async with`; leaving it finishes the requests under way. Entering raises `ConfigurationError` when the
+    Used with `async with`; leaving it finishes the requests in progress. Entering raises `ConfigurationError` when the
     port is taken.
     """
 
@@ -47,8 +55,8 @@ class JsonRpcServer:
         allowed_origins: Iterable[str] = (),
     ) -> None:
         self._dispatcher = Dispatcher(provider)
-        self._feed: Feed | None = None
-        self._dialogues: set[Dialogue] = set()
+        self._subscriptions: Subscriptions | None = None
+        self._connections: set[WebSocketConnection] = set()
         self._host = host
         self._port = port
         self._origins = frozenset(allowed_origins)
@@ -56,20 +64,25 @@ class JsonRpcServer:
 
     @property
     def url(self) -> str:
-        """Where it listens, with the port that was really taken."""
+        """Where it listens, with the actual port."""
         return f"http://{self._host}:{self._port}"
 
     @property
     def ws_url(self) -> str:
-        """The same for WebSockets."""
+        """The address for WebSockets."""
         return f"ws://{self._host}:{self._port}"
+
+    @property
+    def connections(self) -> int:
+        """How many WebSockets are open."""
+        return len(self._connections)
 
     async def __aenter__(self) -> Self:
         app = web.Application(client_max_size=MAX_BODY_BYTES)
         app.router.add_post("/", self._post)
         app.router.add_get("/", self._open_socket)
         app.router.add_options("/", self._preflight)
-        app.cleanup_ctx.append(self._feeding)
+        app.cleanup_ctx.append(self._run_subscriptions)
         app.on_shutdown.append(self._close_sockets)
         self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=2.0)
         await self._runner.setup()
@@ -91,13 +104,13 @@ class JsonRpcServer:
             await self._runner.cleanup()
             self._runner = None
 
-    async def _feeding(self, _app: web.Application) -> AsyncIterator[None]:
-        async with Feed(self._dispatcher.ask) as self._feed:
+    async def _run_subscriptions(self, _app: web.Application) -> AsyncIterator[None]:
+        async with Subscriptions(self._dispatcher.ask) as self._subscriptions:
             yield
 
     async def _close_sockets(self, _app: web.Application) -> None:
-        for dialogue in list(self._dialogues):
-            await dialogue.close()
+        for connection in list(self._connections):
+            await connection.close()
 
     async def _post(self, request: web.Request) -> web.Response:
         headers = self._admit(request)
@@ -113,14 +126,14 @@ class JsonRpcServer:
             raise web.HTTPUpgradeRequired(
                 text="this is a node: POST JSON-RPC here, or open a WebSocket", headers=headers
             )
-        assert self._feed is not None
+        assert self._subscriptions is not None
         await socket.prepare(request)
-        dialogue = Dialogue(request, socket, self._dispatcher, self._feed)
-        self._dialogues.add(dialogue)
+        connection = WebSocketConnection(request, socket, self._dispatcher, self._subscriptions)
+        self._connections.add(connection)
         try:
-            await dialogue.run()
+            await connection.run()
         finally:
-            self._dialogues.discard(dialogue)
+            self._connections.discard(connection)
         return socket
 
     async def _preflight(self, request: web.Request) -> web.Response:
@@ -131,7 +144,7 @@ class JsonRpcServer:
         )
 
     def _admit(self, request: web.Request) -> dict[str, str]:
-        """The headers that let a page read the answer. Raises HTTP 403 for a page that may not ask."""
+        """The headers that let a page read the answer. Raises HTTP 403 for a page that is not allowed to ask."""
         name = (request.host or "").rpartition(":")[0] or request.host
         if self._host in LOOPBACK_NAMES and name not in LOOPBACK_NAMES:
             raise web.HTTPForbidden(text="this node serves its own machine only")
@@ -141,3 +154,78 @@ class JsonRpcServer:
         if origin not in self._origins and "*" not in self._origins:
             raise web.HTTPForbidden(text="pages of this origin may not ask this node")
         return {"Access-Control-Allow-Origin": origin, "Vary": "Origin"}
+
+
+class WebSocketConnection:
+    """One WebSocket: answers its requests one after another, and sends what it subscribed to."""
+
+    def __init__(
+        self,
+        request: web.Request,
+        socket: web.WebSocketResponse,
+        dispatcher: Dispatcher,
+        subscriptions: Subscriptions,
+    ) -> None:
+        self._request = request
+        self._socket = socket
+        self._dispatcher = dispatcher
+        self._subscriptions = subscriptions
+        self._own_ids: set[str] = set()
+        self._unsent: asyncio.Queue[Any] = asyncio.Queue()
+        self._held: list[Any] | None = None
+        """Notifications during a request: the id of a new subscription is sent before its first notification."""
+
+    async def run(self) -> None:
+        """Answer until either side closes the socket."""
+        methods = {"eth_subscribe": self._subscribe, "eth_unsubscribe": self._unsubscribe}
+        writing = asyncio.create_task(self._write(), name="aira-chain-socket-writer")
+        try:
+            async for message in self._socket:
+                if message.type not in (WSMsgType.TEXT, WSMsgType.BINARY):
+                    continue
+                self._held = []
+                answer = await self._dispatcher.respond(message.data, methods=methods)
+                held, self._held = self._held, None
+                for one in ([] if answer is None else [answer]) + held:
+                    self._send(one)
+        finally:
+            for subscription_id in self._own_ids:
+                self._subscriptions.remove(subscription_id)
+            writing.cancel()
+            await asyncio.wait([writing])
+
+    async def close(self) -> None:
+        """Close the socket because the server stops."""
+        await self._socket.close(code=1001, message=b"the node ends")
+
+    async def _subscribe(self, params: list[Any]) -> str:
+        subscription_id = await self._subscriptions.add(params, self._notify)
+        self._own_ids.add(subscription_id)
+        return subscription_id
+
+    async def _unsubscribe(self, params: list[Any]) -> bool:
+        if len(params) != 1 or params[0] not in self._own_ids:
+            raise RpcError(INVALID_PARAMS, "there is no such subscription on this connection")
+        self._own_ids.remove(params[0])
+        return self._subscriptions.remove(params[0])
+
+    def _notify(self, notification: dict[str, Any]) -> None:
+        if self._held is None:
+            self._send(notification)
+        else:
+            self._held.append(notification)
+
+    def _send(self, message: Any) -> None:
+        if self._unsent.qsize() < MAX_UNSENT:
+            self._unsent.put_nowait(message)
+        elif self._request.transport is not None:
+            log.warning(
+                "a client reads too slowly; disconnecting it",
+                extra=log_event("rpc-client-dropped", client=self._request.remote),
+            )
+            self._request.transport.abort()
+
+    async def _write(self) -> None:
+        with suppress(ConnectionError):
+            while True:
+                await self._socket.send_str(json.dumps(await self._unsent.get()))

@@ -62,7 +62,7 @@ class AccountChecks:
         """Whether the account can pay gas. Raises `FeeTooHigh`."""
         node = self._ledgers.node
         balance = await node.eth_balance(self.address)
-        await node.fees.fees(node)
+        node.fees.offer(await node.gas_market())
         one = LEAST_GAS * await node.gas_price()
         count = balance // one if one else AMPLE
         shown = f"{self.address} has {_amount(balance, ETH)}"

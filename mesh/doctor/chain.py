@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from mesh.chain import GWEI, Chain, FeePolicy, Node, Timing
 from mesh.chain.errors import NoContracts, RequestRefused
-from mesh.chain.recognition import is_ours
 from mesh.doctor.checks import CheckResult, failed, passed, warning
 from mesh.doctor.machine import RECENT, compare_chain_clock, compare_node_clock, duration
 
@@ -51,14 +50,14 @@ class ChainChecks:
     async def check_node(self, endpoint: str) -> CheckResult:
         """Whether a node answers, is synced, and gets new blocks. Raises `NodeUnreachable`."""
         async with Node(endpoint, timing=QUICK) as node:
-            client = await _unless_refused(node.web3.client_version, otherwise="")
-            block = await node.web3.eth.get_block("latest")
-            syncing = await _unless_refused(node.web3.eth.syncing, otherwise=False)
+            client = await _unless_refused(node.client_version(), otherwise="")
+            block = await node.latest_header()
+            syncing = await _unless_refused(node.is_syncing(), otherwise=False)
             node_time = await _server_time(endpoint)
             # By the node's clock: ours may be wrong, which another check reports.
             number, age = (
-                int(block["number"]),
-                (time.time() if node_time is None else node_time) - int(block["timestamp"]),
+                block.number,
+                (time.time() if node_time is None else node_time) - block.timestamp,
             )
             if syncing:
                 return failed(
@@ -87,13 +86,13 @@ class ChainChecks:
 
     async def check_clock(self) -> CheckResult:
         """Compare this clock with the newest block."""
-        block = await self.node.web3.eth.get_block("latest")
-        return compare_chain_clock(float(block["timestamp"]), time.time())
+        block = await self.node.latest_header()
+        return compare_chain_clock(float(block.timestamp), time.time())
 
     async def check_contracts(self) -> CheckResult:
         """Whether registry, factory and XRT are the expected contracts. Raises `NoContracts`, `UnknownName`."""
         chain = await self._stack.enter_async_context(self.chain)
-        expected, ours = self._settings.contracts, await is_ours(chain)
+        expected, ours = self._settings.contracts, await chain.has_mesh_contracts()
         where = f"factory {chain.factory}, XRT {chain.xrt}"
         if expected == "mesh" and not ours:
             return failed(

@@ -17,7 +17,7 @@ from mesh.agent import Agent
 from mesh.background import Background
 from mesh.chain import Chain, Timing
 from mesh.devchain import EmbeddedChain
-from mesh.devchain.market import Market, found_market
+from mesh.devchain.development import DevelopmentMarket, deploy_market
 from mesh.market.provider import Provider
 from mesh.network import Endpoints, Network
 from mesh.settings import Settings
@@ -41,7 +41,7 @@ class Founded:
     """A chain in a thread of its own, which any event loop may use, and the market on it."""
 
     node: EmbeddedChain
-    market: Market
+    market: DevelopmentMarket
 
 
 @pytest.fixture(scope="session")
@@ -51,7 +51,7 @@ def founded() -> Iterator[Founded]:
         stack = AsyncExitStack()
         node = runner.run(stack.enter_async_context(EmbeddedChain()))
         try:
-            yield Founded(node, runner.run(found_market(node.provider, node.funded_keys)))
+            yield Founded(node, runner.run(deploy_market(node.provider, node.funded_keys)))
         finally:
             runner.run(stack.aclose())
 

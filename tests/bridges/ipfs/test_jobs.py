@@ -12,7 +12,7 @@ import pytest
 
 from bridges.ipfs.service import IpfsBridge
 from mesh.background import Background
-from mesh.devchain.market import ROLES
+from mesh.devchain.development import ROLES
 from mesh.network import Endpoints, Network
 from schemas import Demand, Offer, Result, decode
 from tests.bridges.ipfs.veterans import Veteran

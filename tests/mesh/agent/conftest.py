@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.chain import TransactionSender
-from mesh.chain.artifacts import load_artifact
 from mesh.network import Endpoints, Network, ServiceFailed, call
 from schemas.rpc import Nothing
 from tests.support.market import founded, place
@@ -25,9 +24,8 @@ __all__ = ["founded", "place"]
 
 async def other_token(place: Place, role: str, *, supply: int) -> str:
     """The address of a token, XRT in all but its name, of which a role has all."""
-    chain, artifact = place.chains[role], load_artifact("XRT")
-    made = chain.node.web3.eth.contract(abi=artifact.abi, bytecode=artifact.bytecode).constructor(supply)
-    data = bytes.fromhex(made.data_in_transaction.removeprefix("0x"))
+    chain = place.chains[role]
+    data = chain.node.creation_code("XRT", supply)
     receipt = await TransactionSender(chain.node, place.market.accounts[role]).send(to=None, data=data)
     assert receipt.contract is not None
     return receipt.contract

@@ -117,7 +117,8 @@ async def test_tokens_are_sent_for_who_may_ask_for_it(place: Place, opened: Aske
     before = await place.balance("robot"), await place.balance("person")
     done = await opened.ask("eth/transfer", TransferRequest(place.address("person"), 250))
     assert (await place.balance("robot"), await place.balance("person")) == (before[0] - 250, before[1] + 250)
-    receipt = await place.chains["person"].node.web3.eth.get_transaction_receipt(done.txhash)
+    receipt = await place.chains["person"].node.receipt(done.txhash)
+    assert receipt is not None
     assert receipt["status"] == 1
 
 

@@ -123,7 +123,9 @@ async def test_a_transfer_that_lands_in_another_block_after_a_reorganisation_is_
         raw = await raw_of(place, tx)
         await place.forget_blocks(1)
         await place.node.request("eth_sendRawTransaction", [raw])
-        assert (await chain.node.web3.eth.get_transaction_receipt(tx))["status"] == 1  # type: ignore[arg-type]
+        receipt = await chain.node.receipt(tx)
+        assert receipt is not None
+        assert receipt["status"] == 1
         await chain.tokens.transfer(agent.address, 8)
         await until(lambda: events[-1].args_value == 8, seconds=30)
         await until_handled(place, agent)

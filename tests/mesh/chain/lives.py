@@ -41,7 +41,7 @@ def stranger() -> str:
 
 
 async def ask(node: Node, method: str, *params: Any) -> Any:
-    return (await node.web3.provider.make_request(method, list(params)))["result"]
+    return await node.request(method, *params)
 
 
 async def waiting(node: Node) -> dict[int, str]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.chain import GWEI, Account, FeePolicy, FeeTooHigh, Node, TransactionSender, new_private_key
-from mesh.chain.fees import Fees
+from mesh.chain.policy import Fees
 from mesh.chain.transports import HttpTransport
 from mesh.errors import ConfigurationError
 from tests.mesh.chain.conftest import QUICK
@@ -36,7 +36,7 @@ def _stranger() -> str:
 
 
 async def _ask(node: Node, method: str, *params: Any) -> Any:
-    return (await node.web3.provider.make_request(method, list(params)))["result"]
+    return await node.request(method, *params)
 
 
 async def _next_base_fee(node: Node, wei: int) -> None:
@@ -52,7 +52,7 @@ async def test_above_the_ceiling_nothing_is_sent(anvil: Anvil) -> None:
             await sender.send(to=friend, data=b"", value=1)
         assert (caught.value.price, caught.value.ceiling) == (31 * GWEI, 20 * GWEI)
         assert caught.value.hint
-        assert await node.web3.eth.get_transaction_count(node.checksum(sender.account.address), "pending") == 0
+        assert await node.transaction_count(sender.account.address, pending=True) == 0
 
 
 async def test_with_patience_a_transaction_waits_for_the_price_to_come_down(anvil: Anvil) -> None:
@@ -78,13 +78,13 @@ async def test_never_more_than_the_ceiling_is_offered(anvil: Anvil) -> None:
 
 async def test_a_replacement_is_dearer_by_what_nodes_want_or_there_is_none(anvil: Anvil) -> None:
     async with Node(anvil.url, timing=QUICK) as node:
-        policy = FeePolicy(ceiling=100 * GWEI)
-        bumped = await policy.bumped(node, Fees(50 * GWEI, 7))
+        policy, market = FeePolicy(ceiling=100 * GWEI), await node.gas_market()
+        bumped = policy.replacement(market, Fees(50 * GWEI, 7))
         assert bumped == Fees(575 * GWEI // 10, GWEI), "the priority fee goes to the market's price at least"
-        assert await policy.bumped(node, Fees(90 * GWEI, 2 * GWEI)) == Fees(100 * GWEI, 23 * GWEI // 10)
-        assert await policy.bumped(node, Fees(91 * GWEI, 2 * GWEI)) is None
-        assert await policy.bumped(node, Fees(10 * GWEI, None)) == Fees(115 * GWEI // 10, None)
-        cheap = await replace(policy, ceiling=GWEI // 2).bumped(node, Fees(1, 1))
+        assert policy.replacement(market, Fees(90 * GWEI, 2 * GWEI)) == Fees(100 * GWEI, 23 * GWEI // 10)
+        assert policy.replacement(market, Fees(91 * GWEI, 2 * GWEI)) is None
+        assert policy.replacement(market, Fees(10 * GWEI, None)) == Fees(115 * GWEI // 10, None)
+        cheap = replace(policy, ceiling=GWEI // 2).replacement(market, Fees(1, 1))
         assert cheap == Fees(GWEI // 2, GWEI // 2), "the priority fee is never above the whole"
 
 
@@ -100,8 +100,8 @@ class _Plain(HttpTransport):
 async def test_a_node_without_a_word_for_priority_fees_is_asked_for_its_price(anvil: Anvil) -> None:
     wire = _Plain(anvil.url)
     async with Node(wire, timing=QUICK) as node:
-        base = int((await node.web3.eth.get_block("latest"))["baseFeePerGas"])
-        price = int(await node.web3.eth.gas_price)
+        base = (await node.latest_header()).base_fee or 0
+        price = await node.gas_price()
         receipt = await _sender(node, anvil).send(to=_stranger(), data=b"", value=1)
         sent = await _ask(node, "eth_getTransactionByHash", receipt.tx)
     assert int(sent["maxPriorityFeePerGas"], 16) == price - base

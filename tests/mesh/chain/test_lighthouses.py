@@ -73,10 +73,10 @@ async def test_a_provider_that_stakes_enough_already_sends_nothing(market: Marke
     account = await _newcomer(market, holding=XRT)
     async with market.chain(account) as chain:
         await chain.lighthouses.become_provider("second", STAKE)
-        sent = await chain.node.web3.eth.get_transaction_count(chain.node.checksum(account.address))
+        sent = await chain.node.transaction_count(account.address)
         state = await chain.lighthouses.become_provider("second", STAKE - 5)
         assert state.stakes == {account.address: STAKE}
-        assert await chain.node.web3.eth.get_transaction_count(chain.node.checksum(account.address)) == sent
+        assert await chain.node.transaction_count(account.address) == sent
         assert (await chain.lighthouses.become_provider("second", STAKE + 1)).stakes == {account.address: STAKE + 1}
 
 
@@ -97,18 +97,18 @@ async def test_a_stake_that_was_sent_before_a_crash_is_waited_for_and_not_sent_a
         beacon, account = await _beacon(market, "beacon"), await _newcomer(market, holding=XRT)
         async with market.chain(account) as chain:
             await chain.tokens.approve(beacon, STAKE)
-            await chain.node.web3.provider.make_request("evm_setAutomine", [False])
+            await chain.node.request("evm_setAutomine", False)
         hasty = replace(QUICK, receipt_timeout=0.3)
-        async with market.chain(account, journal=tmp_path, timing=hasty) as chain:
+        async with market.chain(account, transactions=tmp_path, timing=hasty) as chain:
             with pytest.raises(TransactionTimeout) as sent:
                 await chain.lighthouses.become_provider("beacon", STAKE)
-        async with market.chain(account, journal=tmp_path) as chain, asyncio.timeout(30):
+        async with market.chain(account, transactions=tmp_path) as chain, asyncio.timeout(30):
             becoming = asyncio.create_task(chain.lighthouses.become_provider("beacon", STAKE))
             await asyncio.sleep(5 * QUICK.poll_interval)
-            await chain.node.web3.provider.make_request("evm_mine", [])
+            await chain.node.request("evm_mine")
             assert (await becoming).stakes == {account.address: STAKE}
-            assert await chain.node.web3.eth.get_transaction_receipt(sent.value.tx)  # type: ignore[arg-type]
-            assert await chain.node.web3.eth.get_transaction_count(chain.node.checksum(account.address)) == 2
+            assert await chain.node.receipt(sent.value.tx)
+            assert await chain.node.transaction_count(account.address) == 2
 
 
 @pytest.mark.parametrize("generation", [3, 5])
@@ -128,7 +128,7 @@ async def test_too_small_a_stake_and_too_few_tokens_are_told_before_anything_is_
             await chain.lighthouses.become_provider("fourth", 9)
         with pytest.raises(InsufficientTokens, match=f"has {STAKE} of the token") as poor:
             await chain.lighthouses.become_provider("fourth", STAKE + 1)
-        assert await chain.node.web3.eth.get_transaction_count(chain.node.checksum(account.address)) == 0
+        assert await chain.node.transaction_count(account.address) == 0
     assert isinstance(small.value, InputError)
     assert (small.value.hint, poor.value.hint) != ("", "")
     assert (poor.value.account, poor.value.balance, poor.value.needed) == (account.address, STAKE, STAKE + 1)

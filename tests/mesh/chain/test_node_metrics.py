@@ -50,7 +50,7 @@ async def test_a_transaction_that_goes_through_is_sent_and_mined_and_costs_its_g
         account = Account.from_key(node.funded_keys[0])
         before = await way.eth_balance(account.address)
         receipt = await TransactionSender(way, account).send(to=stranger(), data=b"", value=5)
-        counted = way.tally.statistics()
+        counted = way.metrics.statistics()
         assert counted.transactions == NONE | {"sent": 1, "mined": 1}
         assert (counted.gas_used, counted.wei) == (receipt.gas_used, receipt.wei)
         assert before - await way.eth_balance(account.address) == counted.wei + 5
@@ -62,7 +62,7 @@ async def test_what_the_contracts_would_refuse_is_never_sent_and_costs_nothing(n
     async with Chain(node.provider, account=friend, timing=QUICK) as chain:
         with pytest.raises(Reverted, match="ERC20InsufficientBalance"):
             await chain.tokens.transfer(deployer.address, XRT)
-        counted = chain.node.tally.statistics()
+        counted = chain.node.metrics.statistics()
         assert counted.transactions == NONE | {"refused": 1}
         assert (counted.gas_used, counted.wei) == (0, 0)
 
@@ -75,11 +75,11 @@ async def test_a_node_that_falls_silent_is_lost_once_and_each_question_fails(nod
             for _ in range(3):
                 with pytest.raises(NodeUnreachable):
                     await way.block_number()
-            counted = way.tally.statistics()
+            counted = way.metrics.statistics()
             assert (counted.losses, counted.failures) == (silence, 3 * silence)
             line.cut = False
             await way.block_number()
-        assert way.tally.statistics().losses == 2
+        assert way.metrics.statistics().losses == 2
 
 
 async def test_a_stuck_transaction_is_replaced_and_mined_once(anvil: Anvil) -> None:
@@ -93,7 +93,7 @@ async def test_a_stuck_transaction_is_replaced_and_mined_once(anvil: Anvil) -> N
                 await ask(way, "evm_mine")
                 await asyncio.sleep(0.05)
         await sending
-        counted = way.tally.statistics().transactions
+        counted = way.metrics.statistics().transactions
         assert (
             counted[TransactionOutcome.SENT],
             counted[TransactionOutcome.MINED],

@@ -50,19 +50,19 @@ async def test_what_an_earlier_life_left_in_the_pool_is_not_collided_with(anvil:
         assert await node.eth_balance(friend) == 3
 
 
-async def dropped(anvil: Anvil, friend: str, *, journal: Path) -> str:
+async def dropped(anvil: Anvil, friend: str, *, transactions: Path) -> str:
     """The hash of a transfer of 5 wei in an earlier life, which the node has forgotten."""
-    async with life(anvil, SHORT, journal=journal) as (node, sender):
+    async with life(anvil, SHORT, transactions=transactions) as (node, sender):
         with pytest.raises(TransactionTimeout) as caught:
             await sender.send(to=friend, data=b"", value=5)
         await ask(node, "anvil_dropTransaction", caught.value.tx)
     return caught.value.tx
 
 
-async def test_the_journal_tells_a_later_life_what_the_node_forgot(anvil: Anvil, tmp_path: Path) -> None:
+async def test_a_restarted_process_sends_what_the_node_forgot_again(anvil: Anvil, tmp_path: Path) -> None:
     friend = stranger()
-    forgotten = await dropped(anvil, friend, journal=tmp_path)
-    async with life(anvil, journal=tmp_path) as (node, sender):
+    forgotten = await dropped(anvil, friend, transactions=tmp_path)
+    async with life(anvil, transactions=tmp_path) as (node, sender):
         sending = asyncio.create_task(sender.send(to=friend, data=b"", value=5))
         assert await until_waiting(node, 1) == {0: forgotten}
         await ask(node, "evm_mine")
@@ -73,8 +73,8 @@ async def test_the_journal_tells_a_later_life_what_the_node_forgot(anvil: Anvil,
 
 async def test_a_forgotten_transaction_gives_its_number_to_another(anvil: Anvil, tmp_path: Path) -> None:
     friend = stranger()
-    await dropped(anvil, friend, journal=tmp_path)
-    async with life(anvil, journal=tmp_path) as (node, sender):
+    await dropped(anvil, friend, transactions=tmp_path)
+    async with life(anvil, transactions=tmp_path) as (node, sender):
         sending = asyncio.create_task(sender.send(to=friend, data=b"", value=7))
         assert list(await until_waiting(node, 1)) == [0]
         await ask(node, "evm_mine")
@@ -86,10 +86,10 @@ async def test_what_waits_behind_a_stuck_transaction_of_an_earlier_life_gets_it_
     anvil: Anvil, tmp_path: Path
 ) -> None:
     friend = stranger()
-    async with life(anvil, SHORT, journal=tmp_path) as (node, sender):
+    async with life(anvil, SHORT, transactions=tmp_path) as (node, sender):
         with pytest.raises(TransactionTimeout) as stuck:
             await sender.send(to=friend, data=b"", value=1)
-    async with life(anvil, replace(QUICK, replace_after=0.1), journal=tmp_path) as (node, sender):
+    async with life(anvil, replace(QUICK, replace_after=0.1), transactions=tmp_path) as (node, sender):
         sending = asyncio.create_task(sender.send(to=friend, data=b"", value=2))
         async with asyncio.timeout(10):
             while (await until_waiting(node, 2))[0] == stuck.value.tx:
@@ -99,13 +99,13 @@ async def test_what_waits_behind_a_stuck_transaction_of_an_earlier_life_gets_it_
         assert await node.eth_balance(friend) == 3
 
 
-async def test_a_journal_is_of_one_chain(tmp_path: Path) -> None:
+async def test_a_transaction_folder_belongs_to_one_chain(tmp_path: Path) -> None:
     """A development chain that is started afresh has the same chain id, and none of the old transactions."""
     friend = stranger()
     for born in ("1700000000", "1700000001"):
         async with (
             Anvil(arguments=(NEVER, "--timestamp", born)) as anvil,
-            life(anvil, SHORT, journal=tmp_path) as (node, sender),
+            life(anvil, SHORT, transactions=tmp_path) as (node, sender),
         ):
             with pytest.raises(TransactionTimeout):
                 await sender.send(to=friend, data=b"", value=1)
@@ -142,10 +142,10 @@ class Forgetful(HttpTransport):
             params = [params[0], "latest"]
         return await super().make_request(method, params)
 
-async def main(url, key, friend, journal, count):
+async def main(url, key, friend, folder, count):
     wire = Forgetful(url)
     timing = Timing(poll_interval=0.05, receipt_interval=0.01)
-    async with Node(wire, timing=timing, journal=Path(journal)) as node:
+    async with Node(wire, timing=timing, transactions=Path(folder)) as node:
         sender = TransactionSender(node, Account.from_key(bytes.fromhex(key)))
         await asyncio.gather(*(sender.send(to=friend, data=b"", value=1) for _ in range(int(count))))
     await wire.close()
@@ -154,7 +154,7 @@ asyncio.run(main(*sys.argv[1:]))
 """
 
 
-async def test_processes_that_share_a_journal_never_take_the_same_number(tmp_path: Path) -> None:
+async def test_processes_that_share_a_folder_never_use_the_same_nonce(tmp_path: Path) -> None:
     """Even where the node does not count what waits."""
     friend = stranger()
 
@@ -172,8 +172,8 @@ async def test_processes_that_share_a_journal_never_take_the_same_number(tmp_pat
         assert await node.eth_balance(friend) == 18
 
 
-async def test_a_journal_that_can_not_be_written_is_one_clear_error(anvil: Anvil, tmp_path: Path) -> None:
+async def test_a_folder_that_can_not_be_written_is_one_clear_error(anvil: Anvil, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    async with life(anvil, journal=tmp_path / "file") as (_, sender):
+    async with life(anvil, transactions=tmp_path / "file") as (_, sender):
         with pytest.raises(ConfigurationError, match="can't keep sent transactions"):
             await sender.send(to=stranger(), data=b"", value=1)

@@ -25,7 +25,7 @@ asyncio.run(main(*sys.argv[1:]))
 
 NESTING = """
 import asyncio, sys, threading, msgspec
-import mesh.chain
+import mesh.devchain
 
 def decode():
     try:
@@ -35,7 +35,7 @@ def decode():
 
 async def main():
     decode_in_small_thread()
-    async with mesh.chain.EmbeddedChain():
+    async with mesh.devchain.EmbeddedChain():
         decode_in_small_thread()
 
 def decode_in_small_thread():

@@ -63,7 +63,7 @@ class Fork:
         return "embedded" in self.chain.node.endpoint
 
     async def request(self, method: str, *params: object) -> None:
-        await self.chain.node.web3.provider.make_request(method, list(params))
+        await self.chain.node.request(method, *params)
 
 
 @pytest.fixture(params=["embedded", "anvil"])
@@ -269,7 +269,7 @@ async def test_a_chain_started_afresh_is_not_taken_for_the_one_that_was_read() -
         await asyncio.to_thread(anvil.stop)
         await asyncio.to_thread(anvil.start)
         # Started within the same second, it would come to the same blocks again.
-        await node.web3.provider.make_request("evm_mine", [])
+        await node.request("evm_mine")
         await deploy(node, account)
         async with Chain(node) as chain:
             with pytest.raises(ReorganisedTooDeep, match="no block 4") as caught:

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from eth_abi.abi import encode
 
-from mesh.chain.refusals import HINTS
+from mesh.chain.errors import REVERT_HINTS
 from mesh.chain.reverts import custom_errors, decode_revert, explain
 from schemas import keccak256
 
@@ -35,7 +35,7 @@ def test_a_custom_error_is_found_where_a_node_puts_it(error: dict[str, Any]) -> 
 
 def test_all_that_there_is_advice_for_is_an_error_of_the_contracts() -> None:
     known = {name for name, _ in custom_errors().values()}
-    assert HINTS.keys() - known == {"OutOfGas"}, "which no contract says"
+    assert REVERT_HINTS.keys() - known == {"OutOfGas"}, "which no contract says"
 
 
 @pytest.mark.parametrize(

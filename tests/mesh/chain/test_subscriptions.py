@@ -149,8 +149,7 @@ async def test_what_polls_whole_blocks_finds_its_transactions_in_them(
         receipt = await TransactionSender(chain.node, Account.from_key(node.funded_keys[0])).call(
             chain.node.contract("XRT", deployment.xrt).functions.transfer(deployment.factory, XRT)
         )
-        ask: Any = way.web3.provider.make_request
-        block = (await ask("eth_getBlockByNumber", [hex(receipt.block_number), True]))["result"]
+        block = await way.request("eth_getBlockByNumber", hex(receipt.block_number), True)
         [sent] = [one for one in block["transactions"] if one["to"] == deployment.xrt.lower()]
         assert (sent["hash"], sent["input"][:10], int(sent["blockNumber"], 16)) == (
             receipt.tx,
@@ -158,5 +157,5 @@ async def test_what_polls_whole_blocks_finds_its_transactions_in_them(
             receipt.block_number,
         )
         assert {"from", "gas", "gasPrice", "nonce", "value", "transactionIndex", "blockHash"} <= sent.keys()
-        logs = (await ask("eth_getTransactionReceipt", [sent["hash"]]))["result"]["logs"]
+        logs = (await way.request("eth_getTransactionReceipt", sent["hash"]))["logs"]
         assert logs[0]["topics"][0] == TRANSFER

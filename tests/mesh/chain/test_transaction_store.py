@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.chain.accounts import SignedTransaction
-from mesh.chain.pending import Pending, PendingTransactions
-from mesh.chain.transaction_store import TransactionStore
+from mesh.chain.pending import PendingTransactions
+from mesh.chain.transaction_store import PendingTransaction, TransactionStore
 from mesh.errors import ConfigurationError
 from tests.support.disks import file_size_limit
 
@@ -27,9 +27,9 @@ def other(tmp_path: Path) -> TransactionStore:
     return TransactionStore(tmp_path)
 
 
-def _entry(nonce: int) -> Pending:
+def _entry(nonce: int) -> PendingTransaction:
     fields = {"to": "0x" + "12" * 20, "data": "0x", "value": 2**255, "gas": 21_000, "gasPrice": 1}
-    return Pending(nonce=nonce, fields=fields, versions=[SignedTransaction(b"\x01", "0x01")])
+    return PendingTransaction(nonce=nonce, fields=fields, versions=[SignedTransaction(b"\x01", "0x01")])
 
 
 def test_an_entry_is_anothers_while_it_is_held_and_anyones_afterwards(
@@ -39,15 +39,15 @@ def test_an_entry_is_anothers_while_it_is_held_and_anyones_afterwards(
     hold = one.add(entry)
     assert hold is not None
     assert other.read(()) == ([], frozenset({7}))
-    assert other.hold(entry) is None
+    assert other.lock(entry) is None
     assert other.add(_entry(7)) is None, "the number is taken"
 
     hold.release()
     (left,), elsewhere = other.read(())
     assert elsewhere == frozenset()
     assert (left.nonce, left.fields, left.versions, left.is_watched) == (7, entry.fields, entry.versions, False)
-    assert other.hold(entry) is not None
-    assert one.hold(entry) is None
+    assert other.lock(entry) is not None
+    assert one.lock(entry) is None
 
 
 def test_an_entry_that_is_removed_is_gone_for_all(
@@ -89,7 +89,7 @@ def test_a_version_after_one_that_was_cut_off_is_read(
     hold.release()
     (path,) = tmp_path.iterdir()
     path.write_bytes(path.read_bytes() + b'{"hash": "0x0')
-    taken_up = other.hold(entry)
+    taken_up = other.lock(entry)
     assert taken_up is not None
     entry.versions.append(SignedTransaction(b"\x02", "0x02"))
     taken_up.append(entry)

@@ -163,7 +163,7 @@ async def test_a_transaction_that_is_not_mined_is_given_up_and_the_next_waits_be
         assert caught.value.hint
         with pytest.raises(TransactionTimeout):
             await sender.send(to=friend, data=b"", value=2)
-        await node.web3.provider.make_request("evm_mine", [])
+        await node.request("evm_mine")
         assert await node.eth_balance(friend) == 3
 
 
@@ -176,10 +176,10 @@ async def test_the_number_of_a_transaction_that_the_node_dropped_is_used_again()
         sender = TransactionSender(node, Account.from_key(anvil.private_keys[0]))
         with pytest.raises(TransactionTimeout) as dropped:
             await sender.send(to=friend, data=b"", value=1)
-        await node.web3.provider.make_request("anvil_dropTransaction", [dropped.value.tx])
+        await node.request("anvil_dropTransaction", dropped.value.tx)
         with pytest.raises(TransactionTimeout):
             await sender.send(to=friend, data=b"", value=2)
-        await node.web3.provider.make_request("evm_mine", [])
+        await node.request("evm_mine")
         assert await node.eth_balance(friend) == 2
 
 

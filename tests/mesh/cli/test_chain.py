@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.chain import XRT, Account, Chain, TransactionSender, new_private_key
-from mesh.chain.artifacts import load_artifact
-from mesh.chain.recognition import is_code_of
+from mesh.chain.artifacts import is_code_of, load_artifact
 from mesh.cli.chain import DEPLOYMENT_GAS
 from tests.mesh.cli.chains import Town, columns, refused, write_quick_keyfile
 from tests.support.commands import aira
@@ -162,7 +161,7 @@ def test_code_is_ours_with_any_immutables_and_with_no_other_difference(town: Tow
 
 
 async def _factory_code(chain: Chain) -> bytes:
-    return bytes(await chain.node.web3.eth.get_code(chain.node.checksum(chain.factory)))
+    return await chain.node.code(chain.factory)
 
 
 def test_contracts_can_be_deployed_to_a_node_of_others(tmp_path: Path) -> None:

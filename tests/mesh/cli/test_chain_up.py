@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 from click.testing import CliRunner
-from web3.types import RPCEndpoint
 
 from mesh.chain import XRT, Chain
 from mesh.cli import main
@@ -175,14 +174,14 @@ async def test_a_transaction_that_is_not_mined_can_be_left_and_is_not_sent_twice
         person = variables_of("person", tmp_path, url=served.url, data_dir=str(tmp_path / "person"))
         command = ("xrt", "transfer", NOBODY, "2")
         async with Chain(served.url) as chain:
-            await chain.node.web3.provider.make_request(RPCEndpoint("evm_setAutomine"), [False])
+            await chain.node.request("evm_setAutomine", False)
             says = "waiting until the transaction is mined"
             async with Serving(*AIRA, *command, says=says, variables=person) as waiting:
                 code, seconds = await asyncio.to_thread(waiting.end, signal.SIGINT)
                 assert (code, seconds < SOON) == (130, True), waiting.log()
                 assert "Traceback" not in waiting.log()
             assert await chain.tokens.balance(NOBODY) == 0
-            await chain.node.web3.provider.make_request(RPCEndpoint("evm_setAutomine"), [True])
+            await chain.node.request("evm_setAutomine", True)
             done = await asyncio.to_thread(aira, *command, **person)
             assert done.returncode == 0, done.stderr
             assert await chain.tokens.balance(NOBODY) == 2 * XRT

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.chain import XRT, TransactionSender
-from mesh.chain.artifacts import load_artifact
 from schemas import Liability
 from tests.mesh.cli.chains import REFUND_DELAY, Town, columns, refused
 from tests.support.commands import AIRA, Interrupted, Serving, aira
@@ -181,9 +180,7 @@ def test_a_refund_needs_no_signature(town: Town) -> None:
 def test_a_token_of_another_name_is_not_taken_for_xrt(town: Town) -> None:
     async def forge() -> str:
         async with town.chain("person") as chain:
-            artifact = load_artifact("XRT")
-            contract = chain.node.web3.eth.contract(abi=artifact.abi, bytecode=artifact.bytecode)
-            data = bytes.fromhex(contract.constructor(1_000 * XRT).data_in_transaction[2:])
+            data = chain.node.creation_code("XRT", 1_000 * XRT)
             assert chain.account is not None
             receipt = await TransactionSender(chain.node, chain.account).send(to=None, data=data)
             assert receipt.contract is not None

@@ -50,7 +50,7 @@ async def test_the_chain_is_kept_in_a_file(tmp_path: Path) -> None:
     for _ in range(2):
         with up(tmp_path, *options) as server:
             async with Node(columns(server.log())["chain"]) as node:
-                first_blocks.append((await node.web3.eth.get_block(1))["hash"])
+                first_blocks.append(await node.header(1))
     assert first_blocks[0] == first_blocks[1]
 
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.chain import XRT, Account, TransactionSender, new_private_key
-from mesh.chain.artifacts import load_artifact
 from tests.mesh.cli.chains import MONEY, Town, columns, refused, write_quick_keyfile
 from tests.support.ports import free_port
 
@@ -72,9 +71,7 @@ def test_another_token_counts_in_its_own_units(town: Town) -> None:
 async def _deploy_token(town: Town) -> str:
     """Another ERC-20, with the same code as XRT."""
     async with town.chain("provider") as chain:
-        artifact = load_artifact("XRT")
-        contract = chain.node.web3.eth.contract(abi=artifact.abi, bytecode=artifact.bytecode)
-        data = bytes.fromhex(contract.constructor(123_450_000_000).data_in_transaction[2:])
+        data = chain.node.creation_code("XRT", 123_450_000_000)
         assert chain.account is not None
         receipt = await TransactionSender(chain.node, chain.account).send(to=None, data=data)
         assert receipt.contract is not None

@@ -14,8 +14,7 @@ import pytest
 from mesh.chain import XRT, Account, Chain, Node, TransactionSender
 from mesh.devchain import EmbeddedChain
 from mesh.devchain.anvil import STOP_SECONDS, NodeEnded, find_anvil, serve_anvil
-from mesh.devchain.development import serve_chain
-from mesh.devchain.market import ALLOWANCE
+from mesh.devchain.development import ALLOWANCE, serve_chain
 from mesh.errors import ConfigurationError
 from mesh.settings import Settings
 from tests.support.peers import require
@@ -139,14 +138,14 @@ async def test_a_market_is_kept_with_all_that_happened_on_it(program: Path, tmp_
     ) as served:
         async with served.market.chain(served.url, "person") as chain:
             await chain.tokens.transfer(NOBODY, 7 * XRT)
-            head = await chain.node.web3.eth.get_block("latest")
+            head = await chain.node.latest_header()
         first = served
     async with serve_chain(settings, host="127.0.0.1", port=port, block_time=None, anvil=program, state=state) as again:
         assert again.facts() == first.facts()
         async with Chain(again.url) as chain:
             assert await chain.tokens.balance(NOBODY) == 7 * XRT
             assert await chain.tokens.balance(again.market.accounts["person"].address) == ALLOWANCE - 7 * XRT
-            assert (await chain.node.web3.eth.get_block(head["number"]))["hash"] == head["hash"]
+            assert await chain.node.header(head.number) == head
             assert list((await chain.lighthouses.get("airalab")).stakes) == [again.market.accounts["provider"].address]
 
 
@@ -157,7 +156,7 @@ async def test_a_kept_chain_without_a_market_is_not_built_upon(program: Path, tm
         Node(node.url) as client,
     ):
         await TransactionSender(client, Account.from_key(node.funded_keys[0])).send(to=NOBODY, data=b"", value=1)
-    with pytest.raises(ConfigurationError, match=r"state\.json has no market on it, and is not new$"):
+    with pytest.raises(ConfigurationError, match=r"state\.json is not new, but has no market$"):
         async with serve_chain(
             Settings(data_dir=str(tmp_path)), host="127.0.0.1", port=0, block_time=None, anvil=program, state=state
         ):

@@ -8,10 +8,11 @@ import pytest
 
 from mesh.chain import Account, Node, TransactionSender
 from mesh.devchain.anvil import serve_anvil
-from mesh.devchain.anvil_state import being_founded, founding, kept, prepare_state
+from mesh.devchain.anvil_state import deploying, deployment_mark, prepare_state, state_copy
 from mesh.devchain.development import serve_chain
 from mesh.errors import ConfigurationError
 from mesh.settings import Settings
+from tests.support.log_events import logged_events
 from tests.support.peers import require
 from tests.support.waiting import until
 
@@ -31,7 +32,7 @@ async def test_a_chain_whose_writing_was_cut_off_goes_on_from_the_last_whole_one
     ):
         await TransactionSender(client, Account.from_key(node.funded_keys[0])).send(to=NOBODY, data=b"", value=7)
         await until(
-            lambda: kept(state).exists() and NOBODY[2:].lower() in kept(state).read_text().lower(),
+            lambda: state_copy(state).exists() and NOBODY[2:].lower() in state_copy(state).read_text().lower(),
             what="a copy with the payment in it",
             seconds=30,
         )
@@ -42,7 +43,7 @@ async def test_a_chain_whose_writing_was_cut_off_goes_on_from_the_last_whole_one
         Node(node.url) as client,
     ):
         assert await client.eth_balance(NOBODY) == 7
-    assert "was cut off while it was written: the chain goes on from the last whole one" in caplog.text
+    assert "chain-state-restored" in logged_events(caplog)
 
 
 async def test_a_chain_that_was_killed_while_its_contracts_were_made_begins_anew(
@@ -55,11 +56,11 @@ async def test_a_chain_that_was_killed_while_its_contracts_were_made_begins_anew
         Node(node.url) as client,
     ):
         await TransactionSender(client, Account.from_key(node.funded_keys[0])).send(to=NOBODY, data=b"", value=7)
-        with pytest.raises(RuntimeError, match="killed"), founding(state):
+        with pytest.raises(RuntimeError, match="killed"), deploying(state):
             raise RuntimeError("killed")
     async with serve_chain(settings, host="127.0.0.1", port=0, block_time=None, anvil=program, state=state) as chain:
-        assert "cut off before its contracts were made and saved: the chain begins anew" in caplog.text
-        await until(lambda: not being_founded(state).exists(), what="the contracts to be saved", seconds=30)
+        assert "chain-state-discarded" in logged_events(caplog)
+        await until(lambda: not deployment_mark(state).exists(), what="the contracts to be saved", seconds=30)
         made = chain.market.deployment.lighthouse
     async with serve_chain(settings, host="127.0.0.1", port=0, block_time=None, anvil=program, state=state) as chain:
         assert chain.market.deployment.lighthouse == made
@@ -67,16 +68,16 @@ async def test_a_chain_that_was_killed_while_its_contracts_were_made_begins_anew
 
 def test_without_a_whole_copy_half_a_chain_is_one_clear_line_and_stays_as_it_is(tmp_path: Path) -> None:
     state = tmp_path / "state.json"
-    for file in (state, kept(state)):
+    for file in (state, state_copy(state)):
         file.write_bytes(b'{"accounts": {')
     with pytest.raises(ConfigurationError, match=r"state\.json holds no chain of anvil"):
         prepare_state(state)
-    assert state.read_bytes() == kept(state).read_bytes() == b'{"accounts": {'
+    assert state.read_bytes() == state_copy(state).read_bytes() == b'{"accounts": {'
 
 
 def test_a_whole_chain_is_not_replaced_by_an_older_one(tmp_path: Path) -> None:
     state = tmp_path / "state.json"
     state.write_bytes(b'{"accounts": {}, "block": 2}')
-    kept(state).write_bytes(b'{"accounts": {}, "block": 1}')
+    state_copy(state).write_bytes(b'{"accounts": {}, "block": 1}')
     prepare_state(state)
     assert state.read_bytes() == b'{"accounts": {}, "block": 2}'

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.chain import Account, Chain
-from mesh.devchain.development import DevelopmentChain, serve_chain
-from mesh.devchain.market import ALLOWANCE, ROLES
+from mesh.devchain.development import ALLOWANCE, ROLES, DevelopmentChain, serve_chain
 from mesh.errors import ConfigurationError
 from mesh.settings import Settings
 from tests.support.ports import answers

@@ -10,7 +10,7 @@ from web3 import AsyncWeb3
 from mesh.chain import Account, Chain, deploy
 from mesh.devchain import EmbeddedChain
 from mesh.devchain.jsonrpc import RpcError
-from mesh.devchain.node_filters import MAX_FILTERS
+from mesh.devchain.methods import MAX_FILTERS
 from tests.mesh.chain.conftest import QUICK
 
 if TYPE_CHECKING:

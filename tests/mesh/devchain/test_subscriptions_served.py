@@ -49,7 +49,7 @@ async def test_the_node_is_not_asked_when_nobody_is_subscribed(node: EmbeddedCha
             await client.subscribe("newHeads")
             asked = counting.asked
             await until(lambda: counting.asked > asked + 3, seconds=30)
-        await until(lambda: not server._dialogues, seconds=30)
+        await until(lambda: not server.connections, seconds=30)
         asked = counting.asked
         await asyncio.sleep(0.3)
         assert counting.asked <= asked + 1, "a look may have been under way"

@@ -6,8 +6,6 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from itertools import count
 from typing import TYPE_CHECKING, Any, Self
 
-from web3.types import RPCEndpoint
-
 from mesh.background import Background
 from mesh.chain import XRT, Account, Chain, Timing
 from mesh.chain.events import NewLiability
@@ -25,7 +23,7 @@ if TYPE_CHECKING:
     import zenoh
     from web3.providers.async_base import AsyncBaseProvider
 
-    from mesh.devchain.market import Market
+    from mesh.devchain.development import DevelopmentMarket
     from schemas import Liability, SignedMessage
 
 QUICK = Timing(poll_interval=0.02, receipt_interval=0.01, attempts=1, retry_delay=0.01)
@@ -41,7 +39,9 @@ class Floor:
     The person and the robot of the market trade; `rival` and `poor` are further accounts, which have ETH and no XRT.
     """
 
-    def __init__(self, market: Market, endpoint: str, *, node: str | AsyncBaseProvider, keys: Sequence[bytes]) -> None:
+    def __init__(
+        self, market: DevelopmentMarket, endpoint: str, *, node: str | AsyncBaseProvider, keys: Sequence[bytes]
+    ) -> None:
         self.node = node
         self.deployment = market.deployment
         self.accounts = market.accounts | {
@@ -111,7 +111,7 @@ class Floor:
 
     async def request(self, method: str, *params: Any) -> Any:
         """The node's answer to a JSON-RPC method."""
-        return (await self.chain.node.web3.provider.make_request(RPCEndpoint(method), list(params)))["result"]
+        return await self.chain.node.request(method, *params)
 
     async def mine(self, blocks: int) -> None:
         """Mine empty blocks."""

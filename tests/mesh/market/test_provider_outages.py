@@ -13,7 +13,7 @@ from web3.providers.async_base import AsyncBaseProvider
 
 from mesh.chain import GWEI
 from mesh.devchain import JsonRpcServer
-from mesh.devchain.market import found_market
+from mesh.devchain.development import deploy_market
 from mesh.retry import RetryPolicy
 from schemas import cid_of_bytes, parse_cid
 from tests.mesh.market.floor import QUICK, Floor
@@ -128,7 +128,7 @@ async def test_a_provider_without_eth_says_so_and_goes_on_when_it_has_some(
 ) -> None:
     await floor.found_lighthouse(timeout_blocks=1000, rival=5)
     async with floor.chain_of("rival") as rival:
-        balance, price = await rival.tokens.eth_balance(), await rival.node.web3.eth.gas_price
+        balance, price = await rival.tokens.eth_balance(), await rival.node.gas_price()
         await rival.tokens.send_eth(floor.address("person"), balance - 100_000 * price)
         async with floor.provider("rival"):
             demand = floor.demand()
@@ -144,7 +144,7 @@ async def test_a_provider_without_eth_says_so_and_goes_on_when_it_has_some(
 async def test_a_transaction_that_is_not_mined_for_long_is_waited_for(
     anvil: Anvil, router: EmbeddedRouter, caplog: pytest.LogCaptureFixture
 ) -> None:
-    market = await found_market(anvil.url, anvil.private_keys)
+    market = await deploy_market(anvil.url, anvil.private_keys)
     hasty = replace(QUICK, receipt_timeout=0.2)
     floor = Floor(market, router.endpoint, node=anvil.url, keys=anvil.private_keys)
     async with floor, floor.provider(timing=hasty) as provider:
@@ -164,7 +164,7 @@ async def test_gas_that_is_too_dear_is_waited_for_and_said_once(
     anvil: Anvil, router: EmbeddedRouter, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")
-    market = await found_market(anvil.url, anvil.private_keys)
+    market = await deploy_market(anvil.url, anvil.private_keys)
     floor = Floor(market, router.endpoint, node=anvil.url, keys=anvil.private_keys)
     async with floor, floor.provider() as provider:
         await base_fee(floor, 900 * GWEI)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 from mesh.agent import Agent
 from mesh.chain import XRT, Account, Chain
 from mesh.composition import chain_of
-from mesh.devchain.market import ALLOWANCE, ROLES, found_market
+from mesh.devchain.development import ALLOWANCE, ROLES, deploy_market
 from mesh.settings import Settings
 from schemas import cid_of_bytes
 from tests.mesh.cli.chains import write_quick_keyfile
@@ -43,7 +43,7 @@ class Site:
     @classmethod
     async def found(cls, url: str, keys: Sequence[bytes], endpoint: str, folder: Path) -> Site:
         """Deploy a market, and have its promises allowed once for all."""
-        await found_market(url, keys)
+        await deploy_market(url, keys)
         site = cls(url, keys, endpoint, folder)
         for role in ("robot", "person"):
             async with site.chain(role) as chain:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.chain import Account, write_keyfile
-from mesh.devchain.market import found_market
+from mesh.devchain.development import deploy_market
 from mesh.identity import Member
 from tests.support.commands import AIRA, Serving
 from tests.support.nodes import Anvil
@@ -76,7 +76,7 @@ async def test_a_server_waits_for_its_files_then_the_node_the_contracts_and_the_
         await says(server, f"the {role} waits: no Ethereum node answers at")
         await asyncio.to_thread(node.start)
         await says(server, f"the {role} waits: the chain 31337 has no ")
-        await found_market(node.url, node.private_keys)
+        await deploy_market(node.url, node.private_keys)
         await says(server, "waiting for a router: no Zenoh router at")
         await asyncio.to_thread(router.start)
         await says(server, serves)
@@ -85,7 +85,7 @@ async def test_a_server_waits_for_its_files_then_the_node_the_contracts_and_the_
 
 async def test_a_provider_waits_for_its_stake(tmp_path: Path) -> None:
     with Anvil() as node, EmbeddedRouter() as router:
-        market = await found_market(node.url, node.private_keys)
+        market = await deploy_market(node.url, node.private_keys)
         late = Account.from_key(node.private_keys[3])
         await asyncio.to_thread(hand_over, tmp_path, key=node.private_keys[3])
         variables = variables_of(tmp_path, node=node.port, router=router.port)
@@ -138,7 +138,7 @@ async def test_an_agent_that_is_not_let_in_waits_until_it_is(tmp_path: Path) -> 
     (tmp_path / "other").mkdir()
     site, other = ClosedSite(tmp_path), ClosedSite(tmp_path / "other")
     with Anvil() as node:
-        await found_market(node.url, node.private_keys)
+        await deploy_market(node.url, node.private_keys)
         account = Account.from_key(node.private_keys[1])
         await asyncio.to_thread(hand_over, tmp_path, key=node.private_keys[1])
         mine = site.enlist(Member(name="robot", address=account.address, roles=("agent",)))

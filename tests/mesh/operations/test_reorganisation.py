@@ -6,7 +6,6 @@ import asyncio
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from web3.types import RPCEndpoint
 
 from mesh.agent import Phase
 from mesh.work import outbox
@@ -32,7 +31,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 async def request(chain: Chain, method: str, *parameters: Any) -> Any:
-    return (await chain.node.web3.provider.make_request(RPCEndpoint(method), list(parameters)))["result"]
+    return await chain.node.request(method, *parameters)
 
 
 def patient_robot(site: Site, may_work: asyncio.Event, incoming: list[str], done: list[str]) -> Agent:

@@ -10,11 +10,12 @@ import pytest
 
 from mesh.background import Background
 from mesh.devchain import ServedChain, serve_embedded
+from schemas import parse_address
 from tests.mesh.operations.site import FEE, Site
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Sequence
+    from collections.abc import AsyncIterator
     from pathlib import Path
 
     from mesh.agent import Agent, Outcome
@@ -113,14 +114,13 @@ async def sent(site: Site, chain: Chain, start: int) -> list[Sent]:
     lighthouse = await chain.names.lighthouse(site.lighthouse)
     roles = {site.address(role): role for role in QUOTAS}
     found = []
-    eth = chain.node.web3.eth
     for number in range(start + 1, await chain.block_number() + 1):
-        block = await eth.get_block(number, full_transactions=True)
-        transactions: Sequence[Any] = block["transactions"]
-        for transaction in transactions:
-            if transaction.get("to") == lighthouse:
-                receipt = await eth.get_transaction_receipt(transaction["hash"])
-                found.append(Sent(number, roles[transaction["from"]], receipt["status"] == 1))
+        block = await chain.node.request("eth_getBlockByNumber", hex(number), True)
+        for transaction in block["transactions"]:
+            if transaction["to"] and parse_address(transaction["to"]) == lighthouse:
+                receipt = await chain.node.receipt(transaction["hash"])
+                assert receipt is not None
+                found.append(Sent(number, roles[parse_address(transaction["from"])], receipt["status"] == 1))
     return found
 
 

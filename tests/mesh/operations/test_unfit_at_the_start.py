@@ -7,7 +7,6 @@ import sys
 from typing import TYPE_CHECKING
 
 import pytest
-from web3.types import RPCEndpoint
 
 from mesh.chain import Node, new_private_key
 from tests.mesh.operations.site import MODEL, Site
@@ -45,7 +44,7 @@ def bare() -> Iterator[Anvil]:
 
 async def have_eth(site: Site, role: str, wei: int) -> None:
     async with Node(site.url) as node:
-        await node.web3.provider.make_request(RPCEndpoint("anvil_setBalance"), [site.address(role), hex(wei)])
+        await node.request("anvil_setBalance", site.address(role), hex(wei))
 
 
 async def stake_and_spend_all_eth(site: Site, role: str) -> None:

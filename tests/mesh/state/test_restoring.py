@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.chain.transaction_store import _locked
+from mesh.chain.transaction_store import lock_file
 from mesh.content import Store
 from mesh.errors import ConfigurationError
 from mesh.state import ArchiveUnusable, Existing, Extent, StateExists, StateInUse, back_up, restore, restoring
@@ -135,7 +135,7 @@ async def test_a_store_that_is_open_is_in_use(archive: Path, folder: Folder) -> 
 
 
 async def test_a_transaction_that_somebody_waits_for_is_in_use(archive: Path, folder: Folder) -> None:
-    descriptor = _locked(folder.path / NONCE, fcntl.LOCK_EX)
+    descriptor = lock_file(folder.path / NONCE, fcntl.LOCK_EX)
     assert descriptor is not None
     try:
         with pytest.raises(StateInUse):

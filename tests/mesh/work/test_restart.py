@@ -199,12 +199,12 @@ async def test_a_chain_started_anew_is_another_memory(place: Place) -> None:
     """A development chain gives the same addresses to other contracts: an old job there must not hide a new one."""
     from mesh.chain import Chain
     from mesh.devchain import EmbeddedChain
-    from mesh.devchain.market import found_market
+    from mesh.devchain.development import deploy_market
 
     async with place.agent("robot") as robot:
         here = robot.parts.directory
     async with EmbeddedChain() as node:
-        market = await found_market(node.provider, node.funded_keys)
+        market = await deploy_market(node.provider, node.funded_keys)
         await node.mine()
         async with Chain(node.provider, account=market.accounts["robot"], ens=market.deployment.ens) as chain:
             settings = place.settings("robot", ens_contract=market.deployment.ens)

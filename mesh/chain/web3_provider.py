@@ -1,7 +1,6 @@
-"""The way to a node: one provider that retries what may be retried, and speaks our errors.
+"""The web3 provider in front of one or several nodes, with retries.
 
-Everything above it (web3's modules and contracts) then raises `NodeUnreachable`, `Reverted` or `RequestRefused`
-by itself.
+What uses it (web3's modules and contracts) raises `NodeUnreachable`, `Reverted` and `RequestRefused`.
 """
 
 from __future__ import annotations
@@ -19,18 +18,20 @@ from mesh.chain.node_metrics import NodeMetrics
 from mesh.chain.reverts import decode_revert
 from mesh.chain.transports import HttpTransport, WebSocketTransport
 from mesh.errors import AiraError, ClosedError, ConfigurationError
+from mesh.retry import Backoff
+from mesh.telemetry.context import log_event
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from web3.types import RPCEndpoint, RPCResponse
 
-    from mesh.chain.timing import Timing
+    from mesh.chain.policy import Timing
 
 log = logging.getLogger(__name__)
 
 CONNECTION_ERRORS: Final = (OSError, TimeoutError, ClientError, Web3Exception, ValueError)
-"""What transports raise when there is no node, no connection any more, or no JSON in the answer."""
+"""What transports raise for a missing node, a lost connection and an answer that is not JSON."""
 
 Transport: TypeAlias = HttpTransport | WebSocketTransport
 Endpoint: TypeAlias = "str | Sequence[str] | AsyncBaseProvider"
@@ -39,40 +40,39 @@ SEND: Final = "eth_sendRawTransaction"
 TRANSIENT_STATUS: Final = frozenset({429, 500, 502, 503, 504})
 
 CHECK_TIMEOUT: Final = 2.0
-"""Seconds that opening waits for the nodes beside the one in use, to say which chain they are on."""
+"""Seconds that opening waits for the other nodes to say which chain they are on."""
 
 
 class NotJsonRpc(ValueError):
-    """What answers is no JSON-RPC server, or none of this chain."""
+    """The server does not speak JSON-RPC, or is a node of another chain."""
 
 
 class Upstream:
-    """One of the nodes that requests can go to. `owned` is the transport that is closed with the provider."""
+    """One of the nodes. `owned` is the transport that is closed with the provider."""
 
     def __init__(self, provider: AsyncBaseProvider, *, endpoint: str, owned: Transport | None = None) -> None:
         self.endpoint = endpoint
         self.provider = provider
         self.owned = owned
         self.is_on_chain = False
-        """Whether it was seen to be on the chain of the others."""
+        """Whether it said that it is on the chain of the others."""
 
 
 class ReliableProvider(AsyncBaseProvider):
     """A provider in front of one or several others, with bounded retries.
 
-    A request goes to the node that answered last; when its connection fails, to the next, and so on around all of
-    them, `timing.attempts` times with a growing delay in between. Only a transaction goes to one node once, as its
-    sender has to know whether an earlier attempt may have arrived; the sender's next attempt goes to the next node.
-    A node that is on another chain than the first that answered is an error at the opening, where it answers soon, and
-    passed over later.
+    A request goes to the node that answered last; if its connection fails, to the next, and so on around all of them,
+    again and again by `Timing.request_retry`. Only a transaction goes to one node once, because its sender must know
+    whether an earlier attempt may have arrived; the sender's next attempt goes to the next node. A node on another
+    chain than the first that answered is an error when opening, if it answers soon, and skipped later.
     """
 
-    def __init__(self, ways: Sequence[Upstream], *, timing: Timing, tally: NodeMetrics) -> None:
+    def __init__(self, upstreams: Sequence[Upstream], *, timing: Timing, metrics: NodeMetrics) -> None:
         super().__init__()
-        self.endpoint = ", ".join(way.endpoint for way in ways)
-        self._ways = tuple(ways)
+        self.endpoint = ", ".join(upstream.endpoint for upstream in upstreams)
+        self._upstreams = tuple(upstreams)
         self._timing = timing
-        self._tally = tally
+        self._metrics = metrics
         self._chain_id: object = None
         self._is_open = False
 
@@ -81,21 +81,25 @@ class ReliableProvider(AsyncBaseProvider):
         self._is_open = True
 
     async def check_chains(self, expected: int) -> None:
-        """Look which chain the nodes are on that answer within `CHECK_TIMEOUT`. Raises `WrongChain`."""
-        if len(self._ways) == 1:
+        """Raise `WrongChain` if a node that answers within `CHECK_TIMEOUT` is on another chain."""
+        if len(self._upstreams) == 1:
             return
-        found = await asyncio.gather(*(self._chain_of(way) for way in self._ways))
-        for way, chain_id in zip(self._ways, found, strict=True):
+        found = await asyncio.gather(*(self._chain_of(upstream) for upstream in self._upstreams))
+        for upstream, chain_id in zip(self._upstreams, found, strict=True):
             if chain_id is None:
-                log.warning("the node %s does not answer now; it is asked when another fails", way.endpoint)
+                log.warning(
+                    "the node %s does not answer; it is asked when another fails",
+                    upstream.endpoint,
+                    extra=log_event("node-silent", node=upstream.endpoint),
+                )
             elif chain_id != expected:
-                raise WrongChain(way.endpoint, found=chain_id, expected=expected)
+                raise WrongChain(upstream.endpoint, found=chain_id, expected=expected)
 
-    async def _chain_of(self, way: Upstream) -> int | None:
-        """The number of the chain that a node is on; None if it does not say."""
+    async def _chain_of(self, upstream: Upstream) -> int | None:
+        """The number of a node's chain; None if it does not answer."""
         try:
             async with asyncio.timeout(CHECK_TIMEOUT):
-                response: Any = await way.provider.make_request("eth_chainId", [])  # type: ignore[arg-type]
+                response: Any = await upstream.provider.make_request("eth_chainId", [])  # type: ignore[arg-type]
                 return int(response["result"], 16)
         except (*CONNECTION_ERRORS, LookupError, TypeError):
             return None
@@ -107,54 +111,61 @@ class ReliableProvider(AsyncBaseProvider):
         """
         if not self._is_open:
             raise ClosedError("the connection to the node is not open: use it with `async with`")
-        attempts = 1 if method == SEND else self._timing.attempts
-        delay = self._timing.retry_delay
-        for attempt in range(1, attempts + 1):
+        backoff = Backoff(self._timing.request_retry)
+        while True:
             failures: list[Exception] = []
-            for way in self._ways[:1] if method == SEND else self._ways:
+            for upstream in self._upstreams[:1] if method == SEND else self._upstreams:
                 try:
-                    answer = await self._ask(way, method, params)
-                    self._tally.answered()
+                    answer = await self._ask(upstream, method, params)
+                    self._metrics.answered()
                     return _checked(method, answer)
                 except AiraError:
                     raise
                 except CONNECTION_ERRORS as error:
                     failures.append(error)
-                    self._turn_from(way, _why(error))
-                    why = _why(error) if len(self._ways) == 1 else f"{way.endpoint}: {_why(error)}"
-            if attempt == attempts or not any(_is_transient(failure) for failure in failures):
+                    reason = _reason(error)
+                    self._demote(upstream, reason)
+                    if len(self._upstreams) > 1:
+                        reason = f"{upstream.endpoint}: {reason}"
+            log.debug("%s failed (%s)", method, reason)
+            if method == SEND or not any(_is_transient(failure) for failure in failures) or not await backoff.wait():
                 break
-            log.debug("%s failed (%s); trying again in %.2f s", method, why, delay)
-            await asyncio.sleep(delay)
-            delay *= 2
-        self._tally.failed()
-        raise NodeUnreachable(self.endpoint, why) from failures[-1]
+        self._metrics.failed()
+        raise NodeUnreachable(self.endpoint, reason) from failures[-1]
 
-    async def _ask(self, way: Upstream, method: RPCEndpoint, params: Any) -> dict[str, Any]:
+    async def _ask(self, upstream: Upstream, method: RPCEndpoint, params: Any) -> dict[str, Any]:
         """What a node answers. Raises `CONNECTION_ERRORS`."""
         async with asyncio.timeout(self._timing.request_timeout):
-            if not way.is_on_chain and len(self._ways) > 1:
-                await self._check_chain(way)
-            response: Any = await way.provider.make_request(method, params)
+            if not upstream.is_on_chain and len(self._upstreams) > 1:
+                await self._check_chain(upstream)
+            response: Any = await upstream.provider.make_request(method, params)
         if not isinstance(response, dict) or ("result" not in response and "error" not in response):
             raise NotJsonRpc("what answers is not a JSON-RPC server")
         return response
 
-    async def _check_chain(self, way: Upstream) -> None:
-        response: Any = await way.provider.make_request("eth_chainId", [])  # type: ignore[arg-type]
+    async def _check_chain(self, upstream: Upstream) -> None:
+        response: Any = await upstream.provider.make_request("eth_chainId", [])  # type: ignore[arg-type]
         found = response.get("result") if isinstance(response, dict) else None
         if self._chain_id is None:
             self._chain_id = found
         if found is None or found != self._chain_id:
             raise NotJsonRpc(f"it is on the chain {found}, the others are on {self._chain_id}")
-        way.is_on_chain = True
+        upstream.is_on_chain = True
 
-    def _turn_from(self, way: Upstream, why: str) -> None:
-        """Ask another node first from now on; the one that failed comes last."""
-        way.is_on_chain = False  # it may come back as another
-        if len(self._ways) > 1 and self._ways[0] is way:
-            self._ways = (*self._ways[1:], way)
-            log.warning("the node %s fails (%s); turning to %s", way.endpoint, why, self._ways[0].endpoint)
+    def _demote(self, upstream: Upstream, reason: str) -> None:
+        """Ask another node first from now on, and the one that failed last."""
+        upstream.is_on_chain = False  # it may come back as another
+        if len(self._upstreams) > 1 and self._upstreams[0] is upstream:
+            self._upstreams = (*self._upstreams[1:], upstream)
+            log.warning(
+                "the node %s fails (%s); switching to %s",
+                upstream.endpoint,
+                reason,
+                self._upstreams[0].endpoint,
+                extra=log_event(
+                    "node-switched", failed=upstream.endpoint, reason=reason, next=self._upstreams[0].endpoint
+                ),
+            )
 
     async def is_connected(self, show_traceback: bool = False) -> bool:
         """Whether a node answers."""
@@ -167,26 +178,26 @@ class ReliableProvider(AsyncBaseProvider):
     async def close(self) -> None:
         """Close the connections that this side opened; further requests raise `ClosedError`."""
         self._is_open = False
-        for way in self._ways:
-            if way.owned is not None:
-                await way.owned.close()
+        for upstream in self._upstreams:
+            if upstream.owned is not None:
+                await upstream.owned.close()
 
 
-def open_provider(endpoint: Endpoint, timing: Timing, tally: NodeMetrics | None = None) -> ReliableProvider:
+def open_provider(endpoint: Endpoint, timing: Timing, metrics: NodeMetrics | None = None) -> ReliableProvider:
     """The provider of an endpoint: `http(s)://…`, `ws(s)://…`, several of them, or a provider object.
 
-    Several are a sequence, or one text with commas. Nothing is connected yet. `tally` counts whether they answer.
+    Several are a sequence, or one text with commas. Nothing is connected yet. `metrics` counts whether they answer.
     Raises `ConfigurationError` for any other text.
     """
-    tally = tally or NodeMetrics()
+    metrics = metrics or NodeMetrics()
     if isinstance(endpoint, AsyncBaseProvider):
-        return ReliableProvider([Upstream(endpoint, endpoint=str(endpoint))], timing=timing, tally=tally)
+        return ReliableProvider([Upstream(endpoint, endpoint=str(endpoint))], timing=timing, metrics=metrics)
     texts = [endpoint] if isinstance(endpoint, str) else endpoint
     urls = [url.strip() for text in texts for url in text.split(",")] or [""]
-    return ReliableProvider([_way(url) for url in urls], timing=timing, tally=tally)
+    return ReliableProvider([_upstream(url) for url in urls], timing=timing, metrics=metrics)
 
 
-def _way(url: str) -> Upstream:
+def _upstream(url: str) -> Upstream:
     transport: Transport
     if url.startswith(("http://", "https://")):
         transport = HttpTransport(url)
@@ -219,7 +230,7 @@ def _is_transient(error: Exception) -> bool:
     return not isinstance(error, ValueError)
 
 
-def _why(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     match error:
         case ClientResponseError():
             return f"HTTP {error.status} {error.message}"

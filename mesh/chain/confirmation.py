@@ -1,0 +1,219 @@
+"""Giving a signed transaction to the node, and waiting until it is mined and confirmed.
+
+While it waits, a transaction is replaced by one with higher fees when it is stuck, sent again when the node lost it or
+its block was replaced, and given up when another transaction was mined with its nonce.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Final
+
+from mesh.chain.errors import NodeUnreachable, RequestRefused, TransactionTimeout
+from mesh.chain.node_metrics import TransactionOutcome
+from mesh.chain.policy import Fees
+from mesh.retry import Backoff
+from mesh.telemetry.context import log_event
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from web3.types import TxReceipt
+
+    from mesh.chain.accounts import Account, SignedTransaction
+    from mesh.chain.node import Node
+    from mesh.chain.pending import PendingTransactions
+    from mesh.chain.transaction_store import PendingTransaction
+
+log = logging.getLogger(__name__)
+
+NONCE_CHECKS: Final = 3
+"""How often in a row a node has to say that a nonce is used by another transaction: its index may be behind."""
+
+NONCE_TAKEN: Final = (
+    "nonce too low",
+    "nonce too high",
+    "underpriced",
+    "already known",
+    "known transaction",
+    "already imported",
+    "alreadyknown",
+    "oldnonce",
+)
+"""What geth, anvil, nethermind, erigon and the embedded chain say when another transaction has the nonce."""
+
+
+class NonceLost(Exception):
+    """Another transaction was mined with the nonce: this one never will be, and may be sent with another nonce."""
+
+
+def is_nonce_taken(refused: RequestRefused) -> bool:
+    """Whether a node refused a transaction because of its nonce."""
+    return any(words in refused.detail.lower() for words in NONCE_TAKEN)
+
+
+def is_waiting_elsewhere(refused: RequestRefused) -> bool:
+    """Whether it did so because another transaction with the nonce waits, which it may not count."""
+    return is_nonce_taken(refused) and "nonce" not in refused.detail.lower()
+
+
+async def submit(node: Node, signed: SignedTransaction) -> None:
+    """Give a transaction to the node, and again after a lost connection: the same bytes never count twice.
+
+    Once an attempt may have arrived, the refusal of a later one may mean just that. Raises `NodeUnreachable`,
+    `RequestRefused`.
+    """
+    backoff, may_have_arrived = Backoff(node.timing.request_retry), False
+    while True:
+        try:
+            return await node.send_raw(signed.raw)
+        except NodeUnreachable:
+            may_have_arrived = True
+            if not await backoff.wait():
+                raise
+        except RequestRefused:
+            if may_have_arrived and await node.has_transaction(signed.hash):
+                return None
+            raise
+
+
+async def is_known(node: Node, versions: Iterable[SignedTransaction]) -> bool:
+    """Whether the node has one of the versions of a transaction, mined or waiting."""
+    for signed in versions:
+        if await node.has_transaction(signed.hash):
+            return True
+    return False
+
+
+async def find_receipt(node: Node, versions: Iterable[SignedTransaction]) -> tuple[SignedTransaction, TxReceipt] | None:
+    """The version of a transaction that was mined, and its receipt; None if none was."""
+    for signed in versions:
+        receipt = await node.receipt(signed.hash)
+        if receipt is not None:
+            return signed, receipt
+    return None
+
+
+class Confirmation:
+    """The wait for one transaction of an account, which stays among the account's pending ones."""
+
+    def __init__(self, node: Node, account: Account, pending: PendingTransactions, entry: PendingTransaction) -> None:
+        self._node = node
+        self._account = account
+        self._pending = pending
+        self._entry = entry
+        self._was_mined = False
+        self._nonce_used = 0
+        """Checks in a row that found the nonce used by another transaction."""
+
+    async def wait(self) -> tuple[SignedTransaction, TxReceipt]:
+        """The version that was mined, and its receipt, once it has the confirmations.
+
+        Raises `NonceLost`, `TransactionTimeout`, `NodeUnreachable`.
+        """
+        timing = self._node.timing
+        loop = asyncio.get_running_loop()
+        polling = Backoff(timing.receipt_polling)
+        replace_at = loop.time() + timing.replace_after
+        try:
+            async with asyncio.timeout(timing.receipt_timeout):
+                while True:
+                    found = await self._find_confirmed()
+                    if found is not None:
+                        return found
+                    pause = polling.next_delay() or timing.poll_interval
+                    if pause == timing.poll_interval and not self._was_mined:
+                        await self._check_nonce()
+                    if loop.time() >= replace_at and not self._was_mined:
+                        await self._unblock()
+                        replace_at = loop.time() + timing.replace_after
+                    await asyncio.sleep(pause)
+        except TimeoutError:
+            raise TransactionTimeout(self._entry.newest.hash, timing.receipt_timeout) from None
+
+    async def _find_confirmed(self) -> tuple[SignedTransaction, TxReceipt] | None:
+        """The version that was mined, if it has the confirmations. Sends it again if its block was replaced."""
+        confirmations = self._node.timing.confirmations
+        head = await self._node.block_number() if confirmations > 1 else 0
+        tx = self._entry.newest.hash
+        try:
+            found = await find_receipt(self._node, reversed(self._entry.versions))
+        except RequestRefused as refused:
+            log.debug("%s: %s", tx, refused)  # as nodes do that are still indexing; it was sent
+            return None
+        if found is not None:
+            self._was_mined = True
+            _, receipt = found
+            return found if confirmations == 1 or head >= receipt["blockNumber"] + confirmations - 1 else None
+        if self._was_mined:
+            self._was_mined = False
+            log.warning(
+                "the block with the transaction %s was replaced; sending it again",
+                tx,
+                extra=log_event("transaction-reverted", tx=tx),
+            )
+            await self._send_again(self._entry)
+        return None
+
+    async def _check_nonce(self) -> None:
+        """Raise `NonceLost` once it is certain."""
+        if await self._node.transaction_count(self._account.address) <= self._entry.nonce or await is_known(
+            self._node, self._entry.versions
+        ):
+            self._nonce_used = 0
+            return
+        self._nonce_used += 1
+        if self._nonce_used == NONCE_CHECKS:
+            raise NonceLost
+
+    async def _unblock(self) -> None:
+        """Replace the transaction that holds up the account's others, if it is this one or an abandoned one."""
+        nonce = await self._node.transaction_count(self._account.address)
+        if nonce == self._entry.nonce:
+            await self._replace(self._entry)
+        elif nonce < self._entry.nonce:
+            blocking = next((entry for entry in self._pending.abandoned if entry.nonce == nonce), None)
+            if blocking is not None and await self._pending.take_over(blocking):
+                try:
+                    await self._replace(blocking)
+                finally:
+                    self._pending.abandon(blocking)
+            elif nonce not in self._pending.taken:
+                tx = self._entry.newest.hash
+                log.warning(
+                    "%s waits for nonce %d of its account, which was sent by another program",
+                    tx,
+                    nonce,
+                    extra=log_event("transaction-blocked", tx=tx, nonce=nonce),
+                )
+
+    async def _replace(self, entry: PendingTransaction) -> None:
+        """Send another version with higher fees, or the old one again if the ceiling leaves no room."""
+        fees = self._node.fees.replacement(await self._node.gas_market(), Fees.of(entry.fields))
+        stuck = entry.newest.hash
+        if fees is None:
+            log.warning(
+                "the transaction %s is stuck, and its fees are at the ceiling",
+                stuck,
+                extra=log_event("transaction-stuck", tx=stuck),
+            )
+        else:
+            fields = entry.fields | fees.fields()
+            signed = self._account.sign_transaction({**fields, "nonce": entry.nonce})
+            await self._pending.add_version(entry, fields, signed)
+            self._node.metrics.count(TransactionOutcome.REPLACED)
+            log.warning(
+                "the transaction %s is stuck; replaced by %s with higher fees",
+                stuck,
+                signed.hash,
+                extra=log_event("transaction-replaced", tx=stuck, replacement=signed.hash),
+            )
+        await self._send_again(entry)
+
+    async def _send_again(self, entry: PendingTransaction) -> None:
+        """Give the newest version to the node, which may have it, or may have mined another in the meantime."""
+        try:
+            await submit(self._node, entry.newest)
+        except RequestRefused as refused:
+            log.debug("%s: %s", entry.newest.hash, refused)
