@@ -131,6 +131,21 @@ class TemporaryFile:
 
 
 @contextmanager
+def atomic_file(final: Path) -> Iterator[BinaryIO]:
+    """A stream to a file that appears at `final`, complete and synced, if the `with` block ends without error."""
+    temporary = final.with_name(f"{final.name}.new")
+    try:
+        with temporary.open("wb") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.rename(final)
+        sync_directory(final.parent)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
 def raising_store_full(directory: Path) -> Iterator[None]:
     """Turn an `OSError` that means a full disk into `StoreFull`."""
     try:

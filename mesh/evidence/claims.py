@@ -1,4 +1,4 @@
-"""What is claimed of a job, by the chain or by a signed Result. Pure: no I/O."""
+"""What is claimed of a job, by its contract or a signed Result, and whether signature and metadata agree. No I/O."""
 
 from __future__ import annotations
 
@@ -6,17 +6,46 @@ from typing import TYPE_CHECKING
 
 from msgspec import Struct
 
-from mesh.errors import InvalidMessage
-from mesh.evidence.findings import Finding
-from schemas import Result
+from mesh.errors import InvalidAddress, InvalidMessage
+from mesh.recording import ABOUT
+from schemas import Result, parse_address
 from schemas.signing import verify as verify_signature
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
     from schemas import Liability
 
 
+class Finding(Struct, frozen=True):
+    """The outcome of one check. `holds` is None if it can't be decided; `detail` is for people.
+
+    `name` is machine-readable: `objective-file`, `result-file`, `finalized`, `signature`, `readable`, `statistics`,
+    `closed`, `sequence`, `times`, `liability`, `agent`, `lighthouse`, `objective`, `played`.
+    """
+
+    name: str
+    holds: bool | None
+    detail: str
+
+
+class Verdict(Struct, frozen=True):
+    """All findings, in the order of the checks."""
+
+    findings: tuple[Finding, ...]
+
+    @property
+    def holds(self) -> bool:
+        """Whether no check failed."""
+        return all(finding.holds is not False for finding in self.findings)
+
+    def of(self, name: str) -> Finding | None:
+        """The finding of that name, if any."""
+        return next((finding for finding in self.findings if finding.name == name), None)
+
+
 class Claim(Struct, frozen=True, kw_only=True):
-    """A job as it is claimed to be; a field is empty (or None) where nobody says so.
+    """What is claimed of a job; a field is empty (or None) if nothing is claimed.
 
     `liability`, `promisor` and `lighthouse` are addresses (EIP-55), `objective` and `result` CIDs. `finalized` and
     `success` are the contract's.
@@ -32,7 +61,7 @@ class Claim(Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of_contract(cls, liability: Liability) -> Claim:
-        """What a contract says."""
+        """The claim of a contract."""
         return cls(
             liability=liability.address,
             promisor=liability.promisor,
@@ -45,10 +74,10 @@ class Claim(Struct, frozen=True, kw_only=True):
 
 
 def check_end(claim: Claim) -> Finding:
-    """Whether the contract has ended with a result, which it takes only with the promisor's signature."""
+    """Whether the contract has ended with a result, which it accepts only with the promisor's signature."""
     match claim:
         case Claim(finalized=None):
-            return Finding("finalized", None, "no contract was looked at")
+            return Finding("finalized", None, "no contract was checked")
         case Claim(finalized=False):
             return Finding("finalized", False, "the contract has not ended, and holds no result yet")
         case Claim(result=""):
@@ -58,14 +87,13 @@ def check_end(claim: Claim) -> Finding:
 
 
 def check_signature(claim: Claim, message: bytes | None, *, recording: str) -> Finding:
-    """Whose signature is on the result: `message` is a Result as it travels, `recording` the CID of the file at hand.
+    """Who signed the result. `message` is the encoded Result, `recording` the CID of the file at hand.
 
-    Without a message, a finalized contract is the proof: it compares the signature with its promisor before it takes a
-    result.
+    Without a message, a finalized contract is the proof: it accepts a result only with its promisor's signature.
     """
     if message is None:
         if claim.finalized and claim.result:
-            return Finding("signature", True, f"{claim.promisor} signed it: the contract takes no other")
+            return Finding("signature", True, f"{claim.promisor} signed it: the contract accepts no other")
         return Finding("signature", None, "there is neither a Result message nor an ended contract")
     try:
         verified = verify_signature(message)
@@ -73,7 +101,7 @@ def check_signature(claim: Claim, message: bytes | None, *, recording: str) -> F
         return Finding("signature", False, f"the Result message: {error.detail}")
     result = verified.message
     if not isinstance(result, Result):
-        return Finding("signature", False, f"the message is no Result but of the kind {type(result).__name__}")
+        return Finding("signature", False, f"the message is not a Result but a {type(result).__name__}")
     if result.result != recording:
         return Finding("signature", False, f"the Result message is for another recording, {result.result}")
     if claim.liability and result.liability != claim.liability:
@@ -85,7 +113,7 @@ def check_signature(claim: Claim, message: bytes | None, *, recording: str) -> F
 
 
 def supplemented(claim: Claim, message: bytes | None) -> Claim:
-    """The claim with what a signed Result says where the chain says nothing: for an arbiter without a chain."""
+    """The claim, completed from a signed Result where no contract is known: for an arbiter without a chain."""
     if message is None or claim.liability:
         return claim
     try:
@@ -104,3 +132,33 @@ def supplemented(claim: Claim, message: bytes | None) -> Claim:
         success=result.success if claim.success is None else claim.success,
         finalized=claim.finalized,
     )
+
+
+def check_about(claim: Claim, metadata: Mapping[str, Mapping[str, str]]) -> Iterator[Finding]:
+    """Compare the job in the recording's metadata with the claim, one finding for each field."""
+    about = metadata.get(ABOUT)
+    if about is None:
+        yield Finding("liability", False, f"the recording has no metadata {ABOUT!r}, and so names no liability")
+        return
+    yield _compared("liability", "liability", about.get("liability", ""), claim.liability)
+    yield _compared("agent", "agent", about.get("agent", ""), claim.promisor)
+    yield _compared("lighthouse", "lighthouse", about.get("lighthouse", ""), claim.lighthouse)
+    yield _compared("objective", "objective", about.get("objective", ""), claim.objective)
+
+
+def _compared(name: str, what: str, said: str, claimed: str) -> Finding:
+    if not said:
+        return Finding(name, False, f"the recording names no {what}")
+    if not claimed:
+        return Finding(name, None, f"the recording names the {what} {said[:80]!r}, with nothing to compare it to")
+    if _canonical(said) != _canonical(claimed):
+        return Finding(name, False, f"the recording names the {what} {said[:80]!r}, and it should be {claimed}")
+    return Finding(name, True, f"the recording names the {what} {claimed}")
+
+
+def _canonical(text: str) -> str:
+    """An address in its canonical form; any other text unchanged."""
+    try:
+        return parse_address(text)
+    except InvalidAddress:
+        return text

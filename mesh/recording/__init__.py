@@ -1,7 +1,5 @@
-"""Recordings: objectives of unknown origin (MCAP or ROS 1 bags) checked and played, and what a device did recorded."""
+"""Recordings: objectives of unknown origin (MCAP or ROS 1 bags) checked and played, and jobs recorded."""
 
-from mesh.recording.conversion import bag_to_mcap
-from mesh.recording.described import json_type
 from mesh.recording.errors import (
     CorruptRecording,
     NotARecording,
@@ -12,17 +10,32 @@ from mesh.recording.errors import (
     Unrecordable,
 )
 from mesh.recording.limits import GENEROUS, Limits
-from mesh.recording.lines import InvalidLine, messages_in
-from mesh.recording.objective import ChannelMessage, Objective, Played, Topic, open_objective
-from mesh.recording.packing import PackSummary, pack
-from mesh.recording.partial import ABOUT, CLOSED
-from mesh.recording.playback import AtOnce, Clock, FixedRate, MonotonicClock, Pace, RecordedTimes, Step, paced, timeline
-from mesh.recording.player import play
+from mesh.recording.objective import (
+    ChannelMessage,
+    Objective,
+    Played,
+    Topic,
+    TopicRates,
+    json_type,
+    open_objective,
+    rates_of,
+)
+from mesh.recording.packing import InvalidLine, PackSummary, bag_to_mcap, messages_in, pack
+from mesh.recording.partial import ABOUT, CLOSED, RECOVERED, RecoverySummary, recover
+from mesh.recording.playback import (
+    AtOnce,
+    Clock,
+    FixedRate,
+    MonotonicClock,
+    Pace,
+    RecordedTimes,
+    Step,
+    paced,
+    play,
+    timeline,
+)
 from mesh.recording.preflight import Preflight, preflight
-from mesh.recording.rates import TopicRates, rates_of
-from mesh.recording.recorder import Recorder, RecorderSettings, RecordingAbout, RecordingSummary
-from mesh.recording.recorders import Recorders
-from mesh.recording.recovery import RECOVERED, RecoverySummary, recover
+from mesh.recording.recorder import Recorder, Recorders, RecorderSettings, RecordingAbout, RecordingSummary
 from mesh.recording.source import Attachment, RecordingStatistics
 
 __all__ = [

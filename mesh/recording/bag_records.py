@@ -1,4 +1,4 @@
-"""The records of a ROS 1 bag, one after the other, believing no length that they claim.
+"""Parsing the records of a ROS 1 bag, trusting none of the lengths in it.
 
 Source: the ROS bag format, version 2.0.
 """
@@ -9,9 +9,9 @@ from enum import IntEnum
 from struct import Struct
 from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple
 
-from mesh.recording.cursor import Cursor, text_of
+from mesh.recording.decoding import Cursor, text_of
 from mesh.recording.errors import CorruptRecording, NotARecording
-from mesh.recording.source import Channel, Record
+from mesh.recording.source import RecordedMessage, RecordingChannel
 from schemas.payloads import PayloadType
 
 if TYPE_CHECKING:
@@ -23,13 +23,13 @@ MAGIC: Final = b"#ROSBAG V2.0\n"
 _LENGTH: Final = Struct("<I")
 _TIME: Final = Struct("<II")
 _HEADER: Final = 64 << 10
-"""Bytes of the longest record header taken; what is long is in the data of a record."""
+"""Bytes of the longest record header accepted."""
 _SECOND: Final = 10**9
 _FIELDS: Final = 12
-"""Fields of a header or a connection that are taken: twice as many as any that the format names has."""
+"""The most fields of a header or connection accepted: twice as many as the format uses."""
 
 
-class Op(IntEnum):
+class BagOp(IntEnum):
     """The kinds of records."""
 
     MESSAGE = 2
@@ -40,12 +40,12 @@ class Op(IntEnum):
     CONNECTION = 7
 
 
-CONNECTION: Final = bytes([Op.CONNECTION])
-_IN_CHUNKS: Final = frozenset({CONNECTION, bytes([Op.MESSAGE])})
+CONNECTION: Final = bytes([BagOp.CONNECTION])
+_IN_CHUNKS: Final = frozenset({CONNECTION, bytes([BagOp.MESSAGE])})
 
 
-class Part(NamedTuple):
-    """A record: the fields of its header, where it begins, and where its data is."""
+class BagRecord(NamedTuple):
+    """A record: the fields of its header, where it begins, and the offset and length of its data."""
 
     fields: dict[bytes, bytes]
     begin: int
@@ -54,13 +54,13 @@ class Part(NamedTuple):
 
     @property
     def opcode(self) -> int:
-        """What kind of record it is; -1 if it does not say."""
+        """The kind of the record, a `BagOp`; -1 if it has none."""
         value = self.fields.get(b"op", b"")
         return value[0] if len(value) == 1 else -1
 
 
-def parts(path: Path, file: BinaryIO, size: int) -> Iterator[Part]:
-    """The records of a bag, front to back; their data is not read. Raises `CorruptRecording` where it is cut."""
+def bag_records(path: Path, file: BinaryIO, size: int) -> Iterator[BagRecord]:
+    """The records of a bag in file order, without their data. Raises `CorruptRecording` if the bag is cut off."""
     file.seek(0)
     if file.read(len(MAGIC)) != MAGIC:
         raise NotARecording(path, "it does not begin as a bag does")
@@ -72,19 +72,16 @@ def parts(path: Path, file: BinaryIO, size: int) -> Iterator[Part]:
             raise CorruptRecording(path, f"a record header of {length} bytes at byte {position}")
         fields = fields_of(path, file.read(length))
         offset = position + length + 2 * _LENGTH.size
-        part = Part(fields, position, offset, _length(path, file.read(_LENGTH.size)))
-        if part.length > size - offset:
+        record = BagRecord(fields, position, offset, _length(path, file.read(_LENGTH.size)))
+        if record.length > size - offset:
             raise CorruptRecording(path, f"it is cut off: a record at byte {position} goes beyond the end")
-        _check_first(path, part, size)
-        yield part
-        position = offset + part.length
+        _check_first(path, record, size)
+        yield record
+        position = offset + record.length
 
 
 def fields_of(path: Path, header: bytes) -> dict[bytes, bytes]:
-    """The fields of a record header, or of a connection: each `name=value` after its length.
-
-    Raises `CorruptRecording`.
-    """
+    """The fields of a record header, or of a connection. Raises `CorruptRecording`."""
     position, end, fields = 0, len(header), dict[bytes, bytes]()
     while position < end:
         begin = position + _LENGTH.size
@@ -98,7 +95,7 @@ def fields_of(path: Path, header: bytes) -> dict[bytes, bytes]:
     return fields
 
 
-def parts_in(path: Path, data: bytes) -> Iterator[Part]:
+def records_in_chunk(path: Path, data: bytes) -> Iterator[BagRecord]:
     """The records in the decompressed data of a chunk. Raises `CorruptRecording`."""
     position, end = 0, len(data)
     while position < end:
@@ -111,27 +108,27 @@ def parts_in(path: Path, data: bytes) -> Iterator[Part]:
         fields = fields_of(path, data[header : offset - 4])
         length = _LENGTH.unpack_from(data, offset - 4)[0]
         if length > end - offset or fields.get(b"op") not in _IN_CHUNKS:
-            raise CorruptRecording(path, "a chunk holds what is neither a whole message nor a connection")
-        yield Part(fields, position, offset, length)
+            raise CorruptRecording(path, "a chunk holds something else than whole messages and connections")
+        yield BagRecord(fields, position, offset, length)
         position = offset + length
 
 
-def record_of(path: Path, part: Part, data: bytes) -> Record:
-    """The message of a record of a chunk's data; bags hold one time for it, and no sequence number."""
-    time = part.fields.get(b"time", b"")
+def message_of(path: Path, record: BagRecord, data: bytes) -> RecordedMessage:
+    """The message of a record in a chunk's data. Bags have one time for it, and no sequence number."""
+    time = record.fields.get(b"time", b"")
     if len(time) != _TIME.size:
         raise CorruptRecording(path, "a message without a time")
     seconds, nanoseconds = _TIME.unpack(time)
     when = seconds * _SECOND + nanoseconds
-    payload = data[part.offset : part.offset + part.length]
-    return Record(number_of(path, part, b"conn"), 0, when, when, payload)
+    payload = data[record.offset : record.offset + record.length]
+    return RecordedMessage(number_of(path, record, b"conn"), 0, when, when, payload)
 
 
-def channel_of(path: Path, part: Part, connection: dict[bytes, bytes]) -> Channel:
-    """The channel that a connection is: a record, and the fields of its data."""
+def channel_of(path: Path, record: BagRecord, connection: dict[bytes, bytes]) -> RecordingChannel:
+    """The channel for a connection, which is a record and the fields of its data."""
     kind = text_of(path, connection.get(b"type", b""))
     definition = connection.get(b"message_definition", b"")
-    topic = part.fields.get(b"topic") or connection.get(b"topic", b"")
+    topic = record.fields.get(b"topic") or connection.get(b"topic", b"")
     if not topic or not kind:
         raise CorruptRecording(path, "a connection without topic or type")
     metadata = {
@@ -139,23 +136,23 @@ def channel_of(path: Path, part: Part, connection: dict[bytes, bytes]) -> Channe
         for name, value in connection.items()
         if name not in (b"type", b"message_definition")
     }
-    return Channel(text_of(path, topic), PayloadType("ros1", kind, "ros1msg", definition), metadata)
+    return RecordingChannel(text_of(path, topic), PayloadType("ros1", kind, "ros1msg", definition), metadata)
 
 
-def _check_first(path: Path, part: Part, size: int) -> None:
-    if part.begin != len(MAGIC):
+def _check_first(path: Path, record: BagRecord, size: int) -> None:
+    if record.begin != len(MAGIC):
         return
-    if part.opcode != Op.BAG:
+    if record.opcode != BagOp.BAG:
         raise CorruptRecording(path, "its first record is not that of a bag")
-    if part.fields.get(b"encryptor"):
+    if record.fields.get(b"encryptor"):
         raise NotARecording(path, "it is encrypted")
-    if Cursor(path, part.fields.get(b"index_pos", b"")).u64() > size:
+    if Cursor(path, record.fields.get(b"index_pos", b"")).u64() > size:
         raise CorruptRecording(path, "it is cut off before its index")
 
 
-def number_of(path: Path, part: Part, name: bytes) -> int:
-    """A field of four bytes as a number. Raises `CorruptRecording` if it is not there."""
-    value = part.fields.get(name, b"")
+def number_of(path: Path, record: BagRecord, name: bytes) -> int:
+    """A field of four bytes as a number. Raises `CorruptRecording` if the record does not have it."""
+    value = record.fields.get(name, b"")
     if len(value) != 4:
         raise CorruptRecording(path, f"a record without its field {name.decode()}")
     return int.from_bytes(value, "little")

@@ -1,7 +1,4 @@
-"""What is wrong with a recording that was given, or with one that is being made.
-
-The branch `RecordingError` carries `reason`, a short machine-readable word; `preflight` reports the same words.
-"""
+"""Errors of reading and making recordings. A `RecordingError` has a machine-readable `reason`, as in `preflight`."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ if TYPE_CHECKING:
 
 
 class RecordingError(InputError):
-    """A file can't be taken as a recording. `reason` is machine-readable, `why` is for people."""
+    """A file is not usable as a recording. `reason` is machine-readable, `why` is for people."""
 
     code = "recording-error"
 
@@ -35,48 +32,48 @@ class NotARecording(RecordingError):
 
 
 class CorruptRecording(RecordingError):
-    """A file says that it is a recording, and then is none: cut off, mutated, or never one."""
+    """A file begins as a recording, but is cut off or damaged."""
 
     code = "corrupt-recording"
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(
-            path, why, reason="corrupt", hint="make it again, or save what is readable: `aira objective recover`"
+            path, why, reason="corrupt", hint="record it again, or recover the readable part: `aira objective recover`"
         )
 
 
 class RecordingTooLarge(RecordingError):
-    """A recording is over a limit; `reason` is `too-large` (the file) or `expands-too-much` (what is in it)."""
+    """A recording is over a limit. `reason` is `too-large` for the file, `expands-too-much` for its content."""
 
     code = "recording-too-large"
 
     def __init__(self, path: Path, why: str, *, reason: str = "expands-too-much") -> None:
-        super().__init__(path, why, reason=reason, hint="raise the limits, or make the recording smaller")
+        super().__init__(path, why, reason=reason, hint="raise the limits, or use a smaller recording")
 
 
 class Unrecordable(InputError):
-    """A message can't be recorded as it was given; nothing was written."""
+    """No recording can hold this message; nothing of it was written."""
 
     code = "unrecordable"
 
 
 class RecordingExists(InputError):
-    """A finished recording is there under that name already; none is ever overwritten."""
+    """A recording of that name exists; none is ever overwritten."""
 
     code = "recording-exists"
 
     def __init__(self, path: Path) -> None:
-        super().__init__(f"{path} is there already", hint="record under another name, or move it away")
+        super().__init__(f"{path} already exists", hint="choose another name, or move it away")
         self.path = path
 
 
 class RecordingFailed(AiraError):
-    """The disk refused the recording; what was on it by then can be recovered."""
+    """The disk refused the recording; what was written before can be recovered."""
 
     code = "recording-failed"
 
     def __init__(self, path: Path, why: str) -> None:
-        super().__init__(f"can't go on recording {path}: {why}", hint="make room on the disk, then recover the file")
+        super().__init__(f"can't record to {path}: {why}", hint="free space on the disk, then recover the file")
         self.path = path
         self.why = why
 

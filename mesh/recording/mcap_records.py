@@ -1,7 +1,7 @@
-"""The records of an MCAP file, one after the other, believing no length that they claim.
+"""Parsing the records of an MCAP file, trusting none of the lengths in it.
 
-Source: the MCAP specification, version 0. The records are read here rather than by the `mcap` package because that one
-allocates what a length field asks for, and takes a text that is shorter than it says.
+Source: the MCAP specification, version 0. The `mcap` package can't be used here: it allocates what a length field asks
+for, and accepts a text that is shorter than stated.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple
 
 from mcap.opcode import Opcode
 
-from mesh.recording.cursor import Cursor
+from mesh.recording.decoding import Cursor
 from mesh.recording.errors import CorruptRecording, NotARecording, RecordingTooLarge
-from mesh.recording.source import Attachment, Block, Channel, Record, RecordingStatistics
+from mesh.recording.source import Attachment, RecordedMessage, RecordingBlock, RecordingChannel, RecordingStatistics
 from schemas.payloads import PayloadType
 
 if TYPE_CHECKING:
@@ -28,30 +28,30 @@ MAGIC: Final = b"\x89MCAP0\r\n"
 _PREFIX: Final = Struct("<BQ")
 _MESSAGE: Final = Struct("<HIQQ")
 _CHUNK_HEAD: Final = 40
-"""Bytes of a chunk record before its compression's name and the length of its data."""
+"""Bytes of a chunk record, without the name of its compression and its data."""
 _LONGEST_COMPRESSION: Final = 32
 _ATTACHMENT_HEAD: Final = 64 << 10
-"""Bytes of an attachment in which its names and times must lie."""
+"""Bytes at the start of an attachment that must contain its names and times."""
 _PIECE: Final = 1 << 20
 
 
-class Frame(NamedTuple):
-    """A record of a file: its opcode, and where its `length` bytes begin."""
+class McapRecordHeader(NamedTuple):
+    """The header of a record: its opcode, and the offset and length of its content."""
 
     opcode: int
     offset: int
     length: int
 
 
-class ChunkHead(NamedTuple):
-    """A chunk before its data is looked at."""
+class ChunkHeader(NamedTuple):
+    """The header of a chunk: where its data is, and the data's checksum."""
 
-    block: Block
+    block: RecordingBlock
     crc: int
 
 
-def frames(path: Path, file: BinaryIO, size: int) -> Iterator[Frame]:
-    """The records of a file of `size` bytes up to its footer. Raises `CorruptRecording` where it is cut or mutated."""
+def mcap_records(path: Path, file: BinaryIO, size: int) -> Iterator[McapRecordHeader]:
+    """The headers of all records of a file of `size` bytes. Raises `CorruptRecording` if the file is cut or mutated."""
     file.seek(0)
     if file.read(len(MAGIC)) != MAGIC:
         raise NotARecording(path, "it does not begin as an MCAP file does")
@@ -66,8 +66,8 @@ def frames(path: Path, file: BinaryIO, size: int) -> Iterator[Frame]:
         if length > size - position:
             raise CorruptRecording(path, f"a record at byte {position} goes beyond the end of the file")
         if not opcode:
-            raise CorruptRecording(path, f"a record at byte {position} is of no kind")
-        yield Frame(opcode, position, length)
+            raise CorruptRecording(path, f"a record at byte {position} has no opcode")
+        yield McapRecordHeader(opcode, position, length)
         position += length
         if opcode == Opcode.FOOTER:
             break
@@ -76,11 +76,11 @@ def frames(path: Path, file: BinaryIO, size: int) -> Iterator[Frame]:
         raise CorruptRecording(path, "it does not end as an MCAP file does")
 
 
-def content(path: Path, file: BinaryIO, frame: Frame, *, limits: Limits) -> bytes:
-    """The bytes of a record. Raises `RecordingTooLarge` over `limits.record`."""
-    check_record_size(path, frame.length, limits)
-    file.seek(frame.offset)
-    return file.read(frame.length)
+def read_record(path: Path, file: BinaryIO, header: McapRecordHeader, *, limits: Limits) -> bytes:
+    """The content of a record. Raises `RecordingTooLarge` over `limits.record`."""
+    check_record_size(path, header.length, limits)
+    file.seek(header.offset)
+    return file.read(header.length)
 
 
 def check_record_size(path: Path, size: int, limits: Limits) -> None:
@@ -89,21 +89,21 @@ def check_record_size(path: Path, size: int, limits: Limits) -> None:
         raise RecordingTooLarge(path, f"a record of {size} bytes, more than the {limits.record} allowed")
 
 
-def chunk_head(path: Path, file: BinaryIO, frame: Frame, *, limits: Limits) -> ChunkHead:
-    """Where the data of a chunk is. Raises `RecordingTooLarge` if it or what it expands to is over `limits.record`."""
-    file.seek(frame.offset)
-    head = Cursor(path, file.read(min(frame.length, _CHUNK_HEAD + _LONGEST_COMPRESSION)))
-    head.take(16)
-    size, crc, compression, stored = head.u64(), head.u32(), head.text(), head.u64()
-    begin = frame.length - stored
+def chunk_header(path: Path, file: BinaryIO, header: McapRecordHeader, *, limits: Limits) -> ChunkHeader:
+    """The header of a chunk. Raises `RecordingTooLarge` if its data, compressed or not, is over `limits.record`."""
+    file.seek(header.offset)
+    fields = Cursor(path, file.read(min(header.length, _CHUNK_HEAD + _LONGEST_COMPRESSION)))
+    fields.take(16)
+    size, crc, compression, stored = fields.u64(), fields.u32(), fields.text(), fields.u64()
+    begin = header.length - stored
     if begin != _CHUNK_HEAD + len(compression.encode()):
-        raise CorruptRecording(path, f"a chunk of {frame.length} bytes can't hold {stored} bytes of data")
+        raise CorruptRecording(path, f"a chunk of {header.length} bytes can't hold {stored} bytes of data")
     check_record_size(path, max(size, stored), limits)
-    return ChunkHead(Block(frame.offset + begin, stored, size, compression), crc)
+    return ChunkHeader(RecordingBlock(header.offset + begin, stored, size, compression), crc)
 
 
-def entries(path: Path, data: bytes) -> Iterator[Frame]:
-    """The records in the decompressed data of a chunk, with their place in it. Raises `CorruptRecording`."""
+def records_in_chunk(path: Path, data: bytes) -> Iterator[McapRecordHeader]:
+    """The headers of the records in the decompressed data of a chunk. Raises `CorruptRecording`."""
     position, end = 0, len(data)
     while position < end:
         if end - position < _PREFIX.size:
@@ -112,33 +112,33 @@ def entries(path: Path, data: bytes) -> Iterator[Frame]:
         position += _PREFIX.size
         if length > end - position:
             raise CorruptRecording(path, "a record goes beyond the end of its chunk")
-        yield Frame(opcode, position, length)
+        yield McapRecordHeader(opcode, position, length)
         position += length
 
 
-def record_of(path: Path, data: bytes, frame: Frame) -> Record:
-    """The message of that frame of a chunk's data."""
-    if frame.length < _MESSAGE.size:
-        raise CorruptRecording(path, f"a message of {frame.length} bytes")
-    channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, frame.offset)
-    payload = data[frame.offset + _MESSAGE.size : frame.offset + frame.length]
-    return Record(channel, sequence, log_time, publish_time, payload)
+def message_of(path: Path, data: bytes, header: McapRecordHeader) -> RecordedMessage:
+    """The message with that header in the data of a chunk."""
+    if header.length < _MESSAGE.size:
+        raise CorruptRecording(path, f"a message of {header.length} bytes")
+    channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, header.offset)
+    payload = data[header.offset + _MESSAGE.size : header.offset + header.length]
+    return RecordedMessage(channel, sequence, log_time, publish_time, payload)
 
 
 def schema_of(path: Path, data: bytes) -> tuple[int, tuple[str, str, bytes]]:
-    """The id of a schema record, and its name, encoding and data. The data is never looked into."""
+    """The number of a schema record, and its name, encoding and data. The data is never parsed."""
     cursor = Cursor(path, data)
     return cursor.u16(), (cursor.text(), cursor.text(), cursor.data())
 
 
-def channel_of(path: Path, data: bytes, schemas: dict[int, tuple[str, str, bytes]]) -> tuple[int, Channel]:
-    """The id of a channel record and the channel. Raises `CorruptRecording` if its schema was not seen before."""
+def channel_of(path: Path, data: bytes, schemas: dict[int, tuple[str, str, bytes]]) -> tuple[int, RecordingChannel]:
+    """The number of a channel record, and the channel. Raises `CorruptRecording` if its schema is not in `schemas`."""
     cursor = Cursor(path, data)
     number, schema, topic, encoding, metadata = cursor.u16(), cursor.u16(), cursor.text(), cursor.text(), cursor.pairs()
     if schema and schema not in schemas:
-        raise CorruptRecording(path, f"channel {number} has a schema that is not there")
+        raise CorruptRecording(path, f"channel {number} has an undefined schema")
     described = schemas[schema] if schema else ("", "", b"")
-    return number, Channel(topic, PayloadType(encoding, *described), metadata)
+    return number, RecordingChannel(topic, PayloadType(encoding, *described), metadata)
 
 
 def metadata_of(path: Path, data: bytes) -> tuple[str, dict[str, str]]:
@@ -148,7 +148,7 @@ def metadata_of(path: Path, data: bytes) -> tuple[str, dict[str, str]]:
 
 
 def statistics_of(path: Path, data: bytes) -> RecordingStatistics:
-    """What a statistics record says."""
+    """The content of a statistics record."""
     cursor = Cursor(path, data)
     messages, _schemas, channels = cursor.u64(), cursor.u16(), cursor.u32()
     attachments, _metadata, chunks, start, end = cursor.u32(), cursor.u32(), cursor.u32(), cursor.u64(), cursor.u64()
@@ -160,29 +160,35 @@ def statistics_of(path: Path, data: bytes) -> RecordingStatistics:
     return RecordingStatistics(messages, channels, attachments, chunks, start, end, by_channel)
 
 
-def attachment_of(path: Path, file: BinaryIO, frame: Frame) -> Attachment:
-    """The attachment of that frame, its checksum compared and its data not kept."""
-    file.seek(frame.offset)
-    head = Cursor(path, file.read(min(frame.length, _ATTACHMENT_HEAD)))
-    before = head.left
-    log_time, create_time, name, media_type, size = head.u64(), head.u64(), head.text(), head.text(), head.u64()
-    begin = before - head.left
-    if begin + size + 4 != frame.length:
-        raise CorruptRecording(path, f"an attachment of {frame.length} bytes can't hold {size} bytes of data")
-    end = frame.offset + begin + size
+def attachment_of(path: Path, file: BinaryIO, header: McapRecordHeader) -> Attachment:
+    """The attachment with that header. Its checksum is verified, its data is not kept."""
+    file.seek(header.offset)
+    fields = Cursor(path, file.read(min(header.length, _ATTACHMENT_HEAD)))
+    before = fields.left
+    log_time, create_time, name, media_type, size = (
+        fields.u64(),
+        fields.u64(),
+        fields.text(),
+        fields.text(),
+        fields.u64(),
+    )
+    begin = before - fields.left
+    if begin + size + 4 != header.length:
+        raise CorruptRecording(path, f"an attachment of {header.length} bytes can't hold {size} bytes of data")
+    end = header.offset + begin + size
     file.seek(end)
-    check_stretch(path, file, start=frame.offset, end=end, crc=Cursor(path, file.read(4)).u32())
-    return Attachment(name, media_type, log_time, create_time, frame.offset + begin, size)
+    check_range_crc(path, file, start=header.offset, end=end, crc=Cursor(path, file.read(4)).u32())
+    return Attachment(name, media_type, log_time, create_time, header.offset + begin, size)
 
 
 def check_crc(path: Path, data: bytes, crc: int) -> None:
-    """Raise `CorruptRecording` if the data of a chunk has another CRC-32; 0 means that its writer made none."""
+    """Raise `CorruptRecording` unless the data of a chunk has this CRC-32; 0 means that its writer computed none."""
     if crc and zlib.crc32(data) != crc:
         raise CorruptRecording(path, "the checksum of a chunk is wrong")
 
 
-def check_stretch(path: Path, file: BinaryIO, *, start: int, end: int, crc: int) -> None:
-    """Raise `CorruptRecording` if the bytes of the file from `start` to `end` have another CRC-32; 0 means none."""
+def check_range_crc(path: Path, file: BinaryIO, *, start: int, end: int, crc: int) -> None:
+    """Raise `CorruptRecording` unless the bytes from `start` to `end` have this CRC-32; 0 means that there is none."""
     if not crc:
         return
     found, left = 0, end - start

@@ -1,150 +1,194 @@
-"""Writing the records of an MCAP file, fast enough for all that a busy device says.
+"""Writing MCAP files that every viewer opens, fast enough for a busy device.
 
-The package's own writer takes each number of each message on its own, twice. Here a message is one packed header and
-its payload, and what the index says of a chunk's messages is packed once a chunk; all other records are the package's.
-Source: the MCAP specification, version 1.
+The `mcap` package's own writer packs each field of each message separately, twice. Here a message is one packed header
+and its payload, and the index of a chunk is packed once per chunk; the package packs all other records. What no record
+can hold is refused before anything of it is written. Source: the MCAP specification, version 1.
 """
 
 from __future__ import annotations
 
 import struct
 import zlib
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, BinaryIO, Final
 
 import zstandard
+from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
+
+from mesh.recording.errors import Unrecordable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from mcap.records import McapRecord
+    from mesh.recording.source import Attachment
+    from schemas.payloads import PayloadType
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 LIBRARY: Final = "aira-mesh"
+CHUNK_SIZE: Final = 128 << 10
+"""Bytes of a chunk. With the package's default of 1 MiB, writing one stalls for 13 ms, and a crash loses more."""
+MAX_CHANNELS: Final = 0xFFFF
+MAX_TIME: Final = (1 << 64) - 1
 
+_JSON_SCHEMA: Final = b'{"type":"object"}'
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
 _MESSAGE_FIELDS: Final = _MESSAGE.size - 9
 _INDEX: Final = struct.Struct("<BQHI")
 _FOOTER: Final = struct.Struct("<BQQQ")
 
 
-class McapWriter:
-    """One MCAP file on its way to `stream`, in zstd chunks of about `chunk_size` bytes. For one thread.
+@dataclass
+class WriterChannel:
+    """A channel of the file: its number there, and the sequence number of its next message."""
 
-    Schemas and channels are numbered from 1. Arguments that no record can hold raise before anything is written of
-    it (`struct.error`, `AttributeError`, `UnicodeEncodeError`). Without `finish` the file has no index.
+    id: int
+    sequence: int = 0
+
+
+class McapWriter:
+    """An MCAP file that is written to `stream`, in zstd chunks of about `chunk_size` bytes. For one thread.
+
+    Without `finish` the file has no index and no end; closing the stream is left to the caller. All methods that write
+    raise `OSError`.
     """
 
-    def __init__(self, stream: BinaryIO, *, chunk_size: int) -> None:
+    def __init__(self, stream: BinaryIO, *, profile: str = "", chunk_size: int = CHUNK_SIZE) -> None:
         self._stream = stream
         self._chunk_size = chunk_size
         self._zstd = zstandard.ZstdCompressor()
-        self._schemas: list[Schema] = []
-        self._channels: list[Channel] = []
-        self._chunks: list[ChunkIndex] = []
-        self._metadata: list[MetadataIndex] = []
-        self._attachments: list[AttachmentIndex] = []
+        self._known_channels: dict[object, WriterChannel] = {}
+        self._known_schemas: dict[tuple[str, str, bytes], int] = {}
+        self._schemas: list[records.Schema] = []
+        self._channels: list[records.Channel] = []
+        self._chunks: list[records.ChunkIndex] = []
+        self._metadata: list[records.MetadataIndex] = []
+        self._attachments: list[records.AttachmentIndex] = []
         self._counts: dict[int, int] = {}
         self._parts: list[bytes] = []
         self._size = 0
-        """Bytes of the chunk that is open, in these parts."""
+        """Bytes of the open chunk, which is in `_parts`."""
         self._indexes: dict[int, list[int]] = {}
         """For each channel of the open chunk: log time and offset of one message after the other."""
+        self.messages = 0
+        stream.write(MAGIC + _bytes_of(records.Header(profile, LIBRARY)))
 
-    def start(self, profile: str) -> None:
-        """Write the beginning of the file."""
-        self._stream.write(MAGIC + _bytes_of(Header(profile, LIBRARY)))
+    def add(
+        self,
+        topic: str,
+        payload: bytes,
+        type: PayloadType,
+        *,
+        metadata: Mapping[str, str],
+        log_time_ns: int,
+        publish_time_ns: int,
+        sequence: int | None = None,
+    ) -> None:
+        """Write one message, on the channel of its topic, type and metadata.
 
-    def register_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Write a schema and return its number."""
-        schema = Schema(id=len(self._schemas) + 1, data=data, encoding=encoding, name=name)
-        self._append(_bytes_of(schema))
-        self._schemas.append(schema)
-        return schema.id
+        Without a `sequence`, the messages of a channel are numbered from 0. Times are in nanoseconds. Raises
+        `Unrecordable`, and then has written nothing.
+        """
+        check_message(topic, payload, log_time_ns, publish_time_ns)
+        self.write(self.channel(topic, type, metadata), payload, log_time_ns, publish_time_ns, sequence)
 
-    def register_channel(self, topic: str, encoding: str, schema: int, metadata: Mapping[str, str]) -> int:
-        """Write a channel and return its number."""
-        channel = Channel(
-            id=len(self._channels) + 1,
-            topic=topic,
-            message_encoding=encoding,
-            schema_id=schema,
-            metadata=dict(metadata),
-        )
-        self._append(_bytes_of(channel))
-        self._channels.append(channel)
-        return channel.id
-
-    def add_message(self, channel: int, log_time: int, data: bytes, publish_time: int, sequence: int) -> None:
-        """Write a message; times are in nanoseconds."""
-        size, offset = len(data), self._size
-        head = _MESSAGE.pack(Opcode.MESSAGE, _MESSAGE_FIELDS + size, channel, sequence, log_time, publish_time)
+    def write(
+        self,
+        channel: WriterChannel,
+        payload: bytes,
+        log_time_ns: int,
+        publish_time_ns: int,
+        sequence: int | None = None,
+    ) -> None:
+        """Write one message that passed `check_message`, on a channel of this file."""
+        size, offset, channel_id = len(payload), self._size, channel.id
+        number = (channel.sequence if sequence is None else sequence) & 0xFFFFFFFF
+        head = _MESSAGE.pack(Opcode.MESSAGE, _MESSAGE_FIELDS + size, channel_id, number, log_time_ns, publish_time_ns)
         try:
-            index = self._indexes[channel]
+            index = self._indexes[channel_id]
         except KeyError:
-            index = self._indexes[channel] = []
-        index += (log_time, offset)
-        self._parts += (head, data)
+            index = self._indexes[channel_id] = []
+        index += (log_time_ns, offset)
+        self._parts += (head, payload)
         self._size = offset = offset + _MESSAGE.size + size
+        channel.sequence += 1
+        self.messages += 1
         if offset > self._chunk_size:
             self._close_chunk()
 
+    def channel(self, topic: str, type: PayloadType, metadata: Mapping[str, str]) -> WriterChannel:
+        """The channel of a topic, type and metadata, created on first use. Raises `Unrecordable`."""
+        key = (topic, type, *metadata.items())
+        known = self._known_channels.get(key)
+        if known is not None:
+            return known
+        if len(self._channels) >= MAX_CHANNELS:
+            raise Unrecordable(f"a recording can't hold more than {MAX_CHANNELS} channels")
+        for text in (type.encoding, type.schema_name, type.schema_encoding, *metadata, *metadata.values()):
+            _check_text(text)
+        record = records.Channel(
+            id=len(self._channels) + 1,
+            topic=topic,
+            message_encoding=type.encoding,
+            schema_id=self._schema(type),
+            metadata=dict(metadata),
+        )
+        self._append(_bytes_of(record))
+        self._channels.append(record)
+        channel = self._known_channels[key] = WriterChannel(record.id)
+        return channel
+
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Write a metadata record, outside of the chunks."""
-        record = _bytes_of(Metadata(name=name, metadata=dict(values)))
-        self._metadata.append(MetadataIndex(offset=self._stream.tell(), length=len(record), name=name))
+        """Write a metadata record. Raises `Unrecordable`."""
+        for text in (name, *values, *values.values()):
+            _check_text(text)
+        record = _bytes_of(records.Metadata(name=name, metadata=dict(values)))
+        self._metadata.append(records.MetadataIndex(offset=self._stream.tell(), length=len(record), name=name))
         self._stream.write(record)
 
-    def add_attachment(self, create_time: int, log_time: int, name: str, media_type: str, data: bytes) -> None:
-        """Write an attachment, outside of the chunks; times are in nanoseconds."""
-        record = _bytes_of(
-            Attachment(create_time=create_time, log_time=log_time, name=name, media_type=media_type, data=data)
-        )
+    def add_attachment(self, attachment: Attachment, data: bytes) -> None:
+        """Write an attachment: `data` under the names and times of `attachment`."""
+        create_time, log_time = attachment.create_time, attachment.log_time
+        name, media_type = attachment.name, attachment.media_type
+        record = _bytes_of(records.Attachment(create_time, log_time, name, media_type, data))
+        offset = self._stream.tell()
         self._attachments.append(
-            AttachmentIndex(
-                offset=self._stream.tell(),
-                length=len(record),
-                create_time=create_time,
-                log_time=log_time,
-                data_size=len(data),
-                name=name,
-                media_type=media_type,
-            )
+            records.AttachmentIndex(offset, len(record), log_time, create_time, len(data), name, media_type)
         )
         self._stream.write(record)
 
     def flush(self) -> None:
-        """Close the open chunk, if it has messages, and hand all to the operating system."""
+        """Close the open chunk, if it has messages, and hand everything to the operating system."""
         self._close_chunk()
         self._stream.flush()
 
     def finish(self) -> None:
         """Write the index and the end of the file; the stream stays open."""
         self._close_chunk()
-        self._stream.write(_bytes_of(DataEnd(0)))
+        self._stream.write(_bytes_of(records.DataEnd(0)))
         start = self._stream.tell()
         summary, offsets = self._summary(start)
         offsets_start = start + len(summary)
         summary += _bytes_of(*offsets)
         crc = zlib.crc32(_FOOTER.pack(Opcode.FOOTER, 8 + 8 + 4, start, offsets_start), zlib.crc32(summary))
-        footer = Footer(summary_start=start, summary_offset_start=offsets_start, summary_crc=crc)
+        footer = records.Footer(summary_start=start, summary_offset_start=offsets_start, summary_crc=crc)
         self._stream.write(summary + _bytes_of(footer) + MAGIC)
+
+    def _schema(self, type: PayloadType) -> int:
+        """The number of a type's schema. Every channel gets one: some viewers refuse channels without."""
+        key = (type.schema_name, type.schema_encoding, type.schema_data)
+        if type.encoding == "json" and not type.schema_data:
+            key = (type.schema_name, "jsonschema", _JSON_SCHEMA)
+        known = self._known_schemas.get(key)
+        if known is not None:
+            return known
+        name, encoding, data = key
+        schema = records.Schema(id=len(self._schemas) + 1, data=data, encoding=encoding, name=name)
+        self._append(_bytes_of(schema))
+        self._schemas.append(schema)
+        self._known_schemas[key] = schema.id
+        return schema.id
 
     def _append(self, record: bytes) -> None:
         self._parts.append(record)
@@ -156,7 +200,7 @@ class McapWriter:
         data = b"".join(self._parts)
         times = [time for index in self._indexes.values() for time in (min(index[::2]), max(index[::2]))]
         packed = self._zstd.compress(data)
-        chunk = Chunk(
+        chunk = records.Chunk(
             compression="zstd",
             data=packed,
             message_start_time=min(times),
@@ -168,7 +212,7 @@ class McapWriter:
         indexes, offsets = self._message_indexes(start + len(record))
         self._stream.write(record + indexes)
         self._chunks.append(
-            ChunkIndex(
+            records.ChunkIndex(
                 message_start_time=chunk.message_start_time,
                 message_end_time=chunk.message_end_time,
                 chunk_start_offset=start,
@@ -183,20 +227,20 @@ class McapWriter:
         self._parts, self._size, self._indexes = [], 0, {}
 
     def _message_indexes(self, start: int) -> tuple[bytes, dict[int, int]]:
-        """The index records of the open chunk, which will be at `start`, and where each channel's is."""
-        records, offsets, length = [], {}, 0
+        """The index records of the open chunk, which will be at `start`, and the offset of each channel's."""
+        packed, offsets, length = [], {}, 0
         for channel, index in self._indexes.items():
             self._counts[channel] = self._counts.get(channel, 0) + len(index) // 2
             offsets[channel] = start + length
             size = 8 * len(index)
-            records.append(_INDEX.pack(Opcode.MESSAGE_INDEX, 6 + size, channel, size))
-            records.append(struct.pack(f"<{len(index)}Q", *index))
+            packed.append(_INDEX.pack(Opcode.MESSAGE_INDEX, 6 + size, channel, size))
+            packed.append(struct.pack(f"<{len(index)}Q", *index))
             length += _INDEX.size + size
-        return b"".join(records), offsets
+        return b"".join(packed), offsets
 
-    def _summary(self, start: int) -> tuple[bytes, list[SummaryOffset]]:
-        """All records by which a reader finds its way, which will be at `start`, and where those of each kind are."""
-        groups: list[tuple[Opcode, Sequence[McapRecord]]] = [
+    def _summary(self, start: int) -> tuple[bytes, list[records.SummaryOffset]]:
+        """The summary section, which will be at `start`, and the offsets of its groups."""
+        groups: list[tuple[Opcode, Sequence[records.McapRecord]]] = [
             (Opcode.SCHEMA, self._schemas),
             (Opcode.CHANNEL, self._channels),
             (Opcode.STATISTICS, [self._statistics()]),
@@ -205,16 +249,15 @@ class McapWriter:
             (Opcode.METADATA_INDEX, self._metadata),
         ]
         summary, offsets = b"", []
-        for opcode, records in groups:
-            group = _bytes_of(*records)
+        for opcode, members in groups:
+            group = _bytes_of(*members)
             if group:
-                where = SummaryOffset(group_opcode=opcode, group_start=start + len(summary), group_length=len(group))
-                offsets.append(where)
+                offsets.append(records.SummaryOffset(opcode, start + len(summary), len(group)))
             summary += group
         return summary, offsets
 
-    def _statistics(self) -> Statistics:
-        return Statistics(
+    def _statistics(self) -> records.Statistics:
+        return records.Statistics(
             attachment_count=len(self._attachments),
             channel_count=len(self._channels),
             channel_message_counts=self._counts,
@@ -227,8 +270,27 @@ class McapWriter:
         )
 
 
-def _bytes_of(*records: McapRecord) -> bytes:
+def check_message(topic: str, payload: object, log_time_ns: object, publish_time_ns: object) -> None:
+    """Raise `Unrecordable` for a message that no record can hold."""
+    if not isinstance(payload, bytes):
+        raise Unrecordable(f"a payload must be bytes, not {payload.__class__.__name__}")
+    for moment in (log_time_ns, publish_time_ns):
+        if not isinstance(moment, int) or not 0 <= moment <= MAX_TIME:
+            raise Unrecordable(f"{moment!r} is not a time in nanoseconds")
+    _check_text(topic)
+    if not topic:
+        raise Unrecordable("a message needs a topic")
+
+
+def _check_text(text: str) -> None:
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise Unrecordable(f"{text[:40]!a} can't be encoded as UTF-8") from None
+
+
+def _bytes_of(*members: records.McapRecord) -> bytes:
     builder = RecordBuilder()
-    for record in records:
+    for record in members:
         record.write(builder)
     return bytes(builder.end())  # type: ignore[no-untyped-call]

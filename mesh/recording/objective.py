@@ -1,11 +1,13 @@
-"""Opening a recording of unknown origin to read or play it."""
+"""Opening a recording of unknown origin, to read it or play it."""
 
 from __future__ import annotations
 
 import os
 import stat
+from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
+import msgspec
 from msgspec import Struct
 
 from mesh.recording import bag_records, mcap_records
@@ -13,30 +15,30 @@ from mesh.recording.bag_source import open_bag
 from mesh.recording.errors import NotARecording, RecordingTooLarge
 from mesh.recording.limits import Limits
 from mesh.recording.mcap_source import open_mcap
-from schemas.payloads import PayloadType
+from schemas.payloads import JSON, PayloadType
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
     from mesh.content import Progress
-    from mesh.recording.source import Channel, Look, Source
+    from mesh.recording.source import OnMessage, RecordingChannel, RecordingSource
 
 _DEFAULT: Final = Limits()
 
 
 class Topic(Struct, frozen=True):
-    """A topic of a recording, and how its payloads are to be read. Its name is whatever the file says."""
+    """A topic of a recording and the type of its payloads. The name is unchecked: it is whatever the file says."""
 
     name: str
     type: PayloadType
 
 
 class Played(Struct, frozen=True):
-    """A message of a recording. Times are nanoseconds of the recorder's clock.
+    """A message of a recording. Times are in nanoseconds by the recorder's clock.
 
-    `role` is what the metadata of its channel says: in recordings of ours, whether it was played (`objective`) or said
-    by the `device` or the `agent`.
+    `role` comes from the metadata of its channel: in our recordings, whether it was played (`objective`) or sent by the
+    `device` or the `agent`.
     """
 
     topic: str
@@ -49,21 +51,21 @@ class Played(Struct, frozen=True):
 
 
 class ChannelMessage(Struct, frozen=True):
-    """A message as it lies in its file: on the channel of that number."""
+    """A message of a recording, with the number of its channel in the file."""
 
     channel: int
     message: Played
 
 
 class Objective:
-    """A recording whose every byte was checked. Keeps no file open; its messages are read anew each time.
+    """A recording that was checked completely. No file stays open; the messages are read again each time.
 
-    `format` is `mcap` or `bag`, `size` that of the file in bytes, `count` the number of messages, `metadata` the
-    records of that kind by their names, `attachments` the files in it (a bag has neither). `statistics` is what an
-    MCAP file says about itself, if it does, and `unchecked` how many blocks of messages have no checksum.
+    `format` is `mcap` or `bag`, `size` is in bytes, `count` the number of messages, `metadata` the metadata records by
+    name, and `attachments` the files in it (bags have neither). `statistics` is what an MCAP file states about itself,
+    if it does, and `unchecked` the number of message blocks without a checksum.
     """
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: RecordingSource) -> None:
         self._source = source
         self.path: Final = source.path
         self.format: Final = source.format
@@ -78,46 +80,47 @@ class Objective:
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """The topics in the order in which the file names them; twice if payloads of two types are on one."""
+        """The topics in the order of the file; a topic with payloads of two types appears twice."""
         found = {Topic(channel.topic, channel.type): None for channel in self._source.channels.values()}
         return tuple(found)
 
     def messages(self, *, from_index: int = 0) -> Iterator[Played]:
-        """The messages by their log time, without the first `from_index`; those of one time in the file's order.
+        """The messages by log time, without the first `from_index`; those of equal time in file order.
 
-        Reads the file as it goes, in blocks of it: do so in a thread. Raises `CorruptRecording` if the file is not
-        any more what it was.
+        Reads the file block by block: use a thread. Raises `CorruptRecording` if the file has changed.
         """
         channels = self._source.channels
         for channel, sequence, log_time, publish_time, payload in self._source.in_time_order(skip=from_index):
             yield _played(channels[channel], payload, log_time, publish_time, sequence)
 
     def in_file_order(self) -> Iterator[ChannelMessage]:
-        """The messages as they lie in the file, whatever their times. Otherwise as `messages`."""
+        """The messages in file order, whatever their times. Otherwise like `messages`."""
         channels = self._source.channels
         for channel, sequence, log_time, publish_time, payload in self._source.in_file_order():
             yield ChannelMessage(channel, _played(channels[channel], payload, log_time, publish_time, sequence))
 
 
 def open_objective(path: Path, limits: Limits = _DEFAULT, *, progress: Progress | None = None) -> Objective:
-    """Check the whole of the recording at `path`, an MCAP file or a ROS 1 bag by its first bytes, and open it.
+    """Check the whole recording at `path`, an MCAP file or a ROS 1 bag, and open it.
 
-    Reads the whole file: do so in a thread. Memory is bounded by the limits whatever the file says, and no schema
-    text is ever looked into. `progress` is told how many bytes of the file are read, of how many. Raises
-    `NotARecording`, `RecordingTooLarge`, `CorruptRecording`.
+    Reads the whole file: use a thread. The limits bound the memory, whatever the file states; schema texts are never
+    parsed. `progress` is called with the bytes read, of all. Raises `NotARecording`, `RecordingTooLarge`,
+    `CorruptRecording`.
     """
     return Objective(open_source(path, limits, progress=progress))
 
 
-def open_source(path: Path, limits: Limits, *, look: Look | None = None, progress: Progress | None = None) -> Source:
-    """As `open_objective`, for what needs the messages in the order of the file, or to `look` at them on the way."""
-    size, magic = _look(path)
+def open_source(
+    path: Path, limits: Limits, *, on_message: OnMessage | None = None, progress: Progress | None = None
+) -> RecordingSource:
+    """Like `open_objective`, but returns the source, and calls `on_message` for each message while checking."""
+    size, magic = _size_and_magic(path)
     if size > limits.size:
         raise RecordingTooLarge(path, f"it has {size} bytes, more than the {limits.size} allowed", reason="too-large")
     if magic.startswith(mcap_records.MAGIC):
-        source = open_mcap(path, size, limits, look=look, progress=progress)
+        source = open_mcap(path, size, limits, on_message=on_message, progress=progress)
     elif magic.startswith(bag_records.MAGIC):
-        source = open_bag(path, size, limits, look=look, progress=progress)
+        source = open_bag(path, size, limits, on_message=on_message, progress=progress)
     else:
         raise NotARecording(path, "it is neither an MCAP file nor a ROS 1 bag")
     if progress is not None:
@@ -125,13 +128,54 @@ def open_source(path: Path, limits: Limits, *, look: Look | None = None, progres
     return source
 
 
-def _played(channel: Channel, payload: bytes, log_time: int, publish_time: int, sequence: int) -> Played:
+class TopicRates(Struct, frozen=True):
+    """The number of messages of each topic in consecutive spans of `span_ns` nanoseconds."""
+
+    span_ns: int
+    counts: dict[str, list[int]]
+
+    def per_second(self, topic: str) -> list[float]:
+        """Messages per second in each span."""
+        return [count * 1e9 / self.span_ns for count in self.counts[topic]]
+
+
+def rates_of(messages: Iterable[Played], *, start_ns: int, duration_ns: int, spans: int) -> TopicRates:
+    """Count the messages from `start_ns` to `duration_ns` later in so many spans."""
+    span = max(1, -(-(duration_ns + 1) // spans))
+    counts: dict[str, list[int]] = {}
+    for message in messages:
+        counted = counts.get(message.topic)
+        if counted is None:
+            counted = counts[message.topic] = [0] * spans
+        counted[(message.log_time_ns - start_ns) // span] += 1
+    return TopicRates(span, counts)
+
+
+@lru_cache(maxsize=1024)
+def json_type(kind: type[msgspec.Struct]) -> PayloadType:
+    """The payload type of `kind` as JSON: its name, and its JSON Schema, so that viewers can read the recording.
+
+    Plain `JSON` if `kind` has no schema, or is not an object in JSON.
+    """
+    try:
+        (root,), definitions = msgspec.json.schema_components((kind,), ref_template="#/$defs/{name}")
+    except TypeError:
+        return JSON
+    schema = definitions.get(root.get("$ref", "").rpartition("/")[2], root)
+    if schema.get("type") != "object":
+        return JSON
+    alone = msgspec.json.encode(schema, order="sorted")
+    data = msgspec.json.encode({**schema, "$defs": definitions}, order="sorted") if b'"$ref"' in alone else alone
+    return PayloadType("json", kind.__name__, "jsonschema", data)
+
+
+def _played(channel: RecordingChannel, payload: bytes, log_time: int, publish_time: int, sequence: int) -> Played:
     role = channel.metadata.get("role", "")
     return Played(channel.topic, payload, log_time, publish_time, sequence, channel.type, role)
 
 
-def _look(path: Path) -> tuple[int, bytes]:
-    """The size and the first bytes of a regular file; anything else might block whoever opens it."""
+def _size_and_magic(path: Path) -> tuple[int, bytes]:
+    """The size and the first bytes of a regular file. Opening anything else could block."""
     try:
         status = os.stat(path)
         if not stat.S_ISREG(status.st_mode):

@@ -1,49 +1,54 @@
-"""When each message of a recording is due. Pure: the clock is given, and no file is read here.
+"""Playback: when each message of a recording is due, and giving it then.
 
-Due times count from the start of playing, so that a pause of the process delays messages but never shifts those that
-come after: what is late goes out at once, in order.
+Due times count from the start of the playback, so that a pause of the process delays messages but does not shift later
+ones: late messages go out at once, in order.
 """
 
 from __future__ import annotations
 
 import asyncio
 import time
+from contextlib import aclosing
 from dataclasses import dataclass
+from itertools import islice
 from typing import TYPE_CHECKING, Final, Protocol, TypeAlias
 
 from msgspec import Struct
 
-from mesh.recording.objective import Played
+from mesh.recording.objective import Objective, Played
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterable, Iterable, Iterator
 
 _SECOND: Final = 10**9
 _EARLY_NS: Final = 200_000
-"""An event loop counts in whole milliseconds and wakes up to one too late; what is left after waking earlier than that
-is yielded away, which costs two hundredths of a core at 1 kHz and takes as much off how late messages are."""
+"""An event loop counts in whole milliseconds and wakes up to one too late. So the clock sleeps until this long before
+the due time and yields to the loop for the rest, which costs 2 % of a core at 1 kHz."""
 _UNPAUSED: Final = 32
 """Late messages after which the event loop gets its turn."""
+_AHEAD: Final = 64
+"""Messages read at once, while the batch before is played. A larger batch could delay a message that is due."""
+_AHEAD_BYTES: Final = 4 << 20
 
 
 @dataclass(frozen=True)
 class RecordedTimes:
-    """Messages as far apart as their log times say, divided by `speed`. Raises `ValueError` unless that is above 0."""
+    """Messages at their recorded intervals, divided by `speed`. Raises `ValueError` unless `speed` is positive."""
 
     speed: float = 1.0
 
     def __post_init__(self) -> None:
         if not self.speed > 0:
-            raise ValueError(f"a speed of {self.speed} does not play anything")
+            raise ValueError(f"the speed must be positive, not {self.speed}")
 
     def due_ns(self, position: int, elapsed_ns: int) -> int:
-        """When the message at `position` is due, recorded `elapsed_ns` after the first; from the start, nanoseconds."""
+        """When the message at `position`, recorded `elapsed_ns` after the first, is due: nanoseconds from the start."""
         return elapsed_ns if self.speed == 1 else int(elapsed_ns / self.speed)
 
 
 @dataclass(frozen=True)
 class AtOnce:
-    """Every message as soon as the one before is out."""
+    """Every message immediately after the one before."""
 
     def due_ns(self, position: int, elapsed_ns: int) -> int:
         """Always now."""
@@ -52,16 +57,16 @@ class AtOnce:
 
 @dataclass(frozen=True)
 class FixedRate:
-    """`hz` messages a second, whatever their times. Raises `ValueError` unless that is above 0."""
+    """`hz` messages per second, whatever their times. Raises `ValueError` unless `hz` is positive."""
 
     hz: float
 
     def __post_init__(self) -> None:
         if not self.hz > 0:
-            raise ValueError(f"a rate of {self.hz} does not play anything")
+            raise ValueError(f"the rate must be positive, not {self.hz}")
 
     def due_ns(self, position: int, elapsed_ns: int) -> int:
-        """When the message at `position` is due, from the start, nanoseconds."""
+        """When the message at `position` is due: nanoseconds from the start."""
         return int(position * _SECOND / self.hz)
 
 
@@ -69,7 +74,7 @@ Pace: TypeAlias = RecordedTimes | AtOnce | FixedRate
 
 
 class Step(Struct, frozen=True):
-    """A message to be played `due_ns` nanoseconds after the start; `index` is its place in the whole recording."""
+    """A message to play `due_ns` nanoseconds after the start; `index` is its number in the whole recording."""
 
     index: int
     due_ns: int
@@ -77,34 +82,34 @@ class Step(Struct, frozen=True):
 
 
 class Clock(Protocol):
-    """A time that only goes forward, in nanoseconds from anywhere."""
+    """A monotonic clock, in nanoseconds."""
 
     def now_ns(self) -> int:
         """The time now."""
 
     async def sleep_until(self, when_ns: int) -> None:
-        """Return at `when_ns`, or after a turn of the event loop if that is past."""
+        """Return at `when_ns`; if that is past, after one turn of the event loop."""
 
 
 class MonotonicClock:
-    """The clock of this machine."""
+    """The monotonic clock of this machine."""
 
     def now_ns(self) -> int:
         """The time now."""
         return time.monotonic_ns()
 
     async def sleep_until(self, when_ns: int) -> None:
-        """Return at `when_ns`, late by about a millisecond at most if the loop is not busy."""
+        """Return at `when_ns`, at most about a millisecond late if the loop is not busy."""
         await asyncio.sleep(max(0, when_ns - _EARLY_NS - time.monotonic_ns()) / _SECOND)
-        while time.monotonic_ns() < when_ns:  # noqa: ASYNC110 - nothing else tells the time as exactly
+        while time.monotonic_ns() < when_ns:  # noqa: ASYNC110 - no other wait is as precise
             await asyncio.sleep(0)
 
 
 def timeline(messages: Iterable[Played], pace: Pace, *, first_index: int = 0, start_ns: int = 0) -> Iterator[Step]:
-    """When each message, in the order given, is due.
+    """The steps of a playback of `messages`, in the given order.
 
-    The first is due at once; `first_index` is its place in the recording. With `start_ns`, messages recorded less
-    than that after the first are left out, and the others are due as if the recording began there.
+    The first is due at once; `first_index` is its number in the recording. With `start_ns`, messages recorded less than
+    that after the first are skipped, and the others are due as if the recording began there.
     """
     schedule = _Schedule(pace, first_index=first_index, start_ns=start_ns)
     for message in messages:
@@ -116,9 +121,9 @@ def timeline(messages: Iterable[Played], pace: Pace, *, first_index: int = 0, st
 async def paced(
     messages: AsyncIterable[Played], pace: Pace, clock: Clock, *, first_index: int = 0, start_ns: int = 0
 ) -> AsyncGenerator[Step, None]:
-    """Each step of the `timeline` of `messages` when it is due by `clock`, never before.
+    """Each step of the `timeline` of `messages` when it is due by `clock`, never earlier.
 
-    Time starts when the first message is there. Cancelling is safe between two steps.
+    Time starts with the first message. Cancelling is safe between two steps.
     """
     schedule = _Schedule(pace, first_index=first_index, start_ns=start_ns)
     begin, unpaused = None, 0
@@ -134,8 +139,32 @@ async def paced(
         yield step
 
 
+_AS_RECORDED: Final = RecordedTimes()
+_CLOCK: Final = MonotonicClock()
+
+
+async def play(
+    objective: Objective,
+    *,
+    pace: Pace = _AS_RECORDED,
+    start_index: int = 0,
+    start_ns: int = 0,
+    clock: Clock = _CLOCK,
+) -> AsyncGenerator[Step, None]:
+    """Play an objective: each of its messages when it is due.
+
+    `start_index` skips that many messages, and the next is due at once: to continue after an interruption. `start_ns`
+    starts that long after the first message (after the one at `start_index`). Cancelling, or leaving the loop, stops
+    reading. Raises `CorruptRecording` if the file has changed since it was opened.
+    """
+    messages = _read_ahead(objective.messages(from_index=start_index))
+    async with aclosing(messages):
+        async for step in paced(messages, pace, clock, first_index=start_index, start_ns=start_ns):
+            yield step
+
+
 class _Schedule:
-    """Gives every message that comes its place and its time."""
+    """Gives each message its index and due time."""
 
     def __init__(self, pace: Pace, *, first_index: int, start_ns: int) -> None:
         self._pace = pace
@@ -145,7 +174,7 @@ class _Schedule:
         self._origin: int | None = None
 
     def step(self, message: Played) -> Step | None:
-        """The step of the next message; None if it lies before the start."""
+        """The step of the next message; None if it is before the start."""
         self._index += 1
         if self._origin is None:
             self._origin = message.log_time_ns
@@ -154,3 +183,32 @@ class _Schedule:
             return None
         self._position += 1
         return Step(self._index, self._pace.due_ns(self._position, elapsed), message)
+
+
+async def _read_ahead(messages: Iterator[Played]) -> AsyncGenerator[Played, None]:
+    """The same messages, read in a thread batch by batch: one batch is read while the one before is played."""
+    reading = asyncio.ensure_future(asyncio.to_thread(_batch, messages))
+    try:
+        while batch := await asyncio.shield(reading):
+            reading = asyncio.ensure_future(asyncio.to_thread(_batch, messages))
+            for message in batch:
+                yield message
+    finally:
+        # A generator can't be closed while a thread runs it.
+        await asyncio.wait([reading])
+        if not reading.cancelled():
+            reading.exception()
+        close = getattr(messages, "close", None)
+        if close is not None:
+            close()
+
+
+def _batch(messages: Iterator[Played]) -> list[Played]:
+    batch: list[Played] = []
+    size = 0
+    for message in islice(messages, _AHEAD):
+        batch.append(message)
+        size += len(message.payload)
+        if size >= _AHEAD_BYTES:
+            break
+    return batch

@@ -1,4 +1,4 @@
-"""Whether an objective can be played, before a job is accepted for it."""
+"""Checking whether an objective can be played, before accepting a job with it."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ if TYPE_CHECKING:
     from typing import TypeAlias
 
     from mesh.content import Progress
-    from mesh.recording.source import Channel
+    from mesh.recording.source import RecordingChannel
 
     Obstacle: TypeAlias = Callable[[str, Any], str]
-    """Why nobody can do what a message asks, given its topic and what it says; empty if somebody can."""
+    """Returns why no handler accepts a message, given its topic and value; empty if one does."""
 
 _DEFAULT: Final = Limits()
 _LONGEST_JSON: Final = 4 << 20
-"""Bytes of a JSON message that are read: as objects they take twenty times as much."""
+"""Bytes of the longest JSON message that is decoded: as objects it takes twenty times as much."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Preflight:
-    """What came of looking at an objective.
+    """The outcome of checking an objective.
 
-    `reason` is machine-readable: empty if all is well, or one of `not-a-recording`, `too-large`, `expands-too-much`,
-    `corrupt`, `no-messages`, `too-long`, `unplayable-topic`, `unknown-topic`, `unreadable-message` (one that is not
-    what its own schema says), `unfit-message` (one that no handler here can take). `detail` is for people. `objective`
-    is there as soon as the file itself is sound.
+    `reason` is machine-readable: empty if the objective can be played, or one of `not-a-recording`, `too-large`,
+    `expands-too-much`, `corrupt`, `no-messages`, `too-long`, `unplayable-topic`, `unknown-topic`, `unreadable-message`
+    (its payload does not match its schema), `unfit-message` (no handler accepts it). `detail` is for people.
+    `objective` is set if the file itself is sound.
     """
 
     reason: str = ""
@@ -57,26 +57,26 @@ def preflight(
     obstacle: Obstacle | None = None,
     progress: Progress | None = None,
 ) -> Preflight:
-    """Look at the whole file at `path`; `topics` are those that the device takes (None: any), `obstacle` tells of
-    messages that it does not, `progress` is told how many bytes of the file are read, of how many.
+    """Check the whole file at `path`. Raises nothing for a bad file. Reads the whole file: use a thread.
 
-    Reads the whole file: do so in a thread. Raises nothing for a bad file.
+    `topics` are those that the device accepts (None: any), `obstacle` finds messages that it does not accept.
+    `progress` is called with the bytes read, of all.
     """
-    reading = _Reading(limits, obstacle)
+    check = _MessageCheck(limits, obstacle)
     try:
-        objective = Objective(open_source(path, limits, look=reading.look, progress=progress))
+        objective = Objective(open_source(path, limits, on_message=check.on_message, progress=progress))
     except RecordingError as error:
         return Preflight(reason=error.reason, detail=str(error))
-    reason, detail = _misplaced(objective, limits, topics)
+    reason, detail = _recording_fault(objective, limits, topics)
     if not reason:
-        reason, detail = reading.reason, reading.detail
+        reason, detail = check.reason, check.detail
     return Preflight(reason=reason, detail=detail, objective=objective)
 
 
-def _misplaced(objective: Objective, limits: Limits, topics: Collection[str] | None) -> tuple[str, str]:
-    """What is wrong with the recording as a whole: a reason and a detail, or nothing."""
+def _recording_fault(objective: Objective, limits: Limits, topics: Collection[str] | None) -> tuple[str, str]:
+    """What is wrong with the recording as a whole: a reason and a detail, or empty texts."""
     if not objective.count:
-        return "no-messages", "there is no message in it"
+        return "no-messages", "it has no messages"
     if objective.duration_ns > limits.duration_ns:
         return "too-long", f"playing it takes {objective.duration_ns // 10**9} seconds"
     for topic in objective.topics:
@@ -85,12 +85,12 @@ def _misplaced(objective: Objective, limits: Limits, topics: Collection[str] | N
         except InvalidKey as error:
             return "unplayable-topic", str(error)
         if topics is not None and topic.name not in topics:
-            return "unknown-topic", f"nobody here takes {topic.name}"
+            return "unknown-topic", f"no handler accepts {topic.name}"
     return "", ""
 
 
-class _Reading:
-    """Finds the first message of a file that a handler would choke on in the middle of the job."""
+class _MessageCheck:
+    """Finds the first message that would fail in the middle of the job."""
 
     def __init__(self, limits: Limits, obstacle: Obstacle | None) -> None:
         self.reason = self.detail = ""
@@ -99,26 +99,24 @@ class _Reading:
         self._messages = 0
         self._json = 0
 
-    def look(self, channel: Channel, payload: bytes) -> None:
-        """Read the next message, unless there was one already."""
+    def on_message(self, channel: RecordingChannel, payload: bytes) -> None:
+        """Check the next message, unless one has failed already."""
         if self.reason:
             return
         if channel.type.encoding == "json":
             self._json += len(payload)
             if len(payload) > _LONGEST_JSON or self._json > self._most_json:
-                self._found(
-                    "expands-too-much", channel, f"{len(payload)} bytes of JSON, {self._json} with those before"
-                )
+                self._fail("expands-too-much", channel, f"{len(payload)} bytes of JSON, {self._json} with those before")
                 return
         try:
             said = decode_value(payload, channel.type)
         except InvalidPayload as error:
-            self._found("unreadable-message", channel, str(error))
+            self._fail("unreadable-message", channel, str(error))
             return
         why = self._obstacle(channel.topic, said) if self._obstacle is not None else ""
         if why:
-            self._found("unfit-message", channel, why)
+            self._fail("unfit-message", channel, why)
         self._messages += 1
 
-    def _found(self, reason: str, channel: Channel, why: str) -> None:
+    def _fail(self, reason: str, channel: RecordingChannel, why: str) -> None:
         self.reason, self.detail = reason, f"message {self._messages} on {channel.topic}: {why}"

@@ -1,7 +1,7 @@
-"""Recording what passes, from any thread, without ever making it wait.
+"""Recording messages from any thread, without ever making the caller wait.
 
-One thread owns the file. It closes a chunk and hands it to the operating system every second and every 128 KiB, so
-that a crash of the process costs a second of the recording at most, and puts it on the disk every few seconds.
+One thread owns the file. Every second and every 128 KiB it closes a chunk and hands it to the operating system, so that
+a crash of the process costs at most a second of the recording. Every few seconds it syncs the file to the disk.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Final, Self
 
 from mesh.errors import ClosedError
 from mesh.recording.errors import RecordingFailed
-from mesh.recording.mcap_file import check_message
+from mesh.recording.mcap_writer import check_message
 from mesh.recording.partial import Message, PartialFile
+from mesh.telemetry.context import log_event
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -32,15 +33,15 @@ _COST: Final = 256
 _AT_ONCE: Final = 512
 """Messages written before the thread looks at the clock again."""
 _GATHERING_SECONDS: Final = 0.005
-"""How long messages gather before they are written: a thread that is woken for each of them costs more than that."""
+"""How long messages gather before they are written: waking the thread for each of them costs more."""
 _KNOWN_TOPICS: Final = 4096
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingAbout:
-    """Whose recording it is: what goes into its metadata record `aira`. Any field may be empty.
+    """The job that a recording belongs to: the content of its metadata record `aira`. Any field may be empty.
 
-    `topics` are those that are recorded, separated by commas; empty for all.
+    `topics` are the recorded topics, separated by commas; empty for all.
     """
 
     liability: str = ""
@@ -53,7 +54,7 @@ class RecordingAbout:
 
 @dataclass(frozen=True, kw_only=True)
 class RecorderSettings:
-    """How often a recording is handed over and put on the disk, in seconds, and how much may wait, in bytes."""
+    """How often a recording is flushed to the operating system and synced to the disk, and how many bytes may wait."""
 
     flush_seconds: float = 1.0
     sync_seconds: float = 5.0
@@ -62,9 +63,9 @@ class RecorderSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingSummary:
-    """A finished recording. `recovered` of its `messages` came from a file that a crash had left.
+    """A finished recording. `recovered` of its `messages` are from a file that a crash left behind.
 
-    `lost` messages were dropped because the disk could not keep up. `size` is in bytes.
+    `lost` messages were dropped because the disk was too slow. `size` is in bytes.
     """
 
     path: Path
@@ -76,9 +77,9 @@ class RecordingSummary:
 
 @dataclass(frozen=True, kw_only=True)
 class RecorderStatistics:
-    """What a recorder, or several, have done so far: messages in the file, and messages dropped.
+    """What one or several recorders have done so far: messages written, and messages dropped.
 
-    `lag` is for how many seconds the message that waits longest has waited to be written.
+    `lag` is how many seconds the oldest waiting message has waited to be written.
     """
 
     recorded: int
@@ -90,11 +91,11 @@ _SETTINGS: Final = RecorderSettings()
 
 
 class Recorder:
-    """Makes the recording at `path`, `NAME.mcap`; it is `NAME.mcap.part` until `close`.
+    """Writes the recording at `path`, `NAME.mcap`, which is called `NAME.mcap.part` until `close`.
 
-    A `.part` that a crash left is gone on with: the new recording begins with what can be read of it. Opening blocks
-    on the disk for a moment, `close` until all is written; use threads. Raises `RecordingExists` if `path` is there or
-    somebody else is recording it, `RecordingFailed` if the file can't be made.
+    If a crash left a `.part`, the new recording begins with its readable messages. Opening blocks on the disk for a
+    moment, `close` until everything is written: use threads. Raises `RecordingExists` if `path` exists or another
+    process is recording it, and `RecordingFailed` if the file can't be created.
     """
 
     def __init__(self, path: Path, about: RecordingAbout, *, settings: RecorderSettings = _SETTINGS) -> None:
@@ -133,16 +134,16 @@ class Recorder:
 
     @property
     def lost(self) -> int:
-        """Messages dropped so far, because too much was waiting or the disk refused it."""
+        """Messages dropped so far, because too many were waiting or the disk refused them."""
         return self._lost
 
     @property
     def is_done(self) -> bool:
-        """Whether the file is written, or given up: nothing is counted any more."""
+        """Whether the file is finished or failed: the statistics no longer change."""
         return self._summary is not None or self._failure is not None
 
     def statistics(self) -> RecorderStatistics:
-        """What it has done so far; from any thread."""
+        """What it has done so far. For any thread."""
         with self._lock:
             now = time.monotonic()
             since = self._taken_since if self._taken else self._since if self._queue else now
@@ -158,11 +159,11 @@ class Recorder:
         log_time_ns: int | None = None,
         publish_time_ns: int | None = None,
     ) -> None:
-        """Add a message, without waiting for anything; from any thread. Times are nanoseconds, now if not given.
+        """Add a message without waiting for anything. For any thread. Times are in nanoseconds, by default now.
 
-        `role` tells what was played from what the device said. Over `queue_bytes` waiting, the message is dropped and
-        counted. Raises `Unrecordable` for what no file can hold, `ClosedError`, and `RecordingFailed` once the disk
-        has refused the recording.
+        `role` distinguishes what was played from what the device sent. If more than `queue_bytes` are waiting, the
+        message is dropped and counted. Raises `Unrecordable` for a message that no file can hold, `ClosedError`, and
+        `RecordingFailed` once the disk has refused the recording.
         """
         log_time = time.time_ns() if log_time_ns is None else log_time_ns
         publish_time = log_time if publish_time_ns is None else publish_time_ns
@@ -189,7 +190,7 @@ class Recorder:
             self._wake.set()
 
     def close(self) -> RecordingSummary:
-        """Write what waits, end the file, put it on the disk and give it its name. Safe to call twice.
+        """Write the waiting messages, end and sync the file, and give it its final name. Safe to call twice.
 
         Raises `RecordingFailed` if the disk refused any of it; the `.part` stays for `recover`.
         """
@@ -220,18 +221,18 @@ class Recorder:
                 self._queue.clear()
 
     def _write(self, file: PartialFile) -> None:
-        """Write what comes until `close` was called and nothing waits any more."""
+        """Write messages until `close` was called and none is waiting."""
         every = self._settings.flush_seconds, self._settings.sync_seconds
         while True:
-            if self._wake.wait(file.seconds_to_keep(*every)):
+            if self._wake.wait(file.seconds_until_due(*every)):
                 self._closed.wait(_GATHERING_SECONDS)
             self._wake.clear()
             closing = self._closing
             while batch := self._take():
                 for start in range(0, len(batch), _AT_ONCE):
                     self._add(file, batch[start : start + _AT_ONCE])
-                    file.keep_what_is_due(*every)
-            file.keep_what_is_due(*every)
+                    file.flush_if_due(*every)
+            file.flush_if_due(*every)
             if closing:
                 return
 
@@ -243,10 +244,11 @@ class Recorder:
             self._recorded += len(messages) - len(refused)
         self._taken -= len(messages)
         for error in refused:
-            log.warning("a message is lost for %s: %s", self.path.name, error)
+            event = log_event("recording-message-refused", path=self.path, error=error)
+            log.warning("%s lacks a message: %s", self.path.name, error, extra=event)
 
     def _take(self) -> list[Message]:
-        """All that waits; it counts as waiting until it is written."""
+        """All waiting messages; they count as waiting until they are written."""
         with self._lock:
             batch, self._queue = self._queue, []
             self._taken, self._taken_since = len(batch), self._since
@@ -256,3 +258,40 @@ class Recorder:
         check_message(topic, payload, log_time, publish_time)
         if len(self._topics) < _KNOWN_TOPICS:
             self._topics.add(topic)
+
+
+class Recorders:
+    """Opens recorders, and adds up their statistics, including those of closed ones. For any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._open: list[Recorder] = []
+        self._recorded = 0
+        self._lost = 0
+
+    def open(self, path: Path, about: RecordingAbout) -> Recorder:
+        """Open a `Recorder`; the caller closes it. Raises as that does."""
+        recorder = Recorder(path, about)
+        with self._lock:
+            self._drop_finished()
+            self._open.append(recorder)
+        return recorder
+
+    def statistics(self) -> RecorderStatistics:
+        """What all have done together; `lag` is that of the slowest."""
+        with self._lock:
+            self._drop_finished()
+            now = [recorder.statistics() for recorder in self._open]
+            return RecorderStatistics(
+                recorded=self._recorded + sum(one.recorded for one in now),
+                lost=self._lost + sum(one.lost for one in now),
+                lag=max((one.lag for one in now), default=0.0),
+            )
+
+    def _drop_finished(self) -> None:
+        """Add the statistics of finished recorders to the totals, and drop them."""
+        for recorder in [recorder for recorder in self._open if recorder.is_done]:
+            done = recorder.statistics()
+            self._recorded += done.recorded
+            self._lost += done.lost
+            self._open.remove(recorder)

@@ -1,4 +1,4 @@
-"""What MCAP files and bags have in common: channels, and segments of messages that are read one at a time."""
+"""A checked recording, MCAP or bag: its channels, and its messages in blocks that are read one at a time."""
 
 from __future__ import annotations
 
@@ -7,28 +7,27 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple
 
-from mesh.recording.compression import expand
-from mesh.recording.errors import CorruptRecording, RecordingTooLarge
+from mesh.recording.decoding import expand
+from mesh.recording.errors import CorruptRecording
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
     from pathlib import Path
     from typing import TypeAlias
 
-    from mesh.recording.limits import Limits
     from schemas.payloads import PayloadType
 
-    Look: TypeAlias = Callable[["Channel", bytes], None]
-    """Is shown every message of a file, on its channel, as they lie there, while the file is checked."""
+    OnMessage: TypeAlias = Callable[["RecordingChannel", bytes], None]
+    """Is called with the channel and payload of each message, in file order, while the file is checked."""
 
 _RECORD_COST: Final = 256
 """Bytes of memory that a message takes besides its payload while its segment is being sorted."""
 _SEGMENT_COST: Final = 2048
-"""Bytes of memory that a segment takes besides its data while its messages are being given."""
+"""Bytes of memory that a segment takes besides its data while it is being read."""
 
 
-class Record(NamedTuple):
-    """A message as a file holds it. Times are in nanoseconds."""
+class RecordedMessage(NamedTuple):
+    """A message as it is in a file. Times are in nanoseconds."""
 
     channel: int
     sequence: int
@@ -38,8 +37,8 @@ class Record(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Channel:
-    """A topic of a file, and how its payloads are to be read. `metadata` is the channel's own, of MCAP or a bag."""
+class RecordingChannel:
+    """A channel of a file: a topic, the type of its payloads, and the channel's own metadata."""
 
     topic: str
     type: PayloadType
@@ -47,7 +46,7 @@ class Channel:
 
 
 class Attachment(NamedTuple):
-    """A file within a file: `size` bytes from `offset`. Times are in nanoseconds."""
+    """A file inside the file: `size` bytes at `offset`. Times are in nanoseconds."""
 
     name: str
     media_type: str
@@ -58,7 +57,7 @@ class Attachment(NamedTuple):
 
 
 class RecordingStatistics(NamedTuple):
-    """What an MCAP file says at its end about itself. `by_channel` has the messages of each channel's number."""
+    """The statistics at the end of an MCAP file. `by_channel` is the number of messages by channel number."""
 
     messages: int
     channels: int
@@ -70,8 +69,8 @@ class RecordingStatistics(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Block:
-    """Where messages are in a file: `stored` bytes from `offset`, which expand to `size`."""
+class RecordingBlock:
+    """Where a block of messages is in a file: `stored` bytes at `offset`, which expand to `size`."""
 
     offset: int
     stored: int
@@ -81,10 +80,10 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A block whose messages were read once. `sorted` tells whether they are in the order of their log time."""
+    """A block that was surveyed: its number of messages, first and last log time, and whether they are in order."""
 
     number: int
-    block: Block
+    block: RecordingBlock
     count: int
     start: int
     end: int
@@ -92,37 +91,37 @@ class Segment:
 
     @property
     def cost(self) -> int:
-        """Bytes of memory that it takes while its messages are being given."""
+        """Bytes of memory that it takes while it is being read."""
         return self.block.size + _SEGMENT_COST + (0 if self.sorted else self.count * _RECORD_COST)
 
 
 @dataclass(frozen=True)
-class Source:
-    """A checked file: what is in it, and how the messages of one of its blocks are read.
+class RecordingSource:
+    """A checked file: its content, and how to read the messages of its blocks.
 
-    `records` takes the decompressed bytes of a block and may raise `CorruptRecording`.
+    `read_messages` takes the decompressed bytes of a block and may raise `CorruptRecording`.
     """
 
     path: Path
     format: str
     size: int
-    channels: Mapping[int, Channel]
+    channels: Mapping[int, RecordingChannel]
     segments: tuple[Segment, ...]
     metadata: Mapping[str, Mapping[str, str]]
-    records: Callable[[bytes], Iterator[Record]]
+    read_messages: Callable[[bytes], Iterator[RecordedMessage]]
     attachments: tuple[Attachment, ...] = ()
     statistics: RecordingStatistics | None = None
     unchecked: int = 0
     """Blocks of messages without a checksum."""
 
-    def in_file_order(self) -> Iterator[Record]:
-        """All messages as they lie in the file."""
+    def in_file_order(self) -> Iterator[RecordedMessage]:
+        """All messages in file order."""
         with self.path.open("rb") as file:
             for segment in self.segments:
-                yield from self.records(load(self.path, file, segment.block))
+                yield from self.read_messages(load_block(self.path, file, segment.block))
 
-    def in_time_order(self, *, skip: int = 0) -> Iterator[Record]:
-        """All messages but the first `skip` by their log time; those of one time as they lie in the file."""
+    def in_time_order(self, *, skip: int = 0) -> Iterator[RecordedMessage]:
+        """All messages by log time, without the first `skip`; those of equal time in file order."""
         with self.path.open("rb") as file:
             waiting = sorted(self.segments, key=lambda segment: (segment.start, segment.number))
             position, skip = _skip_whole(waiting, skip)
@@ -131,11 +130,11 @@ class Source:
                 pass
             yield from merged
 
-    def _merge(self, file: BinaryIO, waiting: list[Segment]) -> Iterator[Record]:
-        """Merge segments, each held in memory only while its time span lasts. `waiting` is sorted by start."""
+    def _merge(self, file: BinaryIO, waiting: list[Segment]) -> Iterator[RecordedMessage]:
+        """Merge segments by time, holding each in memory only during its time span. `waiting` is sorted by start."""
         following = iter(waiting)
         upcoming = next(following, None)
-        heap: list[tuple[int, int, Record, Iterator[Record]]] = []
+        heap: list[tuple[int, int, RecordedMessage, Iterator[RecordedMessage]]] = []
         while heap or upcoming:
             while upcoming and (not heap or upcoming.start <= heap[0][0]):
                 self._open(file, upcoming, heap)
@@ -148,40 +147,19 @@ class Source:
             else:
                 heapq.heapreplace(heap, (after.log_time, number, after, rest))
 
-    def _open(self, file: BinaryIO, segment: Segment, heap: list[tuple[int, int, Record, Iterator[Record]]]) -> None:
-        records = self.records(load(self.path, file, segment.block))
+    def _open(
+        self, file: BinaryIO, segment: Segment, heap: list[tuple[int, int, RecordedMessage, Iterator[RecordedMessage]]]
+    ) -> None:
+        records = self.read_messages(load_block(self.path, file, segment.block))
         if not segment.sorted:
             records = iter(sorted(records, key=lambda record: record.log_time))
         first = next(records, None)
         if first is None:
-            raise CorruptRecording(self.path, "it changed while it was being read")
+            raise CorruptRecording(self.path, "the file changed while it was being read")
         heapq.heappush(heap, (first.log_time, segment.number, first, records))
 
 
-@dataclass
-class Expanding:
-    """What the blocks of a file will expand to, in bytes, of which nothing was expanded yet."""
-
-    path: Path
-    limits: Limits
-    size: int = 0
-    bz2: int = 0
-
-    def add(self, block: Block) -> None:
-        """Count a block. Raises `RecordingTooLarge`."""
-        self.size += block.size
-        if self.size > self.limits.expanded:
-            raise RecordingTooLarge(
-                self.path, f"its chunks expand to more than the {self.limits.expanded} bytes allowed"
-            )
-        self.bz2 += block.size if block.compression == "bz2" else 0
-        if self.bz2 > self.limits.bz2:
-            raise RecordingTooLarge(
-                self.path, f"its bz2 chunks expand to more than the {self.limits.bz2} bytes allowed; lz4 is faster"
-            )
-
-
-def load(path: Path, file: BinaryIO, block: Block) -> bytes:
+def load_block(path: Path, file: BinaryIO, block: RecordingBlock) -> bytes:
     """The decompressed bytes of a block. Raises `CorruptRecording`."""
     file.seek(block.offset)
     data = file.read(block.stored)
@@ -190,8 +168,10 @@ def load(path: Path, file: BinaryIO, block: Block) -> bytes:
     return expand(path, data, compression=block.compression, size=block.size)
 
 
-def survey(path: Path, number: int, block: Block, *, records: Iterable[Record]) -> Segment | None:
-    """Read all messages of a block once; None if there are none."""
+def survey_block(
+    path: Path, number: int, block: RecordingBlock, *, records: Iterable[RecordedMessage]
+) -> Segment | None:
+    """Read all messages of a block once, and return its segment; None if it has no messages."""
     count, start, end, last, in_order = 0, 0, 0, -1, True
     for record in records:
         time = record.log_time
@@ -203,35 +183,8 @@ def survey(path: Path, number: int, block: Block, *, records: Iterable[Record]) 
     return Segment(number, block, count, start, end, in_order) if count else None
 
 
-def check_counts(path: Path, limits: Limits, *, records: int, blocks: int) -> None:
-    """Raise `RecordingTooLarge` over `limits.messages` records in blocks, or over `limits.blocks` blocks."""
-    if records > limits.messages:
-        raise RecordingTooLarge(path, f"more than {limits.messages} messages and what describes them")
-    if blocks > limits.blocks:
-        raise RecordingTooLarge(path, f"its messages and attachments lie in more than {limits.blocks} places")
-
-
-def check_definitions(path: Path, limits: Limits, *, channels: int, size: int) -> None:
-    """Raise `RecordingTooLarge` over `limits.channels` channels, or over `limits.definitions` bytes."""
-    if size > limits.definitions or channels > limits.channels:
-        raise RecordingTooLarge(path, f"{channels} channels, {size} bytes of definitions")
-
-
-def check_window(path: Path, segments: Iterable[Segment], limits: Limits) -> None:
-    """Raise `RecordingTooLarge` if giving the messages in order would take more memory than allowed."""
-    open_segments: list[tuple[int, int]] = []
-    held = 0
-    for segment in sorted(segments, key=lambda segment: segment.start):
-        while open_segments and open_segments[0][0] < segment.start:
-            held -= heapq.heappop(open_segments)[1]
-        heapq.heappush(open_segments, (segment.end, segment.cost))
-        held += segment.cost
-        if held > limits.window:
-            raise RecordingTooLarge(path, f"its messages are so out of order that {held} bytes of it overlap in time")
-
-
 def _skip_whole(waiting: list[Segment], skip: int) -> tuple[int, int]:
-    """How many segments (sorted by start) need not be read to skip that many messages, and how many remain to skip."""
+    """How many segments (sorted by start) can be skipped unread, and how many messages remain to skip after them."""
     position = 0
     for segment, following in pairwise(waiting):
         if segment.count > skip or segment.end >= following.start:

@@ -21,7 +21,7 @@ from mesh.composition import load_account
 from mesh.errors import AiraError
 from mesh.settings import Settings
 from schemas import cid_of_bytes
-from tests.mesh.evidence.jobs import LIABILITY, OTHER, made
+from tests.mesh.evidence.jobs import LIABILITY, OTHER, make_job
 from tests.support.commands import aira
 from tests.support.development import settings_of
 from tests.support.listening import Listener
@@ -45,7 +45,7 @@ MODEL = cid_of_bytes(b"what is verified")
 
 @pytest.fixture
 def job(tmp_path: Path) -> JobFiles:
-    return made(tmp_path)
+    return make_job(tmp_path)
 
 
 def verified(job: JobFiles, *more: str | Path) -> Result:

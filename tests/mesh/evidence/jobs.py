@@ -1,4 +1,4 @@
-"""A job that was done, its two files, and what a forger would make of the recording."""
+"""A job with its two files, and ways to forge the recording."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import msgspec
 
 from mesh.evidence import Claim, Verdict, verify
 from mesh.recording import Recorder, RecordingAbout, open_objective
-from mesh.recording.mcap_file import McapFile
+from mesh.recording.mcap_writer import McapWriter
 from schemas import Result, Signer, String, cid_of_file, encode
 from schemas.payloads import STRING
 from tests.support.objectives import objective
@@ -31,29 +31,29 @@ Metadata = dict[str, dict[str, str]]
 
 @dataclass
 class JobFiles:
-    """The files of a job, and what the contract says of it."""
+    """The files of a job, and the claim of its contract."""
 
     objective: Path
     result: Path
     claim: Claim
 
     def verify(self, message: bytes | None = None, **claimed: Any) -> Verdict:
-        """What is found, with these fields of the claim changed."""
+        """Verify the job, with these fields of the claim changed."""
         claim = msgspec.structs.replace(self.claim, **claimed)
         return verify(claim, objective=self.objective, result=self.result, message=message)
 
     def forge(self, change: Callable[[list[ChannelMessage], Metadata], list[ChannelMessage]]) -> None:
-        """Write the recording anew, its messages and metadata changed, as a valid file under a CID of its own."""
+        """Rewrite the recording with changed messages and metadata, as a valid file with its own CID."""
         old = open_objective(self.result)
         metadata = {name: dict(values) for name, values in old.metadata.items()}
         written = change(list(old.in_file_order()), metadata)
         with self.result.open("wb") as stream:
-            file = McapFile(stream)
+            writer = McapWriter(stream)
             for name, values in metadata.items():
-                file.add_metadata(name, values)
+                writer.add_metadata(name, values)
             for one in written:
                 message = one.message
-                file.add(
+                writer.add(
                     message.topic,
                     message.payload,
                     message.type,
@@ -62,16 +62,16 @@ class JobFiles:
                     publish_time_ns=message.publish_time_ns,
                     sequence=message.sequence,
                 )
-            file.finish()
+            writer.finish()
         self.claim = msgspec.structs.replace(self.claim, result=cid_of_file(self.result))
 
     def message(self, signer: Signer = ROBOT, **fields: Any) -> bytes:
-        """The signed Result as it travelled."""
+        """The encoded signed Result."""
         said: dict[str, Any] = {"liability": LIABILITY, "result": cid_of_file(self.result), "success": True} | fields
         return encode(signer.sign(Result(**said)))
 
 
-def made(folder: Path, *, played: tuple[str, ...] = WORDS, topics: str = "", **about: str) -> JobFiles:
+def make_job(folder: Path, *, played: tuple[str, ...] = WORDS, topics: str = "", **about: str) -> JobFiles:
     """A job whose objective has five messages on `/say`, of which these were `played`; the device answered each."""
     path = folder / "objective.mcap"
     path.write_bytes(objective(*(("/say", word) for word in WORDS), ("/stop", b"")))
@@ -105,8 +105,13 @@ def stop(recorder: Recorder) -> None:
     recorder.record(last.topic, last.payload, last.type, role="objective")
 
 
+def failures(verdict: Verdict) -> dict[str, str]:
+    """The findings that do not hold, with their details."""
+    return {finding.name: finding.detail for finding in verdict.findings if finding.holds is False}
+
+
 def renumbered(messages: list[ChannelMessage]) -> list[ChannelMessage]:
-    """The same with numbers without a gap, and the times of the originals in their order."""
+    """The same messages with sequence numbers without gaps and times in order."""
     counts: dict[str, int] = {}
     times = sorted(one.message.log_time_ns for one in messages)
     numbered = []

@@ -14,22 +14,26 @@ from hypothesis import strategies as st
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import CompressionType, Writer
 
-from mesh.recording.mcap_writer import McapWriter
+from mesh.recording import Attachment, Unrecordable
+from mesh.recording.mcap_writer import MAX_CHANNELS, McapWriter, WriterChannel
+from schemas.payloads import RAW, PayloadType
+from tests.mesh.recording.files import T0
 
 Row = tuple[int, int, bytes, int, int]
 CHUNK = 4096
+POSE = PayloadType("json", "Pose", "jsonschema", b'{"type":"object"}')
 
 
 def ours(rows: list[Row], *, channels: int, finish: bool = True) -> bytes:
     stream = io.BytesIO()
-    writer = McapWriter(stream, chunk_size=CHUNK)
-    writer.start("test")
-    prepare(writer, channels)
-    for number, row in enumerate(rows):
-        writer.add_message(*row)
+    writer = McapWriter(stream, profile="test", chunk_size=CHUNK)
+    added = [writer.channel(f"/topic/{number}", POSE, {"role": "device"}) for number in range(channels)]
+    assert [channel.id for channel in added] == list(range(1, channels + 1))
+    for number, (channel, log_time, data, publish_time, sequence) in enumerate(rows):
+        writer.write(added[channel - 1], data, log_time, publish_time, sequence)
         if number == 10:
             writer.add_metadata("note", {"key": "value"})
-            writer.add_attachment(3, 4, "name", "text/plain", b"attached")
+            writer.add_attachment(Attachment("name", "text/plain", 4, 3, 0, 8), b"attached")
     if finish:
         writer.finish()
     else:
@@ -41,7 +45,9 @@ def theirs(rows: list[Row], *, channels: int) -> bytes:
     stream = io.BytesIO()
     writer = Writer(stream, chunk_size=CHUNK, compression=CompressionType.ZSTD)
     writer.start("test", library="aira-mesh")
-    prepare(writer, channels)
+    schema = writer.register_schema(POSE.schema_name, POSE.schema_encoding, POSE.schema_data)
+    for number in range(channels):
+        writer.register_channel(f"/topic/{number}", "json", schema, {"role": "device"})
     for number, (channel, log_time, data, publish_time, sequence) in enumerate(rows):
         writer.add_message(channel, log_time, data, publish_time, sequence)
         if number == 10:
@@ -49,12 +55,6 @@ def theirs(rows: list[Row], *, channels: int) -> bytes:
             writer.add_attachment(3, 4, "name", "text/plain", b"attached")
     writer.finish()  # type: ignore[no-untyped-call]
     return stream.getvalue()
-
-
-def prepare(writer: Any, channels: int) -> None:
-    schema = writer.register_schema("Pose", "jsonschema", b'{"type":"object"}')
-    for number in range(channels):
-        assert writer.register_channel(f"/topic/{number}", "json", schema, {"role": "device"}) == number + 1
 
 
 def rows_of(count: int, channels: int, seed: int = 1) -> list[Row]:
@@ -111,16 +111,20 @@ def test_what_was_flushed_is_readable_without_an_end() -> None:
     assert found == [row[4] for row in rows]
 
 
-@pytest.mark.parametrize("row", [(1, -1, b"", 0, 0), (1, 0, b"", 1 << 64, 0), (1 << 16, 0, b"", 0, 0), (1, 0, 5, 0, 0)])
-def test_a_message_that_no_record_can_hold_leaves_no_trace(row: Any) -> None:
+@pytest.mark.parametrize(
+    ("channel_id", "log_time", "payload", "publish_time"),
+    [(1, -1, b"", 0), (1, 0, b"", 1 << 64), (1 << 16, 0, b"", 0), (1, 0, 5, 0)],
+)
+def test_a_message_that_no_record_can_hold_leaves_no_trace(
+    channel_id: int, log_time: int, payload: Any, publish_time: int
+) -> None:
     stream = io.BytesIO()
     writer = McapWriter(stream, chunk_size=CHUNK)
-    writer.start("")
-    prepare(writer, 1)
-    writer.add_message(1, 1, b"before", 1, 0)
+    channel = writer.channel("/topic/0", POSE, {})
+    writer.write(channel, b"before", 1, 1)
     with pytest.raises((struct.error, TypeError)):
-        writer.add_message(*row)
-    writer.add_message(1, 2, b"after", 2, 1)
+        writer.write(WriterChannel(channel_id), payload, log_time, publish_time)
+    writer.write(channel, b"after", 2, 2)
     writer.finish()
     reader = make_reader(io.BytesIO(stream.getvalue()), validate_crcs=True)
     assert [message.data for _, _, message in reader.iter_messages()] == [b"before", b"after"]
@@ -133,3 +137,49 @@ def test_any_times_and_payloads_are_read_as_written(messages: list[tuple[int, by
     data = ours(rows, channels=1)
     plain = NonSeekingReader(io.BytesIO(data), validate_crcs=True).iter_messages(log_time_order=False)
     assert [(message.log_time, message.data) for _, _, message in plain] == messages
+
+
+GOOD: dict[str, Any] = {
+    "topic": "/a",
+    "payload": b"x",
+    "type": RAW,
+    "metadata": {"role": "device"},
+    "log_time_ns": T0,
+    "publish_time_ns": T0,
+}
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"payload": "text"},
+        {"log_time_ns": -1},
+        {"publish_time_ns": 1 << 64},
+        {"topic": "/\udcff"},
+        {"type": PayloadType("ros1", "\udcff")},
+        {"metadata": {"role": "\udcff"}},
+    ],
+)
+def test_a_bad_argument_leaves_the_file_as_it_was(bad: dict[str, Any]) -> None:
+    stream = io.BytesIO()
+    writer = McapWriter(stream)
+    writer.add(**GOOD)
+    with pytest.raises(Unrecordable):
+        writer.add(**(GOOD | bad))
+    writer.add(**GOOD)
+    with pytest.raises(Unrecordable):
+        writer.add_metadata("x", {"y": "\udcff"})
+    writer.finish()
+    found = list(make_reader(io.BytesIO(stream.getvalue()), validate_crcs=True).iter_messages())
+    assert [(channel.topic, message.data) for _, channel, message in found] == [("/a", b"x")] * 2
+    assert [message.sequence for _, _, message in found] == [0, 1]
+
+
+def test_channels_beyond_what_the_format_can_number_are_refused() -> None:
+    writer = McapWriter(io.BytesIO())
+    for number in range(MAX_CHANNELS):
+        writer.add(**(GOOD | {"topic": f"/{number}"}))
+    with pytest.raises(Unrecordable):
+        writer.add(**(GOOD | {"topic": "/one-more"}))
+    writer.add(**(GOOD | {"topic": "/0"}))
+    assert writer.messages == MAX_CHANNELS + 1

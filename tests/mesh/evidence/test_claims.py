@@ -6,10 +6,7 @@ import pytest
 
 from mesh.evidence import Claim
 from schemas import Demand, cid_of_bytes, encode
-from tests.mesh.evidence.findings import job, wrong
-from tests.mesh.evidence.jobs import OTHER, ROBOT, THIEF, JobFiles
-
-__all__ = ["job"]
+from tests.mesh.evidence.jobs import OTHER, ROBOT, THIEF, JobFiles, failures
 
 
 def test_a_held_result_message_proves_who_signed_it(job: JobFiles) -> None:
@@ -17,7 +14,7 @@ def test_a_held_result_message_proves_who_signed_it(job: JobFiles) -> None:
     assert verdict.holds
     signature = verdict.of("signature")
     assert signature is not None
-    assert signature.detail == f"the promisor, {ROBOT.address}, signed it with success true"
+    assert (signature.holds, ROBOT.address in signature.detail) == (True, True)
 
 
 @pytest.mark.parametrize(
@@ -31,14 +28,14 @@ def test_a_held_result_message_proves_who_signed_it(job: JobFiles) -> None:
 def test_a_result_message_of_another_signer_liability_or_recording_proves_nothing(
     job: JobFiles, fields: dict[str, object], why: str
 ) -> None:
-    said = wrong(job.verify(job.message(**fields)))  # type: ignore[arg-type]
+    said = failures(job.verify(job.message(**fields)))  # type: ignore[arg-type]
     assert set(said) == {"signature"}
     assert why in said["signature"]
 
 
 @pytest.mark.parametrize("content", [b"", b"{}", b"\xff", b'{"liability": 1}'])
 def test_what_is_no_result_message_is_said_to_be_none(job: JobFiles, content: bytes) -> None:
-    assert wrong(job.verify(content))["signature"].startswith("the Result message: ")
+    assert failures(job.verify(content))["signature"].startswith("the Result message: ")
 
 
 def test_a_demand_is_no_result(job: JobFiles) -> None:
@@ -53,7 +50,7 @@ def test_a_demand_is_no_result(job: JobFiles) -> None:
         deadline=1,
         nonce="0" * 64,
     )
-    assert "is no Result" in wrong(job.verify(encode(ROBOT.sign(demand))))["signature"]
+    assert "not a Result" in failures(job.verify(encode(ROBOT.sign(demand))))["signature"]
 
 
 def test_two_files_alone_show_that_they_belong_together_and_leave_the_rest_open(job: JobFiles) -> None:
