@@ -47,7 +47,7 @@ async def test_no_offer_is_made_for_an_objective_that_can_not_be_played(
     robot = going(obliging(place.agent("robot")))
     async with place.at_work(robot) as person:
         unfit = asyncio.create_task(person.demand(place.save(objective(("/fly", Empty())), "unfit.mcap")))
-        await until(lambda: "can't be played (unknown-topic): nobody here takes /fly" in caplog.text, seconds=30)
+        await until(lambda: "can't be played (unknown-topic): no handler accepts /fly" in caplog.text, seconds=30)
         fit = await person.demand(place.save(objective(("/go", Empty()))))
         assert (await fit.outcome()).success
         assert not unfit.done()

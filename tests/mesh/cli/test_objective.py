@@ -240,7 +240,7 @@ def test_what_is_readable_of_a_cut_file_is_saved(tmp_path: Path) -> None:
     saved = tmp_path / "it.recovered.mcap"
     assert (said["file"], said["cid"]) == (str(saved), cid_of_file(saved))
     assert 0 < said["messages"] == open_objective(saved).count < 500
-    refused(call("recover", tmp_path / "it.mcap"), "is there already")
+    refused(call("recover", tmp_path / "it.mcap"), "already exists")
     (tmp_path / "text").write_bytes(b"hello")
     refused(call("recover", tmp_path / "text"), "it does not begin as an MCAP file does")
 

@@ -69,7 +69,7 @@ async def test_a_file_is_fetched_from_whoever_has_it(router: EmbeddedRouter, tmp
 
 def test_what_nobody_has_and_no_router_are_one_clear_line(router: EmbeddedRouter, tmp_path: Path) -> None:
     words: list[str | Path] = ["get", cid_of_bytes(b"nobody's"), "--out", tmp_path / "it", "--fetch-timeout", "0.2"]
-    refused(call(*words, "--connect", router.endpoint), "is not to be had", code=1)
+    refused(call(*words, "--connect", router.endpoint), "is not available", code=1)
     nowhere = ["--connect", free_endpoint(), "--connect-timeout", "0.2"]
     refused(call(*words, *nowhere), "no Zenoh router at", code=1)
     refused(call("pack", "--hear", "a/**", "--out", tmp_path / "it", *nowhere), "no Zenoh router at", code=1)

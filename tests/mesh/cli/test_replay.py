@@ -167,7 +167,7 @@ def test_no_router_nobody_who_has_it_and_no_chain_are_one_clear_line(stage: Stag
     assert (done.exit_code, done.stderr[:28]) == (1, "aira: no Zenoh router at tcp")
     done = stage.play(cid_of_bytes(b"nobody's"), "--to", "a/b", "--fetch-timeout", "0.2")
     assert done.exit_code == 1
-    assert "is not to be had" in done.stderr
+    assert "is not available" in done.stderr
     done = stage.play(ROBOT, "--web3-http-provider", "http://127.0.0.1:9")
     assert done.exit_code == 1
     assert done.stderr.startswith("aira: ")

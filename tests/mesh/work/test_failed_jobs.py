@@ -115,7 +115,7 @@ async def test_what_is_no_recording_is_refused(place: Place) -> None:
 async def test_an_objective_that_nobody_holds_is_given_up_and_refunded(place: Place) -> None:
     robot = doing_nothing(careless(place.agent("robot", fetch_timeout=0.2)))
     note, _ = await refusal(place, robot, cid_of_bytes(b"held by nobody"))
-    assert "is not to be had" in note
+    assert "is not available" in note
 
 
 async def test_an_objective_over_the_size_limit_is_refused(place: Place) -> None:
