@@ -1,7 +1,8 @@
-"""A market as it is operated: a chain behind a URL, a router, and programs of their own with keyfiles and state."""
+"""A market in operation: a chain behind a URL, a router, and processes with keyfiles and state of their own."""
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.agent import Agent
@@ -23,14 +24,14 @@ if TYPE_CHECKING:
 
 MODEL: Final = cid_of_bytes(b"what the robots of the operated market can do")
 PEOPLE: Final = (*ROLES, "rival", "poor")
-"""Who has an account; `rival` and `poor` have ETH only."""
+"""The roles with an account; `rival` and `poor` have ETH only."""
 FEE: Final = 5
-"""What the robot's offers give to the provider, wn."""
+"""The lighthouse fee of the robot's offers, wn."""
 PASSWORD: Final = "only for tests"
 
 
 class Site:
-    """`await Site.found(url, keys, endpoint, folder)`: where the chain's node and the router are."""
+    """`await Site.found(url, keys, endpoint, folder)` with the addresses of the chain's node and the router."""
 
     def __init__(self, url: str, keys: Sequence[bytes], endpoint: str, folder: Path) -> None:
         self.url = url
@@ -42,7 +43,7 @@ class Site:
 
     @classmethod
     async def found(cls, url: str, keys: Sequence[bytes], endpoint: str, folder: Path) -> Site:
-        """Deploy a market, and have its promises allowed once for all."""
+        """Deploy a market, and approve the allowances of robot and person."""
         await deploy_market(url, keys)
         site = cls(url, keys, endpoint, folder)
         for role in ("robot", "person"):
@@ -70,11 +71,11 @@ class Site:
         return chain_of(self.settings(role), self.accounts[role])
 
     def agent(self, role: str, **options: Any) -> Agent:
-        """An agent of that role, not yet running; always with the same memory."""
+        """An agent of that role, not yet running; always with the same state folder."""
         return Agent(MODEL, settings=self.settings(role, **options), account=self.accounts[role])
 
     def variables(self, role: str, **options: str) -> dict[str, str]:
-        """The settings of a program of that role. Its keyfile is made when it is asked for first."""
+        """The settings of a process of that role. The first call writes its keyfile."""
         keyfile, password = self.folder / f"{role}.json", self.folder / "password"
         if not keyfile.exists():
             password.write_text(PASSWORD + "\n")
@@ -91,11 +92,12 @@ class Site:
         return {f"AIRA_{name.upper()}": value for name, value in (fields | options).items()}
 
     def provider(self, role: str = "provider") -> Serving:
-        """`aira provider` as a process, not yet started."""
-        return Serving(*AIRA, "provider", says="serves ", variables=self.variables(role))
+        """`aira provider` as a process that logs in JSON, not yet started."""
+        variables = self.variables(role, log_format="json")
+        return Serving(*AIRA, "provider", says='"provider-started"', variables=variables)
 
     async def found_lighthouse(self, name: str, *, timeout_blocks: int, **quotas: int) -> NewLighthouse:
-        """Make a lighthouse where these roles have so many transactions a turn, and trade there from now on."""
+        """Create a lighthouse with these quotas of transactions per turn, and trade there from now on."""
         async with self.chain("provider") as chain:
             made = await chain.lighthouses.create(minimal_stake=XRT, timeout_blocks=timeout_blocks, name=name)
             for role, quota in quotas.items():
@@ -107,7 +109,7 @@ class Site:
         return made
 
     def robot(self, done: list[str], **options: Any) -> Agent:
-        """A robot that offers to do whatever is asked, and notes what it was told."""
+        """A robot that offers to do every demand, and adds the words of objectives to `done`."""
         robot = self.agent("robot", **options)
 
         @robot.on_demand
@@ -121,7 +123,23 @@ class Site:
         return robot
 
     def job(self, word: str) -> Path:
-        """An objective that has the robot told a word."""
+        """An objective with one message, a word."""
         path = self.folder / f"{word}.mcap"
         path.write_bytes(objective(("/say", word)))
         return path
+
+
+def events(log: str) -> list[dict[str, Any]]:
+    """The events in a log of JSON lines."""
+    return [json.loads(line) for line in log.splitlines() if line.startswith("{")]
+
+
+def has_event(server: Serving, name: str, **facts: str) -> bool:
+    """Whether a process that logs in JSON has logged an event of that name with these facts."""
+    wanted = {"event": name, **facts}.items()
+    return any(wanted <= event.items() for event in events(server.log()))
+
+
+def has_traceback(server: Serving) -> bool:
+    """Whether a process that logs in JSON has logged or printed a traceback."""
+    return "Traceback" in server.log()

@@ -1,4 +1,4 @@
-"""What `aira provider` says of its earnings, against what its account has on the chain."""
+"""The earnings that `aira provider` logs, compared with its account on the chain."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from tests.support.routers import EmbeddedRouter
 
 COST = 10**9
-"""More than the gas of a job is worth, which bounds what is minted for it."""
+"""More than the gas of a job is worth; the cost limits what is minted for the gas."""
 
 
-async def test_what_it_says_is_what_the_account_gained_and_lost(
+async def test_logged_earnings_are_what_the_account_gained_and_spent(
     anvil: Anvil, router: EmbeddedRouter, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -42,7 +42,7 @@ async def test_what_it_says_is_what_the_account_gained_and_lost(
             for word in ("one", "two"):
                 contract = await person.demand(site.job(word), cost=COST)
                 assert (await contract.outcome()).success
-        await until(lambda: caplog.text.count("finalized, success True") == 2, seconds=30)
+        await until(lambda: finalized(caplog) == 2, seconds=30)
         serving.cancel()
         await asyncio.wait([serving])
         gained, spent = await chain.tokens.balance() - xrt, wei - await chain.tokens.eth_balance()
@@ -51,33 +51,39 @@ async def test_what_it_says_is_what_the_account_gained_and_lost(
         created=2, finalized=2, rejected={}, gas_used=gas, spent=spent, fees=2 * FEE, minted=gained - 2 * FEE
     )
     assert earned.minted > 2 * 200_000
-    assert said(caplog) == [str(earned)]
+    assert logged(caplog) == [str(earned)]
 
 
 async def gas_used(chain: Chain, start: int) -> int:
-    """What all transactions after a block took; only the provider sends any."""
+    """The gas of all transactions after a block; only the provider sends any."""
     numbers = range(start + 1, await chain.block_number() + 1)
     blocks = [await chain.node.request("eth_getBlockByNumber", hex(number), False) for number in numbers]
     return sum(int(block["gasUsed"], 16) for block in blocks)
 
 
-def said(caplog: pytest.LogCaptureFixture) -> list[str]:
-    """What the command has logged."""
+def finalized(caplog: pytest.LogCaptureFixture) -> int:
+    """The number of contracts that were finalized with success."""
+    records = [record for record in caplog.records if getattr(record, "event", "") == "contract-finalized"]
+    return sum(record.facts["success"] == "True" for record in records)  # type: ignore[attr-defined]
+
+
+def logged(caplog: pytest.LogCaptureFixture) -> list[str]:
+    """The messages that the command has logged."""
     return [record.getMessage() for record in caplog.records if record.name == command.__name__]
 
 
-async def test_news_of_it_are_told_now_and_then(
+async def test_changed_earnings_are_logged_regularly(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(command, "REPORT", 0.01)
     caplog.set_level(logging.INFO, command.__name__)
-    books = EarningsLedger()
-    reporting = asyncio.create_task(command._report(books.earnings))
-    await until(lambda: len(said(caplog)) == 1)
+    ledger = EarningsLedger()
+    reporting = asyncio.create_task(command._report(ledger.earnings))
+    await until(lambda: len(logged(caplog)) == 1)
     await asyncio.sleep(0.2)
-    assert len(said(caplog)) == 1, "nothing has changed"
-    books.rejected("full")
-    await until(lambda: len(said(caplog)) == 2)
+    assert len(logged(caplog)) == 1, "nothing has changed"
+    ledger.rejected("full")
+    await until(lambda: len(logged(caplog)) == 2)
     reporting.cancel()
     await asyncio.wait([reporting])
-    assert said(caplog)[2:] == [str(books.earnings())]
+    assert logged(caplog)[2:] == [str(ledger.earnings())]

@@ -1,4 +1,4 @@
-"""Servers that are told to wait for ever begin in any order: each says once what it waits for, and goes on alone."""
+"""Servers with `connect_timeout = -1` start in any order: each logs once what it waits for, and goes on by itself."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import pytest
 from mesh.chain import Account, write_keyfile
 from mesh.devchain.development import deploy_market
 from mesh.identity import Member
+from tests.mesh.operations.site import events, has_event
 from tests.support.commands import AIRA, Serving
 from tests.support.nodes import Anvil
 from tests.support.routers import EmbeddedRouter
@@ -25,20 +26,21 @@ if TYPE_CHECKING:
 
 PROVIDER = (*AIRA, "provider")
 AGENT = (sys.executable, "-c", "from mesh import Agent; Agent().run()")
-FILES = "waiting: files that are not there yet: "
+FILES = '"event": "files-outage"'
 SECONDS = 60.0
 
 
 @contextmanager
-def started(*command: str, says: str, variables: Mapping[str, str]) -> Iterator[Serving]:
-    """A server that waits for ever for what it needs, and says so."""
-    with Serving(*command, says=says, variables={"AIRA_CONNECT_TIMEOUT": "-1", **variables}) as server:
+def started(*command: str, says: str = FILES, variables: Mapping[str, str]) -> Iterator[Serving]:
+    """A server that waits for what it needs without limit, and logs that in JSON."""
+    waiting = {"AIRA_CONNECT_TIMEOUT": "-1", "AIRA_LOG_FORMAT": "json"}
+    with Serving(*command, says=says, variables={**waiting, **variables}) as server:
         yield server
 
 
-async def says(server: Serving, words: str) -> None:
-    """Wait until the server has said so; it must not have ended."""
-    await until(lambda: words in server.log(), what=f"{words!r} in the log", seconds=SECONDS)
+async def until_event(server: Serving, name: str, **facts: str) -> None:
+    """Wait until the server has logged such an event; it must still run."""
+    await until(lambda: has_event(server, name, **facts), what=f"{name} {facts} in the log", seconds=SECONDS)
     assert server.pid
 
 
@@ -59,28 +61,29 @@ def hand_over(folder: Path, key: bytes) -> None:
 
 
 @pytest.mark.parametrize(
-    ("program", "role", "serves"),
-    [(PROVIDER, "provider", " serves airalab.lighthouse"), (AGENT, "agent", " on airalab.lighthouse")],
+    ("program", "role"),
+    [(PROVIDER, "provider"), (AGENT, "agent")],
     ids=["provider", "agent"],
 )
 async def test_a_server_waits_for_its_files_then_the_node_the_contracts_and_the_router(
-    program: tuple[str, ...], role: str, serves: str, tmp_path: Path
+    program: tuple[str, ...], role: str, tmp_path: Path
 ) -> None:
     node, router = Anvil(), EmbeddedRouter()
     variables = variables_of(tmp_path, node=node.port, router=router.port)
-    with started(*program, says=FILES, variables=variables) as server, node, router:
+    with started(*program, variables=variables) as server, node, router:
         node.stop()
         router.stop()
         await asyncio.to_thread(hand_over, tmp_path, key=node.private_keys[0])
-        await says(server, "the files are there")
-        await says(server, f"the {role} waits: no Ethereum node answers at")
+        await until_event(server, "files-recovered")
+        await until_event(server, "startup-outage", code="node-unreachable")
         await asyncio.to_thread(node.start)
-        await says(server, f"the {role} waits: the chain 31337 has no ")
+        await until_event(server, "startup-outage", code="no-contracts")
         await deploy_market(node.url, node.private_keys)
-        await says(server, "waiting for a router: no Zenoh router at")
+        await until_event(server, "router-outage", code="network-unavailable")
         await asyncio.to_thread(router.start)
-        await says(server, serves)
-        assert server.log().count(f"the {role} waits: no Ethereum node") == 1
+        await until_event(server, f"{role}-started")
+        unreachable = [event for event in events(server.log()) if event.get("code") == "node-unreachable"]
+        assert len(unreachable) == 1
 
 
 async def test_a_provider_waits_for_its_stake(tmp_path: Path) -> None:
@@ -89,13 +92,13 @@ async def test_a_provider_waits_for_its_stake(tmp_path: Path) -> None:
         late = Account.from_key(node.private_keys[3])
         await asyncio.to_thread(hand_over, tmp_path, key=node.private_keys[3])
         variables = variables_of(tmp_path, node=node.port, router=router.port)
-        with started(*PROVIDER, says=f"the provider waits: {late.address} has no stake", variables=variables) as server:
+        with started(*PROVIDER, says='"code": "no-stake"', variables=variables) as server:
             async with market.chain(node.url, "provider") as chain:
                 await chain.tokens.transfer(late.address, 10**9)
             market.accounts["late"] = late
             async with market.chain(node.url, "late") as chain:
                 await chain.lighthouses.become_provider(market.deployment.lighthouse, 10**9)
-            await says(server, " serves airalab.lighthouse")
+            await until_event(server, "provider-started")
 
 
 async def test_an_edge_agent_waits_for_its_identity_and_its_router(tmp_path: Path) -> None:
@@ -110,11 +113,11 @@ async def test_an_edge_agent_waits_for_its_identity_and_its_router(tmp_path: Pat
         "AIRA_TLS_KEY": str(folder.key),
     }
     edge = (*AIRA, "edge", "/dev/nowhere", "--agent", "0x" + "ab" * 20)
-    with started(*edge, says=FILES + str(folder.certificate), variables=variables) as server:
+    with started(*edge, says=str(folder.certificate), variables=variables) as server:
         away.rename(folder.certificate)
-        await says(server, "waiting for a router: no Zenoh router at")
+        await until_event(server, "router-outage", code="network-unavailable")
         with site.open_router("wheel"):
-            await says(server, "edge of 0x")
+            await until_event(server, "edge-started")
 
 
 async def test_a_router_waits_for_its_roster(tmp_path: Path) -> None:
@@ -128,13 +131,13 @@ async def test_a_router_waits_for_its_roster(tmp_path: Path) -> None:
         "AIRA_TLS_CERTIFICATE": str(site.router.certificate),
         "AIRA_TLS_KEY": str(site.router.key),
     }
-    with started(*AIRA, "router", says=FILES + str(site.roster), variables=variables) as server:
+    with started(*AIRA, "router", says=str(site.roster), variables=variables) as server:
         shutil.move(away, site.roster)
-        await says(server, f"listens at {site.endpoint}")
+        await until_event(server, "router-started")
 
 
-async def test_an_agent_that_is_not_let_in_waits_until_it_is(tmp_path: Path) -> None:
-    """A certificate that the router does not take yet, as its site is made anew."""
+async def test_an_agent_that_the_router_rejects_waits_until_it_is_accepted(tmp_path: Path) -> None:
+    """The router does not accept the certificate yet, as its site is being set up again."""
     (tmp_path / "other").mkdir()
     site, other = ClosedSite(tmp_path), ClosedSite(tmp_path / "other")
     with Anvil() as node:
@@ -149,7 +152,9 @@ async def test_an_agent_that_is_not_let_in_waits_until_it_is(tmp_path: Path) -> 
             "AIRA_TLS_CERTIFICATE": str(member.certificate),
             "AIRA_TLS_KEY": str(member.key),
         }
-        out = "the agent waits: rejected by the Zenoh router"
-        with site.open_router("wheel"), started(*AGENT, says=out, variables=variables) as server:
+        with (
+            site.open_router("wheel"),
+            started(*AGENT, says='"event": "startup-outage"', variables=variables) as server,
+        ):
             shutil.copytree(mine.path, member.path, dirs_exist_ok=True)
-            await says(server, " on airalab.lighthouse")
+            await until_event(server, "agent-started")

@@ -1,4 +1,4 @@
-"""The chain replaces the block in which a contract was made: the job is taken back, made again, done and paid once."""
+"""A reorganisation reverts a contract: it is created again, and its job is done and paid once."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from mesh.agent import Phase
 from mesh.work import outbox
-from tests.mesh.operations.site import FEE, Site
+from tests.mesh.operations.site import FEE, Site, has_event, has_traceback
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tests.support.routers import EmbeddedRouter
 
 COST = 500
-PATIENCE = 60.0
+TIMEOUT = 60.0
 
 
 @pytest.fixture(autouse=True)
@@ -34,8 +34,8 @@ async def request(chain: Chain, method: str, *parameters: Any) -> Any:
     return await chain.node.request(method, *parameters)
 
 
-def patient_robot(site: Site, may_work: asyncio.Event, incoming: list[str], done: list[str]) -> Agent:
-    """A robot that offers to do whatever is asked, waits for leave to do it, and notes contracts and work."""
+def waiting_robot(site: Site, may_work: asyncio.Event, incoming: list[str], done: list[str]) -> Agent:
+    """A robot that offers to do every demand, works when `may_work` is set, and records liabilities and words."""
     robot = site.agent("robot")
 
     @robot.on_demand
@@ -55,27 +55,29 @@ def patient_robot(site: Site, may_work: asyncio.Event, incoming: list[str], done
     return robot
 
 
-async def test_a_contract_that_the_chain_drops_is_made_again_and_its_job_paid_once(
+async def test_a_reverted_contract_is_created_again_and_its_job_paid_once(
     anvil: Anvil, router: EmbeddedRouter, tmp_path: Path
 ) -> None:
     site = await Site.found(anvil.url, anvil.private_keys, router.endpoint, tmp_path)
     may_work = asyncio.Event()
     incoming: list[str] = []
     done: list[str] = []
-    robot = patient_robot(site, may_work, incoming, done)
+    robot = waiting_robot(site, may_work, incoming, done)
 
-    async with site.provider() as provider, robot, site.agent("person") as person, asyncio.timeout(3 * PATIENCE):
+    async with site.provider() as provider, robot, site.agent("person") as person, asyncio.timeout(3 * TIMEOUT):
         chain = person.parts.chain
         before = await chain.tokens.balance(site.address("robot"))
         contract = await person.demand(site.job("once"), cost=COST)
         first = contract.address
-        await until(lambda: incoming == [first], what="the job", seconds=PATIENCE)
-        await until_found(lambda: robot.parts.ledger.job(first), what="the job in the ledger", seconds=PATIENCE)
+        await until(lambda: incoming == [first], what="the job", seconds=TIMEOUT)
+        await until_found(lambda: robot.parts.ledger.job(first), what="the job in the ledger", seconds=TIMEOUT)
 
         await request(chain, "anvil_reorg", 1, [])
         await request(chain, "evm_mine")
-        await until(lambda: "the chain took back 1 contracts" in provider.log(), what="the loss", seconds=PATIENCE)
-        await until(lambda: len(incoming) == 2, what="the contract made again", seconds=PATIENCE)
+        await until(
+            lambda: has_event(provider, "chain-reorganised", created="1"), what="the reorganisation", seconds=TIMEOUT
+        )
+        await until(lambda: len(incoming) == 2, what="the contract created again", seconds=TIMEOUT)
         assert await robot.parts.ledger.job(first) is None or contract.address == first
         may_work.set()
 
@@ -85,4 +87,4 @@ async def test_a_contract_that_the_chain_drops_is_made_again_and_its_job_paid_on
         (made,) = await chain.liabilities.list(promisee=site.address("person"))
         assert (made.address, made.is_finalized, made.is_success) == (contract.address, True, True)
         assert await chain.tokens.balance(site.address("robot")) == before + COST - FEE
-        assert "Traceback" not in provider.log()
+        assert not has_traceback(provider)

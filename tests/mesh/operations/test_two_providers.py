@@ -1,4 +1,4 @@
-"""Two providers of one lighthouse share its work by their stakes; one is killed, and the other does the rest."""
+"""Two providers of one lighthouse share its work by their stakes. After one is killed, the other does the rest."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ JOBS = 30
 COST = 1000
 QUOTAS = {"provider": 2, "rival": 1}
 TIMEOUT_BLOCKS = 6
-PATIENCE = 120.0
+TIMEOUT = 120.0
 
 
 class Sent(NamedTuple):
@@ -51,18 +51,18 @@ async def site(served: ServedChain, router: EmbeddedRouter, tmp_path: Path) -> S
     return site
 
 
-async def test_jobs_are_shared_in_turns_and_taken_over_and_done_once_each(served: ServedChain, site: Site) -> None:
+async def test_providers_share_jobs_and_take_over_and_each_job_is_done_once(served: ServedChain, site: Site) -> None:
     done: list[str] = []
-    async with site.chain("person") as chain, asyncio.timeout(2 * PATIENCE):
+    async with site.chain("person") as chain, asyncio.timeout(2 * TIMEOUT):
         start, before = await chain.block_number(), await wealth(site, chain)
         provider, rival = site.provider("provider"), site.provider("rival")
         async with provider, rival, site.robot(done), site.agent("person") as person, Background() as tasks:
             jobs = [asyncio.create_task(one_job(site, person, number)) for number in range(JOBS)]
-            await until(lambda: len(done) >= JOBS // 2, what="half of the jobs", seconds=PATIENCE)
+            await until(lambda: len(done) >= JOBS // 2, what="half of the jobs", seconds=TIMEOUT)
             shared = await sent(site, chain, start)
             await asyncio.to_thread(rival.kill)
             killed = await chain.block_number()
-            tasks.start(let_time_pass(served), "blocks without transactions")
+            tasks.start(mine_empty_blocks(served), "blocks without transactions")
             outcomes = await asyncio.gather(*jobs)
             log = await asyncio.to_thread(stopped, provider)
         made = await chain.liabilities.list(from_block=start)
@@ -77,13 +77,13 @@ async def test_jobs_are_shared_in_turns_and_taken_over_and_done_once_each(served
 
     assert_in_turns(shared)
     assert {one.role for one in transactions if one.block > killed} == {"provider"}
-    assert Counter(one.went_through for one in transactions) == {True: 2 * JOBS}, "nobody raced anybody"
+    assert Counter(one.went_through for one in transactions) == {True: 2 * JOBS}, "the providers did not race"
 
     assert after["person"] == before["person"] - JOBS * COST
     assert after["robot"] == before["robot"] + JOBS * (COST - FEE)
     assert after["factory"] == before["factory"] == 0
     assert after["provider"] + after["rival"] > before["provider"] + before["rival"] + JOBS * FEE
-    assert sum(after.values()) == supply, "nothing is lost, and nothing comes from nowhere"
+    assert sum(after.values()) == supply, "no XRT is lost or created out of nothing"
     assert "contracts: " in log
     assert "Traceback" not in log
 
@@ -97,14 +97,14 @@ async def one_job(site: Site, person: Agent, number: int) -> Outcome:
     return await (await person.demand(path, cost=COST)).outcome()
 
 
-async def let_time_pass(served: ServedChain) -> None:
+async def mine_empty_blocks(served: ServedChain) -> None:
     while True:
         await served.node.mine()
         await asyncio.sleep(0.03)
 
 
 def stopped(provider: Any) -> str:
-    """What a provider had said when it was asked to end."""
+    """The log of a provider after it was stopped."""
     provider.stop()
     return str(provider.log())
 
@@ -125,7 +125,7 @@ async def sent(site: Site, chain: Chain, start: int) -> list[Sent]:
 
 
 def assert_in_turns(transactions: list[Sent]) -> None:
-    """Without silence in between: twice the one who staked two, once the one who staked one, and so on."""
+    """Without pauses: two transactions of the one with two stakes, one of the other, and so on."""
     pattern = [role for role, quota in QUOTAS.items() for _ in range(quota)]
     expected = [pattern[place % len(pattern)] for place in range(len(transactions))]
     assert [one.role for one in transactions] == expected
@@ -133,7 +133,7 @@ def assert_in_turns(transactions: list[Sent]) -> None:
 
 
 async def wealth(site: Site, chain: Chain) -> dict[str, int]:
-    """Who has how much XRT."""
+    """The XRT of each account."""
     holders = {role: account.address for role, account in site.accounts.items()}
     for name in ("airalab", site.lighthouse):
         holders[name] = await chain.names.lighthouse(name)
