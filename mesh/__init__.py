@@ -1,4 +1,4 @@
-"""AIRA mesh: robots and people trade work without a middleman."""
+"""AIRA mesh: robots and people trade work without a middleman. Users import everything from here."""
 
 from __future__ import annotations
 
@@ -7,23 +7,101 @@ from typing import TYPE_CHECKING, Any
 from schemas.loading import on_demand
 
 if TYPE_CHECKING:
-    from mesh.agent import Agent, Contract, JobFailed, Phase
+    from mesh.agent import (
+        Agent,
+        Contract,
+        FundsShort,
+        Job,
+        JobFailed,
+        LiabilityReverted,
+        OrderExpired,
+        OrderRejected,
+        Outcome,
+        Phase,
+    )
+    from mesh.chain import NodeUnreachable, NotALiability
+    from mesh.content import ContentUnavailable
+    from mesh.errors import (
+        AiraError,
+        ChainError,
+        ClosedError,
+        ConfigurationError,
+        ContentError,
+        InputError,
+        NetworkUnavailable,
+        RemoteError,
+    )
+    from mesh.recording import Objective, Played, Recorder, RecordingAbout, open_objective, pack
+    from mesh.running import fail, run_to_end
     from mesh.settings import Settings
+    from mesh.work.lifecycle import WrongPhase
+    from mesh.work.objectives import ObjectiveUnfit
+    from schemas import (
+        STRING,
+        ZERO_ADDRESS,
+        Demand,
+        Empty,
+        InvalidPayload,
+        Liability,
+        Offer,
+        Result,
+        String,
+        Verified,
+        cid_of_file,
+    )
 
     __version__: str
 
 _HOMES = {
-    "Agent": "mesh.agent",
-    "Contract": "mesh.agent",
-    "JobFailed": "mesh.agent",
-    "Phase": "mesh.agent",
+    "Agent": "mesh.agent.agent",
+    "AiraError": "mesh.errors",
+    "ChainError": "mesh.errors",
+    "ClosedError": "mesh.errors",
+    "ConfigurationError": "mesh.errors",
+    "ContentError": "mesh.errors",
+    "ContentUnavailable": "mesh.content",
+    "Contract": "mesh.agent.contract",
+    "Demand": "schemas",
+    "Empty": "schemas",
+    "FundsShort": "mesh.agent.errors",
+    "InputError": "mesh.errors",
+    "InvalidPayload": "schemas",
+    "Job": "mesh.work.job",
+    "JobFailed": "mesh.work.job",
+    "Liability": "schemas",
+    "LiabilityReverted": "mesh.agent.errors",
+    "NetworkUnavailable": "mesh.errors",
+    "NodeUnreachable": "mesh.chain",
+    "NotALiability": "mesh.chain",
+    "Objective": "mesh.recording",
+    "ObjectiveUnfit": "mesh.work.objectives",
+    "Offer": "schemas",
+    "OrderExpired": "mesh.agent.errors",
+    "OrderRejected": "mesh.agent.errors",
+    "Outcome": "mesh.agent.contract",
+    "Phase": "mesh.work.lifecycle",
+    "Played": "mesh.recording",
+    "Recorder": "mesh.recording",
+    "RecordingAbout": "mesh.recording",
+    "RemoteError": "mesh.errors",
+    "Result": "schemas",
+    "STRING": "schemas",
     "Settings": "mesh.settings",
+    "String": "schemas",
+    "Verified": "schemas",
+    "WrongPhase": "mesh.work.lifecycle",
+    "ZERO_ADDRESS": "schemas",
+    "cid_of_file": "schemas",
+    "fail": "mesh.running",
+    "open_objective": "mesh.recording",
+    "pack": "mesh.recording",
+    "run_to_end": "mesh.running",
 }
 _load = on_demand(__name__, _HOMES)
 
 
 def __getattr__(name: str) -> Any:
-    """Load what is asked for: an edge agent must not pay for the parts that it does not use."""
+    """Load a name on its first use: an edge agent must not load what it does not need."""
     return _version() if name == "__version__" else _load(name)
 
 
@@ -36,4 +114,49 @@ def _version() -> str:
         return "0+unknown"
 
 
-__all__ = ["Agent", "Contract", "JobFailed", "Phase", "Settings", "__version__"]
+__all__ = [
+    "STRING",
+    "ZERO_ADDRESS",
+    "Agent",
+    "AiraError",
+    "ChainError",
+    "ClosedError",
+    "ConfigurationError",
+    "ContentError",
+    "ContentUnavailable",
+    "Contract",
+    "Demand",
+    "Empty",
+    "FundsShort",
+    "InputError",
+    "InvalidPayload",
+    "Job",
+    "JobFailed",
+    "Liability",
+    "LiabilityReverted",
+    "NetworkUnavailable",
+    "NodeUnreachable",
+    "NotALiability",
+    "Objective",
+    "ObjectiveUnfit",
+    "Offer",
+    "OrderExpired",
+    "OrderRejected",
+    "Outcome",
+    "Phase",
+    "Played",
+    "Recorder",
+    "RecordingAbout",
+    "RemoteError",
+    "Result",
+    "Settings",
+    "String",
+    "Verified",
+    "WrongPhase",
+    "__version__",
+    "cid_of_file",
+    "fail",
+    "open_objective",
+    "pack",
+    "run_to_end",
+]

@@ -1,4 +1,4 @@
-"""The base class of roles, such as provider, bridge and agent: opened by `async with`, working while `run` runs."""
+"""The base classes of roles, such as provider, bridge and agent, and of their parts that are opened with them."""
 
 from __future__ import annotations
 
@@ -12,15 +12,14 @@ if TYPE_CHECKING:
     from types import TracebackType
 
 
-class Role(ABC):
-    """`async with role`, then `await role.run()`. Leaving closes everything in reverse order.
+class Lifecycle(ABC):
+    """`async with` opens it. Leaving closes everything in reverse order.
 
-    A subclass sets `title`, opens what it needs in `_open` and works in `_work`. If `_open` fails, what it opened until
-    then is closed.
+    A subclass sets `title` and opens what it needs in `_open`. If `_open` fails, what it opened until then is closed.
     """
 
     title: ClassVar[str]
-    """The role's name in error messages."""
+    """Its name in error messages."""
     _stack: AsyncExitStack | None = None
 
     async def __aenter__(self) -> Self:
@@ -43,15 +42,19 @@ class Role(ABC):
         """Whether it is inside `async with`."""
         return self._stack is not None
 
+    @abstractmethod
+    async def _open(self, stack: AsyncExitStack) -> None:
+        """Open what it needs, on `stack`."""
+
+
+class Role(Lifecycle):
+    """`async with role`, then `await role.run()`. A subclass works in `_work`."""
+
     async def run(self) -> None:
         """Work until cancelled. Raises `ClosedError` outside `async with`."""
         if self._stack is None:
             raise ClosedError(f"this {self.title} is not open", hint="use it inside `async with`")
         await self._work()
-
-    @abstractmethod
-    async def _open(self, stack: AsyncExitStack) -> None:
-        """Open what the role needs, on `stack`."""
 
     @abstractmethod
     async def _work(self) -> None:

@@ -1,18 +1,20 @@
-"""The agent API: what users write agents with."""
+"""The agent API, which users import from `mesh`."""
 
 from mesh.agent.agent import Agent
 from mesh.agent.contract import Contract, Outcome
-from mesh.agent.errors import ContractTakenBack, JobFailed, OrderExpired, OrderRejected, ShortOfFunds
+from mesh.agent.errors import FundsShort, LiabilityReverted, OrderExpired, OrderRejected
+from mesh.work.job import Job, JobFailed
 from mesh.work.lifecycle import Phase
 
 __all__ = [
     "Agent",
     "Contract",
-    "ContractTakenBack",
+    "FundsShort",
+    "Job",
     "JobFailed",
+    "LiabilityReverted",
     "OrderExpired",
     "OrderRejected",
     "Outcome",
     "Phase",
-    "ShortOfFunds",
 ]

@@ -1,8 +1,9 @@
-"""The parts of an agent, opened in their order and closed in the reverse one."""
+"""The components of an agent, and in what order they are opened."""
 
 from __future__ import annotations
 
 import asyncio
+import logging
 import time
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
@@ -12,34 +13,46 @@ from mesh.composition import chain_of, endpoints_of
 from mesh.content import Exchange, Store
 from mesh.errors import ConfigurationError
 from mesh.network import Channel, Network, Services
+from mesh.outage_log import OutageLog
 from mesh.work.ledger import Ledger
-from mesh.work.outbox import Outbox
-from mesh.work.workshop import Workshop
+from mesh.work.outbox import RESEND, Outbox
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
     from mesh.chain import Account, Chain
+    from mesh.retry import RetryPolicy
     from mesh.settings import Settings
     from schemas import Signer
 
 
+log = logging.getLogger(__name__)
+
+
 class ChainHead:
-    """The chain's time as this agent knows it: the number of the last block handled, and when that was."""
+    """How far this agent has handled the chain: the number of its last block, and when that was."""
 
     def __init__(self, head: int) -> None:
+        self._advanced = asyncio.Event()
         self.pass_to(head)
 
     def pass_to(self, block: int) -> None:
         """All of `block` has been handled."""
         self.head = block
         self.passed_at = time.monotonic()
+        self._advanced.set()
+        self._advanced = asyncio.Event()
+
+    async def reached(self, block: int) -> None:
+        """Return when `block` has been handled."""
+        while self.head < block:
+            await self._advanced.wait()
 
 
 @dataclass(frozen=True, kw_only=True)
 class AgentComponents:
-    """What an agent that trades and works consists of; all of it is open."""
+    """The open components of an agent with an account."""
 
     settings: Settings
     network: Network
@@ -52,33 +65,20 @@ class AgentComponents:
     exchange: Exchange
     services: Services
     clock: ChainHead
+    outages: OutageLog
+    """Outages of the node, for everything that waits for it."""
     directory: Path
-    """Where what concerns this chain is kept: ledger and recordings."""
+    """The folder of what belongs to this chain: the ledger and unfinished recordings."""
 
-    def workshop(self) -> Workshop:
-        """The parts that the executor works with."""
-        recordings = self.directory / "recordings"
-        try:
-            recordings.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ConfigurationError(
-                f"can't keep recordings in {recordings}: {error.strerror}", hint="give another folder with --data-dir"
-            ) from None
-        return Workshop(
-            session=self.network.session,
-            signer=self.signer,
-            ledger=self.ledger,
-            outbox=self.outbox,
-            store=self.store,
-            exchange=self.exchange,
-            settings=self.settings,
-            recordings=recordings,
-        )
+    @property
+    def recordings(self) -> Path:
+        """The folder of unfinished recordings; finished ones are in the store."""
+        return self.directory / "recordings"
 
 
 @asynccontextmanager
 async def watching(settings: Settings) -> AsyncIterator[tuple[Network, Channel]]:
-    """The parts of an agent that only watches the market: it needs a router, no account and no chain."""
+    """The components of an agent that only watches the market: it needs a router, but no account and no chain."""
     async with (
         Network(endpoints_of(settings)) as network,
         Channel(network.session, settings.lighthouse_contract) as channel,
@@ -87,16 +87,18 @@ async def watching(settings: Settings) -> AsyncIterator[tuple[Network, Channel]]
 
 
 @asynccontextmanager
-async def working(settings: Settings, account: Account, chain: Chain | None) -> AsyncIterator[AgentComponents]:
-    """The parts of an agent with an account, on `chain` (open), or on the chain that the settings name.
+async def working(
+    settings: Settings, account: Account, chain: Chain | None, *, resend: RetryPolicy = RESEND
+) -> AsyncIterator[AgentComponents]:
+    """The components of an agent with an account, on `chain` (open), or on the chain that the settings name.
 
-    Its state is in the settings' folder, by address; what concerns the chain, by chain.
+    Its state is in the settings' folder by address, and what belongs to a chain in a folder for that chain.
     """
     async with AsyncExitStack() as stack:
         if chain is None:
             chain = await stack.enter_async_context(chain_of(settings, account))
         home = settings.state_directory / account.address
-        directory = home / await _name_of(chain)
+        directory = home / await _chain_folder(chain)
         clock = ChainHead(await chain.block_number())
         network = await stack.enter_async_context(Network(endpoints_of(settings)))
         channel = await stack.enter_async_context(
@@ -107,30 +109,41 @@ async def working(settings: Settings, account: Account, chain: Chain | None) -> 
             Store, home / "content", limit=settings.objective_expanded_limit, quota=settings.content_limit
         )
         stack.callback(store.close)
-        yield AgentComponents(
+        parts = AgentComponents(
             settings=settings,
             network=network,
             chain=chain,
             channel=channel,
             signer=account.signer,
             ledger=ledger,
-            outbox=Outbox(ledger, channel, network, head=lambda: clock.head),
+            outbox=Outbox(ledger, channel, network, head=lambda: clock.head, policy=resend),
             store=store,
             exchange=await stack.enter_async_context(Exchange(network.session, store)),
             services=await stack.enter_async_context(Services(network.session, account.address)),
             clock=clock,
+            outages=OutageLog(log, "chain"),
             directory=directory,
         )
+        _make_folder(parts.recordings)
+        yield parts
 
 
 async def _channel_of(lighthouse: str, network: Network, *, chain: Chain, clock: ChainHead) -> Channel:
-    """The channel of a lighthouse, not yet open, with names and blocks as the chain has them."""
+    """The channel of a lighthouse, not yet open, which resolves names and knows the head by the chain."""
     address = await chain.names.address(lighthouse)
     return Channel(network.session, lighthouse, address=address, resolver=chain.names.address, head=lambda: clock.head)
 
 
-async def _name_of(chain: Chain) -> str:
-    """What tells this chain from all others: a development chain that is started anew has the number of the old one,
-    and the same addresses for other contracts."""
-    block_hash = await chain.node.block_hash(min(1, await chain.block_number()))
-    return f"{chain.chain_id}-{block_hash.hex()[:8]}"
+async def _chain_folder(chain: Chain) -> str:
+    """A name that only this chain has: a restarted development chain has the same number, with other contracts."""
+    first = await chain.node.block_hash(min(1, await chain.block_number()))
+    return f"{chain.chain_id}-{first.hex()[:8]}"
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigurationError(
+            f"can't keep recordings in {folder}: {error.strerror}", hint="give another folder with --data-dir"
+        ) from None

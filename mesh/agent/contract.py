@@ -40,7 +40,7 @@ class Contract:
     async def outcome(self) -> Outcome:
         """Wait until the chain has finalized the contract. Cancelling the wait changes nothing.
 
-        Raises `ClosedError` when the agent ends before the contract does, and `ContractTakenBack` when the chain has
+        Raises `ClosedError` when the agent ends before the contract does, and `LiabilityReverted` when the chain has
         taken it back and it was not made again in time.
         """
         return await asyncio.shield(self._ended)

@@ -1,4 +1,4 @@
-"""What can go wrong in trading and in doing a job, beyond what the parts raise."""
+"""Errors of trading and of an agent's services. `JobFailed`, which handlers raise, is in `mesh.work.job`."""
 
 from __future__ import annotations
 
@@ -10,78 +10,72 @@ if TYPE_CHECKING:
     from schemas.signing import Rejection
 
 
-class JobFailed(AiraError):
-    """Raised by a handler to end its job without success, which refunds the promisee; the text says why."""
-
-    code = "job-failed"
-
-
 class OrderRejected(AiraError):
-    """A provider says that an order can't be used; `rejection` holds its machine-readable reason."""
+    """A provider can't use the order. `rejection` has the reason, a word for programs, and the detail."""
 
     code = "order-rejected"
 
     def __init__(self, rejection: Rejection) -> None:
         super().__init__(
             f"provider {rejection.provider} rejects the order ({rejection.reason}): {rejection.detail}",
-            hint="mend what the reason names and post a new order",
+            hint="fix the reported problem and post a new order",
         )
         self.rejection = rejection
 
 
-class ServiceClosed(AiraError):
-    """A service that others may not use: it signs, spends or drives jobs, and the settings don't open it."""
-
-    code = "service-closed"
-
-    def __init__(self, service: str) -> None:
-        super().__init__(
-            f"this agent does not offer {service} to others",
-            hint="on the agent: open_services = true, behind a router that only those reach who may use its account",
-        )
-        self.service = service
-
-
 class OrderExpired(AiraError):
-    """An order's deadline has passed and nobody took it."""
+    """No offer matched the order before its deadline, the block `deadline`. `order` is its hash."""
 
     code = "order-expired"
 
     def __init__(self, order: str, deadline: int) -> None:
         super().__init__(
-            f"nobody took the order {order[:16]}… until block {deadline}",
-            hint="offer more, or give it a longer lifetime",
+            f"no counterpart matched the order {order[:16]}… before block {deadline}",
+            hint="offer more, or give the order a longer lifetime",
         )
         self.order = order
         self.deadline = deadline
 
 
-class ContractTakenBack(AiraError):
-    """The chain was reorganised, and a contract of before was not made again until its orders' deadline."""
+class LiabilityReverted(AiraError):
+    """A reorganisation reverted the contract `liability`, and it was not created again by its orders' deadline."""
 
-    code = "contract-taken-back"
+    code = "liability-reverted"
 
     def __init__(self, liability: str, deadline: int) -> None:
         super().__init__(
-            f"the chain took the contract {liability} back, and it was not made again until block {deadline}",
-            hint="it pays nobody; post a new order, unless another contract was made of its orders",
+            f"a reorganisation reverted the contract {liability}, and it was not created again by block {deadline}",
+            hint="it pays nobody; post a new order, unless another contract was created from its orders",
         )
         self.liability = liability
         self.deadline = deadline
 
 
-class ShortOfFunds(AiraError):
-    """The account can't pay what it wants to promise: units of the token that it has, and that it needs."""
+class FundsShort(AiraError):
+    """The account has less of a token than its open orders may cost: `balance` and `needed`, in the smallest unit."""
 
-    code = "short-of-funds"
+    code = "funds-short"
 
     def __init__(self, account: str, token: str, *, balance: int, needed: int) -> None:
         super().__init__(
-            f"account {account} has {balance} of token {token}, and {needed} are needed",
+            f"account {account} has {balance} of token {token} and needs {needed}",
             hint="send it the missing tokens, or lower the cost",
         )
         self.balance = balance
         self.needed = needed
 
 
-__all__ = ["ContractTakenBack", "JobFailed", "OrderExpired", "OrderRejected", "ServiceClosed", "ShortOfFunds"]
+class ServiceClosed(AiraError):
+    """A service that the agent's settings don't open to others: it signs, spends or drives jobs."""
+
+    code = "service-closed"
+
+    def __init__(self, service: str) -> None:
+        super().__init__(
+            f"this agent does not offer {service} to others",
+            hint="set open_services = true on the agent, if only those who may use its account reach its router",
+        )
+        self.service = service
+
+
+__all__ = ["FundsShort", "LiabilityReverted", "OrderExpired", "OrderRejected", "ServiceClosed"]

@@ -1,15 +1,16 @@
-"""Providers' rejections of an order. Anybody may write one; a provider's word is what a provider has signed."""
+"""Providers' rejections of an order. Anybody can publish one; only those that a provider signed count."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.background import Background
-from mesh.chain import NodeUnreachable, RequestRefused
 from mesh.network import call_in_loop
+from mesh.telemetry.context import log_event
 from schemas import InvalidRecord, market_selector
 from schemas.signing import Rejection
 
@@ -18,65 +19,60 @@ if TYPE_CHECKING:
 
     import zenoh
 
-    from mesh.chain import Chain
+    from mesh.agent.components import AgentComponents
+
+    OnRejection = Callable[[Rejection], Awaitable[None]]
 
 log = logging.getLogger(__name__)
 
-WAITING: Final = 64
-"""Signed rejections of an order that wait to be looked at; more are dropped, since anybody may sign one."""
-RETRY: Final = 1.0
-"""Seconds before the chain is asked again that did not answer."""
+QUEUED: Final = 64
+"""Most signed rejections of an order that wait to be checked; more are dropped, since anybody can sign one."""
 
 
 class Rejections:
-    """Rejections on the keys of `market` (ENS name), by providers of `lighthouse` (the same name, or the address)."""
+    """Rejections on the agent's market, by the providers of its lighthouse."""
 
-    def __init__(self, session: zenoh.Session, chain: Chain, *, market: str, lighthouse: str) -> None:
-        self._session = session
-        self._chain = chain
-        self._market = market
-        self._lighthouse = lighthouse
+    def __init__(self, parts: AgentComponents) -> None:
+        self._parts = parts
+        self._session = parts.network.session
+        self._chain = parts.chain
 
     @asynccontextmanager
-    async def heard(self, order: str, tell: Callable[[Rejection], Awaitable[None]]) -> AsyncIterator[None]:
-        """Meanwhile `tell` of each rejection of the order (hash, hexadecimal) that a provider has signed.
+    async def received(self, order: str, on_rejection: OnRejection) -> AsyncIterator[None]:
+        """Meanwhile call `on_rejection` with each rejection of the order (hash, hexadecimal) that a provider signed.
 
-        `tell` is called again where it raises `NodeUnreachable` or `RequestRefused`.
+        It is called again if it raises that the node is away.
         """
         loop = asyncio.get_running_loop()
-        signed: asyncio.Queue[Rejection] = asyncio.Queue(WAITING)
+        queue: asyncio.Queue[Rejection] = asyncio.Queue(QUEUED)
 
-        def hear(sample: zenoh.Sample) -> None:
+        def receive(sample: zenoh.Sample) -> None:
             rejection = _signed_rejection(sample.payload.to_bytes())
             if rejection is not None and rejection.order == order:
-                call_in_loop(loop, _put, signed, rejection)
+                call_in_loop(loop, _put, queue, rejection)
 
-        selector = market_selector(self._market, "reject").replace("/*/*", f"/{order}/*")
-        subscriber: Any = self._session.declare_subscriber(selector, hear)
+        selector = market_selector(self._parts.channel.lighthouse, "reject").replace("/*/*", f"/{order}/*")
+        subscriber: Any = self._session.declare_subscriber(selector, receive)
         try:
             async with Background() as tasks:
-                tasks.start(self._examine(signed, tell), f"rejections of {order}")
+                tasks.start(self._check_all(queue, on_rejection), f"rejections of {order}")
                 yield
         finally:
             if not self._session.is_closed():
                 subscriber.undeclare()
 
-    async def _examine(self, signed: asyncio.Queue[Rejection], tell: Callable[[Rejection], Awaitable[None]]) -> None:
-        rejection = await signed.get()
+    async def _check_all(self, queue: asyncio.Queue[Rejection], on_rejection: OnRejection) -> None:
         while True:
-            try:
-                await self._consider(rejection, tell)
-            except (NodeUnreachable, RequestRefused) as error:
-                log.debug("a rejection can't be looked into: %s", error)
-                await asyncio.sleep(RETRY)
-            else:
-                rejection = await signed.get()
+            check = partial(self._check, await queue.get(), on_rejection)
+            await self._chain.retrying(check, outages=self._parts.outages)
 
-    async def _consider(self, rejection: Rejection, tell: Callable[[Rejection], Awaitable[None]]) -> None:
-        if rejection.provider in (await self._chain.lighthouses.get(self._lighthouse)).stakes:
-            await tell(rejection)
+    async def _check(self, rejection: Rejection, on_rejection: OnRejection) -> None:
+        lighthouse = await self._chain.lighthouses.get(self._parts.settings.lighthouse_contract)
+        if rejection.provider in lighthouse.stakes:
+            await on_rejection(rejection)
         else:
-            log.warning("%s, who is no provider, says of an order: %s", rejection.provider, rejection.reason)
+            facts = log_event("rejection-ignored", signer=rejection.provider, reason=rejection.reason)
+            log.warning("%s is no provider, but rejects: %s", rejection.provider, rejection.reason, extra=facts)
 
 
 def _signed_rejection(payload: bytes) -> Rejection | None:

@@ -1,4 +1,4 @@
-"""Trading: orders made, signed and posted; the contract that comes of a demand, and its result."""
+"""Trading: signs and posts the orders of an account, and waits for their contracts and for how those end."""
 
 from __future__ import annotations
 
@@ -6,24 +6,25 @@ import asyncio
 import logging
 import secrets
 from collections import Counter
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from mesh.agent.allowances import Allowances
 from mesh.agent.contract import Contract, Outcome
-from mesh.agent.errors import ContractTakenBack, OrderExpired, OrderRejected
-from mesh.agent.purse import Allowances
+from mesh.agent.errors import LiabilityReverted, OrderExpired, OrderRejected
 from mesh.agent.rejections import Rejections
-from mesh.chain import NodeUnreachable, RequestRefused
 from mesh.errors import AiraError, ClosedError
 from mesh.market.book import Refusal
-from mesh.telemetry.context import liability_context, log_event
+from mesh.role import Lifecycle
+from mesh.telemetry.context import log_event
 from schemas import ZERO_ADDRESS, Demand, Offer, message_hash
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from contextlib import AsyncExitStack
 
     from mesh.agent.components import AgentComponents
-    from mesh.chain import Chain
     from schemas import Liability
     from schemas.signing import Rejection
 
@@ -35,247 +36,264 @@ AnOrder = TypeVar("AnOrder", Demand, Offer)
 
 
 class _Overtaken(Exception):
-    """Generation 5 counts an account's orders: another one was taken before this one, which has to be signed anew."""
+    """The nonce of an order of generation 5 was used by another one of the account: it must be signed again."""
 
 
-class Trader:
-    """Makes the orders of one account and waits for what comes of them, until `close`."""
+@dataclass
+class _OpenOrder:
+    """A signed order of ours that can still become a contract."""
 
-    def __init__(self, parts: AgentComponents, chain: Chain) -> None:
+    signed: Demand | Offer
+    created: asyncio.Future[Contract] | None = None
+    """What the caller of `Trader.demand` waits for."""
+
+    @property
+    def nonce(self) -> int | None:
+        """In generation 5, which counts an account's orders."""
+        return int(self.signed.nonce) if self.signed.generation == 5 else None
+
+
+@dataclass
+class _WatchedContract:
+    """A contract whose end somebody may wait for."""
+
+    ended: asyncio.Future[Outcome]
+    demand: str = ""
+    """The demand of ours that it was created from, if any, and what its caller holds."""
+    contract: Contract | None = None
+    reverted_until: int | None = None
+    """While a reorganisation has reverted it: the block by which it must be created again."""
+
+
+class Trader(Lifecycle):
+    """Trades for one account: `async with Trader(components) as trader`.
+
+    Leaving fails everything that is waited for with `ClosedError`. The runtime reports what happens on the chain.
+    """
+
+    title = "trader"
+
+    def __init__(self, parts: AgentComponents) -> None:
         self._parts = parts
-        self._chain = chain
+        self._chain = parts.chain
         self._address = parts.signer.address
-        self._purse = Allowances(chain, self._address)
-        self._rejections = Rejections(
-            parts.network.session,
-            chain,
-            market=parts.channel.lighthouse,
-            lighthouse=parts.settings.lighthouse_contract,
-        )
-        self._matches: dict[str, asyncio.Future[Contract]] = {}
-        self._nonces: dict[str, int] = {}
-        self._deadlines: dict[str, int] = {}
-        self._counted: dict[str, tuple[Terms, int]] = {}
-        self._endings: dict[str, asyncio.Future[Outcome]] = {}
-        self._contracts: dict[str, Contract] = {}
-        self._unmade: dict[str, int] = {}
-        self._closed = False
-        self._progress = asyncio.Event()
+        self._allowances = Allowances(parts.chain, self._address)
+        self._rejections = Rejections(parts)
+        self._orders: dict[str, _OpenOrder] = {}
+        self._watched: dict[str, _WatchedContract] = {}
 
-    async def close(self) -> None:
-        """Nothing is heard of any more: who waits for a contract, or for its end, gets `ClosedError`."""
-        self._closed = True
-        waiters: list[asyncio.Future[Any]] = [*self._matches.values(), *self._endings.values()]
-        for waiting in waiters:
-            if not waiting.done():
-                waiting.set_exception(ClosedError("the agent has ended", hint="run it again and ask for the contract"))
-                waiting.exception()  # taken note of: perhaps nobody waits for it
-        for identity in list(self._matches):
+    @property
+    def open_orders(self) -> frozenset[str]:
+        """The hashes (hexadecimal) of the open orders."""
+        return frozenset(self._orders)
+
+    @property
+    def watched(self) -> frozenset[str]:
+        """The addresses of the contracts whose end is waited for."""
+        return frozenset(self._watched)
+
+    async def _open(self, stack: AsyncExitStack) -> None:
+        stack.push_async_callback(self._close)
+
+    async def _close(self) -> None:
+        demands = {identity: order.created for identity, order in self._orders.items() if order.created is not None}
+        futures: list[asyncio.Future[Any]] = [*demands.values(), *(one.ended for one in self._watched.values())]
+        for future in futures:
+            _fail(future, ClosedError("the agent has ended", hint="run it again and ask for the contract"))
+        for identity in demands:
             await self._parts.outbox.settle(identity)
 
     async def terms(self, *, model: str, objective: str, cost: int, token: str, validator: str, lifetime: int) -> Terms:
-        """The fields that a demand and an offer share, names looked up, with a deadline."""
-        settings, chain = self._parts.settings, self._chain
+        """The fields that a demand and an offer share, with names resolved, valid for `lifetime` blocks."""
+        settings, names = self._parts.settings, self._chain.names
         return {
-            "model": await chain.names.model(model),
+            "model": await names.model(model),
             "objective": objective,
-            "token": await chain.names.address(token or settings.erc20_token),
+            "token": await names.address(token or settings.erc20_token),
             "cost": cost,
-            "lighthouse": await chain.names.address(settings.lighthouse_contract),
-            "validator": await chain.names.address(validator) if validator else ZERO_ADDRESS,
-            "deadline": await chain.block_number() + lifetime,
+            "lighthouse": await names.address(settings.lighthouse_contract),
+            "validator": await names.address(validator) if validator else ZERO_ADDRESS,
+            "deadline": await self._chain.block_number() + lifetime,
             "sender": None if settings.generation == 3 else self._address,
         }
 
-    def mirrored(self, order: Demand | Offer) -> Terms:
-        """The terms of the counterpart of `order`, in its generation."""
-        kept = ("model", "objective", "token", "cost", "lighthouse", "validator", "deadline")
-        terms = {field: getattr(order, field) for field in kept}
+    def terms_of(self, order: Demand | Offer) -> Terms:
+        """The terms of `order`, for an order of this account in the same generation."""
+        shared = ("model", "objective", "token", "cost", "lighthouse", "validator", "deadline")
+        terms = {field: getattr(order, field) for field in shared}
         return {**terms, "sender": None if order.generation == 3 else self._address}
 
-    async def demand(self, terms: Terms, *, validator_fee: int) -> Contract:
-        """Sign and post a demand, and wait for the contract that it becomes.
+    async def sign(self, kind: type[AnOrder], terms: Terms, **fee: Any) -> AnOrder:
+        """An order with these terms and a fresh nonce, signed and not posted."""
+        is_counted = terms["sender"] is not None
+        nonce = await self._chain.liabilities.next_nonce(self._address) if is_counted else secrets.token_hex(32)
+        return self._parts.signer.sign(kind(**terms, nonce=nonce, **fee))
 
-        The factory is given the allowance that the demand needs. Raises `ShortOfFunds`, `OrderRejected`,
-        `OrderExpired`. Cancelling stops the waiting and the resending; what was sent may still be matched.
+    async def demand(self, terms: Terms, *, validator_fee: int) -> Contract:
+        """Sign and post a demand, and wait for the contract that is created from it.
+
+        Approves the allowance that it needs. Raises `FundsShort`, `OrderRejected` and `OrderExpired`. Cancelling stops
+        the waiting and the resending; a demand that was sent may still become a contract.
         """
         costs = Counter({terms["token"]: terms["cost"]})
         costs[self._chain.xrt] += validator_fee
         while True:
-            signed = await self._signed(Demand, terms, validator_fee=validator_fee)
+            signed = await self.sign(Demand, terms, validator_fee=validator_fee)
             try:
                 return await self._contract_of(signed, costs)
             except _Overtaken:
                 order = message_hash(signed).hex()
-                log.info(
-                    "demand %s is signed anew: its nonce was used meanwhile",
-                    order,
-                    extra=log_event("unnamed", order=order),
-                )
+                facts = log_event("demand-overtaken", order=order)
+                log.info("demand %s is signed again: its nonce was used by another order", order, extra=facts)
 
     async def offer(self, terms: Terms, *, lighthouse_fee: int) -> str:
-        """Sign and post an offer; returns its hash (hex). It is sent again until it is taken or its deadline passes.
+        """Sign and post an offer; returns its hash (hexadecimal). It is resent until it is matched or expires.
 
-        Raises `ShortOfFunds`.
+        Raises `FundsShort`.
         """
-        signed = await self._signed(Offer, terms, lighthouse_fee=lighthouse_fee)
+        signed = await self.sign(Offer, terms, lighthouse_fee=lighthouse_fee)
         identity = message_hash(signed).hex()
-        await self._purse.promise(identity, {self._chain.xrt: lighthouse_fee})
-        self._deadlines[identity] = signed.deadline
-        if signed.generation == 5:
-            self._counted[identity] = terms, lighthouse_fee
+        await self._allowances.ensure(identity, {self._chain.xrt: lighthouse_fee})
+        self._orders[identity] = _OpenOrder(signed)
         await self._parts.outbox.post(signed)
         return identity
-
-    async def matched(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
-        """A contract was made of these orders; ours among them need not be sent again.
-
-        In generation 3 others may have signed the terms of ours, which then has the same hash and is still open.
-        """
-        is_ours = {demand_hash: liability.promisee == self._address, offer_hash: liability.promisor == self._address}
-        for identity in (order.hex() for order, ours in is_ours.items() if ours):
-            self._forget(identity)
-            await self._parts.outbox.spend(identity, liability.address)
-        if is_ours[demand_hash]:
-            self._made(demand_hash.hex(), liability)
-        for identity in list(self._counted):
-            await self._offer_anew(identity)
-        used = self._nonces.get(demand_hash.hex())
-        for identity, nonce in self._nonces.items():
-            if used is not None and nonce <= used and not self._matches[identity].done():
-                self._matches[identity].set_exception(_Overtaken())
-
-    async def unmade(self, address: str) -> None:
-        """There is no contract at `address` after all; its orders are sent again, until their deadline."""
-        deadline = await self._parts.outbox.unspend(address)
-        if deadline is not None and address in self._endings:
-            self._unmade[address] = deadline
 
     async def contract(self, address: str) -> Contract:
         """The contract at `address`, to be waited for. Raises `NotALiability`."""
         address = await self._chain.names.address(address)
-        known = address in self._endings
-        self._ending(address)  # before it is read: it may end in between
+        is_new = address not in self._watched
+        self._watch(address)  # before it is read: it may end in between
         try:
             return self._contract(await self._chain.liabilities.get(address))
         except BaseException:
-            if not known:
-                self._endings.pop(address, None)
+            if is_new:
+                self._watched.pop(address, None)
             raise
+
+    async def matched(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
+        """A contract was created from these orders: stop sending ours.
+
+        In generation 3 somebody else may have signed the terms of ours; ours then has the same hash and is still open.
+        """
+        demand = demand_hash.hex() if liability.promisee == self._address else ""
+        offer = offer_hash.hex() if liability.promisor == self._address else ""
+        taken = self._orders.get(demand)
+        for identity in filter(None, (demand, offer)):
+            self._close_order(identity)
+            await self._parts.outbox.spend(identity, liability.address)
+        if (watched := self._watched.get(liability.address)) is not None:
+            watched.reverted_until = None
+        if demand:
+            self._created(demand, taken, liability)
+        for identity, order in list(self._orders.items()):
+            if order.nonce is not None and isinstance(order.signed, Offer):
+                await self._renew_offer(identity, order.signed)
+        used = None if taken is None else taken.nonce
+        for order in self._orders.values():
+            if used is not None and order.nonce is not None and order.nonce <= used:
+                _fail(order.created, _Overtaken())
+
+    async def liability_reverted(self, address: str) -> None:
+        """A reorganisation reverted the contract at `address`: send its orders again, until their deadline."""
+        deadline = await self._parts.outbox.unspend(address)
+        if deadline is not None and address in self._watched:
+            self._watched[address].reverted_until = deadline
 
     def finalized(self, address: str, outcome: Outcome) -> None:
         """The contract at `address` has ended."""
-        ended = self._endings.pop(address, None)
-        self._contracts = {demand: made for demand, made in self._contracts.items() if made.address != address}
-        if ended is not None and not ended.done():
-            with liability_context(address):
-                log.info("it has ended, %s", "paid" if outcome.success else "refunded")
-            ended.set_result(outcome)
+        watched = self._watched.pop(address, None)
+        if watched is not None and not watched.ended.done():
+            facts = log_event("contract-ended", success=outcome.success, result=outcome.result)
+            log.info("the contract has ended, %s", "paid" if outcome.success else "refunded", extra=facts)
+            watched.ended.set_result(outcome)
 
-    def passed(self, block: int) -> None:
-        """Block `block` is there: orders whose deadline it reaches have expired."""
-        self._progress.set()
-        self._progress = asyncio.Event()
-        for identity, deadline in list(self._deadlines.items()):
-            if deadline <= block:
-                self._forget(identity)
-                matched = self._matches.get(identity)
-                if matched is not None and not matched.done():
-                    matched.set_exception(OrderExpired(identity, deadline))
-        for address, deadline in list(self._unmade.items()):
-            if deadline <= block:
-                self._lose(address, deadline)
-
-    def _lose(self, address: str, deadline: int) -> None:
-        """There will be no contract at `address` any more: its orders have expired."""
-        del self._unmade[address]
-        self._contracts = {demand: made for demand, made in self._contracts.items() if made.address != address}
-        ended = self._endings.pop(address, None)
-        if ended is not None and not ended.done():
-            ended.set_exception(ContractTakenBack(address, deadline))
-            ended.exception()  # taken note of: perhaps nobody waits for it
-
-    async def _signed(self, kind: type[AnOrder], terms: Terms, **fee: Any) -> AnOrder:
-        counted = terms["sender"] is not None
-        nonce = await self._chain.liabilities.next_nonce(self._address) if counted else secrets.token_hex(32)
-        return self._parts.signer.sign(kind(**terms, nonce=nonce, **fee))
+    def new_head(self, block: int) -> None:
+        """The chain has block `block`: orders, and reverted contracts, with an earlier deadline have expired."""
+        for identity, order in list(self._orders.items()):
+            if order.signed.deadline <= block:
+                self._close_order(identity)
+                _fail(order.created, OrderExpired(identity, order.signed.deadline))
+        for address, watched in list(self._watched.items()):
+            if watched.reverted_until is not None and watched.reverted_until <= block:
+                del self._watched[address]
+                _fail(watched.ended, LiabilityReverted(address, watched.reverted_until))
 
     async def _contract_of(self, signed: Demand, costs: Mapping[str, int]) -> Contract:
         """Post a signed demand and wait for its contract."""
         identity = message_hash(signed).hex()
-        matched: asyncio.Future[Contract] = asyncio.get_running_loop().create_future()
-        self._matches[identity] = matched
-        if signed.generation == 5:
-            self._nonces[identity] = int(signed.nonce)
+        created: asyncio.Future[Contract] = asyncio.get_running_loop().create_future()
+        self._orders[identity] = _OpenOrder(signed, created)
         try:
-            async with self._rejections.heard(identity, partial(self._rejected, identity)):
-                await self._purse.promise(identity, costs)
-                self._deadlines[identity] = signed.deadline
+            async with self._rejections.received(identity, partial(self._rejected, identity)):
+                await self._allowances.ensure(identity, costs)
                 await self._parts.outbox.post(signed)
-                return await matched
+                return await created
         finally:
-            del self._matches[identity]
-            self._nonces.pop(identity, None)
-            self._forget(identity)
-            if not self._closed:
+            self._close_order(identity)
+            if self.is_open:
                 await self._parts.outbox.settle(identity)
 
-    def _made(self, demand: str, liability: Liability) -> None:
-        """A demand has become a contract; perhaps once more, at another address, after a reorganisation."""
-        contract, matched = self._contracts.get(demand), self._matches.get(demand)
-        self._unmade.pop(liability.address if contract is None else contract.address, None)
-        if contract is not None and contract.address in self._endings:
-            self._endings[liability.address] = self._endings.pop(contract.address)
-            contract.liability = liability
-        elif matched is not None and not matched.done():
-            log.info("made of the demand %s", demand, extra=log_event("unnamed", order=demand))
-            self._contracts[demand] = self._contract(liability)
-            matched.set_result(self._contracts[demand])
+    def _created(self, demand: str, order: _OpenOrder | None, liability: Liability) -> None:
+        """A demand of ours became a contract; after a reorganisation perhaps again, at another address."""
+        again = next((one for one in self._watched.values() if one.demand == demand), None)
+        if again is not None and again.contract is not None:
+            again.reverted_until = None
+            self._watched[liability.address] = self._watched.pop(again.contract.address)
+            again.contract.liability = liability
+        elif order is not None and order.created is not None and not order.created.done():
+            log.info("created from the demand %s", demand, extra=log_event("contract-created", order=demand))
+            order.created.set_result(self._contract(liability, demand))
 
-    def _contract(self, liability: Liability) -> Contract:
-        ended = self._ending(liability.address)
+    def _contract(self, liability: Liability, demand: str = "") -> Contract:
+        watched = self._watch(liability.address)
+        contract = Contract(liability, watched.ended, self._parts)
+        if demand:
+            watched.demand, watched.contract = demand, contract
         if liability.is_finalized:
             self.finalized(liability.address, Outcome(success=liability.is_success, result=liability.result))
-        return Contract(liability, ended, self._parts)
+        return contract
 
-    def _ending(self, address: str) -> asyncio.Future[Outcome]:
-        return self._endings.setdefault(address, asyncio.get_running_loop().create_future())
+    def _watch(self, address: str) -> _WatchedContract:
+        if address not in self._watched:
+            self._watched[address] = _WatchedContract(asyncio.get_running_loop().create_future())
+        return self._watched[address]
 
-    async def _offer_anew(self, identity: str) -> None:
-        """Sign an offer of generation 5 again: that counts an account's orders, and another one was taken first.
-
-        Raises `NodeUnreachable` and `RequestRefused`, and may then be tried again.
-        """
-        terms, fee = counted = self._counted[identity]
-        self._forget(identity)
+    async def _renew_offer(self, identity: str, offer: Offer) -> None:
+        """Sign an offer of generation 5 again: another order of the account was taken first, and used the nonce."""
+        self._close_order(identity)
+        post = partial(self.offer, self.terms_of(offer), lighthouse_fee=offer.lighthouse_fee)
         try:
-            await self.offer(terms, lighthouse_fee=fee)
-        except (NodeUnreachable, RequestRefused):
-            self._counted[identity] = counted
-            raise
+            await self._chain.retrying(post, outages=self._parts.outages)
         except AiraError as error:
-            log.warning("the offer %s is given up: %s", identity, error, extra=log_event("unnamed", order=identity))
-        await self._parts.outbox.settle(identity)
+            facts = log_event("offer-abandoned", order=identity, code=error.code)
+            log.warning("the offer %s can't be signed again: %s", identity, error, extra=facts)
+        if identity not in self._orders:
+            await self._parts.outbox.settle(identity)
 
-    def _forget(self, identity: str) -> None:
-        self._purse.forget(identity)
-        self._deadlines.pop(identity, None)
-        self._counted.pop(identity, None)
+    def _close_order(self, identity: str) -> None:
+        self._orders.pop(identity, None)
+        self._allowances.release(identity)
 
     async def _rejected(self, identity: str, rejection: Rejection) -> None:
-        """A provider rejects an order; it means nothing where the order has become a contract, by whatever provider.
+        """A provider rejects an order. That means nothing if the order has become a contract, by any provider.
 
-        That is known when the chain has been read as far as it went when the nonce was asked for.
+        Whether it has is known once this agent has read the chain up to the block at which the nonce was read.
         """
         if rejection.reason == Refusal.FULL:
-            known = log_event("unnamed", order=identity, reason=rejection.reason)
-            log.warning("provider %s has no room for the order %s now", rejection.provider, identity, extra=known)
+            facts = log_event("order-deferred", order=identity, provider=rejection.provider, reason=rejection.reason)
+            log.warning("provider %s has no room for the order %s now", rejection.provider, identity, extra=facts)
             return
-        nonce = self._nonces.get(identity)
-        overtaken = nonce is not None and nonce < await self._chain.liabilities.next_nonce(self._address)
-        head = await self._chain.block_number()
-        while self._parts.clock.head < head:
-            await self._progress.wait()
-        matched = self._matches.get(identity)
-        if matched is not None and not matched.done():
-            matched.set_exception(_Overtaken() if overtaken else OrderRejected(rejection))
+        order = self._orders.get(identity)
+        if order is None:
+            return
+        is_overtaken = order.nonce is not None and order.nonce < await self._chain.liabilities.next_nonce(self._address)
+        await self._parts.clock.reached(await self._chain.block_number())
+        if identity in self._orders:
+            _fail(order.created, _Overtaken() if is_overtaken else OrderRejected(rejection))
+
+
+def _fail(future: asyncio.Future[Any] | None, error: Exception) -> None:
+    """Fail what somebody may be waiting for."""
+    if future is not None and not future.done():
+        future.set_exception(error)
+        future.exception()  # marks it as retrieved: perhaps nobody waits

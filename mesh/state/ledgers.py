@@ -29,7 +29,7 @@ ACTIVE: Final = (
 )
 """What would do something when a stranger's ledger is read or written."""
 CURSOR: Final = "listener"
-"""`mesh.work.Listener.NAME`, whose module loads web3."""
+"""`mesh.agent.listener.ChainListener.CURSOR`, whose module loads web3."""
 
 
 @dataclass(frozen=True, kw_only=True)

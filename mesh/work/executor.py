@@ -1,7 +1,7 @@
-"""The executor: from a liability that names us to a signed Result, through every phase, one job at a time.
+"""The executor: takes the liabilities that name this agent as promisor through every phase, to a signed Result.
 
-Objectives of several jobs are fetched and examined at once; a bad or missing one fails its own job (which refunds the
-promisee) and never holds up the others. What is done is in the ledger before anybody is told.
+Objectives of several jobs are fetched at once; jobs run one at a time. A missing or bad objective fails its own job,
+which refunds the promisee, and delays no other. What happens is written to the ledger before anyone is notified.
 """
 
 from __future__ import annotations
@@ -9,65 +9,83 @@ from __future__ import annotations
 import asyncio
 import logging
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Final
+from functools import partial
+from typing import TYPE_CHECKING
 
-import msgspec
+from msgspec.structs import replace
 
-from mesh.errors import ClosedError, ContentError, InputError
-from mesh.telemetry.context import liability_context, with_liability_context
-from mesh.work.lifecycle import Phase, WrongPhase, advance
-from mesh.work.objectives import Objectives
-from mesh.work.playbacks import Playbacks
+from mesh.errors import AiraError, ClosedError, ContentError, InputError
+from mesh.telemetry.context import liability_context, log_event, with_liability_context
+from mesh.work.database import LedgerUnusable
+from mesh.work.lifecycle import STARTABLE, TO_BE_DONE, Phase, WrongPhase, advance
+from mesh.work.outbox import outgoing
+from schemas import Result
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable
+    from collections.abc import AsyncIterator, Awaitable, Callable
 
+    from mesh.content import Store
     from mesh.recording import Objective
-    from mesh.work.job import TopicHandler
-    from mesh.work.ledger import JobRecord
-    from mesh.work.lifecycle import PhaseListener
-    from mesh.work.workshop import Workshop
-    from schemas import Liability
+    from mesh.work.job import TopicHandlers
+    from mesh.work.ledger import JobRecord, Ledger
+    from mesh.work.objectives import Objectives
+    from mesh.work.outbox import Outbox
+    from mesh.work.playbacks import Playbacks
+    from mesh.work.run import JobRun
+    from schemas import Liability, Signer
+
+    OnPhase = Callable[[Phase, Liability], Awaitable[None]]
 
 log = logging.getLogger(__name__)
 
-STARTED: Final = (Phase.READY, Phase.RUNNING)
-"""Phases in which a job may be begun anew or gone on with."""
-PATIENCE: Final = 10.0
-"""Seconds without a new block of an objective after which no job is taken on for it."""
-
 
 class Executor:
-    """Does the jobs of one agent: `run` in a task, `prepare` each new one.
+    """Does the jobs of one agent: `run` in a task, `prepare` each new job.
 
-    With a `performer` a ready job starts and finishes by itself, in the order of arrival; without one it waits for
-    `start` and `finish`.
+    With `handlers` a ready job starts and finishes by itself, in the order of arrival; without, it waits for `start`
+    and `finish`. `on_phase` is called when a job has moved to a phase.
     """
 
-    def __init__(self, workshop: Workshop, *, performer: TopicHandler | None, witness: PhaseListener) -> None:
-        self._shop = workshop
-        self._performer = performer
-        self._witness = witness
-        self._objectives = Objectives(workshop, performer=performer)
+    def __init__(
+        self,
+        *,
+        ledger: Ledger,
+        outbox: Outbox,
+        store: Store,
+        signer: Signer,
+        objectives: Objectives,
+        playbacks: Playbacks,
+        handlers: TopicHandlers | None,
+        on_phase: OnPhase,
+    ) -> None:
+        self._ledger = ledger
+        self._outbox = outbox
+        self._store = store
+        self._signer = signer
+        self._source = objectives
+        self._playbacks = playbacks
+        self._handlers = handlers
+        self._on_phase = on_phase
+        self._preparing: dict[str, asyncio.Task[None]] = {}
+        self._objectives: dict[str, Objective] = {}
         self._ready: asyncio.Queue[str] = asyncio.Queue()
-        self._playbacks = Playbacks(workshop, performer=performer, witness=witness, finish=self._end)
         self._tasks: asyncio.TaskGroup | None = None
         self._opened = asyncio.Event()
         self._changing = asyncio.Lock()
 
     async def run(self) -> None:
-        """Go on with what the ledger holds, then serve; ends by cancellation. A running job is left to be resumed."""
-        left = await self._shop.ledger.jobs((Phase.INCOMING, Phase.READY, Phase.RUNNING))
-        await self._shop.unpin_ended()
+        """Continue the jobs of the ledger, then serve new ones, until cancelled. A running job can be resumed later."""
+        unfinished = await self._ledger.jobs(TO_BE_DONE)
+        await self._release_ended()
         try:
             async with asyncio.TaskGroup() as self._tasks:
-                for job in left:
+                for job in unfinished:
                     self.prepare(job.liability)
                 self._opened.set()
-                await self._serve_ready()
+                await self._serve()
         finally:
             self._tasks = None
-            await self._playbacks.suspend()
+            await self._playbacks.suspend_all()
 
     @property
     def is_running(self) -> bool:
@@ -75,33 +93,39 @@ class Executor:
         return self._tasks is not None
 
     async def opened(self) -> None:
-        """Return when `run` has taken up what the ledger holds."""
+        """Return when `run` has taken up the jobs of the ledger."""
         await self._opened.wait()
 
-    async def examine(self, cid: str) -> Objective:
-        """The objective of that CID, fetched and found fit to be played. Raises `UnfitObjective`, a `ContentError`."""
-        return await self._objectives.examine(cid, patience=PATIENCE)
-
     def prepare(self, liability: Liability) -> None:
-        """Fetch and examine a job's objective in a task; then it is ready, or complete without success."""
-        self._objectives.prepare(liability.address, self._prepare(liability), self._begun())
+        """Fetch and check a job's objective in a task. Then the job is ready, or complete without success."""
+        address = liability.address
+        task = self._preparing[address] = self._running().create_task(self._fetch(liability), name=f"prepare {address}")
+        task.add_done_callback(partial(self._drop_task, address))
 
     @asynccontextmanager
     async def halted(self, address: str) -> AsyncIterator[JobRecord | None]:
-        """Stop whatever runs for a job, keeping its files, and let nothing change meanwhile; gives it if it is ours."""
+        """Stop a job, and let nothing change it meanwhile. Yields its record, None for a liability without a job.
+
+        Its files are kept, and released afterwards if the job is gone or has ended.
+        """
         async with self._changing:
-            job = await self._shop.ledger.job(address)
+            job = await self._ledger.job(address)
             if job is not None:
-                await self._playbacks.abandon(address)
-                self._objectives.forget(address)
+                await self._playbacks.suspend(address)
+                self._objectives.pop(address, None)
             yield job
             if job is not None:
-                await self._shop.unpin(address)
+                await self._release(address)
+
+    async def owe_result(self, address: str, *, success: bool, result: str, note: str) -> None:
+        """Complete a job in the ledger, together with its signed Result, which is sent until the chain has it."""
+        signed = self._signer.sign(Result(liability=address, result=result, success=success))
+        await self._ledger.complete(address, success=success, result=result, note=note, outgoing=outgoing(signed))
 
     @with_liability_context
     async def start(self, address: str) -> None:
         """Play the objective of a ready job. Returns when the playback has begun. Raises `WrongPhase`."""
-        await self._objective_at_hand(address)
+        await self._prepared(address)
         async with self._changing:
             job = await self._startable(address, asked="start")
             if job.phase is not Phase.READY:
@@ -110,131 +134,162 @@ class Executor:
 
     @with_liability_context
     async def restart(self, address: str) -> None:
-        """Begin a running or ready job anew: a fresh recording, the objective from its first message."""
-        await self._objective_at_hand(address)
+        """Play the objective of a running or ready job from its first message, with a new recording."""
+        await self._prepared(address)
         async with self._changing:
             job = await self._startable(address, asked="restart")
-            await self._playbacks.abandon(address)
-            # In this order: a crash between the two may not leave a position past what the recording holds.
-            await self._shop.ledger.set_position(address, 0)
-            await asyncio.to_thread(self._shop.discard_recording, address)
+            await self._playbacks.suspend(address)
+            # In this order: after a crash in between, the position must not be past what the recording holds.
+            await self._ledger.set_position(address, 0)
+            await asyncio.to_thread(self._playbacks.discard_recording, address)
             await self._begin(job, 0)
 
     @with_liability_context
     async def resume(self, address: str) -> None:
-        """Go on with an interrupted job at the position in the ledger, adding to its recording."""
-        await self._objective_at_hand(address)
+        """Continue an interrupted job at the position in the ledger, and its recording."""
+        await self._prepared(address)
         async with self._changing:
             job = await self._startable(address, asked="resume")
-            if address in self._playbacks:
+            if self._playbacks.run(address) is not None:
                 raise WrongPhase(address, asked="resume", phase=job.phase)
             await self._begin(job, job.position)
 
     async def read(self, address: str) -> Liability:
-        """The Liability record of a job, as the ledger has it. Raises `WrongPhase` for what is no job of ours."""
+        """The record of a job's liability as the ledger has it. Raises `WrongPhase` for a liability without a job."""
         job = await self._job(address, asked="read")
-        return msgspec.structs.replace(
-            job.liability,
-            result=job.result or job.liability.result,
-            is_success=bool(job.success),
-            is_finalized=job.phase is Phase.FINALIZED,
-        )
+        is_success, is_finalized = bool(job.success), job.phase is Phase.FINALIZED
+        result = job.result or job.liability.result
+        return replace(job.liability, result=result, is_success=is_success, is_finalized=is_finalized)
 
     @with_liability_context
     async def finish(self, address: str, *, success: bool, note: str = "") -> str:
-        """End a job: close the recording, keep it under its CID, sign and send the Result. Returns the CID.
+        """End a job: close the recording, put it in the store, sign and send the Result. Returns the recording's CID.
 
-        `note` says why it failed, for the recording and the ledger. A job that never started ends with a recording
-        that holds no more than the note. Raises `WrongPhase` when it has ended already.
+        `note` says why the job failed, in the recording and the ledger. The recording of a job that never started holds
+        only the note. Raises `WrongPhase` if the job has ended already.
         """
         async with self._changing:
             job = await self._job(address, asked="finish")
             advance(address, job.phase, Phase.COMPLETE)
-            run = await self._playbacks.stop(address) or await self._shop.new_run(job.liability)
+            run = await self._playbacks.stop(address) or await self._playbacks.create(job.liability)
             summary = await run.close(note)
-            cid = await asyncio.to_thread(self._shop.store.put_file, summary.path, pin=address)
-            await self._shop.owe_result(address, success=success, result=cid, note=note)
+            cid = await asyncio.to_thread(self._store.put_file, summary.path, pin=address)
+            await self.owe_result(address, success=success, result=cid, note=note)
             await asyncio.to_thread(summary.path.unlink, missing_ok=True)
-            self._objectives.forget(address)
-        log.info("complete, success %s, result %s, %d messages", success, cid, summary.messages)
-        await self._witness(Phase.COMPLETE, msgspec.structs.replace(job.liability, result=cid, is_success=success))
-        await self._shop.outbox.send()
+            self._objectives.pop(address, None)
+        facts = log_event("job-finished", success=success, result=cid, messages=summary.messages)
+        log.info("complete, success %s, result %s, %d messages", success, cid, summary.messages, extra=facts)
+        await self._on_phase(Phase.COMPLETE, replace(job.liability, result=cid, is_success=success))
+        await self._outbox.send_new()
         return cid
 
+    @with_liability_context
+    async def _fetch(self, liability: Liability) -> None:
+        """Fetch and check the objective of a job: then it is ready, or complete without success."""
+        address = liability.address
+        try:
+            await asyncio.to_thread(self._store.pin, liability.objective, address)
+            objective = await self._source.examine(liability.objective)
+        except (ContentError, InputError) as error:
+            log.warning("the objective is refused: %s", error, extra=log_event("objective-refused", code=error.code))
+            await self._unless_ended(self.finish(address, success=False, note=str(error)))
+            return
+        async with self._changing:
+            job = await self._ledger.job(address)
+            if job is None or job.phase not in TO_BE_DONE:
+                return
+            if job.phase is Phase.INCOMING:
+                await self._ledger.set_phase(address, Phase.READY)
+            self._objectives[address] = objective
+        if job.phase is Phase.INCOMING:
+            log.info("ready, %d messages to play", objective.count, extra=log_event("job-ready", count=objective.count))
+            await self._on_phase(Phase.READY, liability)
+        self._ready.put_nowait(address)
+
+    async def _serve(self) -> None:
+        """Do ready jobs one after the other. Without handlers, others start them."""
+        while True:
+            address = await self._ready.get()
+            if self._handlers is not None:
+                with liability_context(address):
+                    await self._unless_ended(self._resume_to_end(address))
+
+    async def _resume_to_end(self, address: str) -> None:
+        """Resume a job and wait for its end. It may be restarted in between."""
+        await self.resume(address)
+        while (playback := await self._current_playback(address)) is not None:
+            await asyncio.wait([playback])
+
+    async def _current_playback(self, address: str) -> asyncio.Task[None] | None:
+        async with self._changing:
+            return self._playbacks.task(address)
+
+    async def _begin(self, job: JobRecord, position: int) -> None:
+        liability, objective = job.liability, self._objectives[job.liability.address]
+        facts = log_event("job-started", position=position, count=objective.count)
+        log.info("running, from message %d of %d", position, objective.count, extra=facts)
+        await self._playbacks.begin(liability, objective, position=position, play=self._play, tasks=self._running())
+
+    async def _play(self, run: JobRun) -> None:
+        """Play a run. With handlers, or when it fails, the job then finishes; else the run stays open."""
+        address, success, note = run.liability.address, True, ""
+        try:
+            await self._on_phase(Phase.RUNNING, run.liability)
+            await self._playbacks.play(run, None if self._handlers is None else self._handlers.handle)
+        except LedgerUnusable:  # not the job's fault: it is resumed when the ledger is usable
+            raise
+        except Exception as error:
+            success, note = False, str(error) or type(error).__name__
+            facts = log_event("job-failed", code=getattr(error, "code", ""))
+            log.warning("the job failed: %s", note, exc_info=not isinstance(error, AiraError), extra=facts)
+        await self._ledger.set_position(address, run.position)
+        if self._handlers is not None or not success:
+            await self._unless_ended(self.finish(address, success=success, note=note))
+
+    async def _release(self, address: str) -> None:
+        """Let the store evict the files of a job that has ended, or is gone."""
+        job = await self._ledger.job(address)
+        if job is None or job.phase is Phase.FINALIZED:
+            await asyncio.to_thread(self._store.release, address)
+
+    async def _release_ended(self) -> None:
+        """The same for all jobs: a crash may have come between their end and `_release`."""
+        pins = await asyncio.to_thread(self._store.pins)
+        for label in frozenset().union(*pins.values()):
+            if label.startswith("0x"):  # other labels belong to others
+                await self._release(label)
+
     async def _job(self, address: str, *, asked: str) -> JobRecord:
-        job = await self._shop.ledger.job(address)
+        job = await self._ledger.job(address)
         if job is None:
             raise WrongPhase(address, asked=asked, phase=None)
         return job
 
     async def _startable(self, address: str, *, asked: str) -> JobRecord:
         job = await self._job(address, asked=asked)
-        if job.phase not in STARTED or address not in self._objectives:
+        if job.phase not in STARTABLE or address not in self._objectives:
             raise WrongPhase(address, asked=asked, phase=job.phase)
         return job
 
-    async def _objective_at_hand(self, address: str) -> None:
-        """After a restart of the agent, a job that is ready is so before its objective has been examined again."""
+    async def _prepared(self, address: str) -> None:
+        """Wait until the objective of a startable job is there: after a restart it is checked again first."""
         await self.opened()
-        job = await self._shop.ledger.job(address)
-        if job is not None and job.phase in STARTED:
-            await self._objectives.wait(address)
+        job, preparing = await self._ledger.job(address), self._preparing.get(address)
+        if job is not None and job.phase in STARTABLE and address not in self._objectives and preparing is not None:
+            await asyncio.wait([preparing])
 
-    @with_liability_context
-    async def _prepare(self, liability: Liability) -> None:
-        address = liability.address
-        try:
-            await self._shop.pin(liability.objective, address)
-            objective = await self._objectives.examine(liability.objective)
-        except (ContentError, InputError) as error:
-            log.warning("refused: %s", error)
-            await self._end(address, success=False, note=str(error))
-            return
-        async with self._changing:
-            job = await self._shop.ledger.job(address)
-            if job is None or job.phase not in (Phase.INCOMING, *STARTED):
-                return
-            if job.phase is Phase.INCOMING:
-                await self._shop.ledger.set_phase(address, Phase.READY)
-            self._objectives.keep(address, objective)
-        if job.phase is Phase.INCOMING:
-            log.info("ready, %d messages to play", objective.count)
-            await self._witness(Phase.READY, liability)
-        self._ready.put_nowait(address)
+    def _drop_task(self, address: str, task: asyncio.Task[None]) -> None:
+        if self._preparing.get(address) is task:
+            del self._preparing[address]
 
-    async def _serve_ready(self) -> None:
-        while True:
-            address = await self._ready.get()
-            if self._performer is not None:
-                with liability_context(address):
-                    await self._unless_ended(self._serve(address))
-
-    async def _serve(self, address: str) -> None:
-        """Start or resume a job whose code is ours, and wait for its end; it may be restarted in between."""
-        await self.resume(address)
-        while (playing := await self._play_of(address)) is not None:
-            await asyncio.wait([playing])
-
-    async def _play_of(self, address: str) -> asyncio.Task[None] | None:
-        async with self._changing:
-            return self._playbacks.under_way(address)
-
-    async def _begin(self, job: JobRecord, position: int) -> None:
-        objective = self._objectives[job.liability.address]
-        await self._playbacks.begin(job, objective, self._begun(), position=position)
-
-    async def _end(self, address: str, *, success: bool, note: str) -> None:
-        """Finish a job, unless somebody else has done so."""
-        await self._unless_ended(self.finish(address, success=success, note=note))
-
-    def _begun(self) -> asyncio.TaskGroup:
+    def _running(self) -> asyncio.TaskGroup:
         if self._tasks is None:
             raise ClosedError("the executor is not running")
         return self._tasks
 
     async def _unless_ended(self, ending: Awaitable[object]) -> None:
-        """Wait for `ending`; that somebody else ended the job meanwhile is no error."""
+        """Await `ending`; if something else has ended the job meanwhile, only log it."""
         try:
             await ending
         except WrongPhase as error:
-            log.info("%s", error)
+            log.info("%s", error, extra=log_event("job-ended-already", phase=error.phase))

@@ -113,9 +113,9 @@ class Ledger:
 
     async def jobs_by_phase(self) -> dict[str, int]:
         """How many jobs there are in each phase that has any."""
-        return {phase: count for phase, count, _ in await self.standing()}
+        return {phase: count for phase, count, _ in await self.phases()}
 
-    async def standing(self) -> list[tuple[str, int, float]]:
+    async def phases(self) -> list[tuple[str, int, float]]:
         """Each phase that has any jobs: how many, and since when (Unix time) the one that came first stands there."""
         return await self._database.rows(
             "SELECT phase, COUNT(*), MIN(changed) FROM jobs WHERE NOT aside GROUP BY phase"

@@ -1,29 +1,26 @@
-"""The life of a job, from the liability that names it to the money that ends it. Pure: no I/O."""
+"""The phases of a job, from the new liability to the payment. Pure: no I/O."""
 
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final
 
 from mesh.errors import AiraError
 
-if TYPE_CHECKING:
-    from schemas import Liability
-
 
 class Phase(StrEnum):
-    """Where a job stands. What is written in the ledger, and where a restarted agent goes on."""
+    """Where a job is. The ledger keeps it, and a restarted agent continues from it."""
 
     INCOMING = "incoming"
-    """The liability exists and names us; its objective is not here yet."""
+    """The liability exists and names this agent; its objective has not been fetched yet."""
     READY = "ready"
-    """The objective is here and fit to be played; waits for `start`."""
+    """The objective was fetched and can be played; the job waits for `start`."""
     RUNNING = "running"
     """The objective is being played and the device recorded."""
     COMPLETE = "complete"
     """The recording is closed and the Result signed; it is sent until the contract has it."""
     FINALIZED = "finalized"
-    """The contract has paid, or refunded. Nothing is left to do."""
+    """The contract has paid or refunded. Nothing is left to do."""
 
 
 NEXT: Final = {
@@ -33,13 +30,19 @@ NEXT: Final = {
     Phase.COMPLETE: frozenset({Phase.FINALIZED}),
     Phase.FINALIZED: frozenset(),
 }
-"""Where a job may go from each phase. A job that can't be done goes to COMPLETE with success false, which refunds."""
+"""The phases that may follow each phase. A job that fails moves to COMPLETE without success, which refunds."""
 
 UNFINISHED: Final = (Phase.INCOMING, Phase.READY, Phase.RUNNING, Phase.COMPLETE)
 
+TO_BE_DONE: Final = (Phase.INCOMING, Phase.READY, Phase.RUNNING)
+"""Phases of a job whose work is not done yet."""
+
+STARTABLE: Final = (Phase.READY, Phase.RUNNING)
+"""Phases in which a job's playback may begin, continue or be restarted."""
+
 
 class WrongPhase(AiraError):
-    """Something was asked of a job that its phase does not allow; `phase` is where it stands, None if unknown."""
+    """The job's phase does not allow the operation. `phase` is its phase, None if the agent has no such job."""
 
     code = "wrong-phase"
 
@@ -50,14 +53,8 @@ class WrongPhase(AiraError):
         self.phase = phase
 
 
-class PhaseListener(Protocol):
-    """Whoever is told that a job has come into a phase (after the ledger knows)."""
-
-    async def __call__(self, phase: Phase, liability: Liability) -> None: ...
-
-
 def advance(liability: str, phase: Phase, to: Phase) -> Phase:
-    """`to`, if a job may go there from `phase`; else raises `WrongPhase`."""
+    """`to`, if a job may move there from `phase`. Raises `WrongPhase` otherwise."""
     if to not in NEXT[phase]:
         raise WrongPhase(liability, asked=f"move to {to.value}", phase=phase)
     return to

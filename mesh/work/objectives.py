@@ -1,71 +1,65 @@
-"""The objectives of jobs, and of jobs offered: many fetched at once, examined in turn, kept at hand until the end."""
+"""Fetches objectives and checks that they can be played."""
 
 from __future__ import annotations
 
 import asyncio
 from typing import TYPE_CHECKING, Final
 
+from mesh.errors import InputError
+from mesh.recording import Limits, preflight
 from mesh.settings import LONGEST
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine
-
+    from mesh.content import Exchange, Store
     from mesh.recording import Objective
-    from mesh.work.job import TopicHandler
-    from mesh.work.workshop import Workshop
+    from mesh.settings import ContentSettings
+    from mesh.work.job import TopicHandlers
 
 FETCHES: Final = 32
-"""Objectives looked for at once: one that nobody has must not hold up the others until its time is over."""
-EXAMINATIONS: Final = 1
-"""Objectives examined at once: it takes one core, and up to 256 MiB of memory when a file is out to harm us."""
+"""Objectives fetched at once: one that nobody has must not delay the others."""
+PREFLIGHTS: Final = 1
+"""Objectives checked at once: a check uses one core, and up to 256 MiB of memory for a malicious file."""
+
+
+class ObjectiveUnfit(InputError):
+    """An objective can't be played here. `reason` is the word for programs that the check gave."""
+
+    code = "objective-unfit"
+
+    def __init__(self, cid: str, reason: str, detail: str) -> None:
+        super().__init__(f"objective {cid} can't be played ({reason}): {detail}")
+        self.cid = cid
+        self.reason = reason
 
 
 class Objectives:
-    """Objectives by the address of their liability, each fit to be played by the performer (None: by anybody)."""
+    """The objectives of jobs and of orders. With `handlers`, an objective must fit them."""
 
-    def __init__(self, shop: Workshop, *, performer: TopicHandler | None) -> None:
-        self._shop = shop
-        self._performer = performer
+    def __init__(
+        self, store: Store, exchange: Exchange, settings: ContentSettings, handlers: TopicHandlers | None = None
+    ) -> None:
+        self._store = store
+        self._exchange = exchange
+        self._settings = settings
+        self._handlers = handlers
         self._fetching = asyncio.Semaphore(FETCHES)
-        self._examining = asyncio.Semaphore(EXAMINATIONS)
-        self._preparing: dict[str, asyncio.Task[None]] = {}
-        self._at_hand: dict[str, Objective] = {}
-
-    def __contains__(self, address: str) -> bool:
-        return address in self._at_hand
-
-    def __getitem__(self, address: str) -> Objective:
-        return self._at_hand[address]
-
-    def prepare(self, address: str, work: Coroutine[None, None, None], tasks: asyncio.TaskGroup) -> None:
-        """Run `work`, which is to end with `keep` or with the job, as one of `tasks`."""
-        preparing = self._preparing[address] = tasks.create_task(work, name=f"prepare {address}")
-        preparing.add_done_callback(lambda task: self._prepared(address, task))
+        self._checking = asyncio.Semaphore(PREFLIGHTS)
 
     async def examine(self, cid: str, *, patience: float = LONGEST) -> Objective:
-        """The objective of that CID, found fit to be played here. Raises `UnfitObjective` or a `ContentError`.
+        """The objective with that CID, from the store or fetched from the mesh, after it was checked.
 
-        `patience` is as for `Workshop.fetch`.
+        Fetching fails after `patience`, or the setting `fetch_timeout`, seconds without a new block. Raises
+        `ObjectiveUnfit` and branches of `ContentError`.
         """
+        settings, handlers = self._settings, self._handlers
         async with self._fetching:
-            path = await self._shop.fetch(cid, patience=patience)
-        async with self._examining:
-            return await self._shop.examine(cid, path, performer=self._performer)
-
-    def keep(self, address: str, objective: Objective) -> None:
-        """Have it at hand until `forget`."""
-        self._at_hand[address] = objective
-
-    def forget(self, address: str) -> None:
-        """The job has ended. Unknown ones are ignored."""
-        self._at_hand.pop(address, None)
-
-    async def wait(self, address: str) -> None:
-        """Return when the objective is at hand, or nobody prepares it any more."""
-        preparing = self._preparing.get(address)
-        if preparing is not None and address not in self._at_hand:
-            await asyncio.wait([preparing])
-
-    def _prepared(self, address: str, task: asyncio.Task[None]) -> None:
-        if self._preparing.get(address) is task:
-            del self._preparing[address]
+            path = await asyncio.to_thread(self._store.checked, cid) or await self._exchange.fetch(
+                cid, size_limit=settings.objective_size_limit, timeout=min(patience, settings.fetch_timeout)
+            )
+        limits = Limits(size=settings.objective_size_limit, expanded=settings.objective_expanded_limit)
+        topics, obstacle = (None, None) if handlers is None else (handlers.topics, handlers.obstacle)
+        async with self._checking:
+            outcome = await asyncio.to_thread(preflight, path, limits, topics=topics, obstacle=obstacle)
+        if outcome.objective is None or not outcome.ok:
+            raise ObjectiveUnfit(cid, outcome.reason, outcome.detail)
+        return outcome.objective

@@ -1,11 +1,17 @@
-"""What was said and must arrive: signed messages, sent again until their effect is seen on the chain."""
+"""The outbox: sends signed messages again, with backoff, until their effect is seen on the chain."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import random
+import time
+from contextlib import suppress
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from mesh.retry import Backoff, RetryPolicy
+from mesh.telemetry.context import log_event
 from mesh.work.ledger import Outgoing
 from schemas import Demand, Offer, Result, decode, encode, message_hash
 
@@ -17,19 +23,19 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-RESEND: Final = 3.0
-"""Seconds between two sendings of what has had no effect yet."""
+RESEND: Final = RetryPolicy(initial=3.0, ceiling=60.0)
+"""How long to wait for the effect of a message before it is sent again."""
 
 
 def outgoing_identity(message: Demand | Offer | Result) -> str:
-    """Under what a message waits: an order by its hash, a Result by its liability."""
+    """The key of a message in the outbox: an order's hash, or a Result's liability."""
     if isinstance(message, Result):
         return result_identity(message.liability)
     return message_hash(message).hex()
 
 
 def result_identity(liability: str) -> str:
-    """Under what the Result of the liability at that address waits; there is one only."""
+    """The key of the Result of the liability at that address, of which there is only one."""
     return f"result {liability}"
 
 
@@ -44,57 +50,140 @@ def outgoing(message: Demand | Offer | Result) -> Outgoing:
     )
 
 
-class Outbox:
-    """Sends what the ledger holds to the channel; `run` sends it again and again, and at once when the network is back.
+@dataclass
+class _Attempts:
+    """When a message is sent next (in seconds of the clock), and the deadline (block) of its order."""
 
-    Receivers drop what they know, so a message sent twice costs little and one lost costs a moment.
+    backoff: Backoff
+    next_at: float
+    deadline: int | None
+
+
+class Outbox:
+    """Sends the messages that the ledger holds to the channel. Receivers drop duplicates.
+
+    A message is sent when it is posted, and then again after growing delays (`policy`). All are sent at once, and their
+    delays start over, when `run` starts, when the network returns and when a provider appears on the market: a provider
+    starts with an empty order book. `clock` (seconds) and `chance` (0 to 1, for jitter) are injected by tests.
     """
 
-    def __init__(self, ledger: Ledger, channel: Channel, network: Network, *, head: Callable[[], int]) -> None:
+    def __init__(
+        self,
+        ledger: Ledger,
+        channel: Channel,
+        network: Network,
+        *,
+        head: Callable[[], int],
+        policy: RetryPolicy = RESEND,
+        clock: Callable[[], float] = time.monotonic,
+        chance: Callable[[], float] = random.random,
+    ) -> None:
         self._ledger = ledger
         self._channel = channel
         self._network = network
         self._head = head
+        self._policy = policy
+        self._clock = clock
+        self._chance = chance
+        self._attempts: dict[str, _Attempts] = {}
+        self._changed = asyncio.Event()
 
     async def post(self, message: Demand | Offer | Result) -> None:
         """Keep a signed message until `settle`, and send it now."""
         await self._ledger.post(outgoing(message))
-        self._channel.publish(message)
+        await self.send_new()
 
     async def settle(self, identity: str) -> bool:
-        """The message had its effect; False when it was not waiting."""
+        """Stop sending a message: its effect was seen. False if it was not in the outbox."""
+        self._attempts.pop(identity, None)
         return await self._ledger.settle(identity)
 
     async def spend(self, identity: str, liability: str) -> None:
-        """The order became the contract at the address `liability`, as far as the chain says now."""
+        """Stop sending an order: it became the contract at the address `liability`, unless that is reverted."""
+        self._attempts.pop(identity, None)
         await self._ledger.spend(identity, liability)
 
     async def unspend(self, liability: str) -> int | None:
-        """The chain has no such contract after all: its orders are sent again, now and until they have their effect.
-
-        Returns the block that ends that, None for a contract of none of our orders.
-        """
+        """Send the orders of a reverted contract again. Returns their deadline (block), None if none were ours."""
         deadline = await self._ledger.spent_until(liability)
         if await self._ledger.unspend(liability):
-            await self.send()
+            await self.send_new()
         return deadline
 
-    async def send(self) -> None:
-        """Send everything that waits, once."""
-        for waiting in await self._ledger.outbox(head=self._head()):
-            message = decode(waiting.payload)
-            assert isinstance(message, Demand | Offer | Result)
-            self._channel.publish(message)
+    async def send_new(self) -> None:
+        """Send the messages of the ledger that were not sent yet."""
+        await self._send(lambda identity: identity not in self._attempts)
+
+    async def send_all(self) -> None:
+        """Send all messages, and start their delays over."""
+        self._attempts.clear()
+        await self.send_new()
+
+    async def send_due(self) -> None:
+        """Send the messages whose time has come."""
+        now = self._clock()
+        await self._send(lambda identity: identity not in self._attempts or self._attempts[identity].next_at <= now)
+
+    async def expire(self, head: int) -> None:
+        """Drop the orders whose deadline block `head` has reached."""
+        if any(one.deadline is not None and one.deadline <= head for one in self._attempts.values()):
+            await self._ledger.outbox(head=head)
+            self._attempts = {
+                identity: one for identity, one in self._attempts.items() if one.deadline is None or one.deadline > head
+            }
 
     async def run(self) -> None:
-        """Send what waits every `RESEND` seconds and whenever the network returns. Ends by cancellation."""
+        """Send messages when they are due, until cancelled."""
+        appeared = asyncio.Event()
+        self._channel.watch_presence(lambda _provider: appeared.set(), role="provider")
         async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(self._on_return(), name="outbox after network loss")
+            tasks.create_task(self._send_on_return(), name="outbox after network loss")
+            tasks.create_task(self._send_to_providers(appeared), name="outbox to new providers")
+            await self.send_all()
             while True:
-                await self.send()
-                await asyncio.sleep(RESEND)
+                await self._wait()
+                await self.send_due()
 
-    async def _on_return(self) -> None:
+    async def _send(self, is_due: Callable[[str], bool]) -> None:
+        unsent = await self._ledger.outbox(head=self._head())
+        for one in unsent:
+            if is_due(one.identity):
+                message = decode(one.payload)
+                assert isinstance(message, Demand | Offer | Result)
+                self._channel.publish(message)
+                self._schedule(one)
+        self._attempts = {
+            one.identity: self._attempts[one.identity] for one in unsent if one.identity in self._attempts
+        }
+        self._changed.set()
+
+    def _schedule(self, one: Outgoing) -> None:
+        """Set the time of the next attempt at a message that has just been sent."""
+        if one.identity not in self._attempts:
+            self._attempts[one.identity] = _Attempts(Backoff(self._policy, chance=self._chance), 0.0, one.deadline)
+        attempts = self._attempts[one.identity]
+        attempts.next_at = self._clock() + (attempts.backoff.next_delay() or 0.0)
+
+    async def _wait(self) -> None:
+        """Wait until the next attempt is due."""
+        while True:
+            self._changed.clear()
+            next_at = min((one.next_at for one in self._attempts.values()), default=None)
+            remaining = None if next_at is None else next_at - self._clock()
+            if remaining is not None and remaining <= 0:
+                return
+            with suppress(TimeoutError):
+                async with asyncio.timeout(remaining):
+                    await self._changed.wait()
+
+    async def _send_on_return(self) -> None:
         async for _ in self._network.changes():
             if self._network.connected:
-                await self.send()
+                await self.send_all()
+
+    async def _send_to_providers(self, appeared: asyncio.Event) -> None:
+        while True:
+            await appeared.wait()
+            appeared.clear()
+            log.debug("a provider appeared: all unsent messages are sent again", extra=log_event("provider-appeared"))
+            await self.send_all()

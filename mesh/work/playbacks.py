@@ -1,132 +1,168 @@
-"""What is played now: a run for each job under way, its playback in a task, and how far it has come in the ledger."""
+"""The runs under way: opened with their recordings, played, suspended and continued."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 import time
-from contextvars import ContextVar
-from typing import TYPE_CHECKING, Final, Protocol
+from contextvars import ContextVar, copy_context
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
 
+import mesh
 from mesh.errors import AiraError
-from mesh.telemetry.context import liability_context
-from mesh.work.database import LedgerUnusable
+from mesh.recording import AtOnce, RecordedTimes, Recorders, RecordingAbout
+from mesh.telemetry.context import liability_context, log_event
 from mesh.work.lifecycle import Phase
+from mesh.work.run import JobRun
 
 if TYPE_CHECKING:
-    from mesh.recording import Objective
-    from mesh.work.job import Job, TopicHandler
-    from mesh.work.ledger import JobRecord
-    from mesh.work.lifecycle import PhaseListener
-    from mesh.work.workshop import Workshop
+    from asyncio import TaskGroup
+    from collections.abc import Callable, Coroutine
+    from pathlib import Path
+
+    import zenoh
+
+    from mesh.recording import Objective, Pace, Recorder
+    from mesh.settings import ExecutionSettings
+    from mesh.work.ledger import Ledger
+    from mesh.work.run import Handle
+    from schemas import Liability
 
 log = logging.getLogger(__name__)
 
-PROGRESS: Final = 0.5
-"""Seconds between two notes of a playback's position in the ledger."""
+SAVE_INTERVAL: Final = 0.5
+"""Seconds between two writes of a run's position to the ledger."""
 
 _playing: ContextVar[str] = ContextVar("playing", default="")
-"""The job that the running code plays, or is a handler of."""
-
-
-class Finish(Protocol):
-    """What is to be done when a playback has come to its end."""
-
-    async def __call__(self, address: str, *, success: bool, note: str) -> None: ...
+"""The job whose playback, or handler, is the running code."""
 
 
 class Playbacks:
-    """The runs under way, by the address of their liability. Who calls sees to it that one call changes a job at once.
+    """The runs of one agent's jobs, by the address of their liability. Their recordings are written to `folder`.
 
-    With a `performer`, or when it fails, a playback ends with `finish`; else its run stays open.
+    The caller makes sure that only one call changes a job at a time.
     """
 
     def __init__(
-        self, shop: Workshop, *, performer: TopicHandler | None, witness: PhaseListener, finish: Finish
+        self, session: zenoh.Session, agent: str, ledger: Ledger, settings: ExecutionSettings, folder: Path
     ) -> None:
-        self._shop = shop
-        self._performer = performer
-        self._witness = witness
-        self._finish = finish
-        self._runs: dict[str, Job] = {}
-        self._plays: dict[str, asyncio.Task[None]] = {}
+        self._session = session
+        self._agent = agent
+        self._ledger = ledger
+        self._pace: Pace = AtOnce() if settings.playback == "at-once" else RecordedTimes()
+        names = (name.strip() for name in settings.recording_topics.split(","))
+        self._recorded = frozenset(name for name in names if name) or None
+        self._folder = folder
+        self._runs: dict[str, JobRun] = {}
+        self._tasks: dict[str, asyncio.Task[None]] = {}
+        self.recorders = Recorders()
 
-    def __contains__(self, address: str) -> bool:
-        return address in self._runs
+    async def create(self, liability: Liability, objective: Objective | None = None, *, position: int = 0) -> JobRun:
+        """A run of `objective` from the message at `position`; without an objective, one that only records.
 
-    def __getitem__(self, address: str) -> Job:
-        return self._runs[address]
+        It continues the recording of an interrupted run of the same liability.
+        """
+        return JobRun(
+            self._session,
+            self._agent,
+            liability,
+            await asyncio.to_thread(self._open_recorder, liability),
+            objective=objective,
+            pace=self._pace,
+            position=position,
+            recorded=self._recorded,
+        )
 
-    async def begin(self, job: JobRecord, objective: Objective, tasks: asyncio.TaskGroup, *, position: int) -> None:
-        """Open a run of the job and play its objective from a message on, as one of `tasks`."""
-        address = job.liability.address
-        run = self._runs[address] = await self._shop.new_run(job.liability, objective=objective, position=position)
-        await self._shop.ledger.set_phase(address, Phase.RUNNING, position=position)
+    async def begin(
+        self,
+        liability: Liability,
+        objective: Objective,
+        *,
+        position: int,
+        play: Callable[[JobRun], Coroutine[Any, Any, None]],
+        tasks: TaskGroup,
+    ) -> None:
+        """Open a run of a job, write to the ledger that it is running, and `play` it in one of `tasks`."""
+        address = liability.address
+        run = self._runs[address] = await self.create(liability, objective, position=position)
+        await self._ledger.set_phase(address, Phase.RUNNING, position=position)
         run.open()
-        log.info("running, from message %d of %d", position, objective.count)
-        self._plays[address] = tasks.create_task(self._play(run), name=f"play {address}")
+        context = copy_context()
+        context.run(_playing.set, address)
+        task = self._tasks[address] = tasks.create_task(play(run), name=f"play {address}", context=context)
+        task.add_done_callback(partial(self._drop_task, address))
 
-    def under_way(self, address: str) -> asyncio.Task[None] | None:
-        """The playback of a job, if it goes on."""
-        if (playing := self._plays.get(address)) is not None and playing.done():
-            del self._plays[address]
-            return None
-        return playing
+    async def play(self, run: JobRun, handle: Handle | None) -> None:
+        """Play a run to its end, and keep its position in the ledger. Raises what `handle` raises."""
+        address, saved = run.liability.address, time.monotonic()
 
-    async def stop(self, address: str) -> Job | None:
-        """End the playback of a job and give its run, which is the caller's to close; None if there is none."""
-        await self._stop_playing(address)
+        async def save(position: int) -> None:
+            nonlocal saved
+            if time.monotonic() - saved >= SAVE_INTERVAL:
+                saved = time.monotonic()
+                await self._ledger.set_position(address, position)
+
+        await run.play(handle, progress=save)
+
+    def run(self, address: str) -> JobRun | None:
+        """The open run of a job."""
+        return self._runs.get(address)
+
+    def task(self, address: str) -> asyncio.Task[None] | None:
+        """The playback of a job that has not ended."""
+        return self._tasks.get(address)
+
+    async def stop(self, address: str) -> JobRun | None:
+        """Cancel the playback of a job and wait for its end, unless it is the caller. Returns its run, still open."""
+        if _playing.get() != address and (task := self._tasks.pop(address, None)) is not None:
+            task.cancel()
+            await asyncio.wait([task])
         return self._runs.pop(address, None)
 
-    async def abandon(self, address: str) -> None:
-        """Stop whatever runs for a job, keeping its files."""
-        await self._stop_playing(address)
-        if address in self._runs:
-            await self._put_away(address)
+    async def suspend(self, address: str) -> None:
+        """Stop the run of a job, save its position and close it, so that another run can continue it."""
+        run = await self.stop(address)
+        if run is not None:
+            try:
+                await self._ledger.set_position(address, run.position)
+            finally:
+                await run.close()
 
-    async def suspend(self) -> None:
-        """Leave the running jobs as another run of the agent can go on with them; their playbacks have ended."""
+    async def suspend_all(self) -> None:
+        """Suspend all runs. A position that can't be saved is logged."""
         for address in tuple(self._runs):
             with liability_context(address):
                 try:
-                    await self._put_away(address)
+                    await self.suspend(address)
                 except AiraError as error:
-                    log.error("how far it has come is not written down: %s", error)
+                    facts = log_event("position-not-saved", code=error.code)
+                    log.error("can't save the job's position: %s", error, extra=facts)
 
-    async def _play(self, run: Job) -> None:
-        """Play to the end; with a performer, finish as it went."""
-        address = run.liability.address
-        _playing.set(address)
-        noted, success, note = time.monotonic(), True, ""
+    def _drop_task(self, address: str, task: asyncio.Task[None]) -> None:
+        if self._tasks.get(address) is task:
+            del self._tasks[address]
 
-        async def progress(position: int) -> None:
-            nonlocal noted
-            if time.monotonic() - noted >= PROGRESS:
-                noted = time.monotonic()
-                await self._shop.ledger.set_position(address, position)
+    def discard_recording(self, address: str) -> None:
+        """Delete what an earlier run of the liability at `address` has recorded. Blocks on the disk."""
+        for leftover in self._recording_files(address):
+            leftover.unlink(missing_ok=True)
 
-        try:
-            await self._witness(Phase.RUNNING, run.liability)
-            await run.play(self._performer, progress=progress)
-        except LedgerUnusable:  # not the job's fault, which is gone on with later
-            raise
-        except Exception as error:
-            success, note = False, str(error) or type(error).__name__
-            log.warning("the job failed: %s", note, exc_info=not isinstance(error, AiraError))
-        await self._shop.ledger.set_position(address, run.position)
-        if self._performer is not None or not success:
-            await self._finish(address, success=success, note=note)
+    def _open_recorder(self, liability: Liability) -> Recorder:
+        finished, partial, _ = self._recording_files(liability.address)
+        if finished.exists():  # it was closed, but a crash came before the Result was in the ledger
+            finished.replace(partial)
+        about = RecordingAbout(
+            liability=liability.address,
+            agent=self._agent,
+            lighthouse=liability.lighthouse,
+            objective=liability.objective,
+            software=f"aira-mesh {mesh.__version__}",
+            topics=",".join(sorted(self._recorded or ())),
+        )
+        return self.recorders.open(finished, about)
 
-    async def _put_away(self, address: str) -> None:
-        """Note how far a run has come and close it."""
-        run = self._runs.pop(address)
-        try:
-            await self._shop.ledger.set_position(address, run.position)
-        finally:
-            await run.close()
-
-    async def _stop_playing(self, address: str) -> None:
-        """Cancel the playback of a job and wait for its end, unless it is the playback, or its handler, that asks."""
-        if _playing.get() != address and (playing := self._plays.pop(address, None)) is not None:
-            playing.cancel()
-            await asyncio.wait([playing])
+    def _recording_files(self, address: str) -> tuple[Path, Path, Path]:
+        """The recording when it is finished, while it is written, and while an interrupted one is continued."""
+        finished = self._folder / f"{address}.mcap"
+        return finished, finished.with_name(f"{finished.name}.part"), finished.with_name(f"{finished.name}.cut")

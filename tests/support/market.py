@@ -20,6 +20,7 @@ from mesh.devchain import EmbeddedChain
 from mesh.devchain.development import DevelopmentMarket, deploy_market
 from mesh.market.provider import Provider
 from mesh.network import Endpoints, Network
+from mesh.retry import RetryPolicy
 from mesh.settings import Settings
 from schemas import cid_of_bytes
 from tests.support.waiting import until_found
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from tests.support.routers import EmbeddedRouter
 
 MODEL = cid_of_bytes(b"what the robots of the tests can do")
+QUICK_RESEND = RetryPolicy(initial=0.1, ceiling=0.5)
 QUICK = Timing(poll_interval=0.03, receipt_interval=0.01)
 
 
@@ -105,7 +107,8 @@ class Place:
     def agent(self, role: str, model: str = MODEL, **options: Any) -> Agent:
         """An agent of that role, not yet running; handlers can be added. Always with the same memory."""
         settings = self.settings(role, **options)
-        return Agent(model, settings=settings, account=self.market.accounts[role], chain=self.chains[role])
+        account, chain = self.market.accounts[role], self.chains[role]
+        return Agent(model, settings=settings, account=account, chain=chain, resend=QUICK_RESEND)
 
     @asynccontextmanager
     async def provider(self) -> AsyncIterator[Provider]:
@@ -156,8 +159,8 @@ def careless(robot: Agent) -> Agent:
 
     @robot.on_demand
     async def offer(demand: Verified[Demand]) -> None:
-        trader = robot._working().trader
-        await trader.offer(trader.mirrored(demand.message), lighthouse_fee=0)
+        trader = robot.runtime.trader
+        await trader.offer(trader.terms_of(demand.message), lighthouse_fee=0)
 
     return robot
 

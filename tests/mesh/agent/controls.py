@@ -58,8 +58,16 @@ class Control:
 
     async def played(self, address: str) -> None:
         """Wait until the robot has played the whole objective."""
-        runs = self.robot._working().executor._playbacks
-        await until(lambda: address in runs and runs[address].position == len(WORDS))
+        await self.position(address, len(WORDS))
+
+    async def position(self, address: str, count: int) -> None:
+        """Wait until the robot has played so many messages of the objective."""
+
+        def reached() -> bool:
+            run = self.robot.runtime.playbacks.run(address)
+            return run is not None and run.position == count
+
+        await until(reached)
 
 
 @pytest.fixture

@@ -16,6 +16,7 @@ from mesh.devchain import JsonRpcServer
 from mesh.errors import ConfigurationError
 from schemas import Demand, Offer, Result, Verified, cid_of_bytes
 from tests.mesh.agent.agents import SOON, channel, heard_on, settings
+from tests.support.log_events import logged_facts
 from tests.support.market import MODEL
 from tests.support.orders import LIGHTHOUSE, demand, offer, result, verified_demand
 from tests.support.waiting import until, until_found
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
     from mesh.network import Channel
     from mesh.work.job import Job
-    from tests.support.market import Place
+from tests.support.market import Place
 
 __all__ = ["channel", "settings"]
 
@@ -106,12 +107,14 @@ async def test_all_handlers_of_a_kind_are_called_and_a_failing_one_stops_nothing
             channel.publish(message)
         await until(lambda: len(heard) == 2)
     assert heard == messages
-    assert caplog.text.count("handler crash failed; the agent goes on") == 2
+    assert logged_facts(caplog, "handler-crashed") == [{"handler": "crash", "error": "ZeroDivisionError"}] * 2
     assert caplog.text.count("raise ZeroDivisionError") == 2, "with its traceback"
-    (complaint, _) = [record for record in caplog.records if "I have no account" in record.message]
+    failed = {"handler": "complain", "code": "configuration-error"}
+    assert logged_facts(caplog, "handler-failed") == [failed] * 2
+    (complaint, _) = [record for record in caplog.records if vars(record).get("event") == "handler-failed"]
     assert complaint.levelno == logging.WARNING
     assert not complaint.exc_info
-    assert caplog.text.count("handler be_cancelled ended with the cancellation") == 2
+    assert logged_facts(caplog, "handler-cancelled") == [{"handler": "be_cancelled"}] * 2
 
 
 async def test_open_orders_are_heard_by_who_comes_late(place: Place) -> None:

@@ -73,7 +73,7 @@ async def test_a_playback_in_progress_is_ended_by_finish(place: Place) -> None:
     async with controlled(place, robot) as control, place.agent("person") as person, asyncio.timeout(20):
         contract = await ready(control, person, place, step_ns=HOUR_NS)
         await control.start(contract.address)
-        await until(lambda: robot._working().executor._playbacks[contract.address].position == 1)
+        await control.position(contract.address, 1)
         await control.finish(contract.address)
         assert (await contract.outcome()).success
         assert await recorded(contract) == [("/say", WORDS[0])]
@@ -126,7 +126,7 @@ async def test_a_ready_job_can_be_started_right_after_the_agent_has_come_back(pl
             contract = await ready(control, person, place)
         robot = place.agent("robot")
         async with place.provider(), robot:
-            await robot._working().executor.start(contract.address)
+            await robot.runtime.executor.start(contract.address)
             await robot.finish(contract.address, success=True)
             assert (await contract.outcome()).success
 

@@ -6,7 +6,7 @@ import asyncio
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
-from mesh.agent.token_events import TokenEvents
+from mesh.agent.listener import TokenEvents
 from mesh.chain import Account, Approval, Transfer, new_private_key
 from mesh.network import Endpoints, Network
 from schemas.keys import EthEventKey
@@ -148,11 +148,11 @@ def told_by(*told: Transfer | Approval, taken_back: tuple[Transfer | Approval, .
     keys: list[str] = []
     events = TokenEvents(lambda key, _: keys.append(key.rpartition("/")[2]), ME)
     for event in told:
-        events.tell(event)
+        events.publish(event)
     for event in reversed(taken_back):
-        events.take_back(event)
+        events.revert(event)
     for event in told:
-        events.tell(event)
+        events.publish(event)
     return keys
 
 

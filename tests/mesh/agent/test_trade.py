@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.agent import Outcome, ShortOfFunds
+from mesh.agent import FundsShort, Outcome
 from mesh.chain import NotALiability
 from mesh.content import ContentUnavailable
 from mesh.errors import ClosedError
-from mesh.work import outbox as outbox_module
 from schemas import ZERO_ADDRESS, Demand, cid_of_bytes, cid_of_file, message_hash
 from tests.mesh.agent.trades import OBJECTIVE, all_posted, job, known, posted, waiting, working
 from tests.support.market import MODEL, Place, obliging
@@ -22,11 +21,6 @@ if TYPE_CHECKING:
     from schemas import Verified
 
 GENERATIONS = pytest.mark.parametrize("generation", [3, 5])
-
-
-@pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(outbox_module, "RESEND", 0.1)
 
 
 async def allowance(place: Place, role: str) -> int:
@@ -77,13 +71,13 @@ async def test_a_demand_that_was_overtaken_in_generation_5_is_signed_anew_withou
     """Nobody offers to do it, so no provider says that its nonce is used: the person knows it of the other demand."""
     robot = place.agent("robot", generation=5)
     async with place.provider(), robot, place.agent("person", generation=5) as person:
-        trader = person._working().trader
+        trader = person.runtime.trader
         lonely = asyncio.create_task(person.demand(cid_of_bytes(b"what nobody offers")))
         await posted(person)
-        (overtaken,) = trader._matches
+        (overtaken,) = trader.open_orders
         await robot.offer(objective=OBJECTIVE)
         await person.demand(OBJECTIVE)
-        await until(lambda: len(trader._matches) == 1 and overtaken not in trader._matches)
+        await until(lambda: len(trader.open_orders) == 1 and overtaken not in trader.open_orders)
         await until_found(lambda: all_posted(person, 1))
         lonely.cancel()
         await asyncio.wait([lonely])
@@ -102,7 +96,7 @@ async def test_the_factory_is_allowed_what_all_open_demands_may_cost(place: Plac
 async def test_who_is_short_of_funds_is_told_before_anything_is_sent(place: Place) -> None:
     balance = await place.balance("person")
     async with place.agent("person") as person:
-        with pytest.raises(ShortOfFunds, match=f"has {balance} of token") as caught:
+        with pytest.raises(FundsShort) as caught:
             await person.demand(OBJECTIVE, cost=balance + 1)
         assert (caught.value.balance, caught.value.needed) == (balance, balance + 1)
         assert await waiting(person) == []
@@ -113,7 +107,7 @@ async def test_open_demands_count_towards_what_can_be_paid_until_they_are_given_
     async with place.agent("person") as person:
         first = asyncio.create_task(person.demand(OBJECTIVE, cost=balance))
         await posted(person)
-        with pytest.raises(ShortOfFunds):
+        with pytest.raises(FundsShort):
             await person.demand(OBJECTIVE, cost=1)
         first.cancel()
         await asyncio.wait([first])
@@ -126,7 +120,7 @@ async def test_open_demands_count_towards_what_can_be_paid_until_they_are_given_
 async def test_a_refused_demand_promises_nothing(place: Place) -> None:
     balance = await place.balance("person")
     async with place.agent("person") as person:
-        with pytest.raises(ShortOfFunds):
+        with pytest.raises(FundsShort):
             await person.demand(OBJECTIVE, cost=balance - 10, validator_fee=11)
         demand = asyncio.create_task(person.demand(OBJECTIVE, cost=balance - 10, validator_fee=10))
         await posted(person)
@@ -190,7 +184,7 @@ async def test_an_offer_is_forgotten_at_its_deadline(place: Place) -> None:
     fee = await place.balance("robot")
     async with place.agent("robot") as robot:
         await robot.offer(objective=OBJECTIVE, lighthouse_fee=fee, lifetime=4)
-        with pytest.raises(ShortOfFunds):
+        with pytest.raises(FundsShort):
             await robot.offer(objective=OBJECTIVE, lighthouse_fee=1)
         await place.node.mine(4)
         await until_found(lambda: all_posted(robot, 0))
@@ -213,7 +207,7 @@ async def test_the_lighthouse_fee_of_an_offer_is_paid_and_then_promised_no_more(
         contract = await person.demand(job(place), cost=100)
         await contract.outcome()
         assert contract.liability.lighthouse_fee == 77
-        await until(lambda: not robot._working().trader._purse._promised)
+        await until(lambda: not robot.runtime.trader.open_orders)
         assert provider.earnings().fees == 77
     assert await place.balance("robot") == before + 100 - 77
 
@@ -221,7 +215,7 @@ async def test_the_lighthouse_fee_of_an_offer_is_paid_and_then_promised_no_more(
 async def test_an_offer_may_agree_to_a_bare_demand(place: Place) -> None:
     async with place.agent("robot") as robot, place.agent("person") as person:
         cid = await asyncio.to_thread(person.parts.store.put_file, job(place))
-        terms = await person._working().trader.terms(
+        terms = await person.runtime.trader.terms(
             model=MODEL, objective=cid, cost=3, token="", validator="", lifetime=50
         )
         demand = person.parts.signer.sign(Demand(**terms, nonce="ab" * 32, validator_fee=0))
@@ -233,7 +227,7 @@ async def test_an_offer_may_agree_to_a_bare_demand(place: Place) -> None:
 async def test_an_order_of_an_earlier_run_is_settled_when_it_is_taken(place: Place) -> None:
     """The person's program was killed while it waited; its demand is sent on, and no more once it has a contract."""
     async with place.agent("person") as person:
-        trader = person._working().trader
+        trader = person.runtime.trader
         terms = await trader.terms(
             model=MODEL, objective=cid_of_file(job(place)), cost=0, token="", validator="", lifetime=500
         )
@@ -260,14 +254,14 @@ async def test_a_contract_that_has_ended_has_its_outcome_at_once(place: Place) -
     async with place.agent("provider") as later, asyncio.timeout(10):
         contract = await later.contract(address)
         assert await contract.outcome() == outcome
-        assert later._working().trader._endings == {}
+        assert later.runtime.trader.watched == frozenset()
 
 
 async def test_what_is_no_contract_can_not_be_waited_for(place: Place) -> None:
     async with place.agent("person") as person:
         with pytest.raises(NotALiability):
             await person.contract(place.address("robot"))
-        assert person._working().trader._endings == {}
+        assert person.runtime.trader.watched == frozenset()
 
 
 async def test_giving_up_to_wait_for_an_outcome_leaves_it_to_others(place: Place) -> None:
@@ -287,7 +281,7 @@ async def test_a_contract_refunded_without_a_result_has_no_recording(place: Plac
     async with place.provider(), robot, place.agent("person") as person:
         contract = await person.demand(job(place))
         await known(robot, contract.address)
-        person._working().trader.finalized(contract.address, Outcome(success=False, result=""))
+        person.runtime.trader.finalized(contract.address, Outcome(success=False, result=""))
         with pytest.raises(ContentUnavailable, match="was refunded without a result"):
             await contract.recording()
         await robot.finish(contract.address, success=False)

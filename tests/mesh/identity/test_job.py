@@ -5,10 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
-import pytest
-
 from mesh.identity import Member
-from mesh.work import outbox
 from tests.mesh.operations.site import FEE
 from tests.mesh.operations.site import Site as Market
 from tests.support.commands import AIRA, Serving
@@ -25,11 +22,6 @@ if TYPE_CHECKING:
 COST = 500
 PATIENCE = 60.0
 ROLES = {"robot": "agent", "person": "person", "provider": "provider"}
-
-
-@pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(outbox, "RESEND", 0.3)
 
 
 def tls(folder: MemberFolder) -> dict[str, str]:

@@ -9,6 +9,7 @@ from mesh.agent import Agent
 from mesh.chain import XRT, Account, Chain
 from mesh.composition import chain_of
 from mesh.devchain.development import ALLOWANCE, ROLES, deploy_market
+from mesh.retry import RetryPolicy
 from mesh.settings import Settings
 from schemas import cid_of_bytes
 from tests.mesh.cli.chains import write_quick_keyfile
@@ -28,6 +29,7 @@ PEOPLE: Final = (*ROLES, "rival", "poor")
 FEE: Final = 5
 """The lighthouse fee of the robot's offers, wn."""
 PASSWORD: Final = "only for tests"
+QUICK_RESEND: Final = RetryPolicy(initial=0.3, ceiling=1.0)
 
 
 class Site:
@@ -72,7 +74,8 @@ class Site:
 
     def agent(self, role: str, **options: Any) -> Agent:
         """An agent of that role, not yet running; always with the same state folder."""
-        return Agent(MODEL, settings=self.settings(role, **options), account=self.accounts[role])
+        settings, account = self.settings(role, **options), self.accounts[role]
+        return Agent(MODEL, settings=settings, account=account, resend=QUICK_RESEND)
 
     def variables(self, role: str, **options: str) -> dict[str, str]:
         """The settings of a process of that role. The first call writes its keyfile."""

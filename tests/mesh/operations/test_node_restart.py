@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.work import outbox
 from tests.mesh.operations.site import FEE, Site, has_event, has_traceback
 from tests.support.nodes import Anvil
 from tests.support.waiting import until, until_found
@@ -23,11 +22,6 @@ if TYPE_CHECKING:
 
 COST = 500
 TIMEOUT = 60.0
-
-
-@pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(outbox, "RESEND", 0.3)
 
 
 @asynccontextmanager

@@ -5,10 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
-import pytest
-
 from mesh.agent import Phase
-from mesh.work import outbox
 from tests.mesh.operations.site import FEE, Site, has_event, has_traceback
 from tests.support.waiting import until, until_found
 
@@ -23,11 +20,6 @@ if TYPE_CHECKING:
 
 COST = 500
 TIMEOUT = 60.0
-
-
-@pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(outbox, "RESEND", 0.3)
 
 
 async def request(chain: Chain, method: str, *parameters: Any) -> Any:

@@ -6,10 +6,10 @@ import asyncio
 import shutil
 from typing import TYPE_CHECKING
 
+from mesh.agent.listener import ChainListener
 from mesh.recording import open_objective
 from mesh.state import Extent, back_up, restore
 from mesh.work import Phase
-from mesh.work.listener import Listener
 from schemas import String
 from tests.support.market import in_phase, obliging
 from tests.support.objectives import objective
@@ -123,13 +123,13 @@ async def test_what_was_paid_since_the_backup_is_not_played_however_slowly_the_c
     await restore(archive, disk)
     robot.stuck(at="")
 
-    async def never(_: Listener) -> None:
+    async def never(_: ChainListener) -> None:
         await asyncio.Event().wait()
 
-    monkeypatch.setattr(Listener, "run", never)
+    monkeypatch.setattr(ChainListener, "run", never)
     async with robot.life() as life:
         await in_phase(life, contract, Phase.FINALIZED)
-        await life._working().executor.opened()
+        await life.runtime.executor.opened()
     assert robot.said == [f"only {step}" for step in STEPS]
 
 

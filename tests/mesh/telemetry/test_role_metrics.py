@@ -238,12 +238,12 @@ async def test_an_order_that_is_no_use_is_a_rejection_under_its_reason(place: Pl
     """The person has taken back the allowance that the demand needs."""
     async with provider_at(place) as url, place.agent("robot") as robot, place.agent("person") as person:
         before = await scraped(url)
-        terms = await person._working().trader.terms(
+        terms = await person.runtime.trader.terms(
             model=MODEL, objective=cid_of_bytes(b"x"), cost=10**15, token="", validator="", lifetime=1000
         )
-        signed = await person._working().trader._signed(Demand, terms, validator_fee=0)
+        signed = await person.runtime.trader.sign(Demand, terms, validator_fee=0)
         person.channel.publish(signed)
-        await robot._working().trader.offer(robot._working().trader.mirrored(signed), lighthouse_fee=0)
+        await robot.runtime.trader.offer(robot.runtime.trader.terms_of(signed), lighthouse_fee=0)
 
         async def rejected() -> bool:
             changes = (await scraped(url)).changes(before)

@@ -8,7 +8,7 @@ import pytest
 import zenoh
 
 from mesh.recording import AtOnce, RecordedTimes, Recorder, RecordingAbout, open_objective
-from mesh.work.job import Job, Plan
+from mesh.work.run import JobRun
 from tests.mesh.work.samples import liability
 from tests.support.routers import EmbeddedRouter, client_config
 
@@ -33,7 +33,7 @@ class Making:
     """Makes runs in a folder."""
 
     def __init__(self, session: zenoh.Session, folder: Path) -> None:
-        self._session = session
+        self.session = session
         self._folder = folder
         self.path = folder / "run.mcap"
 
@@ -44,14 +44,22 @@ class Making:
         position: int = 0,
         topics: frozenset[str] | None = None,
         pace: AtOnce | RecordedTimes = AT_ONCE,
-    ) -> Job:
+    ) -> JobRun:
         """A run of the objective in `content`, not yet open."""
         played: Objective | None = None
         if content:
             (self._folder / "objective.mcap").write_bytes(content)
             played = open_objective(self._folder / "objective.mcap")
-        plan = Plan(liability=liability(), objective=played, pace=pace, position=position, topics=topics)
-        return Job(self._session, AGENT, plan, Recorder(self.path, RecordingAbout()))
+        return JobRun(
+            self.session,
+            AGENT,
+            liability(),
+            Recorder(self.path, RecordingAbout()),
+            objective=played,
+            pace=pace,
+            position=position,
+            recorded=topics,
+        )
 
     def recorded(self) -> list[tuple[str, bytes, str]]:
         """What is in the closed recording: topic, payload, type."""

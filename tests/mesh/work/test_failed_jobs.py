@@ -13,7 +13,7 @@ import pytest
 from mesh.agent import JobFailed, Phase
 from mesh.running import _cause
 from mesh.work.database import LedgerUnusable
-from mesh.work.job import NOTE_TOPIC
+from mesh.work.run import NOTE_TOPIC
 from schemas import Empty, String, cid_of_bytes
 from tests.mesh.work.executions import COST, doing_nothing, heard, recorded
 from tests.support.market import Place, careless, obliging

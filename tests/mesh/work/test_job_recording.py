@@ -9,7 +9,7 @@ import pytest
 import zenoh
 
 from mesh.recording import json_type, open_objective
-from mesh.work.job import FLUSH, NOTE_TOPIC
+from mesh.work.run import FLUSH, NOTE_TOPIC
 from schemas import Empty, String
 from tests.mesh.work.runs import AGENT, Making, making, session
 from tests.mesh.work.samples import liability
@@ -70,7 +70,7 @@ async def test_a_type_that_the_objective_describes_is_recorded_with_that_descrip
     scan = BagMessage("/scan", b"\0", 1, type="my/Scan", definition="float32 angle\n")
     run = making.run(Bag([scan]).encode())
     run.open()
-    making._session.put(f"{TOPICS}/scanned", b"\1", encoding="ros1;my/Scan")
+    making.session.put(f"{TOPICS}/scanned", b"\1", encoding="ros1;my/Scan")
     await run.close()
     (topic,) = open_objective(making.path).topics
     assert (topic.name, topic.type.schema_data) == ("/scanned", b"float32 angle\n")
@@ -85,7 +85,7 @@ async def test_what_another_session_puts_before_the_end_is_recorded(making: Maki
     device.put(f"{TOPICS}/unknown/type", b"?", encoding="ros1;wheels/Wheel")
     # The agent has it all when what came after has arrived.
     arrived: list[object] = []
-    with making._session.declare_subscriber("after", arrived.append):
+    with making.session.declare_subscriber("after", arrived.append):
         await until_heard(device, "after")
         device.put("after", b"")
         await until(lambda: arrived)
@@ -111,7 +111,7 @@ async def test_a_forged_end_mark_of_another_session_does_not_cut_the_recording(
     await until_heard(device, f"{TOPICS}/x")
     device.put(f"{TOPICS}{NOTE_TOPIC}", b"", encoding=FLUSH)
     device.put(f"{TOPICS}{NOTE_TOPIC}", b"forged", encoding=FLUSH)
-    with making._session.declare_subscriber(f"{TOPICS}/**", zenoh.handlers.RingChannel(8)) as copies:
+    with making.session.declare_subscriber(f"{TOPICS}/**", zenoh.handlers.RingChannel(8)) as copies:
         await until_heard(device, "aira/agent/*/liability/*/topic/y")
         device.put(f"{TOPICS}/x", b"arrived")
         await until(copies.try_recv)
@@ -126,7 +126,7 @@ async def test_what_can_not_be_recorded_is_counted_and_the_rest_recorded(making:
     await until_heard(device, f"{TOPICS}/good")
     device.put(f"{TOPICS}/bad topic", b"")
     device.put(f"{TOPICS}/good", b"good")
-    await until(lambda: run.refused)
+    await until(lambda: run.unrecordable)
     await run.close()
-    assert run.refused == 1
+    assert run.unrecordable == 1
     assert [topic for topic, _, _ in making.recorded()] == ["/good"]

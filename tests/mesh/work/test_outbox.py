@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
@@ -10,8 +11,8 @@ import pytest
 
 from mesh.background import Background
 from mesh.network import Channel, Endpoints, Network
+from mesh.retry import RetryPolicy
 from mesh.work import Ledger
-from mesh.work import outbox as outbox_module
 from mesh.work.outbox import Outbox, outgoing, outgoing_identity
 from schemas import decode, encode, message_hash
 from tests.support.orders import LIGHTHOUSE, MARKET, demand, offer, result
@@ -21,34 +22,35 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
+    from schemas import Demand, Offer, Result
     from tests.support.routers import EmbeddedRouter
 
-QUICKLY = 0.05
+QUICKLY = RetryPolicy(initial=0.05, ceiling=0.05, jitter=0)
+NEVER = RetryPolicy(initial=3600.0, ceiling=3600.0)
 
 
 class Post:
-    """An outbox on a network of its own, and the chain's head as it knows it."""
+    """An outbox on a network of its own, with the chain's head and the time as the test sets them."""
 
-    def __init__(self, ledger: Ledger, channel: Channel, network: Network) -> None:
+    def __init__(self, ledger: Ledger, channel: Channel, network: Network, policy: RetryPolicy) -> None:
         self.head = 0
+        self.time = 0.0
         self.ledger = ledger
         self.network = network
-        self.outbox = Outbox(ledger, channel, network, head=lambda: self.head)
-
-
-@pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(outbox_module, "RESEND", QUICKLY)
+        clock = time.monotonic if policy is QUICKLY else lambda: self.time
+        self.outbox = Outbox(
+            ledger, channel, network, head=lambda: self.head, policy=policy, clock=clock, chance=lambda: 0.0
+        )
 
 
 @asynccontextmanager
-async def opened(router: EmbeddedRouter, folder: Path) -> AsyncIterator[Post]:
+async def opened(router: EmbeddedRouter, folder: Path, policy: RetryPolicy = QUICKLY) -> AsyncIterator[Post]:
     async with (
         Network(Endpoints(connect=(router.endpoint,))) as network,
         Channel(network.session, MARKET) as channel,
         Ledger(folder / "ledger.sqlite") as ledger,
     ):
-        yield Post(ledger, channel, network)
+        yield Post(ledger, channel, network, policy)
 
 
 @pytest.fixture
@@ -58,75 +60,79 @@ async def post(router: EmbeddedRouter, tmp_path: Path) -> AsyncIterator[Post]:
 
 
 @pytest.fixture
-async def heard(router: EmbeddedRouter) -> AsyncIterator[list[tuple[str, Any]]]:
+async def received(router: EmbeddedRouter) -> AsyncIterator[list[tuple[str, Any]]]:
     """What somebody else hears on the market: key and message."""
-    arrived: list[tuple[str, Any]] = []
+    messages: list[tuple[str, Any]] = []
     async with Network(Endpoints(connect=(router.endpoint,))) as network:
         network.session.declare_subscriber(
             f"aira/{MARKET}/**",
-            lambda sample: arrived.append((str(sample.key_expr), decode(sample.payload.to_bytes()))),
+            lambda sample: messages.append((str(sample.key_expr), decode(sample.payload.to_bytes()))),
         )
-        yield arrived
+        yield messages
 
 
 async def listened_to(post: Post) -> None:
     await until_heard(post.network.session, f"aira/{MARKET}/x")
 
 
-async def test_what_is_posted_is_sent_at_once_on_its_key(post: Post, heard: list[tuple[str, Any]]) -> None:
+async def test_what_is_posted_is_sent_at_once_on_its_key(post: Post, received: list[tuple[str, Any]]) -> None:
     await listened_to(post)
     ours = offer()
     await post.outbox.post(ours)
-    await until(lambda: heard)
+    await until(lambda: received)
     digest = message_hash(ours).hex()
-    assert heard == [(f"aira/{MARKET}/offer/{ours.model}/{digest}", ours)]
+    assert received == [(f"aira/{MARKET}/offer/{ours.model}/{digest}", ours)]
 
 
-async def test_what_has_no_effect_is_sent_again_and_what_has_is_not(post: Post, heard: list[tuple[str, Any]]) -> None:
+async def test_what_has_no_effect_is_sent_again_and_what_has_is_not(
+    post: Post, received: list[tuple[str, Any]]
+) -> None:
     await listened_to(post)
     first, second = demand(), result()
     async with Background() as tasks:
         tasks.start(post.outbox.run(), "outbox")
         await post.outbox.post(first)
         await post.outbox.post(second)
-        await until(lambda: [message for _, message in heard].count(second) >= 3)
+        await until(lambda: [message for _, message in received].count(second) >= 3)
         assert await post.outbox.settle(outgoing_identity(second))
         assert not await post.outbox.settle(outgoing_identity(second))
-        await asyncio.sleep(QUICKLY)
-        so_far = [message for _, message in heard].count(second)
-        before = [message for _, message in heard].count(first)
-        await until(lambda: [message for _, message in heard].count(first) >= before + 3)
-        assert [message for _, message in heard].count(second) == so_far
+        await asyncio.sleep(QUICKLY.initial)
+        so_far = [message for _, message in received].count(second)
+        before = [message for _, message in received].count(first)
+        await until(lambda: [message for _, message in received].count(first) >= before + 3)
+        assert [message for _, message in received].count(second) == so_far
 
 
 async def test_an_order_is_forgotten_at_its_deadline_and_a_result_never(post: Post) -> None:
     await post.outbox.post(demand(deadline=10))
     await post.outbox.post(result())
     post.head = 9
-    await post.outbox.send()
+    await post.outbox.send_all()
     assert len(await post.ledger.outbox(head=0)) == 2
     post.head = 10
-    await post.outbox.send()
+    await post.outbox.send_all()
     assert [waiting.kind for waiting in await post.ledger.outbox(head=0)] == ["result"]
 
 
 async def test_what_waits_survives_a_restart(
-    router: EmbeddedRouter, tmp_path: Path, heard: list[tuple[str, Any]]
+    router: EmbeddedRouter, tmp_path: Path, received: list[tuple[str, Any]]
 ) -> None:
     ours = result()
     async with opened(router, tmp_path) as post:
         await post.ledger.post(outgoing(ours))  # and then, before it was sent, a crash
     async with opened(router, tmp_path) as post:
         await listened_to(post)
-        await post.outbox.send()
-        await until(lambda: heard)
-    assert heard[0][1] == ours
+        await post.outbox.send_all()
+        await until(lambda: received)
+    assert received[0][1] == ours
 
 
-async def test_it_is_sent_at_once_when_the_network_comes_back(
-    router: EmbeddedRouter, post: Post, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(outbox_module, "RESEND", 3600.0)
+async def test_all_is_sent_at_once_when_the_network_comes_back(router: EmbeddedRouter, tmp_path: Path) -> None:
+    async with opened(router, tmp_path, NEVER) as post:
+        await check_sending_on_return(router, post)
+
+
+async def check_sending_on_return(router: EmbeddedRouter, post: Post) -> None:
     ours, arrived = demand(), [b""]
 
     async def comes_back() -> bool:
@@ -145,6 +151,74 @@ async def test_it_is_sent_at_once_when_the_network_comes_back(
     async with Background() as tasks:
         tasks.start(post.outbox.run(), "outbox")
         await until_found(comes_back, seconds=60)
+
+
+async def test_each_message_backs_off_on_its_own(
+    router: EmbeddedRouter, tmp_path: Path, received: list[tuple[str, Any]]
+) -> None:
+    async with opened(router, tmp_path, RetryPolicy(initial=3.0, ceiling=60.0)) as post:
+        await listened_to(post)
+        first, second = demand(), demand()
+
+        async def sent_at(at: float, *expected: object) -> None:
+            """Move the time on; exactly these messages are sent."""
+            post.time, before = at, len(received)
+            await post.outbox.send_due()
+            await until(lambda: len(received) == before + len(expected))
+            assert [message for _, message in received[before:]] == list(expected)
+
+        await post.outbox.post(first)
+        await until(lambda: len(received) == 1)
+        await sent_at(2.9)
+        await sent_at(3.0, first)
+        await post.outbox.post(second)
+        await until(lambda: len(received) == 3)
+        for at, message in (
+            (6, second),
+            (9, first),
+            (12, second),
+            (21, first),
+            (24, second),
+            (45, first),
+            (48, second),
+        ):
+            await sent_at(at - 0.1)
+            await sent_at(at, message)
+        await sent_at(93, first)
+        await sent_at(96, second)
+        await sent_at(152.9)
+        await sent_at(153, first)
+        await post.outbox.send_all()
+        await until(lambda: received[-1][1] == second)
+        await sent_at(155.9)
+        await sent_at(156, first, second)
+
+
+async def test_all_is_sent_at_once_when_a_provider_appears(
+    router: EmbeddedRouter, tmp_path: Path, received: list[tuple[str, Any]]
+) -> None:
+    ours: list[Demand | Offer | Result] = [demand(), offer(), result()]
+    async with opened(router, tmp_path, NEVER) as post, Background() as tasks:
+        await listened_to(post)
+        tasks.start(post.outbox.run(), "outbox")
+        for message in ours:
+            await post.outbox.post(message)
+        await until(lambda: {repr(message) for _, message in received} == {repr(message) for message in ours})
+        await asyncio.sleep(0.1)  # let the outbox's own start be over
+        received.clear()
+        async with Network(Endpoints(connect=(router.endpoint,))) as network, Channel(network.session, MARKET) as late:
+            late.announce("agent", LIGHTHOUSE)
+            late.announce("provider", LIGHTHOUSE)
+            await until(lambda: len(received) >= len(ours))
+            assert sorted(repr(message) for _, message in received) == sorted(map(repr, ours))
+
+
+async def test_expired_orders_are_dropped_when_their_block_is_there(post: Post) -> None:
+    await post.outbox.post(demand(deadline=10))
+    await post.outbox.expire(9)
+    assert len(await post.ledger.outbox(head=0)) == 1
+    await post.outbox.expire(10)
+    assert await post.ledger.outbox(head=0) == []
 
 
 def test_a_result_is_known_by_its_liability_and_an_order_by_its_hash() -> None:

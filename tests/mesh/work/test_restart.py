@@ -5,12 +5,9 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
-import pytest
-
 from mesh.agent import Agent, Phase
 from mesh.recording import open_objective
 from mesh.work import Ledger
-from mesh.work import outbox as outbox_module
 from schemas import String, cid_of_file
 from tests.mesh.work.restarts import COST, WORDS, Paying, made_by_a_provider_that_goes, paid, speaking, words
 from tests.support.market import careless, in_phase, obliging
@@ -26,11 +23,6 @@ if TYPE_CHECKING:
     from tests.support.market import Place
 
 __all__ = ["paid"]
-
-
-@pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(outbox_module, "RESEND", 0.1)
 
 
 async def test_a_ready_job_is_done_after_a_restart(place: Place, paid: Paying) -> None:
@@ -133,10 +125,10 @@ async def test_a_liability_that_has_ended_before_the_agent_heard_of_it_is_no_job
 async def told_again(robot: Agent, contract: Contract) -> None:
     """Have the chain take a contract back and tell it again, as when another block holds the same transaction."""
     hashes = await robot.parts.chain.liabilities.order_hashes(contract.address)
-    await robot._working().unmade(contract.address)
+    await robot.runtime.listener.liability_reverted(contract.address)
     assert await robot.parts.ledger.job(contract.address) is None
     assert "result" not in [waiting.kind for waiting in await robot.parts.ledger.outbox(head=0)]
-    await robot._working().new_liability(contract.liability, demand_hash=hashes[0], offer_hash=hashes[1])
+    await robot.runtime.listener.new_liability(contract.liability, demand_hash=hashes[0], offer_hash=hashes[1])
 
 
 async def test_a_job_that_rested_goes_on_where_it_was(place: Place, paid: Paying) -> None:
@@ -171,7 +163,7 @@ async def test_a_job_may_rest_while_its_objective_is_looked_for(place: Place) ->
         path = words(place)
         contract = await person.demand(cid_of_file(path))
         await in_phase(robot, contract, Phase.INCOMING)
-        await robot._working().unmade(contract.address)
+        await robot.runtime.listener.liability_reverted(contract.address)
         await asyncio.to_thread(person.parts.store.put_file, path)
         await until_found(lambda: held(robot, contract), what="the objective")
         await told_again(robot, contract)

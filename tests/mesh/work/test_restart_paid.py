@@ -9,7 +9,6 @@ import pytest
 
 from mesh.agent import Phase
 from mesh.recording import open_objective
-from mesh.work import outbox as outbox_module
 from mesh.work.outbox import outgoing
 from schemas import String, cid_of_file
 from tests.mesh.work.restarts import COST, WORDS, Paying, made_by_a_provider_that_goes, paid, speaking, words
@@ -26,25 +25,24 @@ if TYPE_CHECKING:
 __all__ = ["paid"]
 
 
-@pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(outbox_module, "RESEND", 0.1)
-
-
 async def test_a_job_that_awaits_its_finish_keeps_its_recording_over_a_restart(place: Place) -> None:
     """Without handlers: what the device has said until the restart is in the Result."""
     async with place.provider(), place.agent("person") as person:
         async with obliging(place.agent("robot")) as robot:
             contract = await person.demand(words(place))
             await in_phase(robot, contract, Phase.READY)
-            executor = robot._working().executor
+            executor = robot.runtime.executor
             await executor.start(contract.address)
-            executor._playbacks[contract.address].publish("/said", "before")
-            await until(lambda: executor._playbacks[contract.address].position == len(WORDS))
+            run = robot.runtime.playbacks.run(contract.address)
+            assert run is not None
+            run.publish("/said", "before")
+            await until(lambda run=run: run.position == len(WORDS))  # type: ignore[misc]
         async with place.agent("robot") as robot:
-            executor = robot._working().executor
+            executor = robot.runtime.executor
             await executor.resume(contract.address)
-            executor._playbacks[contract.address].publish("/said", "after")
+            run = robot.runtime.playbacks.run(contract.address)
+            assert run is not None
+            run.publish("/said", "after")
             await robot.finish(contract.address, success=True)
             assert (await contract.outcome()).success
             recording = open_objective(await contract.recording())
@@ -92,7 +90,7 @@ async def test_a_result_is_out_of_the_outbox_before_its_job_is_marked_as_finaliz
         await ledger.complete(ours.address, success=True, result=signed.result, note="", outgoing=outgoing(signed))
         refuse_to_finalize(robot.parts.directory / "ledger.sqlite")
         with pytest.raises(sqlite3.IntegrityError, match="crash"):
-            await robot._working().finalized(ours.address, success=True, result=signed.result)
+            await robot.runtime.listener.finalized(ours.address, success=True, result=signed.result)
         assert await ledger.outbox(head=0) == []
         job = await ledger.job(ours.address)
         assert job is not None
@@ -121,8 +119,8 @@ async def test_an_end_without_a_result_of_ours_is_not_taken_back(place: Place) -
     async with place.agent("robot") as robot:
         await robot.parts.ledger.add_job(ours)
         await robot.parts.ledger.set_phase(ours.address, Phase.FINALIZED)
-        await robot._working().taken_back(ours.address)
-        await robot._working().taken_back(liability("of somebody else").address)
+        await robot.runtime.listener.finalization_reverted(ours.address)
+        await robot.runtime.listener.finalization_reverted(liability("of somebody else").address)
         assert [job.phase for job in await robot.parts.ledger.jobs(Phase)] == [Phase.FINALIZED]
         assert await robot.parts.ledger.outbox(head=0) == []
 

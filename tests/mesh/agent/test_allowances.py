@@ -1,4 +1,4 @@
-"""The purse: the factory may take what open orders cost, in a world that moves while it is allowed to."""
+"""Allowances: the factory may take what open orders cost, whatever happens while the allowance is approved."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from web3.providers.async_base import AsyncBaseProvider
 
-from mesh.agent import ShortOfFunds
-from mesh.agent.purse import Allowances
+from mesh.agent import FundsShort
+from mesh.agent.allowances import Allowances
 from mesh.chain import Chain
 from schemas import Demand, Offer
 from tests.support.market import QUICK
@@ -54,7 +54,7 @@ async def chain(place: Place, road: Overtaken) -> AsyncIterator[Chain]:
 
 
 @pytest.fixture
-def purse(place: Place, chain: Chain) -> Allowances:
+def allowances(place: Place, chain: Chain) -> Allowances:
     return Allowances(chain, place.address("person"))
 
 
@@ -72,38 +72,38 @@ async def spend(place: Place, cost: int) -> None:
     await place.chains["provider"].liabilities.create(deployment.lighthouse_name, demand, offer)
 
 
-async def test_promises_add_up_and_are_allowed_together(chain: Chain, purse: Allowances) -> None:
-    await purse.promise("one", {chain.xrt: 10})
-    await purse.promise("other", {chain.xrt: 5})
+async def test_promises_add_up_and_are_allowed_together(chain: Chain, allowances: Allowances) -> None:
+    await allowances.ensure("one", {chain.xrt: 10})
+    await allowances.ensure("other", {chain.xrt: 5})
     assert await allowance(chain) == 15
 
 
-async def test_what_is_allowed_already_costs_no_transaction(chain: Chain, purse: Allowances) -> None:
+async def test_what_is_allowed_already_costs_no_transaction(chain: Chain, allowances: Allowances) -> None:
     await chain.tokens.approve(chain.factory, 100)
     before = await chain.block_number()
-    await purse.promise("one", {chain.xrt: 100})
+    await allowances.ensure("one", {chain.xrt: 100})
     assert await chain.block_number() == before
 
 
-async def test_a_promise_of_nothing_asks_nothing(chain: Chain, purse: Allowances) -> None:
+async def test_a_promise_of_nothing_asks_nothing(chain: Chain, allowances: Allowances) -> None:
     before = await chain.block_number()
-    await purse.promise("one", {chain.xrt: 0})
+    await allowances.ensure("one", {chain.xrt: 0})
     assert await chain.block_number() == before
 
 
-async def test_a_forgotten_promise_makes_room(chain: Chain, purse: Allowances) -> None:
+async def test_a_forgotten_promise_makes_room(chain: Chain, allowances: Allowances) -> None:
     balance = await chain.tokens.balance()
-    await purse.promise("one", {chain.xrt: balance})
-    with pytest.raises(ShortOfFunds) as caught:
-        await purse.promise("other", {chain.xrt: 1})
+    await allowances.ensure("one", {chain.xrt: balance})
+    with pytest.raises(FundsShort) as caught:
+        await allowances.ensure("other", {chain.xrt: 1})
     assert caught.value.needed == balance + 1
-    purse.forget("one")
-    purse.forget("never promised")
-    await purse.promise("other", {chain.xrt: balance})
+    allowances.release("one")
+    allowances.release("never promised")
+    await allowances.ensure("other", {chain.xrt: balance})
 
 
 async def test_an_allowance_that_is_used_up_on_the_way_is_given_once_more(
-    place: Place, road: Overtaken, chain: Chain, purse: Allowances
+    place: Place, road: Overtaken, chain: Chain, allowances: Allowances
 ) -> None:
     """Gas is estimated for changing an allowance; to set one anew costs more."""
     await chain.tokens.approve(chain.factory, 100)
@@ -114,6 +114,6 @@ async def test_an_allowance_that_is_used_up_on_the_way_is_given_once_more(
         spent.append(100)
 
     road.meanwhile = spend_all
-    await purse.promise("one", {chain.xrt: 150})
+    await allowances.ensure("one", {chain.xrt: 150})
     assert spent == [100]
     assert await allowance(chain) == 150

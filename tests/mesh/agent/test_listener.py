@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from mesh.agent.listener import ChainListener
 from mesh.chain import Chain, Timing
 from mesh.devchain import JsonRpcServer
-from mesh.work import Ledger
-from mesh.work import listener as listener_module
-from mesh.work.listener import Listener
 from schemas import message_hash
-from tests.mesh.work.diaries import Diary, contract, finalize, ledger, listening, started
+from tests.mesh.agent.listeners import RecordingListener, contract, finalize, ledger, listening, opened, started
+from tests.support.log_events import logged_events
 from tests.support.orders import RECORDING
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
+    from mesh.work import Ledger
     from schemas import Liability
     from tests.support.market import Place
 
@@ -28,42 +28,42 @@ QUICK_TO_GIVE_UP = Timing(poll_interval=0.03, attempts=1)
 
 
 async def test_a_contract_that_names_the_account_is_told_with_its_orders(place: Place, ledger: Ledger) -> None:
-    async with listening(place, ledger) as diary:
+    async with listening(place, ledger) as listener:
         await started(ledger)
         address, demand, offer = await contract(place)
-        await until(lambda: diary.liabilities)
-    ((liability, demand_hash, offer_hash),) = diary.liabilities
+        await until(lambda: listener.liabilities)
+    ((liability, demand_hash, offer_hash),) = listener.liabilities
     assert (liability.address, liability.promisor) == (address, place.address("robot"))
     assert (demand_hash, offer_hash) == (message_hash(demand), message_hash(offer))
 
 
 async def test_contracts_of_others_are_left_out(place: Place, ledger: Ledger) -> None:
-    async with listening(place, ledger) as diary:
+    async with listening(place, ledger) as listener:
         await started(ledger)
         await contract(place, promisor="provider")
         mine, *_ = await contract(place)
-        await until(lambda: diary.liabilities)
-    assert [liability.address for liability, *_ in diary.liabilities] == [mine]
+        await until(lambda: listener.liabilities)
+    assert [liability.address for liability, *_ in listener.liabilities] == [mine]
 
 
 async def test_the_end_of_a_contract_is_told_with_its_result(place: Place, ledger: Ledger) -> None:
-    async with listening(place, ledger) as diary:
+    async with listening(place, ledger) as listener:
         await started(ledger)
         address, *_ = await contract(place)
         await finalize(place, address)
-        await until(lambda: diary.ends)
-    assert diary.ends == [(address, True, RECORDING)]
+        await until(lambda: listener.ends)
+    assert listener.ends == [(address, True, RECORDING)]
 
 
 async def test_one_that_never_ran_begins_at_the_head(place: Place, ledger: Ledger) -> None:
     await contract(place)
     head = await place.chains["robot"].block_number()
-    async with listening(place, ledger) as diary:
+    async with listening(place, ledger) as listener:
         await started(ledger)
-        assert await ledger.cursor(Listener.NAME) == head
+        assert await ledger.cursor(ChainListener.CURSOR) == head
         later, *_ = await contract(place)
-        await until(lambda: diary.liabilities)
-    assert [liability.address for liability, *_ in diary.liabilities] == [later]
+        await until(lambda: listener.liabilities)
+    assert [liability.address for liability, *_ in listener.liabilities] == [later]
 
 
 async def test_what_happens_while_the_agent_is_down_is_read_when_it_is_back(place: Place, ledger: Ledger) -> None:
@@ -71,53 +71,51 @@ async def test_what_happens_while_the_agent_is_down_is_read_when_it_is_back(plac
         await started(ledger)
     address, *_ = await contract(place)
     await finalize(place, address)
-    async with listening(place, ledger) as diary:
-        await until(lambda: diary.ends)
-    assert [liability.address for liability, *_ in diary.liabilities] == [address]
-    assert diary.ends[0][0] == address
+    async with listening(place, ledger) as listener:
+        await until(lambda: listener.ends)
+    assert [liability.address for liability, *_ in listener.liabilities] == [address]
+    assert listener.ends[0][0] == address
 
 
 async def test_a_block_that_was_not_handled_to_its_end_is_handled_again(place: Place, ledger: Ledger) -> None:
-    class Crashing(Diary):
+    class Crashing(RecordingListener):
         async def new_liability(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
             raise ZeroDivisionError
 
-    listener = Listener(place.chains["robot"], ledger, place.address("robot"), Crashing())
-    running = asyncio.create_task(listener.run())
-    await started(ledger)
-    address, *_ = await contract(place)
-    with pytest.raises(ZeroDivisionError):
-        await running
-    async with listening(place, ledger) as diary:
-        await until(lambda: diary.liabilities)
-    assert [liability.address for liability, *_ in diary.liabilities] == [address]
+    async with opened(place, ledger, kind=Crashing) as listener:
+        running = asyncio.create_task(listener.run())
+        await started(ledger)
+        address, *_ = await contract(place)
+        with pytest.raises(ZeroDivisionError):
+            await running
+    async with listening(place, ledger) as listener:
+        await until(lambda: listener.liabilities)
+    assert [liability.address for liability, *_ in listener.liabilities] == [address]
 
 
 async def test_the_head_is_told_as_the_chain_grows_and_kept(place: Place, ledger: Ledger) -> None:
-    async with listening(place, ledger) as diary:
+    async with listening(place, ledger) as listener:
         await started(ledger)
         await place.node.mine(3)
         head = await place.chains["robot"].block_number()
-        await until(lambda: diary.head >= head)
-    assert await ledger.cursor(Listener.NAME) == diary.head
+        await until(lambda: listener.head >= head)
+    assert await ledger.cursor(ChainListener.CURSOR) == listener.head
 
 
 async def test_a_lost_node_is_waited_for_and_said_once(
-    place: Place, ledger: Ledger, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    place: Place, ledger: Ledger, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(listener_module, "RETRY", 0.02)
-    caplog.set_level(logging.INFO, "mesh.work.listener")
+    caplog.set_level(logging.INFO, "mesh.agent")
     async with JsonRpcServer(place.node.provider) as server:
         port = int(server.url.rpartition(":")[2])
         chain = Chain(server.url, ens=place.market.deployment.ens, timing=QUICK_TO_GIVE_UP)
-        async with chain, listening(place, ledger, chain=chain) as diary:
+        async with chain, listening(place, ledger, chain=chain) as listener:
             await started(ledger)
             await server.__aexit__(None, None, None)
             address, *_ = await contract(place)
-            await until(lambda: "can't be read" in caplog.text)
-            await asyncio.sleep(0.2)
+            await until(lambda: "chain-outage" in logged_events(caplog))
             async with JsonRpcServer(place.node.provider, port=port):
-                await until(lambda: diary.liabilities)
-                assert diary.liabilities[0][0].address == address
-    assert caplog.text.count("can't be read") == 1
-    assert caplog.text.count("can be read again") == 1
+                await until(lambda: listener.liabilities)
+                assert listener.liabilities[0][0].address == address
+    outages = [event for event in logged_events(caplog) if event in ("chain-outage", "chain-recovered")]
+    assert outages == ["chain-outage", "chain-recovered"]

@@ -1,16 +1,20 @@
-"""A listener, and the diary of what it tells."""
+"""A listener that writes down what it reads, and contracts for it to read."""
 
 from __future__ import annotations
 
+import dataclasses
 import secrets
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
 import pytest
 
+from mesh.agent.components import working
+from mesh.agent.handlers import Handlers
+from mesh.agent.listener import ChainListener
+from mesh.agent.runtime import AgentRuntime
 from mesh.background import Background
 from mesh.work import Ledger
-from mesh.work.listener import Listener
 from schemas import Demand, Offer, Result
 from tests.support.orders import RECORDING, terms
 from tests.support.waiting import until_found
@@ -19,21 +23,29 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
+    from mesh.agent.components import AgentComponents
     from mesh.chain import Approval, Chain, Transfer
+    from mesh.work.lifecycle import Phase
     from schemas import Liability
     from tests.support.market import Place
 
 
-class Diary:
-    """A party that writes down what it is told."""
+async def ignore(_phase: Phase, _liability: Liability) -> None:
+    pass
 
-    def __init__(self) -> None:
+
+class RecordingListener(ChainListener):
+    """A listener that writes down what happens on the chain, and does nothing about it."""
+
+    def __init__(self, parts: AgentComponents) -> None:
+        runtime = AgentRuntime(parts, Handlers())
+        super().__init__(parts, runtime.trader, runtime.executor, on_phase=ignore)
         self.liabilities: list[tuple[Liability, bytes, bytes]] = []
         self.ends: list[tuple[str, bool, str]] = []
-        self.taken_back_ends: list[str] = []
-        self.taken_back_contracts: list[str] = []
+        self.reverted_ends: list[str] = []
+        self.reverted_contracts: list[str] = []
         self.token_events: list[Transfer | Approval] = []
-        self.taken_back_token_events: list[Transfer | Approval] = []
+        self.reverted_token_events: list[Transfer | Approval] = []
         self.head = 0
 
     async def new_liability(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
@@ -42,17 +54,17 @@ class Diary:
     async def finalized(self, address: str, *, success: bool, result: str) -> None:
         self.ends.append((address, success, result))
 
-    async def taken_back(self, address: str) -> None:
-        self.taken_back_ends.append(address)
+    async def finalization_reverted(self, address: str) -> None:
+        self.reverted_ends.append(address)
 
-    async def unmade(self, address: str) -> None:
-        self.taken_back_contracts.append(address)
+    async def liability_reverted(self, address: str) -> None:
+        self.reverted_contracts.append(address)
 
-    async def token_event(self, event: Transfer | Approval) -> None:
+    def token_event(self, event: Transfer | Approval) -> None:
         self.token_events.append(event)
 
-    async def token_event_taken_back(self, event: Transfer | Approval) -> None:
-        self.taken_back_token_events.append(event)
+    def token_event_reverted(self, event: Transfer | Approval) -> None:
+        self.reverted_token_events.append(event)
 
     async def new_head(self, block: int) -> None:
         self.head = block
@@ -65,27 +77,38 @@ async def ledger(tmp_path: Path) -> AsyncIterator[Ledger]:
 
 
 @asynccontextmanager
-async def listening(
-    place: Place, ledger: Ledger, role: str = "robot", *, chain: Chain | None = None
-) -> AsyncIterator[Diary]:
-    diary = Diary()
-    listener = Listener(chain or place.chains[role], ledger, place.address(role), diary)
-    async with Background() as tasks:
+async def opened(
+    place: Place,
+    ledger: Ledger,
+    *,
+    chain: Chain | None = None,
+    kind: type[RecordingListener] = RecordingListener,
+) -> AsyncIterator[RecordingListener]:
+    """The robot's listener, which does not run yet."""
+    settings, account = place.settings("robot"), place.market.accounts["robot"]
+    async with working(settings, account, chain or place.chains["robot"]) as parts:
+        yield kind(dataclasses.replace(parts, ledger=ledger))
+
+
+@asynccontextmanager
+async def listening(place: Place, ledger: Ledger, *, chain: Chain | None = None) -> AsyncIterator[RecordingListener]:
+    """The robot's listener at work."""
+    async with opened(place, ledger, chain=chain) as listener, Background() as tasks:
         tasks.start(listener.run(), "listener")
-        yield diary
+        yield listener
 
 
 async def started(ledger: Ledger) -> None:
     """Wait until a listener has chosen its first block."""
 
     async def chosen() -> bool:
-        return await ledger.cursor(Listener.NAME) is not None
+        return await ledger.cursor(ChainListener.CURSOR) is not None
 
     await until_found(chosen)
 
 
 async def contract(place: Place, *, promisor: str = "robot") -> tuple[str, Demand, Offer]:
-    """A liability between the person and the promisor, made by the provider."""
+    """A liability between the person and the promisor, created by the provider."""
     deployment = place.market.deployment
     fields = terms(token=deployment.xrt, cost=0, lighthouse=deployment.lighthouse, nonce=secrets.token_hex(32))
     demand = place.market.accounts["person"].signer.sign(Demand(**fields, validator_fee=0))

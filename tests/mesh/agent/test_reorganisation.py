@@ -1,4 +1,4 @@
-"""The listener where the chain takes back what it has told."""
+"""What the listener reverts when the chain is reorganised."""
 
 from __future__ import annotations
 
@@ -7,84 +7,83 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from web3.providers.async_base import AsyncBaseProvider
 
+from mesh.agent.listener import ChainListener
 from mesh.chain import Approval, Chain, ChainWentBack, History, NewLiability, Timing, Transfer
-from mesh.work import Ledger
-from mesh.work import listener as listener_module
-from mesh.work.listener import Listener
-from tests.mesh.work.diaries import Diary, contract, finalize, ledger, listening, started
+from tests.mesh.agent.listeners import contract, finalize, ledger, listening, opened, started
 from tests.support.market import QUICK
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from web3.types import RPCEndpoint, RPCResponse
 
+    from mesh.work import Ledger
     from tests.support.market import Place
 
 __all__ = ["ledger"]
 
 
 async def test_a_chain_that_is_shorter_than_what_was_read_is_refused(place: Place, ledger: Ledger) -> None:
-    await ledger.set_cursor(Listener.NAME, 10**6)
-    listener = Listener(place.chains["robot"], ledger, place.address("robot"), Diary())
-    with pytest.raises(ChainWentBack):
-        await listener.run()
+    await ledger.set_cursor(ChainListener.CURSOR, 10**6)
+    async with opened(place, ledger) as listener:
+        with pytest.raises(ChainWentBack):
+            await listener.run()
 
 
 async def test_an_end_that_the_chain_took_back_is_told(place: Place, ledger: Ledger) -> None:
-    async with listening(place, ledger) as diary:
+    async with listening(place, ledger) as listener:
         await started(ledger)
         address, *_ = await contract(place)
         await finalize(place, address)
-        await until(lambda: diary.ends)
+        await until(lambda: listener.ends)
         await place.forget_blocks(1)
-        await until(lambda: diary.taken_back_ends)
+        await until(lambda: listener.reverted_ends)
         await finalize(place, address)
-        await until(lambda: len(diary.ends) == 2)
-    assert diary.taken_back_ends == [address]
-    assert diary.ends[0][0] == diary.ends[1][0] == address
-    assert len(diary.liabilities) == 1, "what came before is as it was"
+        await until(lambda: len(listener.ends) == 2)
+    assert listener.reverted_ends == [address]
+    assert listener.ends[0][0] == listener.ends[1][0] == address
+    assert len(listener.liabilities) == 1, "what came before is as it was"
 
 
 async def test_an_end_that_was_taken_back_while_the_agent_was_down_is_told(place: Place, ledger: Ledger) -> None:
-    async with listening(place, ledger) as diary:
+    async with listening(place, ledger) as listener:
         await started(ledger)
         address, *_ = await contract(place)
         await finalize(place, address)
         head = await place.chains["robot"].block_number()
-        await until(lambda: diary.head >= head)
+        await until(lambda: listener.head >= head)
     await place.forget_blocks(1)
-    async with listening(place, ledger) as diary:
-        await until(lambda: diary.taken_back_ends)
-    assert diary.taken_back_ends == [address]
+    async with listening(place, ledger) as listener:
+        await until(lambda: listener.reverted_ends)
+    assert listener.reverted_ends == [address]
 
 
 async def test_a_contract_that_the_chain_took_back_is_told_and_told_again_when_it_is_made(
     place: Place, ledger: Ledger
 ) -> None:
-    async with listening(place, ledger) as diary:
+    async with listening(place, ledger) as listener:
         await started(ledger)
         first, demand, offer = await contract(place)
-        await until(lambda: diary.liabilities)
+        await until(lambda: listener.liabilities)
         await place.forget_blocks(1)
-        await until(lambda: diary.taken_back_contracts)
+        await until(lambda: listener.reverted_contracts)
         lighthouse = place.market.deployment.lighthouse_name
         again = await place.chains["provider"].liabilities.create(lighthouse, demand, offer)
-        await until(lambda: len(diary.liabilities) == 2)
-    assert diary.taken_back_contracts == [first]
-    assert [liability.address for liability, *_ in diary.liabilities] == [first, again.liability]
-    assert diary.taken_back_ends == []
+        await until(lambda: len(listener.liabilities) == 2)
+    assert listener.reverted_contracts == [first]
+    assert [liability.address for liability, *_ in listener.liabilities] == [first, again.liability]
+    assert listener.reverted_ends == []
 
 
 async def test_token_events_are_told_and_taken_back(place: Place, ledger: Ledger) -> None:
     person = place.chains["person"]
-    async with listening(place, ledger) as diary:
+    async with listening(place, ledger) as listener:
         await started(ledger)
         await person.tokens.approve(place.address("robot"), 11)
         await person.tokens.transfer(place.address("robot"), 12)
-        await until(lambda: len(diary.token_events) == 2)
+        await until(lambda: len(listener.token_events) == 2)
         await place.forget_blocks(1)
-        await until(lambda: diary.taken_back_token_events)
-    approval, transfer = diary.token_events
+        await until(lambda: listener.reverted_token_events)
+    approval, transfer = listener.token_events
     assert isinstance(approval, Approval)
     assert (approval.owner, approval.spender, approval.value) == (place.address("person"), place.address("robot"), 11)
     assert isinstance(transfer, Transfer)
@@ -93,7 +92,7 @@ async def test_token_events_are_told_and_taken_back(place: Place, ledger: Ledger
         place.address("robot"),
         12,
     )
-    assert diary.taken_back_token_events == [transfer]
+    assert listener.reverted_token_events == [transfer]
 
 
 async def test_as_much_of_the_chain_is_remembered_as_may_be_replaced_whatever_was_so_before(
@@ -103,24 +102,24 @@ async def test_as_much_of_the_chain_is_remembered_as_may_be_replaced_whatever_wa
         timing = Timing(poll_interval=0.03, reorg_depth=depth)
         async with (
             Chain(place.node.provider, ens=place.market.deployment.ens, timing=timing) as chain,
-            listening(place, ledger, chain=chain) as diary,
+            listening(place, ledger, chain=chain) as listener,
         ):
             await started(ledger)
             for _ in range(2 * depth):
                 await contract(place)
                 head = await chain.block_number()
-                await until(lambda diary=diary, head=head: diary.head >= head)  # type: ignore[misc]
-        history = History.decode(await ledger.history(Listener.NAME))
+                await until(lambda listener=listener, head=head: listener.head >= head)  # type: ignore[misc]
+        history = History.decode(await ledger.history(ChainListener.CURSOR))
         assert (history.depth, len(history.blocks)) == (depth, depth + 1)
 
 
 async def test_a_contract_that_a_reorganisation_took_before_it_was_read_is_left_out(
     place: Place, ledger: Ledger
 ) -> None:
-    diary = Diary()
-    listener = Listener(place.chains["robot"], ledger, place.address("robot"), diary)
-    await listener._new_liability(NewLiability(place.address("robot"), "0x"))
-    assert diary.liabilities == []
+    """The chain says of a contract, and when the listener reads it, there is none."""
+    async with opened(place, ledger) as listener:
+        await listener.handle(NewLiability(place.address("robot"), "0x"))
+        assert listener.liabilities == []
 
 
 class Behind(AsyncBaseProvider):
@@ -138,16 +137,13 @@ class Behind(AsyncBaseProvider):
         return await self._node.make_request(method, params)
 
 
-async def test_a_node_that_is_behind_loses_no_contract(
-    place: Place, ledger: Ledger, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(listener_module, "RETRY", 0.05)
+async def test_a_node_that_is_behind_loses_no_contract(place: Place, ledger: Ledger) -> None:
     node = Behind(place)
     robot, ens = place.market.accounts["robot"], place.market.deployment.ens
     async with Chain(node, account=robot, ens=ens, timing=QUICK) as chain:
-        await ledger.set_cursor(Listener.NAME, await chain.block_number())
+        await ledger.set_cursor(ChainListener.CURSOR, await chain.block_number())
         address, *_ = await contract(place)
         node.contract, node.calls = address, 2
-        async with listening(place, ledger, chain=chain) as diary:
-            await until(lambda: diary.liabilities)
-    assert ([made.address for made, *_ in diary.liabilities], node.calls <= 0) == ([address], True)
+        async with listening(place, ledger, chain=chain) as listener:
+            await until(lambda: listener.liabilities)
+    assert ([made.address for made, *_ in listener.liabilities], node.calls <= 0) == ([address], True)

@@ -1,0 +1,269 @@
+"""What happens on the chain, and what it means for the agent: its trade, its jobs, its token events.
+
+`ChainListener` reads the chain block by block and saves its position in the ledger, so nothing is missed while the
+agent is down. A block that was not handled to its end is handled again: handling is idempotent. What a reorganisation
+undoes is undone in the methods named `…_reverted`.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from contextlib import aclosing
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+from msgspec.structs import replace
+
+from mesh.agent.contract import Outcome
+from mesh.chain import (
+    Approval,
+    Finalized,
+    History,
+    NewLiability,
+    NoContracts,
+    NodeUnreachable,
+    NotALiability,
+    Reorganisation,
+    RequestRefused,
+    Transfer,
+)
+from mesh.telemetry.context import liability_context, log_event, with_liability_context
+from mesh.work.lifecycle import TO_BE_DONE, Phase, advance
+from mesh.work.outbox import result_identity
+from schemas.keys import EthEventKey
+from schemas.rpc import ApprovalEvent, TransferEvent
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from mesh.agent.components import AgentComponents
+    from mesh.agent.trade import Trader
+    from mesh.chain import ChainEvent
+    from mesh.work.executor import Executor, OnPhase
+    from mesh.work.ledger import JobRecord
+    from schemas import Liability, Record
+
+log = logging.getLogger(__name__)
+
+READ_ERRORS: Final = (NodeUnreachable, RequestRefused, NoContracts)
+"""Errors after which a liability is read again. `NoContracts`: the node is behind another one that had its block."""
+REVERTED_KEPT: Final = 1_000
+"""Most reverted token events that are remembered, because they may happen again."""
+
+
+class ChainListener:
+    """Reads the chain for one agent. An agent that never ran begins at the head."""
+
+    CURSOR: Final = "listener"
+    """The name of its position in the ledger."""
+
+    def __init__(self, parts: AgentComponents, trader: Trader, executor: Executor, *, on_phase: OnPhase) -> None:
+        self._parts = parts
+        self._chain = parts.chain
+        self._ledger = parts.ledger
+        self._account = parts.signer.address
+        self._trader = trader
+        self._executor = executor
+        self._on_phase = on_phase
+        self._token_events = TokenEvents(parts.channel.put, self._account)
+
+    async def run(self) -> None:
+        """Read until cancelled, through outages of the node. Raises `ChainWentBack` and `UnknownName`."""
+        settings, chain, outages = self._parts.settings, self._chain, self._parts.outages
+        find_token = partial(chain.names.address, settings.erc20_token)
+        token = await chain.retrying(find_token, outages=outages) if settings.erc20_token else ""
+        cursor, history = await self._position()
+        async with aclosing(chain.follow(cursor, history=history, token=token, outages=outages)) as blocks:
+            async for block in blocks:
+                if isinstance(block, Reorganisation):
+                    facts = log_event("chain-reorganised", block=block.block_number, events=len(block.reverted_events))
+                    log.warning("the chain replaced all blocks after %d", block.block_number, extra=facts)
+                    for event in block.reverted_events:
+                        await self.revert(event)
+                for event in block.events:
+                    await self.handle(event)
+                await self._ledger.set_cursor(self.CURSOR, block.block_number, history=history.encode())
+                await self.new_head(block.block_number)
+
+    async def finalize_ended(self) -> None:
+        """Finalize the jobs that ended while the agent was away, before any of them is continued.
+
+        Reading block by block would find them too, but only after a paid job was played to the device again.
+        """
+        for job in await self._ledger.jobs(TO_BE_DONE):
+            read = partial(self._chain.liabilities.get, job.liability.address)
+            try:
+                now = await self._chain.retrying(read, outages=self._parts.outages, errors=READ_ERRORS)
+            except NotALiability:  # reverted, which the listener will find
+                continue
+            if now.is_finalized:
+                await self.finalized(now.address, success=now.is_success, result=now.result)
+
+    async def _position(self) -> tuple[int, History]:
+        """The first block to read, and the history of those before it."""
+        depth = self._chain.node.timing.reorg_depth
+        last = await self._ledger.cursor(self.CURSOR)
+        if last is None:
+            last = await self._chain.retrying(self._chain.block_number, outages=self._parts.outages)
+            await self._ledger.set_cursor(self.CURSOR, last)
+        encoded = await self._ledger.history(self.CURSOR)
+        history = History.decode(encoded) if encoded else History(depth)
+        history.depth = depth  # the setting may have changed
+        return last + 1, history
+
+    async def handle(self, event: ChainEvent) -> None:
+        """Act on an event of the chain."""
+        match event:
+            case NewLiability():
+                with liability_context(event.liability):
+                    await self._read_new(event.liability)
+            case Finalized():
+                await self.finalized(event.liability, success=event.success, result=event.result)
+            case Transfer() | Approval():
+                self.token_event(event)
+
+    async def revert(self, event: ChainEvent) -> None:
+        """Undo an event that a reorganisation has reverted."""
+        match event:
+            case NewLiability():
+                await self.liability_reverted(event.liability)
+            case Finalized():
+                await self.finalization_reverted(event.liability)
+            case Transfer() | Approval():
+                self.token_event_reverted(event)
+
+    async def _read_new(self, address: str) -> None:
+        """Read a new liability and, if it names this account, its orders."""
+
+        async def read() -> tuple[Liability, tuple[bytes, bytes] | None]:
+            liability = await self._chain.liabilities.get(address)
+            is_ours = self._account in (liability.promisor, liability.promisee)
+            return liability, await self._chain.liabilities.order_hashes(address) if is_ours else None
+
+        try:
+            liability, orders = await self._chain.retrying(read, outages=self._parts.outages, errors=READ_ERRORS)
+        except NotALiability:
+            facts = log_event("liability-gone", liability=address)
+            log.warning("the liability was reverted before it was read", extra=facts)
+            return
+        if orders is not None:
+            await self.new_liability(liability, demand_hash=orders[0], offer_hash=orders[1])
+
+    @with_liability_context
+    async def new_liability(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
+        """A contract was created that names this account: as promisee, as promisor, or as both.
+
+        A job that is known already is left alone, unless its liability was reverted and created again.
+        """
+        await self._trader.matched(liability, demand_hash=demand_hash, offer_hash=offer_hash)
+        if liability.promisor != self._account or not self._parts.settings.enable_executor:
+            return
+        await self._executor.opened()
+        if liability.is_finalized or not await self._ledger.add_job(liability):
+            return
+        job = await self._ledger.job(liability.address)
+        if job is not None and job.result is not None:
+            await self._owe_result(job)
+            return
+        facts = log_event("job-accepted", model=liability.model, objective=liability.objective, cost=liability.cost)
+        log.info("new job, model %s, objective %s", liability.model, liability.objective, extra=facts)
+        await self._on_phase(Phase.INCOMING, liability)
+        self._executor.prepare(liability)
+
+    @with_liability_context
+    async def liability_reverted(self, address: str) -> None:
+        """A reorganisation reverted a contract: its job is set aside, and our order is sent again."""
+        async with self._executor.halted(address) as job:
+            if job is not None:
+                await self._ledger.set_aside(address)
+                await self._parts.outbox.settle(result_identity(address))
+                log.warning("the liability was reverted; its job waits", extra=log_event("job-set-aside"))
+        await self._trader.liability_reverted(address)
+
+    @with_liability_context
+    async def finalized(self, address: str, *, success: bool, result: str) -> None:
+        """A contract, perhaps not ours, has paid (`success`) or refunded. `result` is the CID of its recording."""
+        async with self._executor.halted(address) as job:
+            # In this order: after a crash in between, the block is handled again and finds the job unfinished.
+            await self._parts.outbox.settle(result_identity(address))  # also one that was signed by request
+            if job is not None and job.phase is not Phase.FINALIZED:
+                await self._ledger.set_phase(address, advance(address, job.phase, Phase.FINALIZED))
+        if job is not None and job.phase is not Phase.FINALIZED:
+            facts = log_event("job-finalized", success=success)
+            log.info("finalized, %s", "paid" if success else "refunded", extra=facts)
+            ended = replace(job.liability, is_finalized=True, is_success=success, result=job.result or "")
+            await self._on_phase(Phase.FINALIZED, ended)
+        self._trader.finalized(address, Outcome(success=success, result=result))
+
+    @with_liability_context
+    async def finalization_reverted(self, address: str) -> None:
+        """A reorganisation reverted the end of a contract: the Result of its job is sent again.
+
+        A job without a Result stays ended: whoever refunded it will do so again.
+        """
+        async with self._executor.halted(address) as job:
+            if job is not None and job.phase is Phase.FINALIZED and job.result is not None:
+                log.warning("the finalization was reverted", extra=log_event("finalization-reverted"))
+                await self._owe_result(job)
+
+    def token_event(self, event: Transfer | Approval) -> None:
+        """Tokens were transferred, or approved, perhaps not ours."""
+        self._token_events.publish(event)
+
+    def token_event_reverted(self, event: Transfer | Approval) -> None:
+        """A reorganisation reverted that; the new blocks may have it again."""
+        self._token_events.revert(event)
+
+    async def new_head(self, block: int) -> None:
+        """All of `block` has been handled. After a reorganisation it may be lower than before."""
+        self._parts.clock.pass_to(block)
+        self._trader.new_head(block)
+        await self._parts.outbox.expire(block)
+
+    async def _owe_result(self, job: JobRecord) -> None:
+        """Send the Result of a complete job again."""
+        assert job.result is not None
+        await self._executor.owe_result(
+            job.liability.address, success=bool(job.success), result=job.result, note=job.note
+        )
+        await self._parts.outbox.send_new()
+
+
+class TokenEvents:
+    """Publishes token events of `account` on `aira/agent/{account}/eth/event/transfer` or `…/approval`, with `put`.
+
+    An event that is reverted and happens again is published once. One that does not happen again was published in vain,
+    and after a crash in the middle of a block its events are published again: read balances from the chain, don't add
+    up events.
+    """
+
+    def __init__(self, put: Callable[[str, bytes], None], account: str) -> None:
+        self._put = put
+        self._account = account
+        self._reverted: deque[Transfer | Approval] = deque(maxlen=REVERTED_KEPT)
+
+    def publish(self, event: Transfer | Approval) -> None:
+        """Publish an event if it concerns the account and was not published before it was reverted."""
+        parties, record = _record(event)
+        if self._account not in parties:
+            return
+        if event in self._reverted:
+            self._reverted.remove(event)
+            return
+        kind: Final = "transfer" if isinstance(event, Transfer) else "approval"
+        self._put(str(EthEventKey(self._account, kind)), record.encode())
+
+    def revert(self, event: Transfer | Approval) -> None:
+        """A reorganisation reverted the event; it may happen again in another block."""
+        if self._account in _record(event)[0]:
+            self._reverted.append(event)
+
+
+def _record(event: Transfer | Approval) -> tuple[tuple[str, str], Record]:
+    """The accounts that an event concerns, and its record."""
+    match event:
+        case Transfer(sender, recipient, value):
+            return (sender, recipient), TransferEvent(sender, recipient, value)
+        case Approval(owner, spender, value):
+            return (owner, spender), ApprovalEvent(owner, spender, value)

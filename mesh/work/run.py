@@ -1,0 +1,190 @@
+"""A run of a job: its objective played to the handlers, and everything on the job's topics recorded."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import secrets
+import threading
+from typing import TYPE_CHECKING, Final
+
+import zenoh
+
+from mesh.recording import AtOnce, Unrecordable, play
+from mesh.telemetry.context import log_event
+from mesh.work.job import HandlerCancelled, Job
+from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey, parse_key, topic_selector
+from schemas.payloads import STRING, PayloadType, String, payload_type
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from mesh.recording import Objective, Pace, Played, Recorder, RecordingSummary
+    from schemas import Liability
+
+    Handle = Callable[[Job, Played], Awaitable[object]]
+
+log = logging.getLogger(__name__)
+
+QUEUED: Final = 1024
+"""Most played messages that wait for their handler; then the player waits."""
+NOTE_TOPIC: Final = "/aira/note"
+"""Topic of the recording on which the agent says why a job failed."""
+FLUSH: Final = "aira/flush"
+"""Encoding of the message that a run sends to itself to know that it has received everything before it."""
+
+
+class JobRun(Job):
+    """A job while it is worked on: `open`, then `play` once, then `close`. It can't be used again after `close`.
+
+    It plays `objective`, if there is one, from the message at `position`, and records the topics in `recorded` (None:
+    all). It owns the `recorder`; what arrives on the job's topics is recorded in Zenoh's thread, past the event loop.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        agent: str,
+        liability: Liability,
+        recorder: Recorder,
+        *,
+        objective: Objective | None = None,
+        pace: Pace | None = None,
+        position: int = 0,
+        recorded: frozenset[str] | None = None,
+    ) -> None:
+        super().__init__(session, agent, liability, position=position)
+        self._recorder = recorder
+        self._objective = objective
+        self._types = _described(objective)
+        self._marker = secrets.token_bytes(16)
+        self._flushed = threading.Event()
+        self._queue: asyncio.Queue[Played | None] = asyncio.Queue(QUEUED)
+        self._player: asyncio.Task[None] | None = None
+        self._closing = False
+        self.pace: Pace = pace or AtOnce()
+        """How fast the objective is played."""
+        self.recorded = recorded
+        """The topics that are recorded; None for all."""
+        self.unrecordable = 0
+        """Messages on the job's topics that could not be recorded."""
+        if objective is not None:
+            self.topics = frozenset(topic.name for topic in objective.topics)
+
+    def open(self) -> None:
+        """Subscribe to the job's topics; from now on everything on them is recorded."""
+        selector = topic_selector(self._agent, self.liability.address)
+        self._subscriber = self._session.declare_subscriber(selector, self._receive)
+
+    async def play(
+        self,
+        handle: Handle | None,
+        *,
+        progress: Callable[[int], Awaitable[None]],
+    ) -> None:
+        """Play the objective to its end, each message at its time. Returns when the last one is handled.
+
+        Each message goes to the mesh, into the recording and to `handle`, one after the other; then `progress` gets the
+        new position. Raises what `handle` raises. If the run is closed meanwhile (`handle` may do that), it returns
+        after the message that is being handled.
+        """
+        failed: BaseException | None = None
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                if not self._closing:
+                    self._player = tasks.create_task(self._play(), name=f"player {self.liability.address}")
+                tasks.create_task(self._handle_all(handle, progress), name=f"handlers {self.liability.address}")
+        except ExceptionGroup as group:
+            failed = group.exceptions[0]
+        if failed is not None:
+            raise failed
+
+    async def close(self, note: str = "") -> RecordingSummary:
+        """Close the recording, which has everything that was received before. `note` is written at its end."""
+        self._closing = True
+        if self._player is not None:
+            self._player.cancel()
+        with contextlib.suppress(asyncio.QueueFull):  # a full queue wakes the handlers anyway
+            self._queue.put_nowait(None)
+        if self._subscriber is not None:
+            await asyncio.to_thread(self._unsubscribe)
+        if note:
+            self._recorder.record(NOTE_TOPIC, String(note).encode(), STRING, role="agent")
+        return await asyncio.to_thread(self._recorder.close)
+
+    async def _play(self) -> None:
+        assert self._objective is not None, "a run without an objective only records"
+        async for step in play(self._objective, pace=self.pace, start_index=self.position):
+            message = step.message
+            if self._is_recorded(message.topic):
+                self._recorder.record(message.topic, message.payload, message.type, role="objective")
+            key = str(ObjectiveTopicKey(self._agent, self.liability.address, message.topic))
+            self._put(key, message.payload, message.type)
+            await self._queue.put(message)
+        await self._queue.put(None)
+
+    async def _handle_all(
+        self,
+        handle: Handle | None,
+        progress: Callable[[int], Awaitable[None]],
+    ) -> None:
+        while (message := await self._queue.get()) is not None and not self._closing:
+            if handle is not None:
+                self.playing = message
+                await self._handle_one(handle, message)
+            self.position += 1
+            await progress(self.position)
+
+    async def _handle_one(self, handle: Handle, message: Played) -> None:
+        try:
+            await handle(self, message)
+        except asyncio.CancelledError:
+            task = asyncio.current_task()
+            if task is not None and task.cancelling():
+                raise
+            # A task group would take this task for one that it cancelled itself, and the job for done.
+            raise HandlerCancelled(f"the handler of {message.topic} was cancelled") from None
+
+    def _receive(self, sample: zenoh.Sample) -> None:
+        """Zenoh's callback: record a message on the job's topics, or take the run's own marker."""
+        encoding = str(sample.encoding)
+        if encoding == FLUSH and sample.payload.to_bytes() == self._marker:
+            self._flushed.set()
+            return
+        try:
+            key = parse_key(str(sample.key_expr))
+            if isinstance(key, LiabilityTopicKey) and self._is_recorded(key.topic):
+                kind = self._type_of(key.topic, encoding)
+                self._recorder.record(key.topic, sample.payload.to_bytes(), kind, role="device")
+        except Exception as error:
+            # Nothing catches what a callback raises: count and log it, and record the next message.
+            self.unrecordable += 1
+            level = logging.INFO if isinstance(error, Unrecordable) else logging.ERROR
+            facts = log_event("message-not-recorded", liability=self.liability.address, key=sample.key_expr)
+            log.log(level, "%s: can't record %s: %s", self.liability.address, sample.key_expr, error, extra=facts)
+
+    def _type_of(self, topic: str, encoding: str) -> PayloadType:
+        """The type of a received message. Only its name travels; the run may know its description."""
+        return self._types.get((topic, encoding)) or self._types.get(("", encoding)) or payload_type(encoding)
+
+    def _is_recorded(self, topic: str) -> bool:
+        return self.recorded is None or topic in self.recorded
+
+    def _unsubscribe(self) -> None:
+        """Samples reach a subscriber in order: once it has the marker, it has everything that was sent before."""
+        subscriber, self._subscriber = self._subscriber, None
+        with contextlib.suppress(zenoh.ZError):  # a broken session delivers nothing more
+            marker = LiabilityTopicKey(self._agent, self.liability.address, NOTE_TOPIC)
+            local = zenoh.Locality.SESSION_LOCAL
+            self._session.put(str(marker), self._marker, encoding=FLUSH, allowed_destination=local)
+            self._flushed.wait(timeout=5)
+            subscriber.undeclare()
+
+
+def _described(objective: Objective | None) -> dict[tuple[str, str], PayloadType]:
+    """Types that only the objective describes, by any topic ('') and their Zenoh encoding."""
+    if objective is None:
+        return {}
+    types = (topic.type for topic in objective.topics if topic.type.schema_name and topic.type.schema_data)
+    return {("", kind.zenoh_encoding): kind for kind in types if not payload_type(kind.zenoh_encoding).schema_data}

@@ -1,0 +1,68 @@
+"""Runs of jobs: they continue what an interrupted one has recorded, and follow the settings."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.recording import AtOnce, RecordedTimes, open_objective
+from schemas import String
+from tests.mesh.work.samples import liability
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from mesh.work.playbacks import Playbacks
+    from tests.support.market import Place
+
+
+@pytest.fixture
+async def playbacks(place: Place) -> AsyncIterator[Playbacks]:
+    """The playbacks of a robot that does nothing by itself."""
+    async with place.agent("robot", enable_executor=False) as robot:
+        yield robot.runtime.playbacks
+
+
+async def test_an_interrupted_recording_is_continued(playbacks: Playbacks) -> None:
+    first = await playbacks.create(liability())
+    first.open()
+    first.publish("/led", "before")
+    await first.close()  # and then, before the Result was in the ledger, a crash
+    second = await playbacks.create(liability())
+    second.open()
+    second.publish("/led", "after")
+    summary = await second.close()
+    assert summary.recovered == 1
+    recorded = [String.decode(message.payload).data for message in open_objective(summary.path).messages()]
+    assert recorded == ["before", "after"]
+
+
+@pytest.mark.parametrize("leftover", ["", ".part", ".cut"])
+async def test_a_discarded_recording_is_not_continued(playbacks: Playbacks, leftover: str) -> None:
+    first = await playbacks.create(liability())
+    first.open()
+    first.publish("/led", "before")
+    path = (await first.close()).path
+    path.rename(path.with_name(path.name + leftover))
+    playbacks.discard_recording(liability().address)
+    summary = await (await playbacks.create(liability())).close()
+    assert (summary.messages, summary.recovered) == (0, 0)
+
+
+async def test_a_recording_that_does_not_exist_can_be_discarded(playbacks: Playbacks) -> None:
+    playbacks.discard_recording(liability().address)
+
+
+async def test_the_settings_choose_pace_and_topics(place: Place) -> None:
+    async with place.agent("robot", enable_executor=False, playback="recorded", recording_topics=" /a,/b/c ,") as robot:
+        run = await robot.runtime.playbacks.create(liability())
+        assert run.pace == RecordedTimes()
+        assert run.recorded == frozenset({"/a", "/b/c"})
+        await run.close()
+
+
+async def test_by_default_all_topics_are_recorded(playbacks: Playbacks) -> None:
+    run = await playbacks.create(liability())
+    assert (run.pace, run.recorded) == (AtOnce(), None)
+    await run.close()
