@@ -11,12 +11,12 @@ import click
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import print_facts, print_json, printable
 from mesh.errors import AiraError, ConfigurationError, InputError
-from mesh.identity.roles import ROLES
+from mesh.identity.roster import ROLES
 from mesh.running import fail, report, run_to_end
 from mesh.settings import NetworkSettings, options_of
 
 if TYPE_CHECKING:
-    from mesh.identity.certificates import Facts
+    from mesh.identity.certificates import CertificateFacts
     from mesh.identity.folders import SiteFolder
     from mesh.identity.roster import Member
     from mesh.settings import Settings
@@ -130,7 +130,7 @@ def renew(
         fail(failed)
 
 
-@command.command("check", short_help="ask the router whether it heeds an identity")
+@command.command("check", short_help="ask the router whether it admits an identity")
 @click.option("--agent", default="", help="of an edge agent: address of the agent whose device it serves")
 @click.option("--device", default="", help="of an edge agent: name of that device")
 @with_settings(*options_of(NetworkSettings))
@@ -149,10 +149,10 @@ def check(settings: Settings, agent: str, device: str) -> None:
 
 
 async def _check(settings: Settings, address: str, agent: str, device: str) -> None:
-    from mesh.identity.admission import check_standing
+    from mesh.identity.routers import check_admission
     from mesh.network.endpoints import Endpoints
 
-    await check_standing(Endpoints.from_settings(settings), address, agent=agent, device=device)
+    await check_admission(Endpoints.from_settings(settings), address, agent=agent, device=device)
     click.echo(f"{address} is let in and heeded at {', '.join(settings.connect)}")
 
 
@@ -167,12 +167,14 @@ def _own_address(settings: Settings) -> str:
     return facts_of(read_certificate(path), path).holder.address
 
 
-def _make(folder: Path, site: SiteFolder, days: float, roster: Path | None, **about: Any) -> tuple[Facts, Member]:
+def _make(
+    folder: Path, site: SiteFolder, days: float, roster: Path | None, **about: Any
+) -> tuple[CertificateFacts, Member]:
     from msgspec.structs import replace
 
     from mesh.identity.certificates import Holder
+    from mesh.identity.folders import with_member, write_roster
     from mesh.identity.roster import Member, entry_of, roster_from
-    from mesh.identity.roster_file import with_member, write_roster
 
     if "router" in about["roles"] and not about["hosts"]:
         raise InputError("clients check where they connect to", hint="give the router's name or IP address by --host")
@@ -190,15 +192,15 @@ def _make(folder: Path, site: SiteFolder, days: float, roster: Path | None, **ab
     return facts, member
 
 
-def _renew(folder: Path, site: SiteFolder, days: float, roster: Path | None) -> Facts:
-    from mesh.identity.roster_file import with_fingerprint, write_roster
+def _renew(folder: Path, site: SiteFolder, days: float, roster: Path | None) -> CertificateFacts:
+    from mesh.identity.folders import with_fingerprint, write_roster
 
     member = _member(folder)
-    before: Facts = member.facts()
+    before: CertificateFacts = member.facts()
     address, old = before.holder.address, before.fingerprint
     if roster is not None:
         with_fingerprint(roster, address, old=old, new=old)  # raises for who may have none
-    facts: Facts = member.renew(site=site, days=days)
+    facts: CertificateFacts = member.renew(site=site, days=days)
     if roster is not None:
         write_roster(roster, with_fingerprint(roster, address, old=old, new=facts.fingerprint))
     return facts
@@ -220,7 +222,7 @@ def _address(about: dict[str, Any]) -> str:
     raise InputError("whose certificate is it to be?", hint="give the account's --address or its --keyfile")
 
 
-def _standing(facts: Facts, path: Path) -> str:
+def _standing(facts: CertificateFacts, path: Path) -> str:
     """What the roster says of the certificate's holder."""
     from mesh.identity import read_roster
 
@@ -234,7 +236,7 @@ def _standing(facts: Facts, path: Path) -> str:
     return f"in the roster as {', '.join(member.roles)}"
 
 
-def _print(facts: Facts, as_json: bool, standing: str | None = None) -> None:
+def _print(facts: CertificateFacts, as_json: bool, standing: str | None = None) -> None:
     left = facts.left
     expired = left.total_seconds() <= 0
     if as_json:

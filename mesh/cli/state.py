@@ -139,9 +139,9 @@ def _print_archive(found: ArchiveContents) -> None:
 
 
 async def _back_up(folder: Path, file: Path, content: str, *, as_json: bool) -> None:
-    from mesh.state import Extent, back_up
+    from mesh.state import ContentScope, back_up
 
-    done = await back_up(folder, file, content=Extent(content))
+    done = await back_up(folder, file, content=ContentScope(content))
     if as_json:
         print_json({"file": str(file), **_as_dict(done)})
         return
@@ -158,10 +158,10 @@ async def _back_up(folder: Path, file: Path, content: str, *, as_json: bool) -> 
 
 
 async def _restore(folder: Path, file: Path, existing: str, *, as_json: bool) -> None:
-    from mesh.state import Existing
+    from mesh.state import ExistingState
     from mesh.state import restore as put_back
 
-    done = await put_back(file, folder, existing=Existing(existing))
+    done = await put_back(file, folder, existing=ExistingState(existing))
     jobs = {job.liability.address: job.phase.value for job in done.jobs}
     if as_json:
         aside = None if done.aside is None else str(done.aside)

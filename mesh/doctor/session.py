@@ -19,8 +19,7 @@ import zenoh
 from mesh.doctor.checks import CheckResult, failed, passed, warning
 from mesh.doctor.machine import compare_router_clock
 from mesh.errors import RemoteError
-from mesh.identity.admission import NotAdmittedYet
-from mesh.identity.routers import is_loopback
+from mesh.identity.routers import IdentityDenied, is_loopback
 from mesh.network import Endpoints, Network, call_in_loop
 from mesh.network.endpoints import TLS_PREFIXES
 from schemas.key_chunks import address_chunk, lighthouse_chunk, name_chunk
@@ -209,15 +208,15 @@ class SessionChecks:
         return passed(f"open in {took * 1000:.0f} ms, at the router {routers}")
 
     async def check_own_write(self) -> CheckResult:
-        """Whether the router forwards what this identity may write. Raises `NotAdmittedYet`."""
+        """Whether the router forwards what this identity may write. Raises `IdentityDenied`."""
         pair = self._opened()
         if self._roles == ("watcher",):
             if not await pair.is_subscribed(self._keys.own):
-                raise NotAdmittedYet(self._address)
+                raise IdentityDenied(self._address)
             return passed("a watcher writes nothing; what it wants to hear, the router sends")
         took = await pair.round_trip(self._keys.own)
         if took is None:
-            raise NotAdmittedYet(self._address)
+            raise IdentityDenied(self._address)
         return passed(f"heard back through the router in {took * 1000:.1f} ms")
 
     async def check_denied_write(self) -> CheckResult:

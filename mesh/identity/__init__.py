@@ -1,14 +1,11 @@
-"""Who belongs to a site: certificates, the roster, and what each may do on the site's routers.
+"""Identities of a site: certificates, the roster, and the rights of members on the site's routers.
 
-`roles` and `access` say who may do what, from the roster alone; `zenoh_rules` puts it into Zenoh's words. What makes
-certificates is in `certificates` and needs the extra `identity`; it is imported where it is used.
+`certificates` and `folders` need the extra `identity`; import them where you use them.
 """
 
-from mesh.identity.access import Permission, access_of
+from mesh.identity.access_rules import Permission, access_control, access_of
 from mesh.identity.errors import IdentityError, RosterError
-from mesh.identity.roles import ROLES, Right, Role
-from mesh.identity.roster import Member, Roster, entry_of, read_roster, roster_from
-from mesh.identity.zenoh_rules import access_control
+from mesh.identity.roster import ROLES, Member, Right, Role, Roster, entry_of, read_roster, roster_from
 
 __all__ = [
     "ROLES",

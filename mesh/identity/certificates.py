@@ -1,7 +1,7 @@
 """Certificates: a site's own, and those of its members, whose common name is the account's address.
 
-A site's certificate signs all others. Keys are ECDSA P-256, which every TLS library knows. A member's certificate also
-says his name (organization) and roles (organizational units), for people to read: what counts is the roster's word.
+A site's certificate signs all others. Keys are ECDSA P-256, which every TLS library supports. A member's certificate
+also has its name (organization) and roles (organizational units), for people to read: only the roster gives rights.
 Everything here is in memory; needs the extra `identity`.
 """
 
@@ -29,10 +29,10 @@ if TYPE_CHECKING:
     Key = ec.EllipticCurvePrivateKey
 
 EARLIER: Final = timedelta(minutes=5)
-"""A certificate is valid from this long before it was made, as clocks differ."""
+"""A certificate is valid from this long before its creation, because clocks differ."""
 USES: Final = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH])
 HOST_NAME: Final = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9.-]{0,251}[A-Za-z0-9])?")
-NOTHING: Final = {
+NO_OTHER_USAGE: Final = {
     "content_commitment": False,
     "key_encipherment": False,
     "data_encipherment": False,
@@ -44,7 +44,7 @@ NOTHING: Final = {
 
 @dataclass(frozen=True, kw_only=True)
 class Holder:
-    """Whom a member's certificate is for. `hosts` are the names and IP addresses at which a router is reached."""
+    """The holder of a member's certificate. `hosts` are the names and IP addresses of a router."""
 
     address: str
     name: str = ""
@@ -53,7 +53,7 @@ class Holder:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Facts:
+class CertificateFacts:
     """What a member's certificate says. `fingerprint` is SHA-256 of the certificate, 64 hexadecimal digits."""
 
     holder: Holder
@@ -63,7 +63,7 @@ class Facts:
 
     @property
     def left(self) -> timedelta:
-        """How long it is valid yet; not positive once it has expired."""
+        """How long it is still valid; not positive once it has expired."""
         return self.until - datetime.now(UTC)
 
 
@@ -73,9 +73,9 @@ def new_key() -> Key:
 
 
 def site_certificate(key: Key, name: str, days: float) -> x509.Certificate:
-    """A site's own certificate, signed with its own key, valid for so many days."""
+    """A site's own certificate, signed with its own key, valid for `days`."""
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
-    usage = x509.KeyUsage(digital_signature=True, key_cert_sign=True, crl_sign=True, **NOTHING)
+    usage = x509.KeyUsage(digital_signature=True, key_cert_sign=True, crl_sign=True, **NO_OTHER_USAGE)
     return (
         _builder(subject, subject, key.public_key(), days)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
@@ -87,17 +87,17 @@ def site_certificate(key: Key, name: str, days: float) -> x509.Certificate:
 def member_certificate(
     holder: Holder, public_key: Any, *, site: x509.Certificate, site_key: Key, days: float
 ) -> x509.Certificate:
-    """A certificate for a member's public key, signed by the site, valid for so many days but not beyond the site's."""
+    """A certificate for a member's public key, signed by the site, valid for `days` but not longer than the site's."""
     attributes = [
         (NameOID.COMMON_NAME, holder.address),
         *((NameOID.ORGANIZATION_NAME, name) for name in (holder.name,) if name),
         *((NameOID.ORGANIZATIONAL_UNIT_NAME, role) for role in holder.roles),
     ]
     subject = x509.Name([x509.NameAttribute(*attribute) for attribute in attributes])
-    left = (site.not_valid_after_utc - datetime.now(UTC)) / timedelta(days=1)
-    usage = x509.KeyUsage(digital_signature=True, key_cert_sign=False, crl_sign=False, **NOTHING)
+    remaining = (site.not_valid_after_utc - datetime.now(UTC)) / timedelta(days=1)
+    usage = x509.KeyUsage(digital_signature=True, key_cert_sign=False, crl_sign=False, **NO_OTHER_USAGE)
     builder = (
-        _builder(subject, site.subject, public_key, min(days, left))
+        _builder(subject, site.subject, public_key, min(days, remaining))
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(usage, critical=True)
         .add_extension(USES, critical=False)
@@ -108,8 +108,8 @@ def member_certificate(
     return builder.sign(site_key, hashes.SHA256())
 
 
-def facts_of(certificate: x509.Certificate, path: Path) -> Facts:
-    """What a member's certificate says. Raises `IdentityError` if its common name is no address; `path` is its file."""
+def facts_of(certificate: x509.Certificate, path: Path) -> CertificateFacts:
+    """Read a member's certificate. Raises `IdentityError` if its common name is no address; `path` is its file."""
     names = _texts(certificate, NameOID.COMMON_NAME)
     try:
         address = parse_address(names[0] if names else "")
@@ -122,7 +122,7 @@ def facts_of(certificate: x509.Certificate, path: Path) -> Facts:
         roles=tuple(_texts(certificate, NameOID.ORGANIZATIONAL_UNIT_NAME)),
         hosts=_hosts(certificate),
     )
-    return Facts(
+    return CertificateFacts(
         holder=holder,
         since=certificate.not_valid_before_utc,
         until=certificate.not_valid_after_utc,
@@ -136,27 +136,27 @@ def certificate_bytes(certificate: x509.Certificate) -> bytes:
 
 
 def key_bytes(key: Key) -> bytes:
-    """A private key as PEM (PKCS 8), without a password: Zenoh could not give one. To a file of mode 0600, and nowhere
-    else."""
+    """A private key as PEM (PKCS 8), without a password, which Zenoh does not support. Write it only to a file of mode
+    0600."""
     return key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
 
 
 def read_certificate(path: Path) -> x509.Certificate:
-    """The first certificate in a file. Raises `IdentityError`."""
+    """Read the first certificate of a file. Raises `IdentityError`."""
     try:
         return x509.load_pem_x509_certificate(_contents(path))
     except ValueError:
-        raise IdentityError(path, "this is no certificate (PEM)") from None
+        raise IdentityError(path, "this is not a certificate (PEM)") from None
 
 
 def read_key(path: Path) -> Key:
-    """The key in a file. Raises `IdentityError`, which shows nothing of it."""
+    """Read the key of a file. Raises `IdentityError`, which does not show the key."""
     try:
         key = serialization.load_pem_private_key(_contents(path), password=None)
     except (ValueError, TypeError):  # TypeError: it has a password
-        raise IdentityError(path, "this is no private key (PEM, without password)") from None
+        raise IdentityError(path, "this is not a private key (PEM, without password)") from None
     if not isinstance(key, ec.EllipticCurvePrivateKey):
         raise IdentityError(path, "this is not an elliptic curve key")
     return key
@@ -187,7 +187,7 @@ def _host(text: str) -> x509.GeneralName:
     except ValueError:
         pass
     if not HOST_NAME.fullmatch(text):
-        raise InputError(f"{text!r} is no host", hint="give a name or an IP address, without a port")
+        raise InputError(f"{text!r} is not a host", hint="give a name or an IP address, without a port")
     return x509.DNSName(text)
 
 

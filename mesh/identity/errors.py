@@ -1,4 +1,4 @@
-"""What can be wrong with identities and with the roster."""
+"""Errors of identities and of the roster."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ if TYPE_CHECKING:
 
 
 class IdentityError(ConfigurationError):
-    """A certificate or a key is not what it has to be; `path` is the file."""
+    """A certificate or a key can't be used; `path` is its file."""
 
-    code = "identity-error"
+    code = "identity-unusable"
 
     def __init__(self, path: Path, why: str, *, hint: str = "") -> None:
         super().__init__(f"{path}: {why}", hint=hint or "`aira identity new` makes certificates and keys")
@@ -21,9 +21,9 @@ class IdentityError(ConfigurationError):
 
 
 class RosterError(ConfigurationError):
-    """The roster can't be used; `where` is the file and, where it is known, the entry."""
+    """The roster can't be used; `where` is the file and, if known, the entry."""
 
-    code = "roster-error"
+    code = "roster-unusable"
 
     def __init__(self, where: str, why: str, *, hint: str = "") -> None:
         super().__init__(f"the roster {where}: {why}", hint=hint)

@@ -1,12 +1,14 @@
-"""Folders of identities: a site's (`ca.pem`, `ca.key`) and a member's (`identity.pem`, `identity.key`, `ca.pem`).
+"""Files of a site: its folder (`ca.pem`, `ca.key`), those of its members (`identity.pem`, `identity.key`, `ca.pem`),
+and its roster.
 
-Keys are readable by their owner only. Nothing is overwritten, but for a certificate by its renewal, in one step: who
-reads it meanwhile finds the old one or the new one.
+Only their owner can read keys. Nothing is overwritten, except a certificate by its renewal and the roster by a change,
+both atomically. The roster is edited as text, so that comments and order survive.
 """
 
 from __future__ import annotations
 
 import os
+import re
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -14,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from mesh.errors import ConfigurationError
 from mesh.identity.certificates import (
-    Facts,
+    CertificateFacts,
     Holder,
     certificate_bytes,
     check_pair,
@@ -26,10 +28,13 @@ from mesh.identity.certificates import (
     read_key,
     site_certificate,
 )
-from mesh.identity.errors import IdentityError
+from mesh.identity.errors import IdentityError, RosterError
+from mesh.identity.roster import entry_of, roster_from
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from mesh.identity.roster import Member
 
 PRIVATE: Final = 0o600
 PUBLIC: Final = 0o644
@@ -37,13 +42,13 @@ PUBLIC: Final = 0o644
 
 @dataclass(frozen=True)
 class SiteFolder:
-    """Where a site's certificate and key are. Whoever has the key can let in anybody."""
+    """The folder of a site's certificate and key. Whoever has the key can admit anyone."""
 
     path: Path
 
     @property
     def certificate(self) -> Path:
-        """By which members know each other."""
+        """The certificate by which members verify each other."""
         return self.path / "ca.pem"
 
     @property
@@ -52,7 +57,7 @@ class SiteFolder:
         return self.path / "ca.key"
 
     def make(self, *, name: str, days: float) -> None:
-        """Make the site. Raises `ConfigurationError` where there is one already."""
+        """Create the site. Raises `ConfigurationError` if it exists."""
         key = new_key()
         _prepare(self.path, self.certificate, self.key)
         _write(self.key, key_bytes(key), PRIVATE)
@@ -61,7 +66,7 @@ class SiteFolder:
 
 @dataclass(frozen=True)
 class MemberFolder:
-    """Where a member's certificate and key are, and a copy of the site's certificate."""
+    """The folder of a member's certificate and key, and a copy of the site's certificate."""
 
     path: Path
 
@@ -80,8 +85,8 @@ class MemberFolder:
         """The site's certificate: setting `tls_ca`."""
         return self.path / "ca.pem"
 
-    def make(self, holder: Holder, *, site: SiteFolder, days: float) -> Facts:
-        """Make a key, and have the site sign a certificate for it. Raises `ConfigurationError`."""
+    def make(self, holder: Holder, *, site: SiteFolder, days: float) -> CertificateFacts:
+        """Create a key and a certificate for it, signed by the site. Raises `ConfigurationError`."""
         authority, site_key = _opened(site)
         key = new_key()
         certificate = member_certificate(holder, key.public_key(), site=authority, site_key=site_key, days=days)
@@ -91,10 +96,10 @@ class MemberFolder:
         _write(self.certificate, certificate_bytes(certificate), PUBLIC)
         return facts_of(certificate, self.certificate)
 
-    def renew(self, *, site: SiteFolder, days: float) -> Facts:
-        """Have the site sign a new certificate for the same holder and key, valid from now on.
+    def renew(self, *, site: SiteFolder, days: float) -> CertificateFacts:
+        """Create a new certificate for the same holder and key, valid from now on.
 
-        A session that goes on takes it the next time that it connects.
+        An open session uses it the next time it connects.
         """
         authority, site_key = _opened(site)
         facts, public_key = self.facts(), read_certificate(self.certificate).public_key()
@@ -103,21 +108,68 @@ class MemberFolder:
         certificate = member_certificate(facts.holder, public_key, site=authority, site_key=site_key, days=days)
         fresh = self.certificate.with_suffix(".new")
         with suppress(FileNotFoundError):
-            fresh.unlink()  # of a renewal that was broken off
+            fresh.unlink()  # left by an interrupted renewal
         _write(fresh, certificate_bytes(certificate), PUBLIC)
         fresh.replace(self.certificate)
         return facts_of(certificate, self.certificate)
 
-    def facts(self) -> Facts:
-        """What the certificate says. Raises `IdentityError` for files that are missing, malformed or no pair."""
+    def facts(self) -> CertificateFacts:
+        """What the certificate says. Raises `IdentityError` for files that are missing, malformed, or no pair."""
         certificate = read_certificate(self.certificate)
         if self.key.exists():
             check_pair(certificate, read_key(self.key), self.key)
         return facts_of(certificate, self.certificate)
 
 
+def with_member(path: Path, member: Member) -> str:
+    """The roster's text with one more member; the file need not exist. Raises `RosterError` if it can't be added."""
+    before = _text(path) if path.exists() else ""
+    if before and not before.endswith("\n"):
+        before += "\n"
+    text = f"{before}\n{entry_of(member)}" if before else entry_of(member)
+    roster_from(text, where=str(path))
+    return text
+
+
+def with_fingerprint(path: Path, address: str, *, old: str, new: str) -> str:
+    """The roster's text with the fingerprint of a renewed certificate instead of the old one; unchanged if the member's
+    entry has no fingerprint.
+
+    Raises `RosterError` if the member is missing or revoked, or its entry has another fingerprint.
+    """
+    before = _text(path)
+    member = roster_from(before, where=str(path)).find(address)
+    if member is None:
+        raise RosterError(str(path), f"no member has the address {address}")
+    where = f"{path}, member {member.name!r}"
+    if member.revoked:
+        raise RosterError(
+            where, "it is revoked, so its certificate is not renewed", hint="delete the folder of its certificate"
+        )
+    if member.fingerprint not in ("", old):
+        hint = "is this folder outdated? if the roster is, put this fingerprint there"
+        raise RosterError(where, f"it has another certificate than the one with the fingerprint {old}", hint=hint)
+    return re.sub(":?".join(re.findall("..", old)), new, before, flags=re.IGNORECASE)
+
+
+def write_roster(path: Path, text: str) -> None:
+    """Replace the roster file atomically. Raises `ConfigurationError`."""
+    fresh = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with fresh.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        if path.exists():
+            fresh.chmod(path.stat().st_mode & 0o777)
+        fresh.replace(path)
+    except OSError as error:
+        raise ConfigurationError(f"can't write the roster {path}: {error.strerror}") from None
+
+
 def _opened(site: SiteFolder) -> tuple[Any, Any]:
-    """The site's certificate and key, in force."""
+    """The site's certificate and key. Raises `IdentityError`, also if the certificate has expired."""
     certificate, key = read_certificate(site.certificate), read_key(site.key)
     check_pair(certificate, key, site.key)
     if certificate.not_valid_after_utc <= datetime.now(UTC):
@@ -126,18 +178,18 @@ def _opened(site: SiteFolder) -> tuple[Any, Any]:
 
 
 def _prepare(folder: Path, *files: Path) -> None:
-    """Make the folder; what is there already stays as it is."""
+    """Create the folder. Raises `ConfigurationError` if one of the files exists."""
     for file in files:
         if file.exists():
             raise ConfigurationError(f"{file} exists already", hint="nothing is overwritten; choose another folder")
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     except OSError as error:
-        raise ConfigurationError(f"can't make the folder {folder}: {error.strerror}") from None
+        raise ConfigurationError(f"can't create the folder {folder}: {error.strerror}") from None
 
 
 def _write(path: Path, contents: bytes, mode: int) -> None:
-    """Write a new file, which has its mode from the beginning. Raises `ConfigurationError`, also if it is there."""
+    """Create a file with this mode. Raises `ConfigurationError`, also if it exists."""
     try:
         with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
             file.write(contents)
@@ -145,3 +197,12 @@ def _write(path: Path, contents: bytes, mode: int) -> None:
             os.fsync(file.fileno())
     except OSError as error:
         raise ConfigurationError(f"can't write {path}: {error.strerror}") from None
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise RosterError(str(path), f"it can't be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise RosterError(str(path), "it is not UTF-8 text") from None

@@ -1,4 +1,4 @@
-"""The roster: who belongs to a site. A TOML file, and the only place where that is said.
+"""The roster of a site, a TOML file: its members, their roles, and its markets.
 
     lighthouses = ["airalab.lighthouse.3.robonomics.eth"]   # the site's markets; both generations' if not given
 
@@ -9,38 +9,137 @@
     fingerprint = "…"         # of the certificate, SHA-256; for people and for `aira identity show`
     revoked = false
 
-An edge agent (role `edge`) may name the `agent` (address) whose device it serves, and the `device`; otherwise they are
-its own address and name.
+An edge agent (role `edge`) may name the `agent` (address) whose device it serves, and the `device`; by default these
+are its own address and name.
+
+`ROLES` says what each role may do; everything else is denied. Its keys are Zenoh key expressions with placeholders:
+`{own}` is the member's address, `{agent}` and `{device}` those of an edge agent, `{market}` each lighthouse of the
+site. A grant covers the keys and selectors that lie entirely within its own. `schemas.keys` defines the key
+families. Nobody may delete on a market: its keys name no owner, so a storage there would lose another member's
+orders.
 """
 
 from __future__ import annotations
 
 import re
 import tomllib
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from enum import Enum
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, TypeAlias
 
 import msgspec
 from msgspec import Meta, Struct
 
 from mesh.errors import InvalidAddress, InvalidKey
 from mesh.identity.errors import RosterError
-from mesh.identity.roles import ROLES, Role
 from schemas.address import parse_address
 from schemas.key_chunks import lighthouse_chunk, name_chunk
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
     from pathlib import Path
 
 MARKETS: Final = ("airalab.lighthouse.3.robonomics.eth", "airalab.lighthouse.5.robonomics.eth")
-"""The lighthouses of a roster that names none."""
+"""The default lighthouses of a roster."""
 FINGERPRINT: Final = re.compile(r"[0-9a-f]{64}")
 
 Name = Annotated[str, Meta(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f\x7f]+$")]
 
+Role: TypeAlias = Literal["agent", "person", "provider", "operator", "edge", "bridge", "watcher", "router"]
+
+
+class Right(Enum):
+    """An operation on keys."""
+
+    PUT = "put"
+    """Publish."""
+    DELETE = "delete"
+    """Delete what storages hold."""
+    SERVE = "serve"
+    """Declare a queryable, receive queries and reply to them."""
+    TOKEN = "token"
+    """Announce presence by a liveliness token."""
+    GET = "get"
+    """Query, and receive the replies."""
+    SUBSCRIBE = "subscribe"
+    """Receive what is published."""
+    PRESENCE = "presence"
+    """See the liveliness tokens of others."""
+
+
+class Grant(NamedTuple):
+    """Rights on keys."""
+
+    rights: frozenset[Right]
+    keys: tuple[str, ...]
+
+
+def _grant(rights: str, *keys: str) -> Grant:
+    return Grant(frozenset(Right(word) for word in rights.split()), keys)
+
+
+def _orders(*kinds: str) -> Grant:
+    """Publish messages of these kinds; their signatures identify the author."""
+    shapes = {"demand": "*/*", "offer": "*/*", "result": "*/*", "feedback": "*/*", "pending": "*"}
+    return _grant("put", *(f"aira/{{market}}/{kind}/{shapes[kind]}" for kind in kinds))
+
+
+def _presence(*roles: str) -> Grant:
+    return _grant("token", *(f"aira/{{market}}/@agent/{role}/{{own}}" for role in roles))
+
+
+_OWN_SPACE: Final = _grant("put delete serve token get subscribe presence", "aira/agent/{own}/**")
+_READ_MARKET: Final = (
+    _grant("get subscribe", "aira/{market}/**"),
+    _grant("presence", "aira/{market}/@agent/*/*"),
+)
+_READ_CONTENT: Final = _grant("get", "aira/cid/*")
+_HOLD_CONTENT: Final = _grant("get serve", "aira/cid/*")
+
+ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
+    {
+        "agent": (_OWN_SPACE, *_READ_MARKET, _orders("offer", "result"), _presence("agent"), _HOLD_CONTENT),
+        # A person who orders work runs an agent, too.
+        "person": (_OWN_SPACE, *_READ_MARKET, _orders("demand"), _presence("agent", "person"), _HOLD_CONTENT),
+        "provider": (
+            _OWN_SPACE,
+            *_READ_MARKET,
+            _orders("feedback", "pending"),
+            _grant("put", "aira/{market}/reject/*/{own}"),
+            # The provider serves its order book to late subscribers.
+            _grant("serve", "aira/{market}/**"),
+            _presence("provider"),
+        ),
+        "operator": (
+            _OWN_SPACE,
+            *_READ_MARKET,
+            _READ_CONTENT,
+            _grant("get subscribe presence", "aira/agent/**"),
+            _presence("operator"),
+        ),
+        "edge": (
+            _grant("put serve token get subscribe presence", "aira/agent/{agent}/device/{device}/**"),
+            _grant("put serve subscribe", "aira/agent/{agent}/liability/*/topic/**"),
+            _grant("subscribe", "aira/agent/{agent}/liability/*/*", "aira/agent/{agent}/liability/*/objective/**"),
+        ),
+        # A bridge relays messages that are signed elsewhere. Its turn is a separate liveliness token.
+        "bridge": (
+            _OWN_SPACE,
+            *_READ_MARKET,
+            _orders("demand", "offer", "result", "feedback", "pending"),
+            _presence("bridge", "bridge-turn-$*"),
+            _HOLD_CONTENT,
+        ),
+        "watcher": (*_READ_MARKET, _READ_CONTENT, _grant("subscribe presence", "aira/agent/**")),
+        # Another router of the site forwards what it has admitted itself.
+        "router": (_grant(" ".join(right.value for right in Right), "aira/**", "aira/*/@agent/*/*"),),
+    }
+)
+"""What each role may do."""
+
 
 class Member(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One who belongs to the site, or did: `address` and `agent` are in lower case, as in keys."""
+    """A current or revoked member of the site. `address` and `agent` are in lower case, as in keys."""
 
     name: Name
     address: str
@@ -52,13 +151,13 @@ class Member(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Roster(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Everybody, and the lighthouses (ENS names or addresses) whose markets the site's routers carry."""
+    """All members, and the lighthouses (ENS names or addresses) whose markets the site's routers carry."""
 
     lighthouses: tuple[str, ...] = MARKETS
     member: tuple[Member, ...] = ()
 
     def admitted(self) -> tuple[Member, ...]:
-        """The members who are not revoked."""
+        """The members that are not revoked."""
         return tuple(member for member in self.member if not member.revoked)
 
     def find(self, address: str) -> Member | None:
@@ -67,12 +166,12 @@ class Roster(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def read_roster(path: Path) -> Roster:
-    """The roster in a file. Raises `RosterError`."""
+    """Read a roster file. Raises `RosterError`."""
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise RosterError(
-            str(path), f"it can't be read: {error.strerror}", hint="`aira identity new --roster FILE` begins one"
+            str(path), f"it can't be read: {error.strerror}", hint="`aira identity new --roster FILE` creates one"
         ) from None
     except UnicodeDecodeError:
         raise RosterError(str(path), "it is not UTF-8 text") from None
@@ -80,7 +179,7 @@ def read_roster(path: Path) -> Roster:
 
 
 def roster_from(text: str, *, where: str) -> Roster:
-    """The roster that a TOML text holds, checked. Raises `RosterError`; `where` is what it calls the text."""
+    """Parse and check a roster. Raises `RosterError`; `where` names the text in errors."""
     try:
         roster = msgspec.convert(tomllib.loads(text), Roster)
     except tomllib.TOMLDecodeError as error:
@@ -97,16 +196,16 @@ def roster_from(text: str, *, where: str) -> Roster:
 
 
 def entry_of(member: Member) -> str:
-    """The lines of a roster for a member."""
+    """The TOML of a member's entry."""
     fields: dict[str, Any] = {"name": member.name, "address": member.address, "roles": list(member.roles)}
     fields |= {name: text for name in ("agent", "device", "fingerprint") if (text := getattr(member, name))}
-    # A JSON text or list of plain texts is one of TOML, too.
+    # JSON strings and lists of strings are valid TOML.
     lines = (f"{name} = {msgspec.json.encode(value).decode()}" for name, value in fields.items())
     return "\n".join(("[[member]]", *lines, ""))
 
 
 def _checked(member: Member, where: str) -> Member:
-    """The same in canonical form."""
+    """The member in canonical form. Raises `RosterError`."""
     where = f"{where}, member {member.name!r}"
     if not member.roles:
         raise RosterError(where, "it has no role", hint=f"roles are {', '.join(ROLES)}")
@@ -120,7 +219,7 @@ def _checked(member: Member, where: str) -> Member:
     except (InvalidAddress, InvalidKey) as error:
         raise RosterError(where, str(error)) from None
     if "edge" not in member.roles and (member.agent or member.device):
-        raise RosterError(where, "only one with the role edge serves a device of an agent")
+        raise RosterError(where, "only a member with the role edge serves a device of an agent")
     return msgspec.structs.replace(member, address=address, agent=agent, device=device, fingerprint=fingerprint)
 
 
@@ -133,7 +232,7 @@ def _check_unique(where: str, what: str, texts: Iterable[str]) -> None:
 
 
 def _explained(where: str, error: str) -> RosterError:
-    """msgspec's complaint, and where it is: `$.member[1].roles[0]`, counted from one."""
+    """msgspec's error, with its place (`$.member[1].roles[0]`) counted from one."""
     why, _, path = error.partition(" - at `$.")
     place = re.sub(r"\[(\d+)\]", lambda found: f" {int(found[1]) + 1}", path.rstrip("`")).replace(".", ", ")
     hint = f"roles are {', '.join(ROLES)}" if "enum value" in why else ""

@@ -1,32 +1,39 @@
-"""A site's router, from the settings and the roster: as this program runs it, and as `zenohd` does."""
+"""A site's router: its configuration from settings and roster, and whether it admits an identity."""
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
+from contextlib import ExitStack
 from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from mesh.errors import ConfigurationError
+from mesh.errors import ConfigurationError, RemoteError
+from mesh.identity.access_rules import access_control
 from mesh.identity.roster import read_roster
-from mesh.identity.zenoh_rules import access_control
-from mesh.network import Tls
+from mesh.network import Network, Tls, call_in_loop
 from mesh.network.endpoints import Endpoints, check_locators
+from schemas.keys import DeviceTopicKey
 
 if TYPE_CHECKING:
+    import zenoh
+
     from mesh.settings import Settings
 
 HOST: Final = re.compile(r"\w+/(?:\[(?P<six>[^\]]+)\]|(?P<host>[^:]*)):")
 LOCAL: Final = ("unixsock-stream/", "unixpipe/")
-"""How locators begin that only this machine reaches."""
+"""Prefixes of locators that only this machine can reach."""
+FORWARD_TIMEOUT: Final = 5.0
+"""Seconds in which a router would have forwarded a subscription that it allows."""
 
 
 def router_endpoints(settings: Settings) -> Endpoints:
-    """Where a site's router listens, as whom, and who may do what there.
+    """The endpoints of a site's router: addresses, certificate, access rules.
 
-    With a roster it listens on `tls/` only, and lets in who has a certificate of the site. Without one it listens on
-    loopback only. Raises `ConfigurationError`.
+    With a roster it listens on `tls/` only and admits certificates of the site. Without one it listens on loopback
+    only. Raises `ConfigurationError`.
     """
     if not settings.roster:
         check_loopback((*settings.listen, *settings.link))
@@ -35,7 +42,7 @@ def router_endpoints(settings: Settings) -> Endpoints:
     for locator in (*settings.listen, *settings.link):
         if not locator.startswith("tls/"):
             raise ConfigurationError(
-                f"{locator} does not tell who connects, and there is a roster", hint="write it as tls/HOST:PORT"
+                f"with a roster, {locator} can't be used: it does not identify who connects", hint="use tls/HOST:PORT"
             )
     tls = Tls.from_settings(settings)
     if tls is None:
@@ -48,18 +55,18 @@ def router_endpoints(settings: Settings) -> Endpoints:
 
 
 def check_loopback(listen: tuple[str, ...]) -> None:
-    """Raise `ConfigurationError` for a locator that other machines reach, and for what is none."""
+    """Raise `ConfigurationError` for a malformed locator, and for one that other machines can reach."""
     check_locators(*listen)
     for locator in listen:
         if not is_loopback(locator):
             raise ConfigurationError(
                 f"without a roster a router listens on loopback only, and {locator} is open to everybody",
-                hint="listen on tcp/127.0.0.1:7447, or give --roster; `aira identity new --roster FILE` begins one",
+                hint="listen on tcp/127.0.0.1:7447, or give --roster; `aira identity new --roster FILE` creates one",
             )
 
 
 def is_loopback(locator: str) -> bool:
-    """Whether only this machine reaches a locator."""
+    """Whether only this machine can reach a locator."""
     if locator.startswith(LOCAL):
         return True
     place = HOST.match(locator)
@@ -73,7 +80,7 @@ def is_loopback(locator: str) -> bool:
 
 
 def zenohd_configuration(endpoints: Endpoints) -> str:
-    """The same router as a configuration file (JSON5) of `zenohd`. Raises `ConfigurationError` for what can't work."""
+    """The router as a configuration file (JSON5) of `zenohd`. Raises `ConfigurationError` if it can't work."""
     endpoints.config()
     nested: dict[str, Any] = {}
     for path, value in endpoints.options().items():
@@ -84,3 +91,45 @@ def zenohd_configuration(endpoints: Endpoints) -> str:
         section[name] = value
     heading = "// Made by `aira router config`; zenohd reads it when it starts: zenohd --config FILE\n"
     return heading + json.dumps(nested, indent=2) + "\n"
+
+
+class IdentityDenied(RemoteError):
+    """A router accepts this identity's certificate but denies all its operations."""
+
+    code = "identity-denied"
+
+    def __init__(self, address: str) -> None:
+        super().__init__(
+            f"the router accepts {address} but denies all its operations: it is not in the roster, or revoked",
+            hint="ask the site's operator; `aira router acl --check --roster FILE` says who may do what",
+        )
+        self.address = address
+
+
+async def check_admission(endpoints: Endpoints, address: str, *, agent: str = "", device: str = "") -> None:
+    """Return when the router has admitted this identity and forwards its messages.
+
+    A router does not report a denial, so this subscribes to a key below the own address, which every role but `edge`
+    may do; an edge agent subscribes below the device `device` of the agent at `agent`. Raises `IdentityDenied`,
+    `NotAdmitted`, `NetworkUnavailable`, `InvalidKey`.
+    """
+    keys = [str(DeviceTopicKey(address, "check", "/check"))]
+    if agent:
+        keys.append(str(DeviceTopicKey(agent, device, "/check")))
+    async with Network(endpoints) as reader, Network(endpoints) as writer:
+        with ExitStack() as declared:
+            admitted, loop = asyncio.Event(), asyncio.get_running_loop()
+
+            def changed(status: zenoh.MatchingStatus) -> None:
+                if status.matching:
+                    call_in_loop(loop, admitted.set)
+
+            for key in keys:
+                publisher = declared.enter_context(writer.session.declare_publisher(key))
+                publisher.declare_matching_listener(changed)
+                declared.enter_context(reader.session.declare_subscriber(key, lambda sample: None))
+            try:
+                async with asyncio.timeout(FORWARD_TIMEOUT):
+                    await admitted.wait()
+            except TimeoutError:
+                raise IdentityDenied(address) from None

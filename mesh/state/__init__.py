@@ -1,26 +1,26 @@
-"""The state of agents as a whole: looked at, backed up while they run, restored."""
+"""The state of the agents of a data folder: list it, back it up while they run, restore it."""
 
-from mesh.state.archive import About
-from mesh.state.backup import BackedUp, Extent, back_up
-from mesh.state.errors import ArchiveUnusable, NoState, StateExists, StateInUse, StateRestless
+from mesh.state.archive import ArchiveInfo
+from mesh.state.backup import BackupReport, ContentScope, back_up
 from mesh.state.inventory import AccountState, ArchiveContents, ChainState, Inventory, examine_archive, take_inventory
-from mesh.state.restoring import Existing, Restored, restore
+from mesh.state.layout import ArchiveUnusable, NoState, StateChanging, StateExists, StateInUse
+from mesh.state.restoring import ExistingState, RestoreReport, restore
 
 __all__ = [
-    "About",
     "AccountState",
     "ArchiveContents",
+    "ArchiveInfo",
     "ArchiveUnusable",
-    "BackedUp",
+    "BackupReport",
     "ChainState",
-    "Existing",
-    "Extent",
+    "ContentScope",
+    "ExistingState",
     "Inventory",
     "NoState",
-    "Restored",
+    "RestoreReport",
+    "StateChanging",
     "StateExists",
     "StateInUse",
-    "StateRestless",
     "back_up",
     "examine_archive",
     "restore",

@@ -1,8 +1,7 @@
 """The file of a backup: a tar (ustar, regular files only) in one zstd frame, which `tar --zstd` lists and unpacks.
 
-`state.json` is its first member and says of which format it is, `checksums.json` its last, with the SHA-256 of all
-others; so a file that was cut is told from a whole one. Reading takes 512 bytes for a header and no more, so that a
-stranger's file can't ask for memory.
+Its first member, `state.json`, names the format; its last, `checksums.json`, has the SHA-256 of all others, so that a
+truncated file is noticed. A header takes 512 bytes to read and no more, so that a hostile file can't exhaust memory.
 """
 
 from __future__ import annotations
@@ -18,10 +17,10 @@ import zstandard
 
 from mesh.content.files import raising_store_full, sync_directory
 from mesh.errors import ConfigurationError
-from mesh.state.errors import ArchiveUnusable
-from mesh.state.layout import is_part, part_of
+from mesh.state.layout import ArchiveUnusable, is_part, part_of
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from contextlib import AbstractContextManager
     from pathlib import Path
     from types import TracebackType
@@ -32,15 +31,15 @@ FORMAT: Final = 1
 ABOUT: Final = "state.json"
 CHECKSUMS: Final = "checksums.json"
 LARGEST_TEXT: Final = 64 << 20
-"""Bytes that `state.json` and `checksums.json` have at most: a quarter of a million files."""
+"""Most bytes of `state.json` and `checksums.json`: enough for a quarter of a million files."""
 DIGITS: Final = 64
-"""Of a SHA-256 in `checksums.json`."""
+"""Digits of a SHA-256 in `checksums.json`."""
 PIECE: Final = 1 << 20
 """Bytes read and written at once."""
 
 
-class About(msgspec.Struct, frozen=True, kw_only=True):
-    """What a backup says of itself. `made` is when (ISO 8601), `content` which files by CID it has along."""
+class ArchiveInfo(msgspec.Struct, frozen=True, kw_only=True):
+    """The description in a backup. `made` is its time (ISO 8601), `content` says which content files are included."""
 
     format: int
     made: str
@@ -50,36 +49,30 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Sink(Protocol):
-    """Where the bytes of one member go."""
+    """Takes the bytes of one member."""
 
     def write(self, data: bytes, /) -> object: ...
-
-
-class Keep(Protocol):
-    """What to do with a member of that name and size in bytes: where its bytes go, until it is left."""
-
-    def __call__(self, name: str, size: int, /) -> AbstractContextManager[Sink]: ...
 
 
 class ArchiveWriter:
     """Writes the backup at `path`: `with ArchiveWriter(path, about) as archive`, then `add`.
 
-    It is readable by its owner only, and appears whole when the block ends without an error, or not at all. Raises
-    `StoreFull`, and `ConfigurationError` where it can't be written.
+    Only its owner can read it. It appears when the block ends without an error, complete, or not at all. Raises
+    `StoreFull`, and `ConfigurationError` if it can't be written.
     """
 
-    def __init__(self, path: Path, about: About) -> None:
+    def __init__(self, path: Path, about: ArchiveInfo) -> None:
         self._path = path
         self._temporary = path.with_name(f".{path.name}.{os.getpid()}")
         self.about: Final = about
         self._sums: dict[str, str] = {}
         self.size = 0
-        """Bytes of the whole file, once it is there."""
+        """Bytes of the complete file; 0 before."""
 
     def __enter__(self) -> Self:
         try:
             with suppress(FileNotFoundError):
-                self._temporary.unlink()  # in a folder of all, such as /tmp, what is there may be a stranger's
+                self._temporary.unlink()  # in a shared folder such as /tmp it may belong to another user
             descriptor = os.open(self._temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         except OSError as error:
             raise ConfigurationError(f"can't write {self._path}: {error.strerror}") from None
@@ -101,7 +94,7 @@ class ArchiveWriter:
                 self._temporary.unlink()
 
     def add(self, name: str, source: BinaryIO, *, size: int) -> None:
-        """Add the next `size` bytes of `source`. Raises `ConfigurationError` where it has fewer."""
+        """Add the next `size` bytes of `source`. Raises `ConfigurationError` if it has fewer."""
         digest, left = hashlib.sha256(), size
         with raising_store_full(self._path.parent):
             self._begin(name, size)
@@ -120,7 +113,7 @@ class ArchiveWriter:
         if len(sums) > LARGEST_TEXT:
             raise ConfigurationError(
                 f"{len(self._sums):,} files are more than a backup can list",
-                hint="leave content out that is fetched again anyway: --content needed, or none",
+                hint="leave out content that agents can fetch again: --content needed, or none",
             )
         self._add_text(CHECKSUMS, sums)
         self._stream.write(bytes(2 * tarfile.BLOCKSIZE))
@@ -141,33 +134,34 @@ class ArchiveWriter:
         header.size, header.mode = size, 0o600
         try:
             self._stream.write(header.tobuf(tarfile.USTAR_FORMAT))
-        except ValueError as error:  # of 8 GiB and more, which no file of an agent is
+        except ValueError as error:  # 8 GiB or more, larger than any file of an agent
             raise ConfigurationError(f"{name} can't be backed up: {error}") from None
 
     def _pad(self, size: int) -> None:
         self._stream.write(bytes(-size % tarfile.BLOCKSIZE))
 
 
-def read_about(path: Path) -> About:
-    """What a backup says of itself; the rest of it is not looked at. Raises `ArchiveUnusable`."""
-    with _Reading(path) as reading:
+def read_info(path: Path) -> ArchiveInfo:
+    """Read the description of a backup and nothing else. Raises `ArchiveUnusable`."""
+    with _ArchiveReader(path) as reading:
         return reading.about()
 
 
-def read_archive(path: Path, keep: Keep) -> About:
-    """Hand every file of a backup to `keep`, and return what it says of itself once all is found to be as it was made.
+def read_archive(path: Path, open_sink: Callable[[str, int], AbstractContextManager[Sink]]) -> ArchiveInfo:
+    """Write every file of a backup to the sink that `open_sink(name, size)` opens, and return the description.
 
-    Names are those of a state and no others, each once. Raises `ArchiveUnusable`; what was kept is then worth nothing.
+    Names are files of a state, each once. Checksums are compared at the end. Raises `ArchiveUnusable`; what was written
+    must not be used then.
     """
-    with _Reading(path) as reading:
+    with _ArchiveReader(path) as reading:
         about, sums, listed = reading.about(), {}, 0
         while (header := reading.header()).name != CHECKSUMS:
             if part_of(header.name) not in about.parts or header.name in sums:
-                raise ArchiveUnusable(path, f"it holds {header.name[:200]!r}, which is no part of a state")
+                raise ArchiveUnusable(path, f"it contains {header.name[:200]!r}, which is no part of a state")
             listed += len(header.name) + DIGITS
             if listed > LARGEST_TEXT:
                 raise ArchiveUnusable(path, "it holds more files than its checksums could list")
-            with keep(header.name, header.size) as sink:
+            with open_sink(header.name, header.size) as sink:
                 sums[header.name] = reading.copy(header.size, sink)
         text = reading.text(header)
         reading.end()
@@ -178,8 +172,8 @@ def read_archive(path: Path, keep: Keep) -> About:
         return about
 
 
-class _Reading:
-    """A backup's members in their order."""
+class _ArchiveReader:
+    """Reads a backup's members in order."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -195,7 +189,7 @@ class _Reading:
     def __exit__(self, *exc_info: object) -> None:
         self._file.close()
 
-    def about(self) -> About:
+    def about(self) -> ArchiveInfo:
         """The first member."""
         header = self.header()
         if header.name != ABOUT:
@@ -205,13 +199,13 @@ class _Reading:
         if stated != FORMAT:
             why = f"it was written by another version (format {str(stated)[:20]}, this one knows {FORMAT})"
             raise ArchiveUnusable(self._path, why, hint="use the aira-mesh that made it, or a newer one")
-        about = self.decoded(text, About)
+        about = self.decoded(text, ArchiveInfo)
         if not all(is_part(part) for part in about.parts) or len(set(about.parts)) < len(about.parts):
-            raise ArchiveUnusable(self._path, "it says that it has parts which no state has")
+            raise ArchiveUnusable(self._path, "it claims parts that no state has")
         return about
 
     def header(self) -> tarfile.TarInfo:
-        """Of the next member, a regular file."""
+        """The header of the next member, a regular file."""
         block = self._read(tarfile.BLOCKSIZE)
         try:
             header = tarfile.TarInfo.frombuf(block, "utf-8", "surrogateescape")
@@ -222,7 +216,7 @@ class _Reading:
         return header
 
     def text(self, header: tarfile.TarInfo) -> bytes:
-        """The bytes of a member that is read as a whole."""
+        """All bytes of a member."""
         if header.size > LARGEST_TEXT:
             raise ArchiveUnusable(self._path, f"{header.name} in it is too long")
         text = self._read(header.size)
@@ -230,14 +224,14 @@ class _Reading:
         return text
 
     def decoded(self, text: bytes, kind: type[T]) -> T:
-        """What a member's JSON says."""
+        """Decode a member's JSON."""
         try:
             return msgspec.json.decode(text, type=kind)
         except (msgspec.MsgspecError, UnicodeDecodeError) as error:
             raise ArchiveUnusable(self._path, f"it is damaged: {error}") from None
 
     def copy(self, size: int, sink: Sink) -> str:
-        """Write the bytes of a member; gives their SHA-256."""
+        """Write the bytes of a member to `sink`; returns their SHA-256."""
         digest, left = hashlib.sha256(), size
         while left:
             data = self._read(min(left, PIECE))
@@ -248,7 +242,7 @@ class _Reading:
         return digest.hexdigest()
 
     def end(self) -> None:
-        """See that nothing follows; the frame's own checksum is compared here."""
+        """Check that nothing follows. This also compares the checksum of the zstd frame."""
         try:
             rest = self._read(2 * tarfile.BLOCKSIZE) + self._stream.read(1)
         except zstandard.ZstdError as error:
@@ -257,7 +251,7 @@ class _Reading:
             raise ArchiveUnusable(self._path, "something follows its end")
 
     def _read(self, size: int) -> bytes:
-        """Exactly so many bytes."""
+        """Exactly `size` bytes."""
         pieces, left = [], size
         while left:
             try:

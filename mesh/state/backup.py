@@ -1,9 +1,9 @@
-"""Backing up the state of all agents of a data folder, while they run.
+"""Back up the state of all agents of a data folder while they run.
 
-A ledger is copied as it is at one moment; then the recordings of the jobs that run are opened; then the ledger is
-copied again, to see that these jobs run still. If not, all is done anew: so no ledger that says "running" comes without
-what the job has recorded. From the open files as much is read as they had then, whatever becomes of them meanwhile. A
-restored agent finds what a crash at that moment would have left.
+A ledger is copied as it is at one moment. Then the recordings of its running jobs are opened, and the ledger is copied
+again to check that these jobs are still running. If not, all is repeated: a job that the backup calls running always
+comes with its recording. Of the open files as many bytes are read as they had then. A restored agent finds what a crash
+at that moment would have left.
 """
 
 from __future__ import annotations
@@ -21,26 +21,36 @@ from typing import TYPE_CHECKING, BinaryIO, Final, TypeAlias
 
 import mesh
 from mesh.content import Store
-from mesh.state.archive import FORMAT, About, ArchiveWriter
-from mesh.state.errors import NoState, StateRestless
-from mesh.state.layout import LEDGER, RECORDINGS, STAGES, homes_in, part_of, parts_in, pin_name, transactions_in
-from mesh.state.ledgers import copy_ledger, read_ledger
+from mesh.state.archive import FORMAT, ArchiveInfo, ArchiveWriter
+from mesh.state.inventory import copy_ledger, read_ledger
+from mesh.state.layout import (
+    LEDGER,
+    RECORDINGS,
+    STAGES,
+    NoState,
+    StateChanging,
+    account_folders,
+    part_of,
+    parts_in,
+    pin_name,
+    transactions_in,
+)
 from mesh.work import Phase
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from mesh.state.layout import Home
-    from mesh.state.ledgers import LedgerFacts
+    from mesh.state.inventory import LedgerFacts
+    from mesh.state.layout import AccountFolder
 
 TRIES: Final = 10
 
-Opened: TypeAlias = "tuple[Path, BinaryIO]"
-"""Where a file belongs in the data folder, and what to read it from."""
+OpenFile: TypeAlias = "tuple[Path, BinaryIO]"
+"""A file's path in the data folder, and the open file to read it from."""
 
 
-class Extent(StrEnum):
-    """Which files by CID go along."""
+class ContentScope(StrEnum):
+    """Which content files are included."""
 
     NEEDED = "needed"
     """Those that are pinned, and the objectives and results of unfinished jobs and waiting orders."""
@@ -49,10 +59,10 @@ class Extent(StrEnum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class BackedUp:
-    """What a backup has: the accounts, jobs that are not finalized, files by CID; how large it is, in bytes.
+class BackupReport:
+    """What a backup contains: the accounts, the number of unfinalized jobs and of content files; its size in bytes.
 
-    `missing` are CIDs that jobs need and the store does not hold (or not whole): they are fetched again in time.
+    `missing` are CIDs that jobs need and the store does not have (or not intact): agents fetch them again.
     """
 
     accounts: tuple[str, ...]
@@ -62,43 +72,43 @@ class BackedUp:
     size: int
 
 
-async def back_up(folder: Path, target: Path, *, content: Extent) -> BackedUp:
-    """Write the state of all agents of the data folder to the file `target`, replacing it in the end.
+async def back_up(folder: Path, target: Path, *, content: ContentScope) -> BackupReport:
+    """Write the state of all agents of the data folder to the file `target`, which is replaced only at the end.
 
-    Raises `NoState`, `LedgerUnusable`, `StateRestless`, `StoreFull` and `ConfigurationError`; `target` is then as it
+    Raises `NoState`, `LedgerUnusable`, `StateChanging`, `StoreFull` and `ConfigurationError`; `target` is then as it
     was.
     """
     if not parts_in(folder):
         raise NoState(folder)
-    about = About(
+    about = ArchiveInfo(
         format=FORMAT,
         made=datetime.now(UTC).isoformat(timespec="seconds"),
         software=f"aira-mesh {mesh.__version__}",
         content=content,
         parts=parts_in(folder),
     )
-    homes = homes_in(folder)
+    homes = account_folders(folder)
     with (
         ArchiveWriter(target, about) as archive,
         tempfile.TemporaryDirectory(prefix=".aira-state-", dir=target.parent) as scratch,
     ):
-        copying = _Copying(archive, Path(scratch), content)
+        writer = _BackupWriter(archive, Path(scratch), content)
         for home in homes:
-            await copying.home(home)
-        await asyncio.to_thread(copying.transactions, folder)
-    return BackedUp(
+            await writer.home(home)
+        await asyncio.to_thread(writer.transactions, folder)
+    return BackupReport(
         accounts=tuple(home.address for home in homes),
-        jobs=copying.jobs,
-        files=copying.files,
-        missing=tuple(sorted(copying.missing)),
+        jobs=writer.jobs,
+        files=writer.files,
+        missing=tuple(sorted(writer.missing)),
         size=archive.size,
     )
 
 
-class _Copying:
-    """Fills one archive, and counts what it takes."""
+class _BackupWriter:
+    """Adds files to an archive and counts them."""
 
-    def __init__(self, archive: ArchiveWriter, scratch: Path, content: Extent) -> None:
+    def __init__(self, archive: ArchiveWriter, scratch: Path, content: ContentScope) -> None:
         self._archive = archive
         self._scratch = scratch
         self._content = content
@@ -106,43 +116,43 @@ class _Copying:
         self.files = 0
         self.missing: set[str] = set()
 
-    async def home(self, home: Home) -> None:
-        """Take all of an account but its transactions."""
+    async def home(self, home: AccountFolder) -> None:
+        """Add all of an account except its transactions."""
         wanted: set[str] = set()
         for chain in home.chains:
             with ExitStack() as opened:
-                facts, files = await self._settled(chain, opened)
+                facts, files = await self._consistent(chain, opened)
                 for file in files:
                     await asyncio.to_thread(self._add, home.folder.parent, *file)
             self.jobs += len(facts.jobs)
             wanted |= _needed(facts)
-        if self._content is not Extent.NONE and home.content.is_dir():
+        if self._content is not ContentScope.NONE and home.content.is_dir():
             await asyncio.to_thread(self._add_content, home, wanted)
 
     def transactions(self, folder: Path) -> None:
-        """Take what was sent and is not settled; what is settled just now is left out."""
+        """Add pending transactions, without those that are settled meanwhile."""
         for path in transactions_in(folder):
             with suppress(FileNotFoundError), path.open("rb") as file:
                 self._add(folder, path, file)
 
-    async def _settled(self, chain: Path, opened: ExitStack) -> tuple[LedgerFacts, list[Opened]]:
-        """What the ledger of a chain's folder holds, its copy and the recordings that belong to it, open."""
+    async def _consistent(self, chain: Path, opened: ExitStack) -> tuple[LedgerFacts, list[OpenFile]]:
+        """The contents of a chain's ledger, and its copy and the matching recordings as open files."""
         ledger, copy, later = chain / LEDGER, self._scratch / LEDGER, self._scratch / f"later-{LEDGER}"
         for _ in range(TRIES):
             facts = await _copied(ledger, copy)
             with ExitStack() as stack:
-                files: list[Opened] = [(ledger, stack.enter_context(copy.open("rb")))]
+                files: list[OpenFile] = [(ledger, stack.enter_context(copy.open("rb")))]
                 running = [address for address, job in facts.jobs.items() if job.phase is Phase.RUNNING]
                 files += _recordings(chain, running, stack)
-                if _runs_still(running, facts, await _copied(ledger, later)):
+                if _still_running(running, facts, await _copied(ledger, later)):
                     opened.enter_context(stack.pop_all())
                     return facts, files
-        raise StateRestless(chain)
+        raise StateChanging(chain)
 
-    def _add_content(self, home: Home, needed: set[str]) -> None:
+    def _add_content(self, home: AccountFolder, needed: set[str]) -> None:
         with Store(home.content) as store:
             pins = store.pins()
-            wanted = set(store.list()) if self._content is Extent.ALL else {*needed, *pins}
+            wanted = set(store.list()) if self._content is ContentScope.ALL else {*needed, *pins}
             for cid in sorted(wanted):
                 if (path := store.checked(cid)) is None:
                     continue
@@ -154,23 +164,23 @@ class _Copying:
             self.missing |= needed - set(store.list())
 
     def _add(self, folder: Path, path: Path, file: BinaryIO) -> None:
-        """Add what an open file holds now, under its place in the data folder."""
+        """Add what an open file holds now, named by its path in the data folder."""
         name = path.relative_to(folder).as_posix()
-        if part_of(name) in self._archive.about.parts:  # another part began to be only after the backup
+        if part_of(name) in self._archive.about.parts:  # a part that was created after the backup began is left out
             size = file.seek(0, os.SEEK_END)
             file.seek(0)
             self._archive.add(name, file, size=size)
 
 
 async def _copied(ledger: Path, copy: Path) -> LedgerFacts:
-    """Copy a ledger over an earlier copy, and say what it holds."""
+    """Copy a ledger over an earlier copy, and read it."""
     await asyncio.to_thread(copy_ledger, ledger, copy)
     return await read_ledger(copy)
 
 
-def _recordings(chain: Path, running: Iterable[str], opened: ExitStack) -> list[Opened]:
-    """The files of these jobs' recordings, in whichever stage they are, open."""
-    found: list[Opened] = []
+def _recordings(chain: Path, running: Iterable[str], opened: ExitStack) -> list[OpenFile]:
+    """The recordings of these jobs as open files, whatever their suffix."""
+    found: list[OpenFile] = []
     for address in running:
         for stage in STAGES:
             path = chain / RECORDINGS / f"{address}{stage}"
@@ -179,8 +189,8 @@ def _recordings(chain: Path, running: Iterable[str], opened: ExitStack) -> list[
     return found
 
 
-def _runs_still(running: Iterable[str], before: LedgerFacts, after: LedgerFacts) -> bool:
-    """Whether these jobs have neither ended nor begun anew between two looks."""
+def _still_running(running: Iterable[str], before: LedgerFacts, after: LedgerFacts) -> bool:
+    """Whether these jobs have neither ended nor restarted between two copies."""
     return all(
         (job := after.jobs.get(address)) is not None
         and job.phase is Phase.RUNNING
@@ -190,6 +200,6 @@ def _runs_still(running: Iterable[str], before: LedgerFacts, after: LedgerFacts)
 
 
 def _needed(facts: LedgerFacts) -> set[str]:
-    """The CIDs without which the jobs and orders of a ledger can't go on."""
+    """The CIDs that the jobs and orders of a ledger need."""
     results = {job.result for job in facts.jobs.values() if job.result}
     return {*facts.ordered, *results, *(job.liability.objective for job in facts.jobs.values())}

@@ -1,12 +1,14 @@
-"""What a data folder, or a backup, holds of agents: for people who look before they act."""
+"""What a data folder or a backup contains: its ledgers (as files that agents may be using), content, transactions."""
 
 from __future__ import annotations
 
 import asyncio
 import io
+import sqlite3
 import tempfile
 from collections import Counter
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -14,23 +16,48 @@ import msgspec
 
 from mesh.content import Store
 from mesh.content.recovery import is_in_use
+from mesh.errors import ConfigurationError
 from mesh.state.archive import read_archive
-from mesh.state.errors import NoState
-from mesh.state.layout import LEDGER, PINS, RECORDINGS, homes_in, parts_in, transactions_in
-from mesh.state.ledgers import copy_ledger, read_ledger
+from mesh.state.layout import LEDGER, PINS, RECORDINGS, NoState, StateInUse, account_folders, parts_in, transactions_in
+from mesh.work import Ledger
+from mesh.work.database import VERSION, LedgerUnusable
+from mesh.work.lifecycle import UNFINISHED
+from schemas import Demand, Offer, decode
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
-    from mesh.state.archive import About
-    from mesh.state.layout import Home
+    from mesh.state.archive import ArchiveInfo
+    from mesh.state.layout import AccountFolder
+    from mesh.work import JobRecord
 
 _KINDS: Final = {LEDGER: "ledgers", "mcap": "recordings", "jsonl": "transactions"}
+ACTIVE: Final = (
+    "SELECT CASE type WHEN 'table' THEN 'virtual table' ELSE type END FROM sqlite_master"
+    " WHERE type IN ('view', 'trigger') OR sql LIKE 'CREATE VIRTUAL%'"
+)
+"""Finds what would run code when a foreign ledger is read or written."""
+CURSOR: Final = "listener"
+"""`mesh.agent.listener.ChainListener.CURSOR`, whose module loads web3."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LedgerFacts:
+    """What a ledger holds at one moment. `block` is the last one handled, None before the first."""
+
+    jobs: Mapping[str, JobRecord]
+    """Jobs that are not finalized, by the address of their liability."""
+    phases: Mapping[str, int]
+    block: int | None
+    waiting: int
+    """Messages in the outbox."""
+    ordered: frozenset[str]
+    """CIDs of the objectives of the orders in the outbox."""
 
 
 class ChainState(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
     """An account's state on one chain. `block` is the last one handled, None before the first; `waiting` messages are
-    in the outbox, and so many `recordings` under way."""
+    in the outbox, and `recordings` are being written."""
 
     chain: str
     block: int | None
@@ -40,7 +67,7 @@ class ChainState(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
 
 
 class AccountState(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
-    """An account's state. Of its content the number of files, their bytes, and those of pinned ones."""
+    """An account's state, with the number of its content files, their bytes, and the bytes of pinned ones."""
 
     address: str
     in_use: bool
@@ -51,7 +78,7 @@ class AccountState(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
 
 
 class Inventory(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
-    """A data folder. `transactions` of all its accounts were sent and are not settled."""
+    """A data folder. `transactions` counts the files of pending transactions of all accounts."""
 
     folder: str
     accounts: tuple[AccountState, ...]
@@ -59,7 +86,7 @@ class Inventory(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
 
 
 class ArchiveContents(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
-    """A backup that is whole: what it says of itself, how many files of each kind it has, and their bytes."""
+    """A complete backup: its description, the number of files of each kind, and their bytes."""
 
     made: str
     software: str
@@ -69,13 +96,82 @@ class ArchiveContents(msgspec.Struct, frozen=True, kw_only=True, rename="camel")
     bytes: int
 
 
+def copy_ledger(ledger: Path, copy: Path) -> None:
+    """Copy a ledger as it is at this moment, even while an agent writes it. Replaces an earlier copy.
+
+    Raises `LedgerUnusable`, and `ConfigurationError` if a newer version wrote it.
+    """
+    try:
+        with closing(sqlite3.connect(f"{ledger.resolve().as_uri()}?mode=ro", uri=True)) as source:
+            _check_version(source, ledger)
+            copy.unlink(missing_ok=True)
+            with closing(sqlite3.connect(copy)) as target:
+                source.backup(target)
+                target.execute("PRAGMA journal_mode = DELETE")  # one file, without a log beside it
+    except sqlite3.Error as error:
+        raise LedgerUnusable(ledger, error) from None
+
+
+def check_ledger(ledger: Path) -> None:
+    """Raise `LedgerUnusable` for a ledger that is damaged or has more than tables, `ConfigurationError` if a newer
+    version wrote it."""
+    try:
+        with closing(sqlite3.connect(ledger)) as database:
+            (found,) = database.execute("PRAGMA integrity_check(1)").fetchone()
+            if found != "ok":
+                raise LedgerUnusable(ledger, found)
+            _check_version(database, ledger)
+            if (kind := database.execute(ACTIVE).fetchone()) is not None:
+                raise LedgerUnusable(ledger, f"it contains a {kind[0]}, which no ledger has")
+    except sqlite3.Error as error:
+        raise LedgerUnusable(ledger, error) from None
+
+
+async def read_ledger(copy: Path) -> LedgerFacts:
+    """What a copy of a ledger holds."""
+    async with Ledger(copy) as ledger:
+        waiting = [decode(one.payload) for one in await ledger.outbox(head=0)]
+        return LedgerFacts(
+            jobs={job.liability.address: job for job in await ledger.jobs(UNFINISHED)},
+            phases=await ledger.jobs_by_phase(),
+            block=await ledger.cursor(CURSOR),
+            waiting=len(waiting),
+            ordered=frozenset(order.objective for order in waiting if isinstance(order, Demand | Offer)),
+        )
+
+
+@contextmanager
+def locked_ledger(ledger: Path) -> Iterator[None]:
+    """Lock a ledger, so that no agent can open it. Raises `StateInUse` if one has it open, `LedgerUnusable`."""
+    with closing(sqlite3.connect(ledger, timeout=0, isolation_level=None)) as database:
+        try:
+            database.execute("PRAGMA locking_mode = EXCLUSIVE")
+            database.execute("BEGIN EXCLUSIVE")
+        except sqlite3.OperationalError as error:
+            if getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_BUSY:
+                raise StateInUse(ledger) from None
+            raise LedgerUnusable(ledger, error) from None
+        except sqlite3.DatabaseError:
+            pass  # no ledger, or a damaged one: no agent works with it
+        yield
+
+
+def _check_version(database: sqlite3.Connection, ledger: Path) -> None:
+    (version,) = database.execute("PRAGMA user_version").fetchone()
+    if version > VERSION:
+        raise ConfigurationError(
+            f"the ledger {ledger} was written by a newer version (format {version}, this one knows {VERSION})",
+            hint="upgrade aira-mesh",
+        )
+
+
 async def take_inventory(folder: Path) -> Inventory:
-    """Look at a data folder, whose agents may run. Raises `NoState`, `LedgerUnusable`, `StoreDamaged`."""
+    """List what a data folder contains; its agents may run. Raises `NoState`, `LedgerUnusable`, `StoreDamaged`."""
     if not parts_in(folder):
         raise NoState(folder)
     return Inventory(
         folder=str(folder),
-        accounts=tuple([await _account(home) for home in homes_in(folder)]),
+        accounts=tuple([await _account(home) for home in account_folders(folder)]),
         transactions=len(transactions_in(folder)),
     )
 
@@ -86,13 +182,13 @@ def examine_archive(path: Path) -> ArchiveContents:
     size = 0
 
     @contextmanager
-    def count(name: str, length: int) -> Iterator[_Nowhere]:
+    def count(name: str, length: int) -> Iterator[_NullSink]:
         nonlocal size
         kinds[_kind(name)] += 1
         size += length
-        yield _Nowhere()
+        yield _NullSink()
 
-    about: About = read_archive(path, count)
+    about: ArchiveInfo = read_archive(path, count)
     return ArchiveContents(
         made=about.made,
         software=about.software,
@@ -103,22 +199,22 @@ def examine_archive(path: Path) -> ArchiveContents:
     )
 
 
-class _Nowhere(io.RawIOBase):
-    """Takes everything and keeps nothing."""
+class _NullSink(io.RawIOBase):
+    """Discards what is written."""
 
     def write(self, data: object, /) -> int:
         return 0
 
 
 def _kind(name: str) -> str:
-    """What a file of a state is, in a word."""
+    """The kind of a file of a state."""
     path = Path(name)
     if PINS in path.parts:
         return "pins"
     return next((kind for ending, kind in _KINDS.items() if ending in path.name), "content")
 
 
-async def _account(home: Home) -> AccountState:
+async def _account(home: AccountFolder) -> AccountState:
     in_use = home.content.is_dir() and is_in_use(home.content)
     chains = tuple([await _chain(folder) for folder in home.chains])
     files, size, pinned = await asyncio.to_thread(_content, home)
@@ -141,7 +237,7 @@ async def _chain(folder: Path) -> ChainState:
     )
 
 
-def _content(home: Home) -> tuple[int, int, int]:
+def _content(home: AccountFolder) -> tuple[int, int, int]:
     if not home.content.is_dir():
         return 0, 0, 0
     with Store(home.content) as store:

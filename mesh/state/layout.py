@@ -1,11 +1,11 @@
-"""What of a data folder is the state of its agents: which files, by their names. Everything else stays where it is.
+"""Which files of a data folder are the state of its agents, and the errors of the commands on it.
 
     0x…/1-5f3a…/ledger.sqlite               jobs, outbox and cursor of an account on one chain
-    0x…/1-5f3a…/recordings/0x….mcap.part    what running jobs have recorded
+    0x…/1-5f3a…/recordings/0x….mcap.part    recordings of running jobs
     0x…/content/Qm…                         files by their CID, and `.pins` beside them
-    transactions/1-5f3a…/0x…/….jsonl        transactions that were sent and are not settled
+    transactions/1-5f3a…/0x…/….jsonl        pending transactions
 
-Keyfiles and passwords have no place in there, and so none in a backup.
+Keyfiles and passwords are not part of it, and so never in a backup. Other files are left alone.
 """
 
 from __future__ import annotations
@@ -14,8 +14,10 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from mesh.errors import ConfigurationError, InputError
+
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
 LEDGER: Final = "ledger.sqlite"
@@ -24,8 +26,8 @@ CONTENT: Final = "content"
 PINS: Final = ".pins"
 TRANSACTIONS: Final = "transactions"
 STAGES: Final = (".mcap.cut", ".mcap.part", ".mcap")
-"""How the file of a recording ends while it is gone on with, made, and whole: in this order it goes from one to the
-next, so that who looks for them in it misses none."""
+"""Suffixes of a recording while it is being resumed, written, and complete. A file changes its suffix in this order, so
+a search in this order misses none."""
 
 _ADDRESS: Final = r"0x[0-9a-fA-F]{40}"
 _CHAIN: Final = r"[0-9]{1,20}-[0-9a-f]{8,64}"
@@ -40,9 +42,63 @@ _ADDRESS_NAME: Final = re.compile(_ADDRESS)
 _CHAIN_NAME: Final = re.compile(_CHAIN)
 
 
+class ArchiveUnusable(InputError):
+    """A file is no backup, is damaged, or contains unexpected files. Nothing of it was used."""
+
+    code = "archive-unusable"
+
+    def __init__(self, path: Path, why: str, *, hint: str = "take another backup; nothing was changed") -> None:
+        super().__init__(f"{path} can't be used: {why}", hint=hint)
+        self.path = path
+
+
+class StateInUse(ConfigurationError):
+    """An agent is using the state that should be replaced."""
+
+    code = "state-in-use"
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(f"{path} is in use", hint="stop the agent first")
+        self.path = path
+
+
+class StateExists(ConfigurationError):
+    """The data folder has a state already."""
+
+    code = "state-exists"
+
+    def __init__(self, folder: Path, parts: Sequence[str]) -> None:
+        super().__init__(
+            f"{folder} has a state already: {', '.join(parts)}",
+            hint="give another folder with --data-dir, or --existing set-aside to keep the old state beside the new",
+        )
+        self.folder = folder
+        self.parts = tuple(parts)
+
+
+class NoState(ConfigurationError):
+    """The data folder has no state."""
+
+    code = "state-missing"
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(f"there is no agent's state in {folder}", hint="name its folder with --data-dir")
+        self.folder = folder
+
+
+class StateChanging(ConfigurationError):
+    """Jobs started and ended faster than they could be copied."""
+
+    code = "state-changing"
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(f"the jobs of {path} change too quickly to be copied", hint="try again, or stop the agent")
+        self.path = path
+
+
 @dataclass(frozen=True)
-class Home:
-    """The folder of one account in a data folder."""
+class AccountFolder:
+    """The folder of an account in a data folder."""
 
     folder: Path
 
@@ -58,19 +114,19 @@ class Home:
 
     @property
     def chains(self) -> tuple[Path, ...]:
-        """The folders of the chains on which it has a ledger."""
+        """The folders of the chains on which the account has a ledger."""
         return tuple(
             path for path in _folders(self.folder) if _CHAIN_NAME.fullmatch(path.name) and (path / LEDGER).is_file()
         )
 
 
-def homes_in(folder: Path) -> tuple[Home, ...]:
+def account_folders(folder: Path) -> tuple[AccountFolder, ...]:
     """The accounts that have files in a data folder."""
-    return tuple(Home(path) for path in _folders(folder) if _ADDRESS_NAME.fullmatch(path.name))
+    return tuple(AccountFolder(path) for path in _folders(folder) if _ADDRESS_NAME.fullmatch(path.name))
 
 
 def transactions_in(folder: Path) -> tuple[Path, ...]:
-    """The files of transactions under way in a data folder, of all accounts."""
+    """The files of pending transactions in a data folder, of all accounts."""
     return tuple(
         path
         for path in sorted((folder / TRANSACTIONS).glob("*/*/*.jsonl"))
@@ -81,31 +137,31 @@ def transactions_in(folder: Path) -> tuple[Path, ...]:
 def parts_in(folder: Path) -> tuple[str, ...]:
     """The parts that a data folder has; see `part_of`."""
     sent = {path.parent.relative_to(folder).as_posix() for path in transactions_in(folder)}
-    return (*sorted(sent), *(home.address for home in homes_in(folder)))
+    return (*sorted(sent), *(home.address for home in account_folders(folder)))
 
 
 def part_of(name: str) -> str | None:
-    """Which part of a state a file belongs to, by its name in a backup: an account's folder, or that of its
-    transactions on one chain. None for what is no file of a state.
+    """The part of the state that a file belongs to, by its name in a backup: an account's folder, or the folder of its
+    transactions on one chain. None if it is no file of a state.
 
-    A part comes and goes as a whole. No name that this knows leads out of the folder.
+    A part is restored as a whole. No accepted name leads out of the folder.
     """
     found = _ACCOUNT_FILE.fullmatch(name) or _TRANSACTION.fullmatch(name)
     return found["part"] if found else None
 
 
 def is_part(name: str) -> bool:
-    """Whether a part of a state can be called so."""
+    """Whether this is a valid name of a part."""
     return _PART.fullmatch(name) is not None
 
 
 def pin_name(address: str, cid: str, label: str) -> str:
-    """What a pin is called in a backup: headers of a tar have no room for a file's name of 111 letters."""
+    """The name of a pin in a backup. (A tar header has no room for its file name of 111 letters.)"""
     return f"{address}/{CONTENT}/{PINS}/{cid}/{label}"
 
 
-def place_of(name: str) -> str:
-    """Where a file of a backup belongs, as a path under the data folder."""
+def path_of(name: str) -> str:
+    """The path of a backup's file under the data folder."""
     folder, pin, label = name.rpartition("/")
     return f"{folder}.{label}" if pin and f"/{CONTENT}/{PINS}/" in folder else name
 

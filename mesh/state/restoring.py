@@ -1,4 +1,4 @@
-"""Restoring a backup: everything is unpacked beside its place and examined, and only then given its name."""
+"""Restore a backup: unpack it into a temporary folder, check it, and only then rename it into place."""
 
 from __future__ import annotations
 
@@ -17,10 +17,17 @@ from typing import TYPE_CHECKING, BinaryIO, Final
 from mesh.content.files import raising_store_full, sync_directory
 from mesh.content.recovery import is_in_use
 from mesh.errors import ConfigurationError
-from mesh.state.archive import read_about, read_archive
-from mesh.state.errors import ArchiveUnusable, StateExists, StateInUse
-from mesh.state.layout import CONTENT, LEDGER, TRANSACTIONS, place_of
-from mesh.state.ledgers import check_ledger, kept_out, read_ledger
+from mesh.state.archive import read_archive, read_info
+from mesh.state.inventory import check_ledger, locked_ledger, read_ledger
+from mesh.state.layout import (
+    CONTENT,
+    LEDGER,
+    TRANSACTIONS,
+    ArchiveUnusable,
+    StateExists,
+    StateInUse,
+    path_of,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -28,25 +35,25 @@ if TYPE_CHECKING:
     from mesh.work import JobRecord
 
 STAGING: Final = ".restore-"
-"""Begins the name of the folder in which a backup is unpacked."""
+"""Prefix of the folder in which a backup is unpacked."""
 REPLACED: Final = ".replaced-"
-"""Begins the name of the folder in which a state that made room is kept."""
+"""Prefix of the folder that keeps a replaced state."""
 SPARE: Final = 64 << 20
-"""Bytes that a backup leaves free on the disk, whatever it says that it holds."""
+"""Bytes that unpacking leaves free on the disk, whatever size the backup claims."""
 
 
-class Existing(StrEnum):
-    """What becomes of a state that is where the restored one belongs."""
+class ExistingState(StrEnum):
+    """What to do with an existing state."""
 
     REFUSE = "refuse"
     SET_ASIDE = "set-aside"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Restored:
-    """What a restored state has: when it was backed up (ISO 8601), its parts, and its jobs that are not finalized.
+class RestoreReport:
+    """A restored state: when it was backed up (ISO 8601), its parts, and its jobs that are not finalized.
 
-    `aside` is where the state is that was there before.
+    `aside` is the folder that keeps the state it replaced.
     """
 
     made: str
@@ -55,16 +62,16 @@ class Restored:
     aside: Path | None
 
 
-async def restore(archive: Path, folder: Path, *, existing: Existing = Existing.REFUSE) -> Restored:
-    """Put the state in the file `archive` into the data folder, which is made if it is not there.
+async def restore(archive: Path, folder: Path, *, existing: ExistingState = ExistingState.REFUSE) -> RestoreReport:
+    """Restore the state in the file `archive` to the data folder, which is created if necessary.
 
-    A part (an account's folder, its transactions on a chain) appears whole or not at all, and when one can't be put in
-    its place, those before it are taken back. Raises `ArchiveUnusable`, `StateExists`, `StateInUse`, `LedgerUnusable`,
-    `StoreFull` and `ConfigurationError`; then all is as it was.
+    A part (an account's folder, its transactions on a chain) appears whole or not at all; if one can't be moved into
+    place, the others are moved back. Raises `ArchiveUnusable`, `StateExists`, `StateInUse`, `LedgerUnusable`,
+    `StoreFull` and `ConfigurationError`; then nothing has changed.
     """
-    about = await asyncio.to_thread(read_about, archive)
+    about = await asyncio.to_thread(read_info, archive)
     with _scratch(folder) as staging, ExitStack() as locks:
-        # First, for it takes no time; and again below, for what has come about meanwhile.
+        # A quick check first; repeated below, because agents may have started meanwhile.
         _check_free(folder, about.parts, existing, locks=None)
         await asyncio.to_thread(_unpack, archive, staging)
         parts = tuple(part for part in about.parts if (staging / part).is_dir())
@@ -75,12 +82,12 @@ async def restore(archive: Path, folder: Path, *, existing: Existing = Existing.
         await asyncio.to_thread(_sync, staging)
         there = _check_free(folder, parts, existing, locks=locks)
         aside = _exchange(staging, folder, parts, there)
-    return Restored(made=about.made, parts=parts, jobs=tuple(jobs), aside=aside)
+    return RestoreReport(made=about.made, parts=parts, jobs=tuple(jobs), aside=aside)
 
 
 @contextmanager
 def _scratch(folder: Path) -> Iterator[Path]:
-    """A folder in the data folder itself: that one may be all that can be written, as in a container."""
+    """A temporary folder in the data folder, which may be the only writable one, as in a container."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         staging = Path(tempfile.mkdtemp(prefix=STAGING, dir=folder))
@@ -103,8 +110,8 @@ def _unpack(archive: Path, staging: Path) -> None:
         nonlocal left
         left -= size
         if left < 0:
-            raise ArchiveUnusable(archive, "it needs more room than the disk has", hint="make room on that disk")
-        path = staging / place_of(name)
+            raise ArchiveUnusable(archive, "it needs more space than the disk has", hint="free some space on that disk")
+        path = staging / path_of(name)
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         with raising_store_full(staging), path.open("xb") as file:
             yield file
@@ -117,32 +124,32 @@ def _unpack(archive: Path, staging: Path) -> None:
 
 
 def _sync(staging: Path) -> None:
-    """Put the names of all that was unpacked on the disk."""
+    """Sync all unpacked directories to disk."""
     for path, _, _ in os.walk(staging):
         sync_directory(Path(path))
 
 
 def _check_free(
-    folder: Path, parts: tuple[str, ...], existing: Existing, *, locks: ExitStack | None
+    folder: Path, parts: tuple[str, ...], existing: ExistingState, *, locks: ExitStack | None
 ) -> tuple[str, ...]:
-    """Which parts are there already, and keep agents out of them as long as `locks` is open.
+    """The parts that exist already; agents are locked out of them until `locks` is closed.
 
-    Raises `StateInUse`, and `StateExists` where they are not to be set aside.
+    Raises `StateInUse`, and `StateExists` unless they should be set aside.
     """
     there = tuple(part for part in parts if (folder / part).exists())
     with ExitStack() as held:
         for part in there:
-            _keep_out(folder / part, held)
-        if there and existing is Existing.REFUSE:
+            _lock(folder / part, held)
+        if there and existing is ExistingState.REFUSE:
             raise StateExists(folder, there)
         if locks is not None:
             locks.enter_context(held.pop_all())
     return there
 
 
-def _keep_out(part: Path, held: ExitStack) -> None:
+def _lock(part: Path, held: ExitStack) -> None:
     for ledger in sorted(part.glob(f"*/{LEDGER}")):
-        held.enter_context(kept_out(ledger))
+        held.enter_context(locked_ledger(ledger))
     if (part / CONTENT).is_dir() and is_in_use(part / CONTENT):
         raise StateInUse(part / CONTENT)
     for entry in sorted(part.glob("*.jsonl")):
@@ -154,8 +161,8 @@ def _keep_out(part: Path, held: ExitStack) -> None:
 
 
 def _exchange(staging: Path, folder: Path, parts: tuple[str, ...], there: tuple[str, ...]) -> Path | None:
-    """Give the parts their names, those that are there another; the transactions first, so that an agent's ledger is
-    there only when all else is. Returns where the old parts are."""
+    """Move the old parts aside and the new ones into place. Transactions first, so that a ledger appears only when
+    everything else is there. Returns the folder of the old parts."""
     aside = folder / f"{REPLACED}{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}" if there else None
     moved: list[tuple[Path, Path]] = []
     try:
@@ -177,5 +184,5 @@ def _move(source: Path, target: Path, moved: list[tuple[Path, Path]]) -> None:
         target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         source.rename(target)
     except OSError as error:
-        raise ConfigurationError(f"can't put {target} in its place: {error.strerror}") from None
+        raise ConfigurationError(f"can't move {target} into place: {error.strerror}") from None
     moved.append((source, target))

@@ -23,7 +23,7 @@ from tests.support.waiting import wait_until
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.identity.roles import Role
+    from mesh.identity.roster import Role
     from schemas import Signer
 
 

@@ -15,7 +15,7 @@ from tests.support.sites import MARKET, Site
 from tests.support.waiting import at_most
 
 if TYPE_CHECKING:
-    from mesh.identity.roles import Role
+    from mesh.identity.roster import Role
 
 ARM = "0x" + "0a" * 20
 AGENT = "0x" + "0b" * 20

@@ -1,6 +1,6 @@
 """Who plays in the matrix: members of a site and two who don't belong, the keys that each tries, and what each may.
 
-The tables say by hand what `mesh.identity.roles` says for Zenoh.
+The tables say by hand what `mesh.identity.roster` says for Zenoh.
 """
 
 from __future__ import annotations

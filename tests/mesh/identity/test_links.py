@@ -104,7 +104,7 @@ async def test_who_is_no_router_in_the_roster_links_nothing(site: Site) -> None:
 def test_a_link_that_shows_no_certificate_is_refused(site: Site) -> None:
     settings = dataclasses.replace(site.settings(), link=("tcp/192.0.2.1:7447",))
 
-    with pytest.raises(ConfigurationError, match="does not tell who connects"):
+    with pytest.raises(ConfigurationError, match="it does not identify who connects"):
         router_endpoints(settings)
     with pytest.raises(ConfigurationError, match="without a roster a router listens on loopback only"):
         router_endpoints(dataclasses.replace(settings, roster="", listen=("tcp/127.0.0.1:1",)))

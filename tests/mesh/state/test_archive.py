@@ -14,7 +14,7 @@ import pytest
 import zstandard
 
 from mesh.errors import ConfigurationError
-from mesh.state import ArchiveUnusable, Extent, back_up, examine_archive, restore, restoring
+from mesh.state import ArchiveUnusable, ContentScope, back_up, examine_archive, restore, restoring
 from mesh.state import archive as archives
 from tests.mesh.state.conftest import ADDRESS, CHAIN, Folder, forge, members, names_in, unpacked
 
@@ -29,7 +29,7 @@ CID = "Qm" + "1" * 44
 
 @pytest.fixture
 async def archive(folder: Folder, tmp_path: Path) -> Path:
-    await back_up(folder.path, tmp_path / "it", content=Extent.ALL)
+    await back_up(folder.path, tmp_path / "it", content=ContentScope.ALL)
     return tmp_path / "it"
 
 
@@ -112,7 +112,7 @@ async def test_more_than_the_disk_has_is_refused_at_its_header(
         members[1][0].size = 8**11 - 1
 
     monkeypatch.setattr(restoring, "SPARE", shutil.disk_usage(tmp_path).free - (4 << 30))
-    assert "more room than the disk has" in await refused(forge(archive, tmp_path / "forged", change), tmp_path)
+    assert "more space than the disk has" in await refused(forge(archive, tmp_path / "forged", change), tmp_path)
 
 
 async def test_more_files_than_the_checksums_could_list_are_refused_before_their_end(
@@ -134,7 +134,7 @@ async def test_a_backup_that_could_not_be_read_again_is_not_made(
 ) -> None:
     monkeypatch.setattr(archives, "LARGEST_TEXT", 500)
     with pytest.raises(ConfigurationError, match="files are more than a backup can list"):
-        await back_up(folder.path, tmp_path / "it", content=Extent.ALL)
+        await back_up(folder.path, tmp_path / "it", content=ContentScope.ALL)
     assert names_in(tmp_path) == ["data"]
 
 
@@ -143,7 +143,7 @@ async def test_a_file_that_a_stranger_put_in_the_way_gets_nothing(folder: Folder
     prepared = tmp_path / f".it.{os.getpid()}"
     prepared.touch(mode=0o666)
     with prepared.open("rb") as kept_open:
-        await back_up(folder.path, tmp_path / "it", content=Extent.NONE)
+        await back_up(folder.path, tmp_path / "it", content=ContentScope.NONE)
         assert kept_open.read() == b""
     assert (tmp_path / "it").stat().st_mode & 0o777 == 0o600
 

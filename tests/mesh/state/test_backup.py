@@ -12,7 +12,7 @@ import pytest
 
 from mesh.content import Store
 from mesh.errors import ConfigurationError
-from mesh.state import Extent, NoState, StateRestless, back_up, examine_archive, take_inventory
+from mesh.state import ContentScope, NoState, StateChanging, back_up, examine_archive, take_inventory
 from mesh.state import backup as backup_module
 from mesh.work import Ledger, Phase
 from mesh.work.outbox import outgoing
@@ -25,13 +25,13 @@ from tests.support.orders import result
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.state.ledgers import LedgerFacts
+    from mesh.state.inventory import LedgerFacts
 
 RECORDING = f"{ADDRESS}/{CHAIN}/recordings/{JOB.address}.mcap.part"
 
 
 async def test_a_backup_has_the_state_and_no_key(folder: Folder, tmp_path: Path) -> None:
-    done = await back_up(folder.path, tmp_path / "it", content=Extent.NEEDED)
+    done = await back_up(folder.path, tmp_path / "it", content=ContentScope.NEEDED)
 
     found = members(tmp_path / "it")
     objective = f"{ADDRESS}/content/{cid_of_bytes(OBJECTIVE)}"
@@ -53,9 +53,12 @@ async def test_a_backup_has_the_state_and_no_key(folder: Folder, tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("content", "held"), [(Extent.ALL, {OBJECTIVE, UNUSED}), (Extent.NEEDED, {OBJECTIVE}), (Extent.NONE, set())]
+    ("content", "held"),
+    [(ContentScope.ALL, {OBJECTIVE, UNUSED}), (ContentScope.NEEDED, {OBJECTIVE}), (ContentScope.NONE, set())],
 )
-async def test_content_goes_along_as_told(folder: Folder, tmp_path: Path, content: Extent, held: set[bytes]) -> None:
+async def test_content_is_included_as_requested(
+    folder: Folder, tmp_path: Path, content: ContentScope, held: set[bytes]
+) -> None:
     await back_up(folder.path, tmp_path / "it", content=content)
     assert {data for name, data in members(tmp_path / "it").items() if "content/Qm" in name} == held
 
@@ -64,14 +67,14 @@ async def test_what_jobs_need_and_nobody_holds_is_named(folder: Folder, tmp_path
     missing = cid_of_bytes(b"gone")
     async with Ledger(folder.ledger) as ledger:
         await ledger.add_job(liability("two", objective=missing))
-    assert missing in (await back_up(folder.path, tmp_path / "it", content=Extent.NEEDED)).missing
+    assert missing in (await back_up(folder.path, tmp_path / "it", content=ContentScope.NEEDED)).missing
 
 
 async def test_rotten_content_is_left_out_and_named(folder: Folder, tmp_path: Path) -> None:
     held = folder.home / "content" / cid_of_bytes(OBJECTIVE)
     held.chmod(0o644)
     held.write_bytes(b"what is to be Done")
-    done = await back_up(folder.path, tmp_path / "it", content=Extent.ALL)
+    done = await back_up(folder.path, tmp_path / "it", content=ContentScope.ALL)
     assert cid_of_bytes(OBJECTIVE) in done.missing
     assert done.files == 1
 
@@ -91,7 +94,7 @@ async def test_a_job_that_ends_during_the_backup_is_in_it_either_running_or_ende
         return facts
 
     monkeypatch.setattr(backup_module, "_copied", copied_and_then_ended)
-    await back_up(folder.path, tmp_path / "it", content=Extent.NEEDED)
+    await back_up(folder.path, tmp_path / "it", content=ContentScope.NEEDED)
 
     (tmp_path / "ledger").write_bytes(members(tmp_path / "it")[f"{ADDRESS}/{CHAIN}/ledger.sqlite"])
     async with Ledger(tmp_path / "ledger") as ledger:
@@ -109,12 +112,12 @@ async def end_the_job(folder: Folder) -> None:
     (folder.recordings / f"{JOB.address}.mcap.part").unlink()
 
 
-async def test_jobs_that_never_rest_are_given_up_and_leave_no_file(
+async def test_jobs_that_keep_changing_are_an_error_and_leave_no_file(
     folder: Folder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(backup_module, "_runs_still", lambda *_: False)
-    with pytest.raises(StateRestless):
-        await back_up(folder.path, tmp_path / "it", content=Extent.NEEDED)
+    monkeypatch.setattr(backup_module, "_still_running", lambda *_: False)
+    with pytest.raises(StateChanging):
+        await back_up(folder.path, tmp_path / "it", content=ContentScope.NEEDED)
     assert names_in(tmp_path) == ["data"]
 
 
@@ -123,7 +126,7 @@ async def test_a_ledger_that_is_written_meanwhile_is_whole_in_the_backup(folder:
         writing = asyncio.create_task(write_without_end(ledger))
         try:
             for number in range(5):
-                await back_up(folder.path, tmp_path / f"{number}", content=Extent.NONE)
+                await back_up(folder.path, tmp_path / f"{number}", content=ContentScope.NONE)
         finally:
             writing.cancel()
             await asyncio.wait([writing])
@@ -156,7 +159,7 @@ async def test_a_backup_replaces_an_earlier_one_only_when_it_is_whole(folder: Fo
     (tmp_path / "it").write_bytes(b"the earlier one")
     folder.ledger.write_bytes(b"no ledger at all")
     with pytest.raises(ConfigurationError):
-        await back_up(folder.path, tmp_path / "it", content=Extent.NEEDED)
+        await back_up(folder.path, tmp_path / "it", content=ContentScope.NEEDED)
     assert (tmp_path / "it").read_bytes() == b"the earlier one"
     assert names_in(tmp_path) == ["data", "it"]
 
@@ -164,14 +167,14 @@ async def test_a_backup_replaces_an_earlier_one_only_when_it_is_whole(folder: Fo
 async def test_a_folder_without_state_is_said_to_have_none(tmp_path: Path) -> None:
     (tmp_path / "content").mkdir()
     with pytest.raises(NoState):
-        await back_up(tmp_path, tmp_path / "it", content=Extent.NEEDED)
+        await back_up(tmp_path, tmp_path / "it", content=ContentScope.NEEDED)
 
 
 async def test_a_full_disk_is_told_and_leaves_no_file(folder: Folder, tmp_path: Path) -> None:
     with Store(folder.home / "content") as store:
         store.put_bytes(os.urandom(3 << 20), pin="user")
     with file_size_limit(1 << 20), pytest.raises(Exception, match=r"(full|room)"):
-        await back_up(folder.path, tmp_path / "it", content=Extent.ALL)
+        await back_up(folder.path, tmp_path / "it", content=ContentScope.ALL)
     assert not (tmp_path / "it").exists()
 
 
@@ -190,7 +193,7 @@ async def test_the_inventory_says_who_is_at_work(folder: Folder) -> None:
 
 
 async def test_a_backup_says_what_it_is(folder: Folder, tmp_path: Path) -> None:
-    await back_up(folder.path, tmp_path / "it", content=Extent.ALL)
+    await back_up(folder.path, tmp_path / "it", content=ContentScope.ALL)
     found = examine_archive(tmp_path / "it")
     assert found.files == {"content": 2, "ledgers": 1, "pins": 1, "recordings": 1, "transactions": 1}
     assert found.content == "all"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from mesh.agent.listener import ChainListener
 from mesh.recording import open_objective
-from mesh.state import Extent, back_up, restore
+from mesh.state import ContentScope, back_up, restore
 from mesh.work import Phase
 from schemas import String
 from tests.support.market import in_phase, obliging
@@ -81,7 +81,7 @@ async def test_after_a_restore_every_job_ends_once(place: Place) -> None:
             robot.stuck(at="second 2")
             second = await ask(place, person, "second")
             await until(lambda: "second 1" in robot.said)
-            await back_up(disk, archive, content=Extent.NEEDED)
+            await back_up(disk, archive, content=ContentScope.NEEDED)
             robot.released.set()
             await second.outcome()
             await (await ask(place, person, "third")).outcome()
@@ -116,7 +116,7 @@ async def test_what_was_paid_since_the_backup_is_not_played_however_slowly_the_c
         robot.stuck(at="only 2")
         contract = await ask(place, person, "only")
         await until(lambda: "only 1" in robot.said)
-        await back_up(disk, archive, content=Extent.NEEDED)
+        await back_up(disk, archive, content=ContentScope.NEEDED)
         robot.released.set()
         await contract.outcome()
     lose(disk)
@@ -142,7 +142,7 @@ async def test_a_job_that_ran_during_the_backup_goes_on_where_it_was(place: Plac
             robot.stuck(at="only 2")
             contract = await ask(place, person, "only")
             await until(lambda: "only 1" in robot.said)
-        await back_up(disk, archive, content=Extent.NEEDED)
+        await back_up(disk, archive, content=ContentScope.NEEDED)
         lose(disk)
         await restore(archive, disk)
         robot.stuck(at="")
@@ -164,7 +164,7 @@ async def test_a_signed_result_is_sent_by_the_restored_agent_as_it_was(place: Pl
             robot.released.set()
             await in_phase(life, contract, Phase.COMPLETE)
             signed = await life.parts.ledger.outbox(head=0)
-            await back_up(disk, archive, content=Extent.NEEDED)
+            await back_up(disk, archive, content=ContentScope.NEEDED)
         lose(disk)
         await restore(archive, disk)
         async with robot.life() as life:

@@ -18,7 +18,16 @@ import pytest
 from mesh.chain.transaction_store import lock_file
 from mesh.content import Store
 from mesh.errors import ConfigurationError
-from mesh.state import ArchiveUnusable, Existing, Extent, StateExists, StateInUse, back_up, restore, restoring
+from mesh.state import (
+    ArchiveUnusable,
+    ContentScope,
+    ExistingState,
+    StateExists,
+    StateInUse,
+    back_up,
+    restore,
+    restoring,
+)
 from mesh.work import Ledger, Phase
 from mesh.work.database import VERSION, LedgerUnusable
 from schemas import cid_of_bytes
@@ -60,7 +69,7 @@ def program(text: str, *arguments: Path) -> Iterator[None]:
 
 @pytest.fixture
 async def archive(folder: Folder, tmp_path: Path) -> Path:
-    await back_up(folder.path, tmp_path / "it", content=Extent.ALL)
+    await back_up(folder.path, tmp_path / "it", content=ContentScope.ALL)
     return tmp_path / "it"
 
 
@@ -105,7 +114,7 @@ async def test_the_old_state_can_be_set_aside_and_restored_by_hand(archive: Path
         await ledger.set_phase(JOB.address, Phase.FINALIZED)
     secrets = [folder.path / "development" / "robot.json"]
 
-    done = await restore(archive, folder.path, existing=Existing.SET_ASIDE)
+    done = await restore(archive, folder.path, existing=ExistingState.SET_ASIDE)
 
     assert done.aside is not None
     async with Ledger(folder.ledger) as ledger:
@@ -116,22 +125,24 @@ async def test_the_old_state_can_be_set_aside_and_restored_by_hand(archive: Path
     assert all(secret.exists() for secret in secrets), "what is no part of a state stays where it is"
 
 
-@pytest.mark.parametrize("existing", list(Existing))
-async def test_a_ledger_that_an_agent_has_open_is_in_use(archive: Path, folder: Folder, existing: Existing) -> None:
+@pytest.mark.parametrize("existing", list(ExistingState))
+async def test_a_ledger_that_an_agent_has_open_is_in_use(
+    archive: Path, folder: Folder, existing: ExistingState
+) -> None:
     async with Ledger(folder.ledger):
         with pytest.raises(StateInUse):
             await restore(archive, folder.path, existing=existing)
-    await restore(archive, folder.path, existing=Existing.SET_ASIDE)
+    await restore(archive, folder.path, existing=ExistingState.SET_ASIDE)
 
 
 async def test_a_ledger_that_another_process_has_open_is_in_use(archive: Path, folder: Folder) -> None:
     with program(AGENT, folder.ledger), pytest.raises(StateInUse):
-        await restore(archive, folder.path, existing=Existing.SET_ASIDE)
+        await restore(archive, folder.path, existing=ExistingState.SET_ASIDE)
 
 
 async def test_a_store_that_is_open_is_in_use(archive: Path, folder: Folder) -> None:
     with Store(folder.home / "content"), pytest.raises(StateInUse):
-        await restore(archive, folder.path, existing=Existing.SET_ASIDE)
+        await restore(archive, folder.path, existing=ExistingState.SET_ASIDE)
 
 
 async def test_a_transaction_that_somebody_waits_for_is_in_use(archive: Path, folder: Folder) -> None:
@@ -139,7 +150,7 @@ async def test_a_transaction_that_somebody_waits_for_is_in_use(archive: Path, fo
     assert descriptor is not None
     try:
         with pytest.raises(StateInUse):
-            await restore(archive, folder.path, existing=Existing.SET_ASIDE)
+            await restore(archive, folder.path, existing=ExistingState.SET_ASIDE)
     finally:
         os.close(descriptor)
 
@@ -156,7 +167,7 @@ async def test_no_agent_opens_a_state_while_it_is_exchanged(
         return exchange(*arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(restoring, "_exchange", tried)
-    await restore(archive, folder.path, existing=Existing.SET_ASIDE)
+    await restore(archive, folder.path, existing=ExistingState.SET_ASIDE)
     assert "database is locked" in refused[0]
 
 
@@ -173,7 +184,7 @@ async def test_when_one_part_can_t_be_placed_all_is_as_it_was(
 
     monkeypatch.setattr(restoring, "_move", refuse_the_last)
     with pytest.raises(ConfigurationError, match="the disk is gone"):
-        await restore(archive, folder.path, existing=Existing.SET_ASIDE)
+        await restore(archive, folder.path, existing=ExistingState.SET_ASIDE)
     assert folder.contents() == before
 
 
@@ -192,7 +203,7 @@ async def test_a_newer_ledger_in_a_backup_is_named_and_nothing_changed(
 async def test_a_newer_ledger_is_not_backed_up(folder: Folder, tmp_path: Path) -> None:
     mark_as_version(folder.ledger, VERSION + 1)
     with pytest.raises(ConfigurationError) as caught:
-        await back_up(folder.path, tmp_path / "it", content=Extent.NONE)
+        await back_up(folder.path, tmp_path / "it", content=ContentScope.NONE)
     assert caught.value.hint == "upgrade aira-mesh"
     assert str(folder.ledger) in str(caught.value)
 
@@ -220,7 +231,7 @@ async def test_a_ledger_that_does_something_when_it_is_used_is_refused(
     with closing(sqlite3.connect(ledger)) as database:
         database.execute(statement)
         database.commit()
-    with pytest.raises(LedgerUnusable, match=f"it holds a {kind}, as no ledger does"):
+    with pytest.raises(LedgerUnusable, match=kind):
         await restore(forge_ledger(archive, tmp_path / "forged", ledger.read_bytes()), tmp_path / "new")
     assert names_in(tmp_path / "new") == []
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from mesh.identity.roles import Role
+    from mesh.identity.roster import Role
     from schemas import Signer
     from tests.support.market import Place
     from tests.support.routers import EmbeddedRouter
