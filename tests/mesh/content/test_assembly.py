@@ -42,7 +42,7 @@ def refused(store: Store, blocks: list[UnixfsBlock]) -> ContentCorrupt:
     return caught.value
 
 
-def test_a_file_comes_together_in_any_order_of_its_parts(store: Store) -> None:
+def test_a_file_is_assembled_from_blocks_in_any_order(store: Store) -> None:
     data = random.Random(1).randbytes(200 * CHUNK_SIZE)
     cid, blocks = blocks_of(data)
     with store.assemble(cid) as assembly:
@@ -56,7 +56,7 @@ def test_a_file_comes_together_in_any_order_of_its_parts(store: Store) -> None:
     assert all(store.get_block(name) == block for name, block in blocks.items())
 
 
-def test_bytes_of_another_hash_are_refused_and_the_true_ones_still_taken(store: Store) -> None:
+def test_a_block_with_another_hash_is_refused_and_the_right_one_still_accepted(store: Store) -> None:
     cid, blocks = blocks_of(b"the truth")
     with store.assemble(cid) as assembly:
         with pytest.raises(ContentCorrupt):
@@ -65,14 +65,14 @@ def test_bytes_of_another_hash_are_refused_and_the_true_ones_still_taken(store: 
         assert assembly.finish().read_bytes() == b"the truth"
 
 
-def test_the_root_tells_when_a_file_is_too_large(store: Store) -> None:
+def test_a_file_that_is_too_large_is_refused_by_its_root(store: Store) -> None:
     cid, blocks = blocks_of(bytes(CHUNK_SIZE + 1))
     with store.assemble(cid, size_limit=CHUNK_SIZE) as assembly, pytest.raises(ContentTooLarge) as caught:
         assembly.put(assembly.root, blocks[cid])
     assert (caught.value.cid, caught.value.size, caught.value.limit) == (cid, CHUNK_SIZE + 1, CHUNK_SIZE)
 
 
-def test_the_limit_of_the_store_holds_whatever_the_caller_allows(store: Store) -> None:
+def test_a_caller_can_not_raise_the_limit_of_the_store(store: Store) -> None:
     huge = parent([(leaf(b"x"), 1)], sizes=[store.limit + 1])
     with store.assemble(huge.cid, size_limit=1 << 60) as assembly, pytest.raises(ContentTooLarge):
         assembly.put(assembly.root, huge.data)
@@ -83,23 +83,23 @@ def test_a_part_longer_than_its_link_says_is_refused(store: Store) -> None:
     assert refused(store, [part, parent([(part, 1000)], sizes=[1])]).reason == "wrong-size"
 
 
-def test_what_is_no_file_is_refused(store: Store) -> None:
+def test_a_block_that_is_not_a_file_is_refused(store: Store) -> None:
     assert refused(store, [block_of(b"\x0a\x02\x08\x01")]).reason == "not-a-file"
 
 
-def test_empty_parts_are_refused_since_there_could_be_any_number(store: Store) -> None:
+def test_links_to_empty_parts_are_refused(store: Store) -> None:
     empty = leaf(b"")
     assert refused(store, [empty, parent([(empty, 0), (empty, 0)])]).reason == "empty-part"
 
 
-def test_a_tree_without_end_is_refused(store: Store) -> None:
+def test_a_tree_that_is_too_deep_is_refused(store: Store) -> None:
     chain = [leaf(b"x")]
     for _ in range(MAX_DEPTH + 1):
         chain.append(parent([(chain[-1], 1)]))
     assert refused(store, chain).reason == "too-deep"
 
 
-def test_a_node_may_hold_bytes_of_the_file_before_its_parts(store: Store) -> None:
+def test_an_inner_node_may_contain_bytes_of_the_file(store: Store) -> None:
     tail = leaf(b"and these")
     root = parent([(tail, 9)], data=b"these ")
     with store.assemble(root.cid) as assembly:
@@ -107,7 +107,7 @@ def test_a_node_may_hold_bytes_of_the_file_before_its_parts(store: Store) -> Non
         assert assembly.finish().read_bytes() == b"these and these"
 
 
-def test_a_block_that_repeats_is_needed_once(store: Store) -> None:
+def test_a_repeated_block_is_needed_once(store: Store) -> None:
     cid, blocks = blocks_of(bytes(50 * CHUNK_SIZE))
     with store.assemble(cid) as assembly:
         assert put_all(assembly, blocks) == 2
@@ -124,7 +124,7 @@ def test_blocks_of_files_already_held_are_not_needed(store: Store) -> None:
     assert store.has(cid)
 
 
-def test_an_interrupted_assembly_is_gone_on_with(store: Store) -> None:
+def test_an_interrupted_assembly_is_continued(store: Store) -> None:
     cid, blocks = blocks_of(random.Random(3).randbytes(10 * CHUNK_SIZE))
     with store.assemble(cid) as assembly:
         put_all(assembly, blocks, at_most=7)
@@ -135,7 +135,7 @@ def test_an_interrupted_assembly_is_gone_on_with(store: Store) -> None:
     assert store.verify(cid) == store.path(cid)
 
 
-def test_remains_that_have_rotted_are_not_believed(store: Store) -> None:
+def test_damaged_blocks_of_an_earlier_attempt_are_not_used(store: Store) -> None:
     data = random.Random(4).randbytes(3 * CHUNK_SIZE)
     cid, blocks = blocks_of(data)
     with store.assemble(cid) as assembly:
@@ -147,7 +147,7 @@ def test_remains_that_have_rotted_are_not_believed(store: Store) -> None:
         assert assembly.finish().read_bytes() == data
 
 
-def test_two_assemblies_of_one_file_do_not_disturb_each_other(store: Store) -> None:
+def test_two_assemblies_of_one_file_do_not_interfere(store: Store) -> None:
     data = random.Random(5).randbytes(3 * CHUNK_SIZE)
     cid, blocks = blocks_of(data)
     with store.assemble(cid) as first, store.assemble(cid) as second:
@@ -160,7 +160,7 @@ def test_two_assemblies_of_one_file_do_not_disturb_each_other(store: Store) -> N
     assert list(store.directory.glob(".p*-*")) == []
 
 
-def test_a_place_knows_where_it_belongs(store: Store) -> None:
+def test_references_have_offset_size_and_depth(store: Store) -> None:
     cid, blocks = blocks_of(random.Random(6).randbytes(2 * CHUNK_SIZE + 7))
     with store.assemble(cid) as assembly:
         places = assembly.put(assembly.root, blocks[cid])

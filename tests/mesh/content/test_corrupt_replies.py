@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import zenoh
 
 
-async def test_a_liar_is_counted_and_named_and_somebody_elses_answer_used(
+async def test_a_corrupt_reply_is_counted_by_sender_and_another_holder_used(
     store: Store,
     holder_store: Store,
     session: zenoh.Session,
@@ -43,7 +43,7 @@ async def test_a_liar_is_counted_and_named_and_somebody_elses_answer_used(
     assert lies[str(third_session.zid())] >= 1
 
 
-async def test_a_holder_of_the_root_that_lies_about_the_parts_is_left_for_another(
+async def test_a_holder_that_sends_corrupt_parts_is_replaced_by_another(
     store: Store,
     holder_store: Store,
     session: zenoh.Session,
@@ -74,7 +74,7 @@ async def test_a_holder_of_the_root_that_lies_about_the_parts_is_left_for_anothe
             assert str(third_session.zid()) in exchange.statistics().corrupt_blocks
 
 
-async def test_if_all_lie_the_content_is_corrupt_and_they_are_named(
+async def test_if_all_replies_are_corrupt_the_error_names_their_senders(
     store: Store, session: zenoh.Session, other_session: zenoh.Session
 ) -> None:
     cid = cid_of_bytes(b"true")
@@ -87,7 +87,7 @@ async def test_if_all_lie_the_content_is_corrupt_and_they_are_named(
     assert store.list() == ()
 
 
-async def test_a_holder_that_never_answers_does_not_hold_up_another(
+async def test_a_silent_holder_does_not_delay_another(
     store: Store,
     holder_store: Store,
     session: zenoh.Session,

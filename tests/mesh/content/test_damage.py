@@ -49,7 +49,7 @@ def test_a_file_of_other_chunking_is_read_and_copied(store: Store, tmp_path: Pat
     assert store.copy(cid, tmp_path / "copy").read_bytes() == data
 
 
-def test_a_node_with_bytes_of_its_own_is_read(store: Store) -> None:
+def test_a_file_whose_inner_node_contains_bytes_is_read(store: Store) -> None:
     tail = leaf(b"and these")
     cid = put_tree(store, [tail, parent([(tail, 9)], data=b"these ")])
     with store.open(cid) as file:
@@ -58,7 +58,7 @@ def test_a_node_with_bytes_of_its_own_is_read(store: Store) -> None:
         assert file.read(3) == b"d t"
 
 
-def test_reading_stops_where_the_file_has_rotted_and_names_it(store: Store) -> None:
+def test_reading_a_damaged_block_raises_content_corrupt(store: Store) -> None:
     data = sample_bytes(3 * CHUNK_SIZE)
     cid = store.put_bytes(data)
     flip_bit(store.directory / cid, 2 * CHUNK_SIZE + 9)
@@ -82,7 +82,7 @@ def test_a_file_that_was_cut_short_is_damaged(store: Store) -> None:
     assert store.damaged() == (cid,)
 
 
-def test_a_copy_is_whole_or_not_there(store: Store, tmp_path: Path) -> None:
+def test_a_copy_is_complete_or_leaves_the_target_unchanged(store: Store, tmp_path: Path) -> None:
     data = sample_bytes(2 * CHUNK_SIZE + 1)
     cid = store.put_bytes(data)
     target = tmp_path / "out" / "copy.bin"
@@ -102,7 +102,7 @@ def test_a_copy_is_whole_or_not_there(store: Store, tmp_path: Path) -> None:
         store.copy(cid, target)
 
 
-def test_checking_the_store_names_every_damaged_file_and_no_other(store: Store) -> None:
+def test_checking_the_store_reports_exactly_the_damaged_files(store: Store) -> None:
     cids = [store.put_bytes(sample_bytes(size)) for size in (0, 5, 1000, CHUNK_SIZE + 1, 700_000)]
     other = put_tree(store, chunked(sample_bytes(9000), 1000))
     bad = sorted([cids[2], cids[4]])
@@ -119,7 +119,7 @@ def test_checking_the_store_names_every_damaged_file_and_no_other(store: Store) 
     assert store.check().damaged == ()
 
 
-def test_a_damaged_file_that_is_put_again_is_damaged_no_more(store: Store) -> None:
+def test_putting_a_damaged_file_again_repairs_it(store: Store) -> None:
     cid = store.put_bytes(sample_bytes(1000))
     flip_bit(store.directory / cid, 1)
     assert store.checked(cid) is None
@@ -129,7 +129,7 @@ def test_a_damaged_file_that_is_put_again_is_damaged_no_more(store: Store) -> No
     assert store.usage().bytes == 1000
 
 
-def test_progress_of_a_put_is_told(store: Store, tmp_path: Path) -> None:
+def test_a_put_reports_progress(store: Store, tmp_path: Path) -> None:
     source = tmp_path / "source"
     source.write_bytes(sample_bytes(3 * CHUNK_SIZE + 1))
     told: list[tuple[int, int | None]] = []
@@ -141,7 +141,7 @@ def test_progress_of_a_put_is_told(store: Store, tmp_path: Path) -> None:
     assert told.pop() == (3 * CHUNK_SIZE + 1, None)
 
 
-async def test_of_a_damaged_file_only_the_damaged_block_is_fetched_again(
+async def test_only_the_damaged_block_of_a_file_is_fetched_again(
     store: Store, holder_store: Store, session: zenoh.Session, other_session: zenoh.Session
 ) -> None:
     data = sample_bytes(20 * CHUNK_SIZE)
@@ -156,7 +156,7 @@ async def test_of_a_damaged_file_only_the_damaged_block_is_fetched_again(
     assert leftovers(store.directory) == []
 
 
-async def test_a_holder_whose_file_has_rotted_sets_it_aside_and_the_other_holder_gives_it(
+async def test_a_holder_sets_its_damaged_file_aside_and_another_holder_serves_it(
     tmp_path: Path,
     store: Store,
     holder_store: Store,
@@ -182,7 +182,7 @@ async def test_a_holder_whose_file_has_rotted_sets_it_aside_and_the_other_holder
     assert holder_store.list() == (cid,)
 
 
-def test_an_index_that_others_use_is_not_built_anew_under_them(store: Store) -> None:
+def test_an_index_in_use_is_not_rebuilt(store: Store) -> None:
     store.put_bytes(b"held")
     store.close()
     with Store(store.directory) as user:
@@ -202,7 +202,7 @@ def test_an_index_that_others_use_is_not_built_anew_under_them(store: Store) -> 
         assert again.get_block(cid_of_bytes(b"held")) is not None
 
 
-def test_a_store_whose_index_fails_says_so_in_its_own_terms(store: Store) -> None:
+def test_a_broken_index_raises_store_damaged(store: Store) -> None:
     store.put_bytes(b"held")
     with sqlite3.connect(store.directory / ".blocks.sqlite") as other:
         other.execute("DROP TABLE block")
@@ -213,7 +213,7 @@ def test_a_store_whose_index_fails_says_so_in_its_own_terms(store: Store) -> Non
         store.put_bytes(b"more")
 
 
-def test_a_closed_store_says_so(store: Store) -> None:
+def test_a_closed_store_raises_closed_error(store: Store) -> None:
     store.close()
     store.close()
     with pytest.raises(ClosedError):

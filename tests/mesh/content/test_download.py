@@ -53,7 +53,7 @@ def is_meant(query: zenoh.Query, session: zenoh.Session) -> bool:
     return query.parameters.get("holder", str(session.zid())) == str(session.zid())
 
 
-async def test_all_holders_of_a_file_give_parts_of_it(tmp_path: Path, store: Store, router: EmbeddedRouter) -> None:
+async def test_all_holders_of_a_file_serve_parts_of_it(tmp_path: Path, store: Store, router: EmbeddedRouter) -> None:
     data = sample_bytes(60 * CHUNK_SIZE)
     async with AsyncExitStack() as stack:
         holders = []
@@ -76,7 +76,7 @@ async def test_all_holders_of_a_file_give_parts_of_it(tmp_path: Path, store: Sto
         assert told[-1] == (len(data), len(data))
 
 
-async def test_of_two_holders_one_lies_in_every_tenth_block_and_is_named(
+async def test_a_holder_with_every_tenth_block_corrupt_is_named(
     store: Store,
     holder_store: Store,
     session: zenoh.Session,
@@ -112,7 +112,7 @@ async def test_of_two_holders_one_lies_in_every_tenth_block_and_is_named(
     assert store.check().damaged == ()
 
 
-async def test_a_fetch_killed_in_the_middle_is_gone_on_with_by_another_process(
+async def test_another_process_continues_a_killed_fetch(
     tmp_path: Path, holder_store: Store, router: EmbeddedRouter, other_session: zenoh.Session
 ) -> None:
     data = sample_bytes(200 * CHUNK_SIZE)
@@ -152,7 +152,7 @@ async def test_a_fetch_killed_in_the_middle_is_gone_on_with_by_another_process(
     assert leftovers(tmp_path / "fetched") == []
 
 
-async def test_what_a_fetch_has_got_so_far_is_given_to_others(
+async def test_blocks_of_an_unfinished_fetch_are_served(
     store: Store, session: zenoh.Session, other_session: zenoh.Session
 ) -> None:
     data = sample_bytes(3 * CHUNK_SIZE)
@@ -171,7 +171,7 @@ async def test_what_a_fetch_has_got_so_far_is_given_to_others(
         assert [reply.ok.payload.to_bytes() for reply in replies if reply.ok] == [blocks[first]]
 
 
-async def test_what_nobody_has_leaves_nothing_behind(store: Store, session: zenoh.Session) -> None:
+async def test_a_failed_fetch_leaves_no_files(store: Store, session: zenoh.Session) -> None:
     async with Exchange(session, store) as exchange:
         with pytest.raises(ContentUnavailable) as caught:
             await exchange.fetch(block_of(b"nobody's").cid, timeout=0.2)
@@ -198,7 +198,7 @@ async def refused(
     return caught.value.reason, count
 
 
-async def test_a_bomb_of_links_is_refused_by_its_root(
+async def test_a_root_with_too_many_links_is_refused(
     store: Store, session: zenoh.Session, other_session: zenoh.Session
 ) -> None:
     grain = leaf(b"x")
@@ -207,7 +207,7 @@ async def test_a_bomb_of_links_is_refused_by_its_root(
     assert count == 1
 
 
-async def test_a_bomb_in_two_steps_ends_at_the_bound_and_asks_for_no_block_twice(
+async def test_a_tree_with_too_many_links_in_two_levels_is_refused(
     store: Store, session: zenoh.Session, other_session: zenoh.Session
 ) -> None:
     grain = leaf(b"x")
@@ -217,7 +217,7 @@ async def test_a_bomb_in_two_steps_ends_at_the_bound_and_asks_for_no_block_twice
     assert count <= 3 * 8, "each of three blocks, by each of eight threads at most"
 
 
-async def test_a_tree_deeper_than_any_file_is_refused(
+async def test_fetching_a_tree_that_is_too_deep_is_refused(
     store: Store, session: zenoh.Session, other_session: zenoh.Session
 ) -> None:
     chain = [leaf(b"x")]
@@ -228,7 +228,7 @@ async def test_a_tree_deeper_than_any_file_is_refused(
     assert count <= 13
 
 
-async def test_a_block_swollen_with_what_no_file_needs_is_refused(
+async def test_an_oversized_block_is_refused(
     store: Store, session: zenoh.Session, other_session: zenoh.Session
 ) -> None:
     grain = leaf(b"x")

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @pytest.mark.parametrize("size", [0, 1, CHUNK_SIZE, 5 * CHUNK_SIZE + 1, 175 * CHUNK_SIZE])
-async def test_a_file_is_fetched_from_who_has_it_and_given_on(
+async def test_a_file_is_fetched_from_its_holder_and_then_served(
     tmp_path: Path, store: Store, holder_store: Store, session: zenoh.Session, other_session: zenoh.Session, size: int
 ) -> None:
     data = sample_bytes(size)
@@ -40,7 +40,7 @@ async def test_a_file_is_fetched_from_who_has_it_and_given_on(
             assert (await third.fetch(cid)).read_bytes() == data
 
 
-async def test_what_nobody_has_is_unavailable_after_the_timeout(store: Store, session: zenoh.Session) -> None:
+async def test_a_file_that_nobody_holds_is_unavailable_after_the_timeout(store: Store, session: zenoh.Session) -> None:
     cid = cid_of_bytes(b"nobody's")
     async with Exchange(session, store) as exchange:
         begin = time.monotonic()
@@ -51,13 +51,13 @@ async def test_what_nobody_has_is_unavailable_after_the_timeout(store: Store, se
     assert store.list() == ()
 
 
-async def test_a_bad_name_is_no_question_to_the_network(store: Store, session: zenoh.Session) -> None:
+async def test_an_invalid_cid_is_not_requested(store: Store, session: zenoh.Session) -> None:
     async with Exchange(session, store) as exchange:
         with pytest.raises(InvalidCid):
             await exchange.fetch("aira/cid/**")
 
 
-async def test_a_holder_may_come_late(
+async def test_a_holder_may_appear_late(
     store: Store, holder_store: Store, session: zenoh.Session, other_session: zenoh.Session
 ) -> None:
     async with Exchange(session, store) as exchange, Exchange(other_session, holder_store) as holder:
@@ -68,7 +68,7 @@ async def test_a_holder_may_come_late(
         assert (await fetching).read_bytes() == b"late"
 
 
-async def test_too_large_a_file_is_refused_by_its_root_alone(
+async def test_a_file_that_is_too_large_costs_one_block(
     store: Store, holder_store: Store, session: zenoh.Session, other_session: zenoh.Session
 ) -> None:
     cid = holder_store.put_bytes(sample_bytes(4 * CHUNK_SIZE))
@@ -80,7 +80,7 @@ async def test_too_large_a_file_is_refused_by_its_root_alone(
     assert store.list() == ()
 
 
-async def test_who_does_not_hold_a_block_or_is_not_meant_says_nothing(
+async def test_queries_for_others_or_for_missing_blocks_get_no_reply(
     holder_store: Store, session: zenoh.Session, other_session: zenoh.Session
 ) -> None:
     cid = holder_store.put_bytes(b"held")
@@ -96,7 +96,7 @@ async def test_who_does_not_hold_a_block_or_is_not_meant_says_nothing(
         assert (holder.statistics().missed, holder.statistics().ignored) == (1, 2)
 
 
-async def test_a_fetch_whose_holder_leaves_is_gone_on_with_from_what_came(
+async def test_a_fetch_continues_with_another_holder(
     store: Store, holder_store: Store, session: zenoh.Session, other_session: zenoh.Session
 ) -> None:
     data = sample_bytes(30 * CHUNK_SIZE)
@@ -121,7 +121,7 @@ async def test_a_fetch_whose_holder_leaves_is_gone_on_with_from_what_came(
     assert second == len(blocks) - first
 
 
-async def test_cancelling_a_fetch_ends_it_and_loses_nothing(
+async def test_a_cancelled_fetch_ends_and_can_be_repeated(
     store: Store, holder_store: Store, session: zenoh.Session, other_session: zenoh.Session
 ) -> None:
     cid = cid_of_bytes(b"wanted")
@@ -138,7 +138,7 @@ async def test_cancelling_a_fetch_ends_it_and_loses_nothing(
         assert (await exchange.fetch(cid)).read_bytes() == b"wanted"
 
 
-async def test_a_slow_holder_is_waited_for_as_long_as_blocks_come(
+async def test_a_slow_holder_is_accepted_while_blocks_arrive(
     store: Store, session: zenoh.Session, other_session: zenoh.Session
 ) -> None:
     data = sample_bytes(3 * CHUNK_SIZE)
@@ -156,7 +156,7 @@ async def test_a_slow_holder_is_waited_for_as_long_as_blocks_come(
             assert time.monotonic() - begin > 2
 
 
-async def test_one_file_asked_for_twice_at_once_is_fetched_once(
+async def test_concurrent_fetches_of_one_file_download_it_once(
     store: Store, holder_store: Store, session: zenoh.Session, other_session: zenoh.Session
 ) -> None:
     cid = holder_store.put_bytes(sample_bytes(8 * CHUNK_SIZE))
@@ -194,7 +194,7 @@ async def test_a_fetch_outlives_a_restart_of_the_router(
         assert (await fetching).read_bytes() == b"later"
 
 
-async def test_a_session_that_is_closed_first_ends_the_exchange_too(
+async def test_closing_the_session_first_ends_the_exchange(
     store: Store, router: EmbeddedRouter, session: zenoh.Session
 ) -> None:
     async with Exchange(session, store) as exchange:

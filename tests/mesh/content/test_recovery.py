@@ -110,7 +110,7 @@ def check_consistent(directory: Path) -> None:
     assert leftovers(directory) == []
 
 
-def test_a_put_that_is_killed_at_any_step_leaves_a_store_that_is_right(tmp_path: Path) -> None:
+def test_a_put_killed_at_any_step_leaves_a_consistent_store(tmp_path: Path) -> None:
     with Store(tmp_path, quota=QUOTA) as store:
         kept = store.put_bytes(b"was there before")
     work = f"store.put_bytes(bytes(range(256)) * {2 * CHUNK_SIZE // 256 + 1}, pin='job')"
@@ -122,7 +122,7 @@ def test_a_put_that_is_killed_at_any_step_leaves_a_store_that_is_right(tmp_path:
         assert store.pins() == {put: {"job"}}
 
 
-def test_making_room_and_removing_may_be_killed_at_any_step(tmp_path: Path) -> None:
+def test_eviction_and_removal_killed_at_any_step_leave_a_consistent_store(tmp_path: Path) -> None:
     with Store(tmp_path, quota=QUOTA) as store:
         pinned = store.put_bytes(bytes(1_000_000), pin="job")
         for number in range(1, 4):
@@ -133,7 +133,7 @@ def test_making_room_and_removing_may_be_killed_at_any_step(tmp_path: Path) -> N
         assert store.list() == (pinned,)
 
 
-def test_setting_a_damaged_file_aside_may_be_killed_at_any_step(tmp_path: Path) -> None:
+def test_setting_aside_killed_at_any_step_leaves_a_consistent_store(tmp_path: Path) -> None:
     rotten, sound = bytes(range(256)) * (2 * CHUNK_SIZE // 256 + 1), b"is as it was"
 
     def damage(directory: Path) -> None:
@@ -162,7 +162,7 @@ def test_setting_a_damaged_file_aside_may_be_killed_at_any_step(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_what_a_put_has_acknowledged_outlives_kills_at_any_moment(tmp_path: Path, seed: int) -> None:
+def test_acknowledged_puts_survive_kills_at_any_moment(tmp_path: Path, seed: int) -> None:
     chance = random.Random(seed)
     script = PUTTER.replace("QUOTA", str(QUOTA))
     for number in range(10):

@@ -28,7 +28,7 @@ EMPTY_FILE = "QmbFMke1KXqnYyBBWxB74N4c5SBnJMVAiMNRcGu6x1AwQH"
 @pytest.mark.parametrize(
     "size", [0, 1, CHUNK_SIZE - 1, CHUNK_SIZE, CHUNK_SIZE + 1, 2 * CHUNK_SIZE, 174 * CHUNK_SIZE + 1]
 )
-def test_what_is_put_is_found_under_its_cid_whole_and_block_by_block(store: Store, size: int) -> None:
+def test_a_file_is_stored_under_its_cid_with_all_its_blocks(store: Store, size: int) -> None:
     data = random.Random(size).randbytes(size)
     cid = store.put_bytes(data)
     assert cid == cid_of_bytes(data)
@@ -40,11 +40,11 @@ def test_what_is_put_is_found_under_its_cid_whole_and_block_by_block(store: Stor
         assert store.get_block(block.cid) == block.data
 
 
-def test_the_empty_file_has_its_documented_name(store: Store) -> None:
+def test_the_empty_file_has_its_documented_cid(store: Store) -> None:
     assert store.put_bytes(b"") == EMPTY_FILE
 
 
-def test_a_stream_of_any_size_is_put_in_constant_memory(store: Store) -> None:
+def test_storing_a_stream_takes_constant_memory(store: Store) -> None:
     store.put_bytes(b"what is loaded once is not counted")
     tracemalloc.start()
     try:
@@ -55,7 +55,7 @@ def test_a_stream_of_any_size_is_put_in_constant_memory(store: Store) -> None:
     assert peak < 4 << 20
 
 
-def test_what_is_not_held_is_unavailable(store: Store) -> None:
+def test_a_file_that_is_not_held_is_unavailable(store: Store) -> None:
     assert not store.has(EMPTY_FILE)
     assert store.path(EMPTY_FILE) is None
     assert store.checked(EMPTY_FILE) is None
@@ -67,20 +67,20 @@ def test_what_is_not_held_is_unavailable(store: Store) -> None:
 
 
 @pytest.mark.parametrize("name", ["", "../secret", "Qm", EMPTY_FILE + "/x", ".lock"])
-def test_no_name_but_a_cid_reaches_the_disk(store: Store, name: str) -> None:
+def test_only_cids_reach_the_disk(store: Store, name: str) -> None:
     for call in (store.path, store.has, store.checked, store.verify, store.open, store.get_block, store.assemble):
         with pytest.raises(InvalidCid):
             call(name)
 
 
-def test_a_source_that_breaks_leaves_nothing(store: Store) -> None:
+def test_a_failing_source_leaves_no_files(store: Store) -> None:
     with pytest.raises(OSError, match="the source broke"):
         store.put_stream(RandomStream(3 << 20, fail_at=1 << 20))
     assert store.list() == ()
     assert leftovers(store.directory) == []
 
 
-def test_a_source_that_breaks_late_leaves_nothing_in_the_index(store: Store) -> None:
+def test_a_source_that_fails_late_leaves_nothing_in_the_index(store: Store) -> None:
     with pytest.raises(OSError, match="the source broke"):
         store.put_stream(RandomStream(40 << 20, fail_at=1 << 20))
     with closing(BlockIndex(store.directory / ".blocks.sqlite")) as index:
@@ -107,14 +107,14 @@ def files_of_a_mebibyte() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("files_of_a_mebibyte")
-def test_a_full_disk_is_said_so_and_leaves_nothing(store: Store) -> None:
+def test_a_full_disk_raises_store_full_and_leaves_no_files(store: Store) -> None:
     with pytest.raises(StoreFull):
         store.put_bytes(bytes(3 << 20))
     assert store.list() == ()
     assert leftovers(store.directory) == []
 
 
-def test_a_rotten_file_is_found_out_and_moved_aside(store: Store) -> None:
+def test_a_damaged_file_is_detected_and_set_aside(store: Store) -> None:
     data = random.Random(1).randbytes(600_000)
     cid = store.put_bytes(data)
     flip_bit(store.directory / cid, 300_000)
@@ -134,7 +134,7 @@ def test_a_file_that_changed_after_it_was_checked_is_hashed_again(store: Store) 
     assert store.checked(cid) is None
 
 
-def test_rotten_bytes_are_never_given_as_a_block(store: Store) -> None:
+def test_damaged_bytes_are_never_served_as_a_block(store: Store) -> None:
     data = random.Random(2).randbytes(2 * CHUNK_SIZE)
     cid = store.put_bytes(data)
     first, second, root = blocks_of_stream(io.BytesIO(data))
@@ -147,7 +147,7 @@ def test_rotten_bytes_are_never_given_as_a_block(store: Store) -> None:
     assert store.get_block(root.cid) is None
 
 
-def test_a_block_of_two_files_is_found_when_one_of_them_is_gone(store: Store) -> None:
+def test_a_block_of_two_files_is_found_after_one_is_deleted(store: Store) -> None:
     shared = random.Random(3).randbytes(CHUNK_SIZE)
     cids = [store.put_bytes(shared + tail) for tail in (b"one", b"two")]
     block = next(iter(blocks_of_stream(io.BytesIO(shared))))
@@ -158,7 +158,7 @@ def test_a_block_of_two_files_is_found_when_one_of_them_is_gone(store: Store) ->
 
 
 @pytest.mark.parametrize("damage", ["gone", "garbage"])
-def test_the_index_is_built_again(tmp_path: Path, damage: str) -> None:
+def test_a_lost_or_broken_index_is_rebuilt(tmp_path: Path, damage: str) -> None:
     data = random.Random(4).randbytes(CHUNK_SIZE + 1)
     with Store(tmp_path) as store:
         cid = store.put_bytes(data)
@@ -173,7 +173,7 @@ def test_the_index_is_built_again(tmp_path: Path, damage: str) -> None:
         assert store.list() == (cid,)
 
 
-def test_a_stray_file_under_a_name_that_is_not_its_own_is_moved_aside(tmp_path: Path) -> None:
+def test_a_file_with_the_wrong_cid_is_set_aside(tmp_path: Path) -> None:
     (tmp_path / EMPTY_FILE).write_bytes(b"not empty")
     with Store(tmp_path) as store:
         assert store.list() == ()
@@ -196,7 +196,7 @@ def test_a_file_of_other_chunking_is_checked_by_its_tree(store: Store) -> None:
         store.verify(root.cid)
 
 
-def test_a_directory_that_can_not_be_used_is_a_matter_of_configuration(tmp_path: Path) -> None:
+def test_an_unusable_directory_raises_configuration_error(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ConfigurationError) as caught:
         Store(tmp_path / "file" / "store")
@@ -240,7 +240,7 @@ def test_processes_may_share_a_directory(tmp_path: Path) -> None:
     assert leftovers(tmp_path) == []
 
 
-def test_what_a_killed_writer_left_is_cleared_but_not_what_a_living_one_writes(tmp_path: Path) -> None:
+def test_files_of_killed_writers_are_deleted_and_those_of_live_ones_kept(tmp_path: Path) -> None:
     with subprocess.Popen(
         [sys.executable, "-c", STUCK_WRITER, str(tmp_path)], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as writer:

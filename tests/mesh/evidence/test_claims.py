@@ -9,7 +9,7 @@ from schemas import Demand, cid_of_bytes, encode
 from tests.mesh.evidence.jobs import OTHER, ROBOT, THIEF, JobFiles, failures
 
 
-def test_a_held_result_message_proves_who_signed_it(job: JobFiles) -> None:
+def test_a_result_message_proves_who_signed_it(job: JobFiles) -> None:
     verdict = job.verify(job.message(), finalized=None)
     assert verdict.holds
     signature = verdict.of("signature")
@@ -25,7 +25,7 @@ def test_a_held_result_message_proves_who_signed_it(job: JobFiles) -> None:
         ({"result": cid_of_bytes(b"another")}, "for another recording"),
     ],
 )
-def test_a_result_message_of_another_signer_liability_or_recording_proves_nothing(
+def test_a_result_message_with_another_signer_liability_or_recording_fails(
     job: JobFiles, fields: dict[str, object], why: str
 ) -> None:
     said = failures(job.verify(job.message(**fields)))  # type: ignore[arg-type]
@@ -34,11 +34,11 @@ def test_a_result_message_of_another_signer_liability_or_recording_proves_nothin
 
 
 @pytest.mark.parametrize("content", [b"", b"{}", b"\xff", b'{"liability": 1}'])
-def test_what_is_no_result_message_is_said_to_be_none(job: JobFiles, content: bytes) -> None:
+def test_an_undecodable_result_message_fails(job: JobFiles, content: bytes) -> None:
     assert failures(job.verify(content))["signature"].startswith("the Result message: ")
 
 
-def test_a_demand_is_no_result(job: JobFiles) -> None:
+def test_a_demand_is_not_a_result(job: JobFiles) -> None:
     demand = Demand(
         model=cid_of_bytes(b"m"),
         objective=cid_of_bytes(b"o"),
@@ -53,7 +53,7 @@ def test_a_demand_is_no_result(job: JobFiles) -> None:
     assert "not a Result" in failures(job.verify(encode(ROBOT.sign(demand))))["signature"]
 
 
-def test_two_files_alone_show_that_they_belong_together_and_leave_the_rest_open(job: JobFiles) -> None:
+def test_two_files_alone_leave_the_other_findings_open(job: JobFiles) -> None:
     job.claim = Claim()
     verdict = job.verify()
     assert verdict.holds
@@ -61,7 +61,7 @@ def test_two_files_alone_show_that_they_belong_together_and_leave_the_rest_open(
     assert untold == {"finalized", "signature", "result-file", "objective-file", "liability", "agent", "lighthouse"}
 
 
-def test_two_files_and_the_message_are_enough_for_an_arbiter_without_a_chain(job: JobFiles) -> None:
+def test_an_arbiter_needs_no_chain_with_the_result_message(job: JobFiles) -> None:
     job.claim = Claim()
     verdict = job.verify(job.message())
     assert verdict.holds

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from tests.mesh.evidence.jobs import Metadata
 
 
-def test_of_an_honest_job_everything_holds(job: JobFiles) -> None:
+def test_every_finding_of_an_honest_job_holds(job: JobFiles) -> None:
     verdict = job.verify()
     assert [finding.name for finding in verdict.findings] == [
         "finalized",
@@ -159,7 +159,7 @@ def of_nobody(messages: list[ChannelMessage], metadata: Metadata) -> list[Channe
         (of_nobody, {"liability": "names no liability"}),
     ],
 )
-def test_a_forged_recording_is_found_out_and_the_fault_named(
+def test_a_forged_recording_fails_with_the_right_findings(
     job: JobFiles, forgery: object, found: dict[str, str]
 ) -> None:
     job.forge(forgery)  # type: ignore[arg-type]
@@ -175,7 +175,7 @@ def another_answer(messages: list[ChannelMessage], metadata: Metadata) -> list[C
     return messages
 
 
-def test_whatever_is_changed_it_is_not_the_file_that_was_signed(job: JobFiles) -> None:
+def test_a_changed_file_is_not_the_one_that_was_signed(job: JobFiles) -> None:
     signed = job.claim.result
     job.forge(another_answer)
     assert job.verify().holds
@@ -183,21 +183,21 @@ def test_whatever_is_changed_it_is_not_the_file_that_was_signed(job: JobFiles) -
     assert failures(verdict) == {"result-file": f"the result is {cid_of_file(job.result)}, and it should be {signed}"}
 
 
-def test_a_file_that_is_cut_is_no_evidence(job: JobFiles) -> None:
+def test_a_cut_recording_is_not_readable(job: JobFiles) -> None:
     job.result.write_bytes(job.result.read_bytes()[:-20])
     said = failures(job.verify())
     assert set(said) == {"result-file", "readable"}
     assert "end" in said["readable"]
 
 
-def test_a_flipped_bit_is_found_by_a_checksum(job: JobFiles) -> None:
+def test_a_flipped_bit_fails_the_checksum(job: JobFiles) -> None:
     content = bytearray(job.result.read_bytes())
     content[content.index(b"\x28\xb5\x2f\xfd") + 40] ^= 1
     job.result.write_bytes(content)
     assert set(failures(job.verify())) == {"result-file", "readable"}
 
 
-def test_another_objective_than_that_of_the_contract_is_told(job: JobFiles) -> None:
+def test_another_objective_than_the_contracts_fails(job: JobFiles) -> None:
     said = failures(job.verify(objective=cid_of_bytes(b"harder work")))
     assert set(said) == {"objective-file", "objective"}
 
@@ -219,7 +219,7 @@ def test_a_job_that_failed_may_have_played_only_the_beginning(tmp_path: Path) ->
     assert job.verify(success=False).holds
 
 
-def test_topics_that_were_not_to_be_recorded_need_not_be_there(tmp_path: Path) -> None:
+def test_topics_that_were_not_recorded_may_be_missing(tmp_path: Path) -> None:
     job = make_job(tmp_path, topics="/say")
     verdict = job.verify()
     assert verdict.holds
@@ -228,7 +228,7 @@ def test_topics_that_were_not_to_be_recorded_need_not_be_there(tmp_path: Path) -
     assert played.detail.endswith("only 1 topics were recorded")
 
 
-def test_messages_that_were_lost_are_not_hidden(tmp_path: Path) -> None:
+def test_lost_messages_fail_the_closed_finding(tmp_path: Path) -> None:
     job = make_job(tmp_path)
     job.result.unlink()
     with Recorder(job.result, RecordingAbout(liability=LIABILITY)) as recorder:
@@ -269,9 +269,7 @@ def interrupted(tmp_path: Path, *parts: tuple[str, ...]) -> JobFiles:
         (((), WORDS), "all 6 messages of the objective were played, in order"),
     ],
 )
-def test_a_job_that_was_gone_on_with_after_a_breakdown_holds_and_says_so(
-    tmp_path: Path, parts: tuple[tuple[str, ...], ...], detail: str
-) -> None:
+def test_a_job_continued_after_a_crash_holds(tmp_path: Path, parts: tuple[tuple[str, ...], ...], detail: str) -> None:
     verdict = interrupted(tmp_path, *parts).verify()
     assert failures(verdict) == {}
     closed, played = verdict.of("closed"), verdict.of("played")
@@ -281,14 +279,14 @@ def test_a_job_that_was_gone_on_with_after_a_breakdown_holds_and_says_so(
     assert (played.holds, played.detail) == (True, detail)
 
 
-def test_what_a_breakdown_has_cost_is_told_and_left_open(tmp_path: Path) -> None:
+def test_messages_lost_in_a_crash_leave_the_finding_open(tmp_path: Path) -> None:
     verdict = interrupted(tmp_path, WORDS[:2], WORDS[3:]).verify()
     played = verdict.of("played")
     assert played is not None
     assert (played.holds, played.detail[:40]) == (None, "1 messages are not in the recording: the")
 
 
-def test_an_objective_that_is_no_recording_was_not_played(tmp_path: Path) -> None:
+def test_an_objective_that_is_not_a_recording_was_not_played(tmp_path: Path) -> None:
     job = make_job(tmp_path, played=())
     job.objective.write_bytes(b"no recording")
     played = job.verify(success=False).of("played")

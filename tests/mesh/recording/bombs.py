@@ -11,7 +11,7 @@ import zstandard
 from mcap.opcode import Opcode
 
 from mesh.recording import Limits
-from tests.mesh.recording.raw import CHANNEL, SCHEMA, chunk, message, raw_file, record, text
+from tests.mesh.recording.files import CHANNEL, SCHEMA, chunk, message, raw_file, record, text
 from tests.support.bags import MAGIC, Bag, BagMessage, compress, fields
 from tests.support.bags import record as bag_record
 

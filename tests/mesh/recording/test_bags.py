@@ -24,7 +24,7 @@ def kept(directory: Path, content: bytes) -> Path:
 
 @pytest.mark.parametrize("indexed", [True, False])
 @pytest.mark.parametrize("compression", ["none", "bz2", "lz4"])
-def test_everything_in_a_bag_is_given_as_it_is(tmp_path: Path, compression: Compression, indexed: bool) -> None:
+def test_all_content_of_a_bag_is_read(tmp_path: Path, compression: Compression, indexed: bool) -> None:
     objective = open_objective(kept(tmp_path, Bag(MESSAGES, compression, indexed=indexed).encode()))
     assert objective.format == "bag"
     assert objective.count == 250
@@ -35,7 +35,7 @@ def test_everything_in_a_bag_is_given_as_it_is(tmp_path: Path, compression: Comp
     assert played == [(one.topic, one.payload, one.time_ns, one.time_ns) for one in MESSAGES]
 
 
-def test_messages_come_by_their_time_whatever_their_place_in_the_bag(tmp_path: Path) -> None:
+def test_messages_of_a_bag_are_sorted_by_time(tmp_path: Path) -> None:
     shuffled = [MESSAGES[n * 97 % 250] for n in range(250)]
     objective = open_objective(kept(tmp_path, Bag(shuffled, per_chunk=20).encode()))
     assert [one.log_time_ns for one in objective.messages()] == [one.time_ns for one in MESSAGES]
@@ -48,7 +48,7 @@ def test_messages_outside_chunks_are_read_too(tmp_path: Path) -> None:
     assert (first.payload, first.log_time_ns) == (string("loose"), 5 * SECOND + 6)
 
 
-def test_the_type_is_what_the_connection_says(tmp_path: Path) -> None:
+def test_the_payload_type_comes_from_the_connection(tmp_path: Path) -> None:
     sent = BagMessage("/scan", b"\0", T0, type="sensor_msgs/LaserScan", md5sum="90c7", definition="float32 angle\n\xff")
     (topic,) = open_objective(kept(tmp_path, Bag([sent]).encode())).topics
     assert topic.type == PayloadType("ros1", "sensor_msgs/LaserScan", "ros1msg", "float32 angle\n\xff".encode())
@@ -62,14 +62,14 @@ def test_a_bag_cut_within_a_record_is_corrupt(tmp_path: Path, indexed: bool) -> 
             open_objective(kept(tmp_path, whole[:length]))
 
 
-def test_a_closed_bag_without_its_index_is_cut_and_an_unclosed_one_is_not(tmp_path: Path) -> None:
+def test_a_closed_bag_without_an_index_is_corrupt_and_an_unclosed_one_is_not(tmp_path: Path) -> None:
     closed, unclosed = (Bag(MESSAGES, per_chunk=250, indexed=indexed).encode() for indexed in (True, False))
     with pytest.raises(CorruptRecording, match="before its index"):
         open_objective(kept(tmp_path, closed[: len(unclosed) - 200]))
     assert open_objective(kept(tmp_path, unclosed)).count == 250
 
 
-def test_an_encrypted_bag_is_none_that_can_be_read(tmp_path: Path) -> None:
+def test_an_encrypted_bag_is_not_a_recording(tmp_path: Path) -> None:
     header = {"op": b"\x03", "index_pos": bytes(8), "encryptor": b"rosbag/AesCbcEncryptor"}
     with pytest.raises(NotARecording, match="encrypted"):
         open_objective(kept(tmp_path, MAGIC + record(header, b"")))
@@ -108,7 +108,7 @@ def chunk(data: bytes, *, compression: bytes = b"none", size: int | None = None)
         (BAG + record({"op": b"\x07", "topic": b"/a"}, b""), "without its field conn"),
     ],
 )
-def test_what_no_writer_writes_is_corrupt(tmp_path: Path, content: bytes, why: str) -> None:
+def test_malformed_records_are_corrupt(tmp_path: Path, content: bytes, why: str) -> None:
     with pytest.raises(CorruptRecording, match=why):
         open_objective(kept(tmp_path, MAGIC + content))
 
@@ -123,6 +123,6 @@ def test_what_no_writer_writes_is_corrupt(tmp_path: Path, content: bytes, why: s
         (Limits(expanded=10_000), "expand"),
     ],
 )
-def test_every_limit_holds(tmp_path: Path, limits: Limits, what: str) -> None:
+def test_every_limit_is_enforced(tmp_path: Path, limits: Limits, what: str) -> None:
     with pytest.raises(RecordingTooLarge, match=what):
         open_objective(kept(tmp_path, Bag(MESSAGES, "bz2").encode()), limits)

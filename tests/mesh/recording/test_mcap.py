@@ -13,8 +13,19 @@ from mcap.writer import CompressionType, Writer
 
 from mesh.recording import CorruptRecording, Limits, NotARecording, RecordingTooLarge, open_objective
 from schemas.payloads import PayloadType
-from tests.mesh.recording.files import T0, mcap_file, with_messages
-from tests.mesh.recording.raw import CHANNEL, MAGIC, SCHEMA, chunk, message, raw_file, record, text
+from tests.mesh.recording.files import (
+    CHANNEL,
+    MAGIC,
+    SCHEMA,
+    T0,
+    chunk,
+    mcap_file,
+    message,
+    raw_file,
+    record,
+    text,
+    with_messages,
+)
 from tests.support.bags import Bag, BagMessage
 
 if TYPE_CHECKING:
@@ -39,7 +50,7 @@ def kept(directory: Path, content: bytes) -> Path:
     ],
     ids=lambda options: ",".join(options),
 )
-def test_everything_in_a_file_is_given_as_it_is(tmp_path: Path, options: dict[str, Any]) -> None:
+def test_all_content_of_a_file_is_read(tmp_path: Path, options: dict[str, Any]) -> None:
     times = [T0 + n * 1000 for n in range(500)]
     objective = open_objective(kept(tmp_path, with_messages(times, **options)))
     assert objective.format == "mcap"
@@ -55,7 +66,7 @@ def test_everything_in_a_file_is_given_as_it_is(tmp_path: Path, options: dict[st
         assert (one.sequence, one.type) == (number, kind)
 
 
-def test_messages_come_by_their_time_whatever_their_place_in_the_file(tmp_path: Path) -> None:
+def test_messages_of_a_file_are_sorted_by_time(tmp_path: Path) -> None:
     times = [T0 + n * 7919 % 1000 for n in range(1000)]
     objective = open_objective(kept(tmp_path, with_messages(times)))
     played = [one.log_time_ns for one in objective.messages()]
@@ -63,21 +74,21 @@ def test_messages_come_by_their_time_whatever_their_place_in_the_file(tmp_path: 
     assert objective.start_ns == T0
 
 
-def test_messages_of_one_time_come_in_the_order_of_the_file(tmp_path: Path) -> None:
+def test_messages_of_equal_time_keep_the_order_of_the_file(tmp_path: Path) -> None:
     objective = open_objective(kept(tmp_path, with_messages([T0] * 300)))
     assert [one.sequence for one in objective.messages()] == list(range(300))
 
 
 @pytest.mark.parametrize("disorder", [1, 7919])
 @pytest.mark.parametrize("skip", [0, 1, 99, 100, 499, 500, 501])
-def test_reading_may_begin_at_any_message(tmp_path: Path, skip: int, disorder: int) -> None:
+def test_reading_can_start_at_any_message(tmp_path: Path, skip: int, disorder: int) -> None:
     times = [T0 + n * disorder % 500 for n in range(500)]
     objective = open_objective(kept(tmp_path, with_messages(times)))
     everything = list(objective.messages())
     assert list(objective.messages(from_index=skip)) == everything[skip:]
 
 
-def test_schema_text_is_never_looked_into(tmp_path: Path) -> None:
+def test_schema_text_is_never_parsed(tmp_path: Path) -> None:
     hostile = b"import os; os.abort()\n=====\nMSG: \xff\xfe"
 
     def write(writer: Writer) -> None:
@@ -96,14 +107,14 @@ def test_a_channel_may_have_no_schema(tmp_path: Path) -> None:
     assert objective.topics[0].type == PayloadType("json")
 
 
-def test_metadata_is_given_by_its_names(tmp_path: Path) -> None:
+def test_metadata_is_given_by_name(tmp_path: Path) -> None:
     objective = open_objective(kept(tmp_path, mcap_file(lambda writer: writer.add_metadata("aira", {"agent": "0x1"}))))
     assert objective.metadata == {"aira": {"agent": "0x1"}}
     assert objective.count == 0
     assert list(objective.messages()) == []
 
 
-def test_attachments_and_records_of_unknown_kinds_are_passed_over(tmp_path: Path) -> None:
+def test_unknown_records_are_skipped_and_attachments_listed(tmp_path: Path) -> None:
     def write(writer: Writer) -> None:
         writer.add_attachment(T0, T0, "photo", "image/png", bytes(3 << 20))
 
@@ -123,7 +134,7 @@ def test_a_file_cut_anywhere_is_corrupt(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("options", [{}, {"enable_data_crcs": True, "use_chunking": False}], ids=["chunks", "plain"])
-def test_a_flipped_bit_in_the_data_is_found_by_its_checksum(tmp_path: Path, options: dict[str, Any]) -> None:
+def test_a_flipped_bit_in_the_data_fails_its_checksum(tmp_path: Path, options: dict[str, Any]) -> None:
     times = [T0 + n for n in range(50)]
     whole = bytearray(with_messages(times, compression=CompressionType.NONE, **options))
     whole[whole.index(b'{"n":7}') + 5] ^= 1
@@ -131,14 +142,14 @@ def test_a_flipped_bit_in_the_data_is_found_by_its_checksum(tmp_path: Path, opti
         open_objective(kept(tmp_path, bytes(whole)))
 
 
-def test_a_flipped_bit_in_the_index_is_found_by_its_checksum(tmp_path: Path) -> None:
+def test_a_flipped_bit_in_the_index_fails_its_checksum(tmp_path: Path) -> None:
     whole = bytearray(with_messages([T0]))
     whole[whole.rindex(b"/b")] ^= 1
     with pytest.raises(CorruptRecording, match="checksum"):
         open_objective(kept(tmp_path, bytes(whole)))
 
 
-def test_a_file_over_the_size_limit_is_not_even_read(tmp_path: Path) -> None:
+def test_a_file_over_the_size_limit_is_not_read(tmp_path: Path) -> None:
     with pytest.raises(RecordingTooLarge) as caught:
         open_objective(kept(tmp_path, bytes(1001)), Limits(size=1000))
     assert caught.value.reason == "too-large"
@@ -161,7 +172,7 @@ def test_a_small_file_that_expands_too_much_is_refused_without_expanding_it(tmp_
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
-def test_a_chunk_that_expands_beyond_what_it_says_is_stopped_there(tmp_path: Path, compression: str) -> None:
+def test_a_chunk_never_expands_beyond_its_stated_size(tmp_path: Path, compression: str) -> None:
     import lz4.frame  # type: ignore[import-untyped]
 
     inner = bytes(256 << 20)
@@ -178,7 +189,7 @@ def test_a_chunk_that_expands_beyond_what_it_says_is_stopped_there(tmp_path: Pat
     assert peak < 8 << 20
 
 
-def test_messages_so_out_of_order_that_they_do_not_fit_in_memory_are_refused(tmp_path: Path) -> None:
+def test_messages_too_far_out_of_order_to_sort_are_refused(tmp_path: Path) -> None:
     path = kept(tmp_path, with_messages([T0 + n * 7919 % 5000 for n in range(5000)]))
     assert open_objective(path).count == 5000
     with pytest.raises(RecordingTooLarge, match="out of order"):
@@ -195,7 +206,7 @@ def test_messages_so_out_of_order_that_they_do_not_fit_in_memory_are_refused(tmp
         (Limits(expanded=2000), "expand"),
     ],
 )
-def test_every_limit_holds(tmp_path: Path, limits: Limits, what: str) -> None:
+def test_every_limit_is_enforced(tmp_path: Path, limits: Limits, what: str) -> None:
     path = kept(tmp_path, with_messages([T0 + n for n in range(100)]))
     assert open_objective(path).count == 100
     with pytest.raises(RecordingTooLarge, match=what) as caught:
@@ -227,14 +238,14 @@ def test_every_limit_holds(tmp_path: Path, limits: Limits, what: str) -> None:
         ),
     ],
 )
-def test_what_no_writer_writes_is_corrupt(tmp_path: Path, content: bytes, why: str) -> None:
+def test_malformed_records_are_corrupt(tmp_path: Path, content: bytes, why: str) -> None:
     with pytest.raises(CorruptRecording, match=why) as caught:
         open_objective(kept(tmp_path, content))
     assert caught.value.reason == "corrupt"
     assert caught.value.hint
 
 
-def test_a_file_that_changes_after_it_was_opened_is_found_out(tmp_path: Path) -> None:
+def test_a_file_changed_after_opening_is_corrupt(tmp_path: Path) -> None:
     path = kept(tmp_path, with_messages([T0 + n for n in range(500)]))
     objective = open_objective(path)
     messages = objective.messages()
@@ -251,7 +262,7 @@ def test_a_message_record_is_read_as_the_package_writes_it() -> None:
 
 
 @pytest.mark.parametrize("content", [with_messages([T0] * 500), Bag([BagMessage("/a", b"", T0)] * 500).encode()])
-def test_progress_is_told_in_bytes_of_the_file(tmp_path: Path, content: bytes) -> None:
+def test_progress_is_reported_in_bytes_of_the_file(tmp_path: Path, content: bytes) -> None:
     told: list[tuple[int, int | None]] = []
     open_objective(kept(tmp_path, content), progress=lambda done, total: told.append((done, total)))
     assert len(told) > 3

@@ -90,12 +90,12 @@ def content_of(data: bytes) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("count", "channels"), [(0, 1), (1, 1), (11, 2), (1000, 1), (1000, 40), (3000, 3)])
-def test_a_file_is_that_of_the_packages_own_writer(count: int, channels: int) -> None:
+def test_a_file_has_the_same_content_as_one_by_the_mcap_package(count: int, channels: int) -> None:
     rows = rows_of(count, channels)
     assert content_of(ours(rows, channels=channels)) == content_of(theirs(rows, channels=channels))
 
 
-def test_the_index_leads_to_each_message_of_a_window() -> None:
+def test_the_index_finds_each_message_of_a_time_window() -> None:
     rows = rows_of(2000, 5)
     reader = make_reader(io.BytesIO(ours(rows, channels=5)), validate_crcs=True)
     start, end = 10**18 + 2 * 10**8, 10**18 + 3 * 10**8
@@ -104,7 +104,7 @@ def test_the_index_leads_to_each_message_of_a_window() -> None:
     assert found == [row[4] for row in due]
 
 
-def test_what_was_flushed_is_readable_without_an_end() -> None:
+def test_flushed_messages_are_readable_without_an_end() -> None:
     rows = rows_of(100, 2)
     messages = NonSeekingReader(io.BytesIO(ours(rows, channels=2, finish=False))).iter_messages(log_time_order=False)
     found = [next(messages)[2].sequence for _ in rows]
@@ -160,7 +160,7 @@ GOOD: dict[str, Any] = {
         {"metadata": {"role": "\udcff"}},
     ],
 )
-def test_a_bad_argument_leaves_the_file_as_it_was(bad: dict[str, Any]) -> None:
+def test_an_unrecordable_message_leaves_the_file_intact(bad: dict[str, Any]) -> None:
     stream = io.BytesIO()
     writer = McapWriter(stream)
     writer.add(**GOOD)
@@ -175,7 +175,7 @@ def test_a_bad_argument_leaves_the_file_as_it_was(bad: dict[str, Any]) -> None:
     assert [message.sequence for _, _, message in found] == [0, 1]
 
 
-def test_channels_beyond_what_the_format_can_number_are_refused() -> None:
+def test_more_channels_than_the_format_can_number_are_refused() -> None:
     writer = McapWriter(io.BytesIO())
     for number in range(MAX_CHANNELS):
         writer.add(**(GOOD | {"topic": f"/{number}"}))

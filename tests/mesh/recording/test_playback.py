@@ -71,7 +71,7 @@ def objective(directory: Path, *times: int) -> Objective:
         (FixedRate(hz=100), [0, 10, 20, 30]),
     ],
 )
-def test_when_each_message_is_due(pace: Pace, due: list[int]) -> None:
+def test_due_times_of_messages(pace: Pace, due: list[int]) -> None:
     recorded = messages(0, 10 * MILLISECOND, 10 * MILLISECOND, 250 * MILLISECOND)
     steps = list(timeline(recorded, pace))
     assert [step.due_ns for step in steps] == [one * MILLISECOND for one in due]
@@ -79,12 +79,12 @@ def test_when_each_message_is_due(pace: Pace, due: list[int]) -> None:
     assert [step.message for step in steps] == recorded
 
 
-def test_from_a_position_the_first_message_is_due_at_once_and_keeps_its_place() -> None:
+def test_starting_at_an_index_makes_its_message_due_at_once() -> None:
     steps = list(timeline(messages(5, 7, 20)[1:], RecordedTimes(), first_index=1))
     assert [(step.index, step.due_ns) for step in steps] == [(1, 0), (2, 13)]
 
 
-def test_from_a_time_what_was_before_is_left_out_and_the_rest_due_as_if_it_began_there() -> None:
+def test_starting_at_a_time_skips_earlier_messages() -> None:
     recorded = messages(0, 4, 10, 15)
     steps = list(timeline(recorded, RecordedTimes(), start_ns=6))
     assert [(step.index, step.due_ns) for step in steps] == [(2, 4), (3, 9)]
@@ -93,14 +93,14 @@ def test_from_a_time_what_was_before_is_left_out_and_the_rest_due_as_if_it_began
 
 
 @pytest.mark.parametrize("value", [0, -1, float("nan")])
-def test_a_pace_that_never_comes_to_an_end_is_refused(value: float) -> None:
+def test_a_pace_must_be_positive(value: float) -> None:
     with pytest.raises(ValueError, match="must be positive"):
         RecordedTimes(speed=value)
     with pytest.raises(ValueError, match="must be positive"):
         FixedRate(hz=value)
 
 
-async def test_messages_are_given_when_due_and_never_before() -> None:
+async def test_messages_are_never_given_before_they_are_due() -> None:
     clock = WoundClock()
     begin = clock.now
     seen = []
@@ -110,7 +110,7 @@ async def test_messages_are_given_when_due_and_never_before() -> None:
     assert clock.slept_until == [begin + 10, begin + 2500]
 
 
-async def test_after_a_stall_the_late_ones_go_at_once_and_the_others_keep_their_time() -> None:
+async def test_a_stall_does_not_shift_later_messages() -> None:
     clock = WoundClock()
     begin = clock.now
     seen = []
@@ -121,7 +121,7 @@ async def test_after_a_stall_the_late_ones_go_at_once_and_the_others_keep_their_
     assert seen == [0, 10, 510, 510, 1000]
 
 
-async def test_playing_at_once_lets_others_have_the_event_loop() -> None:
+async def test_playing_at_once_yields_to_the_event_loop() -> None:
     turns = 0
 
     async def other() -> None:
@@ -138,7 +138,7 @@ async def test_playing_at_once_lets_others_have_the_event_loop() -> None:
 
 
 @pytest.mark.parametrize("start", [0, 1, 700, 999, 1000])
-async def test_an_objective_is_played_whole_from_any_position(tmp_path: Path, start: int) -> None:
+async def test_an_objective_is_played_from_any_index(tmp_path: Path, start: int) -> None:
     it = objective(tmp_path, *(T0 + n * 100 for n in range(1000)))
     played = [step async for step in play(it, pace=AtOnce(), start_index=start)]
     assert [step.index for step in played] == list(range(start, 1000))
@@ -153,7 +153,7 @@ async def test_an_objective_is_played_from_a_time(tmp_path: Path) -> None:
     assert played == [(8, SECOND - 1), (9, 2 * SECOND - 1)]
 
 
-async def test_playing_can_be_left_at_any_message(tmp_path: Path) -> None:
+async def test_playing_can_stop_at_any_message(tmp_path: Path) -> None:
     it = objective(tmp_path, *(T0 + n for n in range(2000)))
     playing = play(it, pace=AtOnce())
     async for step in playing:
@@ -162,7 +162,7 @@ async def test_playing_can_be_left_at_any_message(tmp_path: Path) -> None:
     await playing.aclose()
 
 
-async def test_playing_can_be_cancelled_while_it_waits(tmp_path: Path) -> None:
+async def test_playing_can_be_cancelled_while_waiting(tmp_path: Path) -> None:
     it = objective(tmp_path, T0, T0 + 3600 * SECOND)
     first = asyncio.Event()
 
@@ -177,7 +177,7 @@ async def test_playing_can_be_cancelled_while_it_waits(tmp_path: Path) -> None:
         await task
 
 
-async def test_a_file_that_changes_while_it_is_played_is_found_out(tmp_path: Path) -> None:
+async def test_a_file_changed_while_playing_is_corrupt(tmp_path: Path) -> None:
     it = objective(tmp_path, *(T0 + n for n in range(2000)))
     it.path.write_bytes(it.path.read_bytes()[:3000])
     with pytest.raises(CorruptRecording):
@@ -185,7 +185,7 @@ async def test_a_file_that_changes_while_it_is_played_is_found_out(tmp_path: Pat
             pass
 
 
-async def test_at_a_thousand_a_second_99_of_100_are_no_later_than_two_milliseconds(tmp_path: Path) -> None:
+async def test_at_1_khz_99_percent_are_at_most_two_milliseconds_late(tmp_path: Path) -> None:
     it = objective(tmp_path, *(T0 + n * MILLISECOND for n in range(500)))
     found = []
     for _ in range(10):

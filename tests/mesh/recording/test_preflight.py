@@ -25,7 +25,7 @@ def on_topic(topic: str, payload: bytes = b"{}") -> bytes:
 
 
 @pytest.mark.parametrize("content", [with_messages([T0]), Bag([BagMessage("/a", string("x"), T0)]).encode()])
-def test_a_good_objective_comes_back_open(tmp_path: Path, content: bytes) -> None:
+def test_a_good_objective_is_returned_open(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "objective"
     path.write_bytes(content)
     outcome = preflight(path)
@@ -52,7 +52,7 @@ def test_a_good_objective_comes_back_open(tmp_path: Path, content: bytes) -> Non
         (with_messages([T0] * 300), "expands-too-much"),
     ],
 )
-def test_what_can_not_be_played_is_told_by_a_word_for_programs(tmp_path: Path, content: bytes, reason: str) -> None:
+def test_an_unplayable_objective_has_a_reason(tmp_path: Path, content: bytes, reason: str) -> None:
     path = tmp_path / "objective"
     path.write_bytes(content)
     outcome = preflight(path, Limits(size=30_000, expanded=8000), topics={"/a", "/b", "a b", "/a/**"})
@@ -62,13 +62,13 @@ def test_what_can_not_be_played_is_told_by_a_word_for_programs(tmp_path: Path, c
     assert (outcome.objective is None) == (reason in ("not-a-recording", "corrupt", "too-large", "expands-too-much"))
 
 
-def test_any_topic_will_do_where_no_device_says_otherwise(tmp_path: Path) -> None:
+def test_without_a_device_any_topic_is_accepted(tmp_path: Path) -> None:
     path = tmp_path / "objective"
     path.write_bytes(on_topic("/whatever"))
     assert preflight(path).ok
 
 
-def test_what_is_no_file_is_no_recording(tmp_path: Path) -> None:
+def test_a_path_that_is_not_a_regular_file_is_not_a_recording(tmp_path: Path) -> None:
     assert preflight(tmp_path / "missing").reason == "not-a-recording"
     assert preflight(tmp_path).reason == "not-a-recording"
     os.mkfifo(tmp_path / "pipe")
@@ -76,7 +76,7 @@ def test_what_is_no_file_is_no_recording(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("kind", "payload"), [("std_msgs/String", b"\x09\0\0\0x"), ("std_msgs/Empty", b"x")])
-def test_a_message_that_is_not_what_its_type_says_is_named(tmp_path: Path, kind: str, payload: bytes) -> None:
+def test_a_message_that_contradicts_its_type_is_reported(tmp_path: Path, kind: str, payload: bytes) -> None:
     path = tmp_path / "objective"
     path.write_bytes(Bag([BagMessage("/b", payload, T0 + n, type=kind) for n in range(3)]).encode())
     outcome = preflight(path)
@@ -84,13 +84,13 @@ def test_a_message_that_is_not_what_its_type_says_is_named(tmp_path: Path, kind:
     assert outcome.detail.startswith(f"message 0 on /b: not a {kind}: ")
 
 
-def test_a_type_that_nobody_here_knows_is_carried_as_it_is(tmp_path: Path) -> None:
+def test_an_unknown_type_is_accepted(tmp_path: Path) -> None:
     path = tmp_path / "objective"
     path.write_bytes(Bag([BagMessage("/b", b"\xff", T0, type="my/Type")]).encode())
     assert preflight(path).ok
 
 
-def test_the_first_message_that_nobody_can_take_is_named(tmp_path: Path) -> None:
+def test_the_first_message_that_no_handler_accepts_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "objective"
 
     def write(writer: Writer) -> None:
@@ -110,7 +110,7 @@ def test_the_first_message_that_nobody_can_take_is_named(tmp_path: Path) -> None
     assert asked == [("/a", 1), ("/a", 2), ("/a", 30)]
 
 
-def test_more_json_than_can_be_read_in_time_is_refused(tmp_path: Path) -> None:
+def test_too_much_json_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "objective"
     path.write_bytes(on_topic("/a", b"[" + b" " * 1000 + b"]"))
     assert preflight(path, Limits(json=1002)).ok

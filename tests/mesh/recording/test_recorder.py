@@ -34,7 +34,7 @@ def read_by_the_package(path: Path) -> list[tuple[Any, Any, Any]]:
         return list(make_reader(file, validate_crcs=True).iter_messages())
 
 
-def test_a_recording_holds_what_was_recorded_and_whose_it_is(tmp_path: Path) -> None:
+def test_a_recording_has_its_messages_and_its_job(tmp_path: Path) -> None:
     path = tmp_path / "new" / "it.mcap"
     with Recorder(path, ABOUT) as recorder:
         recorder.record("/blink", String("blue").encode(), STRING, role="objective", log_time_ns=T0)
@@ -67,7 +67,7 @@ def test_a_recording_holds_what_was_recorded_and_whose_it_is(tmp_path: Path) -> 
     ]
 
 
-def test_viewers_find_a_schema_both_times_and_the_role_on_every_channel(tmp_path: Path) -> None:
+def test_every_channel_has_schema_times_and_role(tmp_path: Path) -> None:
     path = tmp_path / "it.mcap"
     with Recorder(path, ABOUT) as recorder:
         for kind in (EMPTY, STRING, JSON, RAW, PayloadType("ros1", "my/Type", "ros1msg"), PayloadType("json", "Led")):
@@ -102,7 +102,7 @@ def test_viewers_find_a_schema_both_times_and_the_role_on_every_channel(tmp_path
         {"topic": "/\udcff"},
     ],
 )
-def test_what_can_not_be_recorded_is_refused_and_harms_nothing(tmp_path: Path, bad: dict[str, Any]) -> None:
+def test_unrecordable_messages_are_refused(tmp_path: Path, bad: dict[str, Any]) -> None:
     good: dict[str, Any] = {"topic": "/a", "payload": b"x", "type": RAW, "log_time_ns": T0}
     with Recorder(tmp_path / "it.mcap", ABOUT) as recorder:
         recorder.record(**good)
@@ -113,7 +113,7 @@ def test_what_can_not_be_recorded_is_refused_and_harms_nothing(tmp_path: Path, b
     assert len(read_by_the_package(tmp_path / "it.mcap")) == 2
 
 
-def test_a_type_that_no_file_can_hold_costs_its_messages_only_and_they_are_counted(tmp_path: Path) -> None:
+def test_messages_of_an_unrecordable_type_are_dropped_and_counted(tmp_path: Path) -> None:
     with Recorder(tmp_path / "it.mcap", ABOUT) as recorder:
         recorder.record("/a", b"1", RAW)
         recorder.record("/a", b"2", PayloadType("\udcff"))
@@ -123,7 +123,7 @@ def test_a_type_that_no_file_can_hold_costs_its_messages_only_and_they_are_count
     assert open_objective(summary.path).metadata["aira-closed"]["lost"] == "1"
 
 
-def test_what_does_not_fit_in_the_queue_is_dropped_and_counted(tmp_path: Path) -> None:
+def test_messages_beyond_the_queue_are_dropped_and_counted(tmp_path: Path) -> None:
     settings = RecorderSettings(queue_bytes=10_000)
     with Recorder(tmp_path / "it.mcap", ABOUT, settings=settings) as recorder:
         recorder.record("/a", bytes(20_000), RAW)
@@ -136,7 +136,7 @@ def test_what_does_not_fit_in_the_queue_is_dropped_and_counted(tmp_path: Path) -
     assert summary.lost == recorder.lost
 
 
-def test_the_queue_takes_more_as_soon_as_some_of_it_is_written(tmp_path: Path) -> None:
+def test_the_queue_accepts_more_once_some_is_written(tmp_path: Path) -> None:
     with Recorder(tmp_path / "it.mcap", ABOUT, settings=RecorderSettings(queue_bytes=20_000)) as recorder:
         taken, end = 0, time.monotonic() + 30
         while taken < 20 and time.monotonic() < end:
@@ -146,7 +146,7 @@ def test_the_queue_takes_more_as_soon_as_some_of_it_is_written(tmp_path: Path) -
         assert recorder.close().messages == taken == 20
 
 
-def test_many_threads_may_record_at_once(tmp_path: Path) -> None:
+def test_many_threads_record_at_once(tmp_path: Path) -> None:
     with Recorder(tmp_path / "it.mcap", ABOUT) as recorder:
 
         def talk(topic: str) -> None:
@@ -165,7 +165,7 @@ def test_many_threads_may_record_at_once(tmp_path: Path) -> None:
         assert said == [(b"%d" % number, number) for number in range(2000)]
 
 
-def test_nothing_is_taken_after_the_close(tmp_path: Path) -> None:
+def test_nothing_is_recorded_after_close(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "it.mcap", ABOUT)
     first = recorder.close()
     assert recorder.close() == first
@@ -173,7 +173,7 @@ def test_nothing_is_taken_after_the_close(tmp_path: Path) -> None:
         recorder.record("/a", b"", RAW)
 
 
-def test_a_finished_recording_is_never_written_over(tmp_path: Path) -> None:
+def test_a_finished_recording_is_never_overwritten(tmp_path: Path) -> None:
     Recorder(tmp_path / "it.mcap", ABOUT).close()
     before = (tmp_path / "it.mcap").read_bytes()
     with pytest.raises(RecordingExists):
@@ -181,7 +181,7 @@ def test_a_finished_recording_is_never_written_over(tmp_path: Path) -> None:
     assert (tmp_path / "it.mcap").read_bytes() == before
 
 
-def test_a_recording_that_somebody_else_is_making_is_left_alone(tmp_path: Path) -> None:
+def test_a_recording_in_progress_elsewhere_is_refused(tmp_path: Path) -> None:
     with Recorder(tmp_path / "it.mcap", ABOUT) as recorder:
         recorder.record("/a", b"mine", RAW)
         with pytest.raises(RecordingExists):
@@ -189,13 +189,13 @@ def test_a_recording_that_somebody_else_is_making_is_left_alone(tmp_path: Path) 
     assert open_objective(tmp_path / "it.mcap").count == 1
 
 
-def test_where_no_file_can_be_made_it_is_said_at_once(tmp_path: Path) -> None:
+def test_a_file_that_can_not_be_created_fails_at_once(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(RecordingFailed):
         Recorder(tmp_path / "file" / "it.mcap", ABOUT)
 
 
-def test_a_disk_that_refuses_the_recording_is_reported_and_what_was_written_is_there(tmp_path: Path) -> None:
+def test_a_full_disk_fails_the_recording_and_keeps_what_was_written(tmp_path: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     recorder = Recorder(tmp_path / "it.mcap", ABOUT)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, hard))
@@ -212,7 +212,7 @@ def test_a_disk_that_refuses_the_recording_is_reported_and_what_was_written_is_t
         assert again.close().recovered > 50
 
 
-def test_what_was_recorded_is_handed_over_every_second_without_a_close(tmp_path: Path) -> None:
+def test_messages_are_flushed_every_second(tmp_path: Path) -> None:
     settings = RecorderSettings(flush_seconds=0.05)
     with Recorder(tmp_path / "it.mcap", ABOUT, settings=settings) as recorder:
         recorder.record("/a", b"soon", RAW)
@@ -224,9 +224,7 @@ def test_what_was_recorded_is_handed_over_every_second_without_a_close(tmp_path:
             pytest.fail("nothing came to the file")
 
 
-def test_what_was_recorded_is_put_on_the_disk_in_time_though_nothing_more_comes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_messages_are_synced_in_time_without_further_messages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     synced = threading.Semaphore(0)
     fsync = os.fsync
 
@@ -259,13 +257,13 @@ def messages_in_the_prefix(path: Path) -> int:
     return count
 
 
-def test_the_lock_of_a_recording_ends_with_it(tmp_path: Path) -> None:
+def test_closing_a_recording_releases_its_lock(tmp_path: Path) -> None:
     Recorder(tmp_path / "it.mcap", ABOUT).close()
     with (tmp_path / "it.mcap").open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
-def test_recording_does_not_make_its_caller_wait(tmp_path: Path) -> None:
+def test_recording_does_not_block_the_caller(tmp_path: Path) -> None:
     with Recorder(tmp_path / "it.mcap", ABOUT) as recorder:
         took = []
         for _ in range(2000):

@@ -128,11 +128,11 @@ def bag(tmp_path: Path, tutorial: Tutorial) -> Path:
     return path
 
 
-def test_a_tutorial_has_its_published_name(bag: Path, tutorial: Tutorial) -> None:
+def test_a_tutorial_has_its_published_cid(bag: Path, tutorial: Tutorial) -> None:
     assert cid_of_file(bag) == tutorial.cid
 
 
-def test_a_tutorial_holds_its_one_message(bag: Path, tutorial: Tutorial) -> None:
+def test_a_tutorial_has_its_one_message(bag: Path, tutorial: Tutorial) -> None:
     outcome = preflight(bag, topics={"/blink"})
     assert outcome.ok
     assert outcome.objective is not None
@@ -141,7 +141,7 @@ def test_a_tutorial_holds_its_one_message(bag: Path, tutorial: Tutorial) -> None
     assert decode_value(message.payload, message.type) == tutorial.says
 
 
-def test_a_tutorial_is_the_same_as_mcap(bag: Path, tutorial: Tutorial) -> None:
+def test_a_tutorial_is_unchanged_as_mcap(bag: Path, tutorial: Tutorial) -> None:
     converted = open_objective(bag_to_mcap(bag, bag.with_suffix(".mcap"), cid=tutorial.cid))
     assert converted.metadata["aira"] == {"source": tutorial.cid, "source_format": "bag"}
     assert list(converted.messages()) == list(open_objective(bag).messages())

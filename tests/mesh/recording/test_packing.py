@@ -1,17 +1,20 @@
+"""Objectives from JSON lines and from ROS 1 bags."""
+
 from __future__ import annotations
 
 import json
 from typing import TYPE_CHECKING
 
 import pytest
+from mcap.reader import make_reader
 
-from mesh.recording import InvalidLine, PackSummary, messages_in, open_objective, pack
+from mesh.recording import CorruptRecording, InvalidLine, PackSummary, bag_to_mcap, messages_in, open_objective, pack
 from schemas.payloads import EMPTY, JSON, RAW, STRING, PayloadType, String
+from tests.mesh.recording.files import SECOND, T0
+from tests.support.bags import Bag, BagMessage, Compression, string
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-SECOND = 10**9
 
 
 @pytest.mark.parametrize(
@@ -31,18 +34,18 @@ SECOND = 10**9
         ({"data": "AAE=", "type": "ros1;my_msgs/Move"}, b"\0\1", PayloadType("ros1", "my_msgs/Move", "ros1msg")),
     ],
 )
-def test_what_a_line_says(line: dict[str, object], payload: bytes, kind: PayloadType) -> None:
+def test_a_line_becomes_a_message(line: dict[str, object], payload: bytes, kind: PayloadType) -> None:
     (message,) = messages_in([json.dumps({"topic": "/a"} | line).encode()])
     assert (message.topic, message.payload, message.type) == ("/a", payload, kind)
     assert (message.log_time_ns, message.publish_time_ns) == (0, 0)
 
 
-def test_a_line_without_a_time_has_that_of_the_line_before() -> None:
+def test_a_line_without_a_time_repeats_the_previous_one() -> None:
     lines = [b'{"topic":"/a"}', b'{"topic":"/a","time":1.5}', b"\n", b'{"topic":"/b"}', b'{"topic":"/a","time":1}']
     assert [message.log_time_ns for message in messages_in(lines)] == [0, SECOND * 3 // 2, SECOND * 3 // 2, SECOND]
 
 
-def test_times_are_right_to_the_nanosecond() -> None:
+def test_times_are_exact_to_the_nanosecond() -> None:
     (message,) = messages_in([b'{"topic":"/a","time":1535622771.123456789}'])
     assert message.log_time_ns == 1_535_622_771_123_456_789
 
@@ -68,7 +71,7 @@ def test_times_are_right_to_the_nanosecond() -> None:
         (b'{"topic":"/a","data":"\\ud800"}', ""),
     ],
 )
-def test_a_line_that_is_no_message_is_named_by_its_number(line: bytes, why: str) -> None:
+def test_an_invalid_line_is_reported_by_its_number(line: bytes, why: str) -> None:
     with pytest.raises(InvalidLine) as caught:
         list(messages_in([b'{"topic":"/a"}', b"", line]))
     assert caught.value.number == 3
@@ -77,7 +80,7 @@ def test_a_line_that_is_no_message_is_named_by_its_number(line: bytes, why: str)
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_lines_become_a_recording_and_the_same_lines_the_same_bytes(tmp_path: Path) -> None:
+def test_equal_lines_make_equal_recordings(tmp_path: Path) -> None:
     lines = [b'{"topic":"/b","time":2,"data":"late"}', b'{"topic":"/a","time":0.5}', b'{"topic":"/b","time":1}']
     packed = pack(messages_in(lines), tmp_path / "it.mcap")
     assert packed == PackSummary(messages=3, topics=2, duration_ns=SECOND * 3 // 2)
@@ -91,3 +94,42 @@ def test_a_bad_line_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(InvalidLine):
         pack(messages_in([b'{"topic":"/a"}', b"?"]), tmp_path / "it.mcap")
     assert list(tmp_path.iterdir()) == []
+
+
+SENT = [
+    *(BagMessage("/blink", string(f"message {n}"), T0 + (n * 7 % 50) * SECOND) for n in range(50)),
+    BagMessage("/ping", b"", T0, type="std_msgs/Empty", md5sum="d41d8cd98f00b204e9800998ecf8427e", definition=""),
+]
+
+
+@pytest.mark.parametrize("compression", ["none", "bz2", "lz4"])
+def test_a_bag_is_converted_to_mcap_without_loss(tmp_path: Path, compression: Compression) -> None:
+    bag = tmp_path / "it.bag"
+    bag.write_bytes(Bag(SENT, compression, per_chunk=7).encode())
+    path = bag_to_mcap(bag, tmp_path / "it.mcap", cid="QmTheBag")
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert reader.get_header().profile == "ros1"
+        found = list(reader.iter_messages(log_time_order=False))
+    assert [(channel.topic, one.log_time, one.data) for _, channel, one in found] == [
+        (sent.topic, sent.time_ns, sent.payload) for sent in SENT
+    ]
+    for schema, channel, _ in found:
+        sent = next(sent for sent in SENT if sent.topic == channel.topic)
+        assert schema is not None
+        assert (schema.name, schema.encoding, schema.data) == (sent.type, "ros1msg", sent.definition.encode())
+        assert channel.message_encoding == "ros1"
+        assert channel.metadata["md5sum"] == sent.md5sum
+        assert channel.metadata["callerid"] == "/tester"
+    objective = open_objective(path)
+    assert objective.metadata["aira"] == {"source": "QmTheBag", "source_format": "bag"}
+    played = [(one.topic, one.payload, one.log_time_ns) for one in open_objective(bag).messages()]
+    assert [(one.topic, one.payload, one.log_time_ns) for one in objective.messages()] == played
+
+
+def test_a_bad_bag_leaves_no_file(tmp_path: Path) -> None:
+    bag = tmp_path / "it.bag"
+    bag.write_bytes(Bag(SENT).encode()[:5000])
+    with pytest.raises(CorruptRecording):
+        bag_to_mcap(bag, tmp_path / "it.mcap")
+    assert [path.name for path in tmp_path.iterdir()] == ["it.bag"]

@@ -1,3 +1,5 @@
+"""Message rates, and types with JSON schemas."""
+
 from __future__ import annotations
 
 import json
@@ -5,11 +7,32 @@ from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 
-from mesh.recording import Recorder, RecordingAbout, json_type, open_objective
-from schemas.payloads import JSON
+from mesh.recording import Played, Recorder, RecordingAbout, json_type, open_objective, rates_of
+from schemas.payloads import JSON, RAW
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+
+def at(topic: str, *times: int) -> list[Played]:
+    return [Played(topic, b"", time, time, 0, RAW) for time in times]
+
+
+def test_messages_are_counted_in_equal_spans_from_the_first_to_the_last() -> None:
+    messages = at("/a", 100, 101, 149, 150, 199, 200) + at("/b", 200)
+    rates = rates_of(messages, start_ns=100, duration_ns=100, spans=2)
+    assert rates.counts == {"/a": [4, 2], "/b": [0, 1]}
+    assert rates.span_ns == 51
+
+
+def test_messages_of_one_moment_fall_in_one_span() -> None:
+    rates = rates_of(at("/a", 7, 7), start_ns=7, duration_ns=0, spans=4)
+    assert rates.counts == {"/a": [2, 0, 0, 0]}
+
+
+def test_counts_convert_to_messages_per_second() -> None:
+    rates = rates_of(at("/a", 0, 1, 999_999_999), start_ns=0, duration_ns=999_999_999, spans=2)
+    assert rates.per_second("/a") == [4.0, 2.0]
 
 
 class Point(msgspec.Struct):
@@ -32,7 +55,7 @@ class Waves(msgspec.Struct):
     sum: complex
 
 
-def test_a_struct_is_described_as_an_object_with_its_fields_and_units() -> None:
+def test_a_struct_has_a_schema_with_its_fields_and_units() -> None:
     kind = json_type(Point)
     schema = json.loads(kind.schema_data)
     assert (kind.encoding, kind.schema_name, kind.schema_encoding) == ("json", "Point", "jsonschema")
@@ -41,14 +64,14 @@ def test_a_struct_is_described_as_an_object_with_its_fields_and_units() -> None:
     assert schema["required"] == ["x"]
 
 
-def test_what_a_struct_refers_to_is_in_its_schema_itself_too() -> None:
+def test_a_schema_includes_the_structs_it_refers_to() -> None:
     schema = json.loads(json_type(Way).schema_data)
     assert schema["type"] == "object"
     assert set(schema["$defs"]) == {"Point", "Way"}
     assert schema["properties"]["points"]["items"] == {"$ref": "#/$defs/Point"}
 
 
-def test_what_is_no_object_in_json_or_has_no_schema_is_plain_json() -> None:
+def test_types_without_an_object_schema_are_plain_json() -> None:
     assert json_type(Pair) == JSON
     assert json_type(Waves) == JSON
 
