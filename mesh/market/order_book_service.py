@@ -1,9 +1,8 @@
-"""The market's memory: who comes late asks for the open orders, and the order book answers."""
+"""Answers queries for the open orders of a market, which a client sends after it has subscribed."""
 
 from __future__ import annotations
 
 import asyncio
-import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -13,37 +12,50 @@ from mesh.network import call_in_loop, verified_key
 from schemas import encode, lighthouse_selector
 
 if TYPE_CHECKING:
+    from concurrent.futures import Future
     from types import TracebackType
 
     from mesh.market.book import Order, OrderBook
     from schemas import Verified
 
-ANSWERERS: Final = 2
-"""Threads that answer: a market can be large, and who asks may be slow to take the answers."""
-QUESTIONS: Final = 64
-"""Questions that are answered or wait for it, each with a list of the book as it was; more are turned down."""
+THREADS: Final = 2
+"""Threads that answer: a book can be large, and a client may take the answers slowly."""
+PENDING: Final = 64
+"""Queries that may be pending, each with a copy of the list of orders; further ones are dropped."""
 
 
 class OrderBookService:
-    """Answers queries on the keys of a lighthouse from its `book`, inside `async with`.
+    """Answers queries on the keys of `lighthouse` (ENS name) from its `book`, inside `async with`.
 
-    `lighthouse` is the ENS name. Leaving `async with` breaks off what is not answered yet.
+    At most `limit` queries are pending at a time. Leaving `async with` aborts the answers.
     """
 
-    def __init__(self, session: zenoh.Session, lighthouse: str, book: OrderBook) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        lighthouse: str,
+        book: OrderBook,
+        *,
+        limit: int = PENDING,
+        threads: ThreadPoolExecutor | None = None,
+    ) -> None:
         self._session = session
         self._lighthouse = lighthouse
         self._book = book
-        self._room = threading.Semaphore(QUESTIONS)
-        self._threads = ThreadPoolExecutor(ANSWERERS, thread_name_prefix="market memory")
+        self._limit = limit
+        self._threads = threads or ThreadPoolExecutor(THREADS, thread_name_prefix="order book")
+        self._answers: set[Future[None]] = set()
         self._open = True
+
+    @property
+    def pending(self) -> int:
+        """The number of queries that are being answered or wait for it."""
+        return len(self._answers)
 
     async def __aenter__(self) -> Self:
         loop = asyncio.get_running_loop()
         self._queryable: Any = self._session.declare_queryable(
-            lighthouse_selector(self._lighthouse),
-            lambda query: call_in_loop(loop, self._answer_soon, query),
-            complete=True,
+            lighthouse_selector(self._lighthouse), lambda query: call_in_loop(loop, self.answer, query), complete=True
         )
         return self
 
@@ -55,17 +67,17 @@ class OrderBookService:
             self._queryable.undeclare()
         self._threads.shutdown(wait=False, cancel_futures=True)
 
-    def _answer_soon(self, query: zenoh.Query) -> None:
-        """On the loop's thread, as the book changes there."""
-        if self._open and self._room.acquire(blocking=False):
-            answering = self._threads.submit(self._answer, query, list(self._book.orders()))
-            answering.add_done_callback(lambda done: self._room.release())
+    def answer(self, query: zenoh.Query) -> None:
+        """Answer a query in a thread, or drop it. Call it in the event loop's thread, where the book changes."""
+        if self._open and len(self._answers) < self._limit:
+            answer = self._threads.submit(self._reply, query, list(self._book.orders()))
+            self._answers.add(answer)
+            answer.add_done_callback(self._answers.discard)
         else:
             query.drop()  # type: ignore[no-untyped-call]
 
-    def _answer(self, query: zenoh.Query, orders: list[Verified[Order]]) -> None:
-        """Leaving `with` tells the asker that this was all."""
-        with query:
+    def _reply(self, query: zenoh.Query, orders: list[Verified[Order]]) -> None:
+        with query:  # leaving it ends the answer
             for order in orders:
                 key = verified_key(self._lighthouse, order)
                 if not self._open:

@@ -1,20 +1,19 @@
-"""The market's memory by itself: what it tells, and how it ends."""
+"""The order book service: its answers, its limit, and its end."""
 
 from __future__ import annotations
 
 import asyncio
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 from mesh.market import OrderBook
-from mesh.market import order_book_service as memory_module
-from mesh.market.order_book_service import ANSWERERS, OrderBookService
+from mesh.market.order_book_service import THREADS, OrderBookService
 from mesh.network import Endpoints, Network, message_key
 from tests.support.orders import LIGHTHOUSE, MARKET, MODEL, OTHER_MODEL, verified_demand, verified_offer
 from tests.support.waiting import at_most, until, until_answered
 
 if TYPE_CHECKING:
-    import pytest
     import zenoh
 
     from schemas import Verified
@@ -37,7 +36,7 @@ def ask(session: zenoh.Session, selector: str) -> list[str]:
     return [str(reply.ok.key_expr) for reply in session.get(selector, timeout=5) if reply.ok is not None]
 
 
-async def test_it_tells_what_is_asked_for(router: EmbeddedRouter) -> None:
+async def test_it_answers_with_the_orders_that_match_the_query(router: EmbeddedRouter) -> None:
     mine, other, offer = verified_demand(model=MODEL), verified_demand(model=OTHER_MODEL), verified_offer(cost=1)
     keys = {name: message_key(MARKET, order.message) for name, order in (("d", mine), ("e", other), ("o", offer))}
     async with (
@@ -58,7 +57,7 @@ async def test_it_tells_what_is_asked_for(router: EmbeddedRouter) -> None:
             assert set(await asyncio.to_thread(ask, two.session, selector)) == expected
 
 
-async def test_it_tells_the_book_as_it_is_when_asked(router: EmbeddedRouter) -> None:
+async def test_it_answers_with_the_book_at_the_time_of_the_query(router: EmbeddedRouter) -> None:
     book = holding(verified_demand())
     async with network(router) as one, network(router) as two, OrderBookService(one.session, MARKET, book):
         await until_answered(two.session, f"aira/{MARKET}/**")
@@ -67,60 +66,56 @@ async def test_it_tells_the_book_as_it_is_when_asked(router: EmbeddedRouter) -> 
         assert await asyncio.to_thread(ask, two.session, f"aira/{MARKET}/**") == []
 
 
-async def test_leaving_breaks_off_long_answers_and_those_not_begun(router: EmbeddedRouter) -> None:
+async def test_leaving_aborts_long_answers_and_those_that_wait(router: EmbeddedRouter) -> None:
     book = holding(*(verified_demand() for _ in range(3000)))
     async with network(router) as one, network(router) as two:
-        memory = await OrderBookService(one.session, MARKET, book).__aenter__()
+        service = await OrderBookService(one.session, MARKET, book).__aenter__()
         await until_answered(two.session, f"aira/{MARKET}/**")
         asking = [asyncio.create_task(asyncio.to_thread(ask, two.session, f"aira/{MARKET}/**")) for _ in range(5)]
-        await until(lambda: memory._threads._work_queue.qsize() > 0)
+        await until(lambda: service.pending > THREADS)
 
         with at_most(3):
-            await memory.__aexit__(None, None, None)
+            await service.__aexit__(None, None, None)
             answers = await asyncio.gather(*asking)
 
         assert min(len(answer) for answer in answers) < 3000
 
 
-async def test_a_question_that_comes_while_leaving_is_turned_down(router: EmbeddedRouter) -> None:
+async def test_a_query_that_arrives_after_leaving_is_dropped(router: EmbeddedRouter) -> None:
     asked: list[zenoh.Query] = []
     async with network(router) as one, network(router) as two:
-        async with OrderBookService(one.session, MARKET, holding()) as memory:
+        async with OrderBookService(one.session, MARKET, holding()) as service:
             pass
         with one.session.declare_queryable("test", asked.append):
             await until_answered(two.session, "test")
             asking = asyncio.create_task(asyncio.to_thread(ask, two.session, "test"))
             await until(lambda: asked)
 
-            memory._answer_soon(asked.pop())
+            service.answer(asked.pop())
 
             with at_most(2):
                 assert await asking == []
 
 
-async def test_more_questions_than_can_wait_are_turned_down(
-    router: EmbeddedRouter, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each that waits has a list of the whole book: whoever asks again and again would take all memory."""
-    monkeypatch.setattr(memory_module, "QUESTIONS", 1)
-    order, answerers_are_free = verified_demand(), threading.Event()
+async def test_queries_above_the_limit_are_dropped(router: EmbeddedRouter) -> None:
+    """Each pending query has a list of the whole book; without a limit a client could exhaust the memory."""
+    order, may_answer, threads = verified_demand(), threading.Event(), ThreadPoolExecutor(1)
     async with (
         network(router) as one,
         network(router) as two,
-        OrderBookService(one.session, MARKET, holding(order)) as memory,
+        OrderBookService(one.session, MARKET, holding(order), limit=1, threads=threads) as service,
     ):
         await until_answered(two.session, f"aira/{MARKET}/**")
-        await until(lambda: memory._room._value == 1)
-        for _ in range(ANSWERERS):
-            memory._threads.submit(answerers_are_free.wait)
+        await until(lambda: service.pending == 0)
+        threads.submit(may_answer.wait)
         first = asyncio.create_task(asyncio.to_thread(ask, two.session, f"aira/{MARKET}/**"))
-        await until(lambda: memory._threads._work_queue.qsize() > 0)
+        await until(lambda: service.pending == 1)
 
         with at_most(3):
             assert await asyncio.to_thread(ask, two.session, f"aira/{MARKET}/**") == []
 
         assert not first.done()
-        answerers_are_free.set()
+        may_answer.set()
         assert await first == [message_key(MARKET, order.message)]
         await until_answered(two.session, f"aira/{MARKET}/**")
 
