@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Final
 ROOT: Final = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))  # the daemons are those of the tests
 
-from bridges.ipfs import ChannelBridge, Daemon, Gate, Journal  # noqa: E402
+from bridges.ipfs import ChannelBridge, Daemon, RelayJournal, RelayValidator  # noqa: E402
 from mesh.background import Background  # noqa: E402
 from mesh.network import Channel, Endpoints, Network, free_endpoint  # noqa: E402
 from messages import route  # noqa: E402
@@ -136,8 +136,10 @@ async def over_bridge(
         network = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,))))
         person = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,))))
         channel = await stack.enter_async_context(Channel(person.session, LIGHTHOUSE, address=ADDRESS))
-        journal = stack.enter_context(Journal(folder / "journal.sqlite"))
-        bridge = ChannelBridge(network, here, Gate(LIGHTHOUSE, address=lambda: ADDRESS), journal, lighthouse=LIGHTHOUSE)
+        journal = stack.enter_context(RelayJournal(folder / "journal.sqlite"))
+        bridge = ChannelBridge(
+            network, here, RelayValidator(LIGHTHOUSE, address=lambda: ADDRESS), journal, lighthouse=LIGHTHOUSE
+        )
         await stack.enter_async_context(bridge)
         tasks = await stack.enter_async_context(Background())
         tasks.start(listen(there, LIGHTHOUSE, ear, ready), "listens")
@@ -182,7 +184,7 @@ async def measure_all(endpoint: str, one: IpfsDaemon, two: IpfsDaemon, count: in
     """All three ways."""
     async with Daemon(one.api) as here, Daemon(two.api) as there:
         for daemon in (here, there):
-            await daemon.greet()
+            await daemon.detect_version()
         await here.connect(two.swarm_address)
         with tempfile.TemporaryDirectory() as folder:
             return {

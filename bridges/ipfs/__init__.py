@@ -1,4 +1,4 @@
-"""The door to IPFS: the legacy network's PubSub channel, and its content by CID."""
+"""The bridge to IPFS: the legacy network's PubSub channel, and its content by CID."""
 
 from bridges.ipfs.channel import ChannelBridge
 from bridges.ipfs.daemon import Daemon
@@ -9,26 +9,23 @@ from bridges.ipfs.errors import (
     IpfsError,
     JournalFailed,
     NoPeers,
-    Overtaken,
+    PublishedOutOfOrder,
     PubSubDisabled,
 )
-from bridges.ipfs.gate import Gate
-from bridges.ipfs.journal import Journal
-from bridges.ipfs.status import BridgeStatus, status_key
+from bridges.ipfs.journal import RelayJournal
+from bridges.ipfs.validation import RelayValidator
 
 __all__ = [
     "AccessDenied",
-    "BridgeStatus",
     "ChannelBridge",
     "Daemon",
     "DaemonRefused",
     "DaemonUnreachable",
-    "Gate",
     "IpfsError",
-    "Journal",
     "JournalFailed",
     "NoPeers",
-    "Overtaken",
     "PubSubDisabled",
-    "status_key",
+    "PublishedOutOfOrder",
+    "RelayJournal",
+    "RelayValidator",
 ]

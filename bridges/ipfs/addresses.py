@@ -1,4 +1,4 @@
-"""Where a daemon's RPC or a gateway is: as a multiaddr or as a URL. Pure."""
+"""Addresses of a daemon's RPC or a gateway: multiaddrs and URLs. Pure."""
 
 from __future__ import annotations
 
@@ -13,23 +13,24 @@ _HIGHEST_PORT: Final = 65_535
 
 
 def base_url(text: str) -> str:
-    """The URL of `text`, which is one already or a multiaddr, without a slash at its end.
+    """The URL for `text`, which is a URL or a multiaddr, without a trailing slash.
 
-    `/ip4/127.0.0.1/tcp/5001`, also with `/http`, `/https` or `/tls/http` behind it. Raises `ConfigurationError`.
+    Multiaddrs look like `/ip4/127.0.0.1/tcp/5001`, optionally followed by `/http`, `/https` or `/tls/http`. Raises
+    `ConfigurationError`.
     """
     url = _of_multiaddr(text) if text.startswith("/") else text
     try:
         parts = urlsplit(url)
         usable = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
-    except ValueError:  # a port that is none, brackets that do not close
+    except ValueError:  # an invalid port, or an unclosed bracket
         usable = False
     if not usable or parts.query or parts.fragment:
-        raise ConfigurationError(f"{text!r} is no address of an IPFS daemon or gateway", hint=_HINT)
+        raise ConfigurationError(f"{text!r} is not the address of an IPFS daemon or gateway", hint=_HINT)
     return url.rstrip("/")
 
 
 def without_credentials(url: str) -> str:
-    """The same URL as it may be shown: without what stands before an `@`."""
+    """The URL without user name and password, for display."""
     scheme, _, rest = url.partition("://")
     return f"{scheme}://{rest.rpartition('@')[2]}"
 
@@ -40,7 +41,7 @@ def _of_multiaddr(text: str) -> str:
             scheme = {(): "http", ("http",): "http", ("https",): "https", ("tls", "http"): "https"}.get(tuple(rest))
             if scheme is not None:
                 return f"{scheme}://{f'[{host}]' if kind == 'ip6' else host}:{port}"
-    raise ConfigurationError(f"{text!r} is no multiaddr of an IPFS daemon's RPC", hint=_HINT)
+    raise ConfigurationError(f"{text!r} is not a multiaddr of an IPFS daemon's RPC", hint=_HINT)
 
 
 def _is_port(text: str) -> bool:

@@ -1,4 +1,4 @@
-"""The bridge of one lighthouse between the mesh's keys and the IPFS topic of its name."""
+"""The bridge of one lighthouse between its keys on the mesh and its topic on IPFS."""
 
 from __future__ import annotations
 
@@ -11,64 +11,64 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import zenoh
 
-from bridges.ipfs.carrying import MARK, ToIpfs, ToMesh
-from bridges.ipfs.link import Link
-from bridges.ipfs.memory import Side
-from bridges.ipfs.metrics import Standing
-from bridges.ipfs.presence import Presence
-from bridges.ipfs.report import figures_of, news
-from bridges.ipfs.status import BridgeStatus, status_key
-from bridges.ipfs.traffic import LIMIT, Fate, Traffic
+from bridges.ipfs.daemon_link import RECONNECT, DaemonLink
+from bridges.ipfs.journal import Side
+from bridges.ipfs.presence import BridgePresence
+from bridges.ipfs.publishers import BRIDGE_MARK, PUBLISH_RETRY, IpfsPublisher, MeshPublisher
+from bridges.ipfs.relay import QUEUE_LIMIT, MessageRelay, RelayOutcome
+from bridges.ipfs.status import BridgeHealth, changes_between, counters_of
 from mesh.errors import InvalidMessage
 from mesh.network import Pump, call_in_loop
 from mesh.role import Role
+from mesh.telemetry.context import log_event
 from schemas import lighthouse_selector
+from schemas.status import BridgeStatus, bridge_status_key
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from contextlib import AsyncExitStack
 
     from bridges.ipfs.daemon import Daemon
-    from bridges.ipfs.dialects import Event
-    from bridges.ipfs.gate import Gate, Passenger
-    from bridges.ipfs.journal import Journal
+    from bridges.ipfs.journal import RelayJournal
+    from bridges.ipfs.pubsub import PubsubMessage
+    from bridges.ipfs.validation import RelayMessage, RelayValidator
     from mesh.network import Network
+    from mesh.retry import RetryPolicy
     from schemas.status import ContentMetrics
 
 log = logging.getLogger(__name__)
 
-LOOK: Final = 1.0
-"""Seconds between two looks at what was left to other bridges."""
-REPORT: Final = 60.0
-"""Seconds between two lines of the log with what was done meanwhile."""
-LOOKING_UP: Final = 256
-"""Messages that wait for their ENS names at most."""
-_NAMED: Final = re.compile(rb"\.(?:eth|sid|test)\"", re.IGNORECASE)
-"""A message that holds an ENS name has this somewhere."""
+OVERDUE_INTERVAL: Final = 1.0
+"""Seconds between two checks of messages left to other bridges."""
+REPORT_INTERVAL: Final = 60.0
+"""Seconds between two log events with the counters."""
+LOOKUP_LIMIT: Final = 256
+"""Messages that may wait for the resolution of their ENS names."""
+_ENS_NAME: Final = re.compile(rb"\.(?:eth|sid|test)\"", re.IGNORECASE)
+"""Occurs in every message that contains an ENS name."""
 
 
-class Sample(NamedTuple):
-    """What came on the mesh; `marked` if a bridge has put it."""
+class MeshMessage(NamedTuple):
+    """A message received on the mesh; `by_bridge` if a bridge put it there."""
 
     key: str
     payload: bytes
-    marked: bool
+    by_bridge: bool
 
 
 class ChannelBridge(Role):
-    """Carries messages both ways: `async with ChannelBridge(...) as bridge`, then `run`.
+    """Relays messages both ways: `async with ChannelBridge(...) as bridge`, then `run`.
 
-    `gate` checks what passes for `lighthouse` (ENS name); `journal` is this bridge's own memory; `neighbours` are swarm
-    addresses to keep the daemon connected to; `address` is the bridge's name on the mesh, by default a new one;
-    `carried` is told of each message that this bridge has put on a side; `content` gives the figures of what this one
-    does with content. What was done is logged every `report` seconds in which something was.
+    `validator` checks the messages of `lighthouse` (ENS name); `journal` belongs to this bridge alone; `swarm_peers`
+    are multiaddrs to which the daemon is kept connected; `address` identifies the bridge on the mesh, by default a
+    random one; `limit` bounds the queue of each direction; `published` is called with each message that this bridge
+    sent; `content` returns metrics for the status. Changed counters are logged every `report_interval` seconds.
+    `reconnect` and `publish_retry` are the delays after failures of the daemon. The caller closes network, daemon and
+    journal.
 
-    Network, daemon and journal stay the caller's to close.
-
-    A message that was accepted is carried, and once: it waits in the journal until the daemon has taken it, also when
-    `run` is cancelled meanwhile. When the daemon dies in the middle of a call nobody can know whether that one message
-    went out, and it is published again; what a daemon took in its very last moment may be lost with it, until its
-    sender sends it again.
+    An accepted message is sent exactly once: it waits in the journal until the daemon has accepted it, even if `run`
+    is cancelled. Exceptions: if the daemon dies during a call, the message may have gone out and is published again; a
+    message that the daemon accepted just before it died may be lost until its sender repeats it.
     """
 
     title = "bridge"
@@ -77,66 +77,70 @@ class ChannelBridge(Role):
         self,
         network: Network,
         daemon: Daemon,
-        gate: Gate,
-        journal: Journal,
+        validator: RelayValidator,
+        journal: RelayJournal,
         *,
         lighthouse: str,
-        neighbours: tuple[str, ...] = (),
+        swarm_peers: tuple[str, ...] = (),
         address: str | None = None,
-        limit: int = LIMIT,
-        carried: Callable[[Side, Passenger], None] = lambda side, passenger: None,
+        limit: int = QUEUE_LIMIT,
+        published: Callable[[Side, RelayMessage], None] = lambda side, message: None,
         content: Callable[[], ContentMetrics | None] = lambda: None,
-        report: float = REPORT,
+        report_interval: float = REPORT_INTERVAL,
+        reconnect: RetryPolicy = RECONNECT,
+        publish_retry: RetryPolicy = PUBLISH_RETRY,
     ) -> None:
         self.lighthouse: Final = lighthouse.lower()
         self.address: Final = (address or f"0x{secrets.token_hex(20)}").lower()
         self._network = network
         self._daemon = daemon
-        self._gate = gate
+        self._validator = validator
         self._journal = journal
-        self.link: Final = Link(daemon, self.lighthouse, neighbours=neighbours)
-        self.traffic: Final = Traffic(time.monotonic, journal, limit=limit)
-        self._to_ipfs = ToIpfs(self.link, self.traffic, carried)
-        self._to_mesh = ToMesh(network, self.traffic, carried)
+        self.link: Final = DaemonLink(daemon, self.lighthouse, swarm_peers=swarm_peers, retry=reconnect)
+        self.relay: Final = MessageRelay(time.monotonic, journal, limit=limit)
+        self._to_ipfs = IpfsPublisher(self.link, self.relay, published, publish_retry)
+        self._to_mesh = MeshPublisher(network, self.relay, published)
         self._content = content
-        self._report_interval = report
-        self._began = time.monotonic()
-        self._looking_up = asyncio.Semaphore(LOOKING_UP)
+        self._report_interval = report_interval
+        self._started = time.monotonic()
+        self._lookups = asyncio.Semaphore(LOOKUP_LIMIT)
 
     async def _open(self, stack: AsyncExitStack) -> None:
         session = self._network.session
-        self._pump: Pump[Sample] = await stack.enter_async_context(
-            Pump(session, lighthouse_selector(self.lighthouse), _read)
+        self._pump: Pump[MeshMessage] = await stack.enter_async_context(
+            Pump(session, lighthouse_selector(self.lighthouse), _convert)
         )
-        # After the subscription: who sees the bridge's token can be sure to be heard.
+        # After the subscription: once its token is seen, the bridge receives what is published.
         self._presence = await stack.enter_async_context(
-            Presence(session, self.lighthouse, self.address, self.traffic, wake=self._wake)
+            BridgePresence(session, self.lighthouse, self.address, self.relay, wake=self._wake)
         )
         loop = asyncio.get_running_loop()
         queryable: Any = session.declare_queryable(
-            status_key(self.address, self.lighthouse), lambda query: call_in_loop(loop, self._answer, query)
+            bridge_status_key(self.address, self.lighthouse), lambda query: call_in_loop(loop, self._answer, query)
         )
         stack.callback(lambda: None if session.is_closed() else queryable.undeclare())
-        self._restore()
+        self.relay.restore()
+        self._wake()
 
     async def _work(self) -> None:
         async with asyncio.TaskGroup() as tasks:
             self._tasks = tasks
-            tasks.create_task(self._take_from_mesh(), name=f"mesh → bridge {self.lighthouse}")
-            tasks.create_task(self.link.run(self._take_from_ipfs, self._link_changed), name=f"IPFS → {self.lighthouse}")
+            tasks.create_task(self._receive_from_mesh(), name=f"mesh → bridge {self.lighthouse}")
+            tasks.create_task(
+                self.link.run(self._receive_from_ipfs, self._link_changed), name=f"IPFS → {self.lighthouse}"
+            )
             tasks.create_task(self._to_ipfs.run(), name=f"bridge → IPFS {self.lighthouse}")
             tasks.create_task(self._to_mesh.run(), name=f"bridge → mesh {self.lighthouse}")
-            tasks.create_task(self._look_after_left(), name=f"left over {self.lighthouse}")
+            tasks.create_task(self._take_overdue(), name=f"overdue messages {self.lighthouse}")
             tasks.create_task(self._report(), name=f"report of {self.lighthouse}")
 
     def status(self) -> BridgeStatus:
-        """How it is now."""
-        own, others = self.traffic.own, self.traffic.others
+        """The bridge's current status."""
         return BridgeStatus(
             bridge=self.address,
             lighthouse=self.lighthouse,
             state=self._state(),
-            carries=own is not None and all(own < other for other in others),
+            carries=self.relay.is_active,
             api=self._daemon.api,
             daemon=str(self._daemon.version or ""),
             dialect=self._daemon.dialect,
@@ -144,15 +148,15 @@ class ChannelBridge(Role):
             mesh_peers=tuple(sorted(f"{key.role} {key.agent}" for key in self._presence.present)),
             losses=self.link.losses,
             last_error=self.link.error,
-            to_ipfs=self.traffic.way(Side.IPFS, per_second=self._to_ipfs.rate.per_second()),
-            to_mesh=self.traffic.way(Side.MESH, per_second=self._to_mesh.rate.per_second()),
+            to_ipfs=self.relay.status(Side.IPFS, per_second=self._to_ipfs.rate.per_second()),
+            to_mesh=self.relay.status(Side.MESH, per_second=self._to_mesh.rate.per_second()),
             content=self._content(),
-            uptime=round(time.monotonic() - self._began, 1),
+            uptime=round(time.monotonic() - self._started, 1),
         )
 
-    def standing(self) -> Standing:
-        """How it is now, and what it stands on."""
-        return Standing(self.status(), routed=self._network.connected, subscribed=self.link.up)
+    def health(self) -> BridgeHealth:
+        """The status, and whether the router and the daemon are connected."""
+        return BridgeHealth(self.status(), routed=self._network.connected, subscribed=self.link.up)
 
     def _state(self) -> str:
         if not self._network.connected:
@@ -161,99 +165,92 @@ class ChannelBridge(Role):
             return "no daemon"
         return "connected" if self.link.listeners else "alone"
 
-    async def _take_from_mesh(self) -> None:
+    async def _receive_from_mesh(self) -> None:
         dropped = 0
-        async for sample in self._pump:
+        async for message in self._pump:
             if (lost := self._pump.dropped - dropped) > 0:
                 dropped += lost
-                self.traffic.dropped[Side.IPFS]["unseen"] += lost
-            await self._take(sample.payload, Side.MESH, key=sample.key, by_bridge=sample.marked)
+                self.relay.dropped[Side.IPFS]["unseen"] += lost
+            await self._receive(message.payload, Side.MESH, key=message.key, by_bridge=message.by_bridge)
 
-    async def _take_from_ipfs(self, event: Event | None) -> None:
-        if event is None:
-            self._refuse(Side.IPFS, InvalidMessage("line", "the daemon's line can't be read"))
+    async def _receive_from_ipfs(self, message: PubsubMessage | None) -> None:
+        if message is None:
+            self._reject(Side.IPFS, InvalidMessage("line", "unreadable line from the daemon"))
         else:
-            await self._take(event.data, Side.IPFS, echo=event.sender == self.link.identity)
+            await self._receive(message.data, Side.IPFS, echo=message.sender == self.link.identity)
 
-    async def _take(
+    async def _receive(
         self, payload: bytes, side: Side, *, key: str | None = None, echo: bool = False, by_bridge: bool = False
     ) -> None:
-        self.traffic.counts[side.other]["received"] += 1
-        if not _NAMED.search(payload):
-            await self._pass(payload, side, key=key, echo=echo, by_bridge=by_bridge)
-        elif self._looking_up.locked():
-            self._refuse(side, InvalidMessage("name", "too many messages wait for their names"))
-        else:  # others overtake a message whose names are looked up
-            await self._looking_up.acquire()
-            looking_up = self._pass(payload, side, key=key, echo=echo, by_bridge=by_bridge)
-            task = self._tasks.create_task(looking_up, name="names of a message")
-            task.add_done_callback(lambda _: self._looking_up.release())
+        self.relay.counts[side.other]["received"] += 1
+        if not _ENS_NAME.search(payload):
+            await self._accept(payload, side, key=key, echo=echo, by_bridge=by_bridge)
+        elif self._lookups.locked():
+            self._reject(side, InvalidMessage("name", "too many messages wait for the resolution of names"))
+        else:  # later messages may overtake this one
+            await self._lookups.acquire()
+            lookup = self._accept(payload, side, key=key, echo=echo, by_bridge=by_bridge)
+            task = self._tasks.create_task(lookup, name="resolve names of a message")
+            task.add_done_callback(lambda _: self._lookups.release())
 
-    async def _pass(self, payload: bytes, side: Side, *, key: str | None, echo: bool, by_bridge: bool) -> None:
+    async def _accept(self, payload: bytes, side: Side, *, key: str | None, echo: bool, by_bridge: bool) -> None:
         try:
-            passenger = await self._gate.admit(payload, key=key)
+            message = await self._validator.validate(payload, key=key)
         except InvalidMessage as error:
-            self._refuse(side, error)
+            self._reject(side, error)
             return
-        if self.traffic.seen(passenger, side, echo=echo, by_bridge=by_bridge) is Fate.ACCEPTED:
+        if self.relay.receive(message, side, echo=echo, by_bridge=by_bridge) is RelayOutcome.ACCEPTED:
             self._wake()
 
-    def _refuse(self, side: Side, error: InvalidMessage) -> None:
-        self.traffic.invalid[side.other][error.reason] += 1
-        log.debug("%s: from %s: %s", self.lighthouse, side.value, error)
+    def _reject(self, side: Side, error: InvalidMessage) -> None:
+        self.relay.invalid[side.other][error.reason] += 1
+        log.debug("%s: rejected a message from %s: %s", self.lighthouse, side.value, error)
 
     def _wake(self) -> None:
         self._to_ipfs.wake()
         self._to_mesh.wake()
 
-    async def _look_after_left(self) -> None:
+    async def _take_overdue(self) -> None:
         while True:
-            await asyncio.sleep(LOOK)
-            if (count := self.traffic.look_after_left()) > 0:
-                log.warning("%s: %d messages that other bridges did not carry", self.lighthouse, count)
+            await asyncio.sleep(OVERDUE_INTERVAL)
+            if (count := self.relay.take_overdue()) > 0:
+                overdue = log_event("messages-overdue", lighthouse=self.lighthouse, count=count)
+                log.warning("%s: other bridges did not send %d messages", self.lighthouse, count, extra=overdue)
                 self._wake()
 
     async def _report(self) -> None:
-        """Say what was done, not each message: a flood must not become one of the log. Losses are warnings."""
+        """Log changed counters rather than each message, so that a flood does not fill the log. Losses are warnings."""
         before: dict[str, int] = {}
         while True:
             await asyncio.sleep(self._report_interval)
-            self._journal.tidy()
-            now = figures_of(status := self.status())
-            if said := news(before, now):
-                level = logging.WARNING if ".dropped." in said else logging.INFO
-                log.log(level, "%s: state=%s carries=%s %s", self.lighthouse, status.state, status.carries, said)
+            self._journal.prune()
+            now = counters_of(status := self.status())
+            if changes := changes_between(before, now):
+                level = logging.WARNING if ".dropped." in changes else logging.INFO
+                facts = {"lighthouse": self.lighthouse, "state": status.state, "carries": status.carries}
+                report = log_event("bridge-reported", changes=changes, **facts)
+                log.log(level, "%s: state=%s carries=%s %s", *facts.values(), changes, extra=report)
             before = now
 
     def _link_changed(self) -> None:
         if not self.link.up:
-            self._presence.hide()
+            self._presence.withdraw()
             return
-        self._presence.show(deaf=not self.link.listeners)
-        if self.link.listeners and self.traffic.to[Side.IPFS].say_again():
+        self._presence.announce(isolated=not self.link.listeners)
+        if self.link.listeners and self.relay.queues[Side.IPFS].requeue_unheard():
             self._wake()
-
-    def _restore(self) -> None:
-        for fingerprint, age in self._journal.known():
-            for side in Side:
-                self.traffic.memory.note(fingerprint, side, age=age)
-        for side, waiting in self._journal.left_over():
-            waiting.since = time.monotonic()
-            self.traffic.restore(waiting, side)
-        self._wake()
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
             if self.is_open:
-                query.reply(
-                    status_key(self.address, self.lighthouse), self.status().encode(), encoding="application/json"
-                )
+                key = bridge_status_key(self.address, self.lighthouse)
+                query.reply(key, self.status().encode(), encoding="application/json")
 
 
-def _read(sample: zenoh.Sample) -> Sample | None:
-    """What the pump's thread makes of a sample. Why a provider rejects an order has no place on the legacy channel."""
+def _convert(sample: zenoh.Sample) -> MeshMessage | None:
+    """Convert a sample on the pump's thread. Rejections by providers do not exist on the legacy channel."""
     key = str(sample.key_expr)
     if sample.kind != zenoh.SampleKind.PUT or key.split("/")[2:3] == ["reject"]:
         return None
     attachment = sample.attachment
-    return Sample(key, sample.payload.to_bytes(), attachment is not None and attachment.to_bytes() == MARK)
+    return MeshMessage(key, sample.payload.to_bytes(), attachment is not None and attachment.to_bytes() == BRIDGE_MARK)

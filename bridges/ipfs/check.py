@@ -1,4 +1,4 @@
-"""The checks of the IPFS daemon for `aira doctor`: whether it answers, admits us, and has PubSub and peers."""
+"""The checks of the IPFS daemon for `aira doctor`: whether it answers, accepts our credentials, has PubSub and peers."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from mesh.doctor.context import DoctorContext
-    from mesh.settings import Settings
+    from mesh.settings import IpfsSettings, Settings
 
-PATIENCE: Final = 4.0
-"""Seconds for an answer."""
+CALL_TIMEOUT: Final = 4.0
+"""Seconds for a call."""
 
 
 def checks(context: DoctorContext) -> list[Check]:
@@ -32,35 +32,35 @@ def checks(context: DoctorContext) -> list[Check]:
     ]
 
 
-async def check_daemon(settings: Settings) -> CheckResult:
-    """Whether it answers and admits us. Raises `DaemonUnreachable`, `AccessDenied`, `ConfigurationError`."""
-    async with _greeted(settings) as daemon:
+async def check_daemon(settings: IpfsSettings) -> CheckResult:
+    """Whether it answers and accepts our credentials. Raises `IpfsError`, `ConfigurationError`."""
+    async with _connected(settings) as daemon:
         return passed(f"{daemon.version} at {daemon.api}, speaks the {daemon.dialect} dialect")
 
 
 async def check_pubsub(settings: Settings) -> CheckResult:
     """Whether PubSub is enabled, and how many others subscribe to the lighthouse's topic. Raises `PubSubDisabled`."""
-    async with _greeted(settings) as daemon:
+    async with _connected(settings) as daemon:
         topic = settings.lighthouse_contract
         listeners = len(await daemon.listeners(topic))
         return passed(f"enabled; {listeners} other{'' if listeners == 1 else 's'} on {topic}")
 
 
-async def check_swarm(settings: Settings) -> CheckResult:
+async def check_swarm(settings: IpfsSettings) -> CheckResult:
     """Whether the daemon is connected to others."""
-    async with _greeted(settings) as daemon:
-        count = len(await daemon.neighbours())
+    async with _connected(settings) as daemon:
+        count = len(await daemon.swarm_peers())
         if not count:
             return warning(
-                "the daemon is connected to no other, so nobody receives what it publishes",
+                "the daemon is connected to no other node, so nobody receives its messages",
                 hint="name the legacy nodes with --ipfs-swarm-connect /…/p2p/ID, or let the daemon reach the internet",
             )
         return passed(f"connected to {count} other{'' if count == 1 else 's'}")
 
 
 @asynccontextmanager
-async def _greeted(settings: Settings) -> AsyncIterator[Daemon]:
+async def _connected(settings: IpfsSettings) -> AsyncIterator[Daemon]:
     authorization = authorization_of(settings)
-    async with Daemon(settings.ipfs_http_provider, authorization=authorization, patience=PATIENCE) as daemon:
-        await daemon.greet()
+    async with Daemon(settings.ipfs_http_provider, authorization=authorization, call_timeout=CALL_TIMEOUT) as daemon:
+        await daemon.detect_version()
         yield daemon

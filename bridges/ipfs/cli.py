@@ -1,19 +1,20 @@
-"""`aira bridge ipfs`: the door to the legacy network."""
+"""`aira bridge ipfs`: the bridge to the legacy network."""
 
 from __future__ import annotations
 
-import asyncio
 import dataclasses
 import logging
 from contextlib import AsyncExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import click
 
 from mesh.cli.options import with_settings
 from mesh.cli.output import announce
 from mesh.errors import ConfigurationError, NetworkUnavailable
+from mesh.outage_log import OutageLog
+from mesh.retry import Backoff
 from mesh.running import run_until_stopped
 from mesh.settings import ChainSettings, NetworkSettings, TelemetrySettings, options_of
 from mesh.telemetry.context import LogSource
@@ -30,13 +31,10 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-AGAIN: Final = 1.0
-"""Seconds between two attempts to reach a router, each of which lasts as long as the settings say."""
-
 
 @click.command("ipfs", short_help="the legacy network's IPFS PubSub channel, and its content")
-@click.option("--api", help="the daemon's RPC, a multiaddr or a URL; the same as --ipfs-http-provider")
-@click.option("--lighthouse", "lighthouses", multiple=True, metavar="NAME", help="several channels: name each")
+@click.option("--api", help="the daemon's RPC, a multiaddr or a URL; same as --ipfs-http-provider")
+@click.option("--lighthouse", "lighthouses", multiple=True, metavar="NAME", help="a channel to bridge; repeatable")
 @with_settings(
     *options_of(NetworkSettings),
     "ipfs_http_provider",
@@ -53,11 +51,11 @@ AGAIN: Final = 1.0
     *options_of(TelemetrySettings),
 )
 def command(settings: Settings, api: str | None, lighthouses: tuple[str, ...]) -> None:
-    """Carry messages and content between the mesh and the legacy network on IPFS. Ctrl-C ends it.
+    """Relay messages and content between the mesh and the legacy network on IPFS. Ctrl-C stops it.
 
-    The daemon needs PubSub; it, the router and the node of the chain may come later, and come back. Several bridges may
-    serve one lighthouse, each with a --data-dir of its own: one carries, the others stand by. Until the node is there,
-    or without one (--web3-http-provider ""), no ENS name in a message is looked up, and deadlines are not checked.
+    The daemon needs PubSub. It, the router and the chain's node may start later, and may restart. Several bridges may
+    serve one lighthouse, each with its own --data-dir: one is active, the others stand by. Until the node is reachable,
+    or without one (--web3-http-provider ""), ENS names in messages are not resolved and deadlines are not checked.
     """
     if api:
         settings = dataclasses.replace(settings, ipfs_http_provider=api)
@@ -65,7 +63,7 @@ def command(settings: Settings, api: str | None, lighthouses: tuple[str, ...]) -
 
 
 def _address(settings: Settings) -> str | None:
-    """As whom the bridge shows itself: the holder of its certificate, or of the keyfile, or nobody in particular."""
+    """The bridge's address: its certificate's holder, or the keyfile's account, or None for a random one."""
     from mesh.cli.chain_client import own_address
 
     if not settings.tls_certificate:
@@ -77,9 +75,8 @@ def _address(settings: Settings) -> str | None:
 
 
 async def _serve(settings: Settings, lighthouses: tuple[str, ...]) -> None:
-    from bridges.ipfs.addresses import base_url
-
     try:
+        from bridges.ipfs.addresses import base_url
         from bridges.ipfs.service import IpfsBridge
     except ModuleNotFoundError as error:
         raise ConfigurationError(
@@ -89,12 +86,12 @@ async def _serve(settings: Settings, lighthouses: tuple[str, ...]) -> None:
     from mesh.starting import wait_for_files
     from mesh.telemetry.serving import Telemetry
 
-    base_url(settings.ipfs_http_provider)  # before anything is waited for
+    base_url(settings.ipfs_http_provider)  # fails now rather than after the wait for files or a router
     async with AsyncExitStack() as stack:
         telemetry = await stack.enter_async_context(Telemetry(settings.metrics_listen))
         await wait_for_files(settings)
         chain = _chain(settings)
-        network = await _network(settings, stack, waits=telemetry.starting)
+        network = await _network(settings, stack, waiting=telemetry.starting)
         bridge = await stack.enter_async_context(
             IpfsBridge(network, settings, lighthouses=lighthouses, chain=chain, address=_address(settings))
         )
@@ -104,41 +101,42 @@ async def _serve(settings: Settings, lighthouses: tuple[str, ...]) -> None:
 
 
 async def _introduce(bridge: IpfsBridge, network: Network, stack: AsyncExitStack) -> None:
-    """Say what the bridge is, and answer who asks for its log."""
+    """Announce the bridge, and serve its log."""
     from mesh.network import Services
 
     set_process_source(LogSource("bridge", parse_address(bridge.channels[0].address)))
     for channel in bridge.channels:
         words = f"bridge {channel.address} carries {channel.lighthouse} to and from {bridge.daemon.api}"
         announce(log, "bridge-started", words, bridge=channel.address)
-    # Of one process: each address answers for all of it.
+    # The process has one log, which it serves at each address.
     for address in {channel.address for channel in bridge.channels}:
         services = await stack.enter_async_context(Services(network.session, address))
         services.offer("logs", LogService("bridge", "").logs)
 
 
-async def _network(settings: Settings, stack: AsyncExitStack, *, waits: Callable[[str], None]) -> Network:
-    """The session, as soon as there is a router; `waits` is told why there is none."""
+async def _network(settings: Settings, stack: AsyncExitStack, *, waiting: Callable[[str], None]) -> Network:
+    """The session, once there is a router; `waiting` is called with the error while there is none."""
     from mesh.composition import endpoints_of
     from mesh.network import Network
 
-    said = False
+    backoff, outage = Backoff(), OutageLog(log, "router")
     while True:
         try:
-            return await stack.enter_async_context(Network(endpoints_of(settings)))
+            network = await stack.enter_async_context(Network(endpoints_of(settings)))
         except NetworkUnavailable as error:
-            if not said:
-                log.warning("the bridge waits for a router: %s", error)
-            waits(str(error))
-            said = True
-            await asyncio.sleep(AGAIN)
+            outage.failed(error, "the bridge waits for a router")
+            waiting(str(error))
+            await backoff.wait()
+        else:
+            outage.recovered("a router answers")
+            return network
 
 
 def _chain(settings: Settings) -> Callable[[], Chain] | None:
-    """What makes a client of the chain, if the settings name one. Raises `ConfigurationError`."""
+    """A factory of chain clients, None if the settings name no node. Raises `ConfigurationError`."""
     from mesh.composition import chain_of
 
     if not settings.web3_http_provider.strip() and not settings.web3_ws_provider.strip():
         return None
-    chain_of(settings, None)  # that the settings can't be meant is told at once
+    chain_of(settings, None)  # checks the settings now
     return lambda: chain_of(settings, None)

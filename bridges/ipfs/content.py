@@ -1,4 +1,4 @@
-"""Content over the bridge: the mesh has what IPFS has, and what is made in the mesh is added to IPFS."""
+"""The content bridge: serves IPFS content to the mesh, and adds the mesh's files to IPFS."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 import zenoh
 
-from bridges.ipfs.adding import add_as_named
 from bridges.ipfs.errors import IpfsError
+from bridges.ipfs.transfers import add_file
 from mesh.content import ContentUnavailable
 from mesh.content.download import HOLDER
 from mesh.content.exchange import CID_SELECTOR
 from mesh.errors import AiraError, ClosedError, InvalidKey
 from mesh.network import call_in_loop
+from mesh.retry import Backoff, RetryPolicy
+from mesh.telemetry.context import log_event
 from schemas import CidKey, InputError, parse_block, parse_key
 from schemas.status import ContentMetrics
 
@@ -25,36 +27,34 @@ if TYPE_CHECKING:
     from types import TracebackType
 
     from bridges.ipfs.daemon import Daemon
-    from bridges.ipfs.sources import Sources
+    from bridges.ipfs.transfers import ContentSources
     from mesh.content import Exchange, Store
 
 log = logging.getLogger(__name__)
 
-PATIENCE: Final = 10.0
+BLOCK_TIMEOUT: Final = 10.0
 """Seconds that a source has for a block."""
-ANSWERS: Final = 32
-"""Questions of the mesh that are passed on to IPFS at once; others get no answer from here, and are asked again."""
-TRANSFERS: Final = 8
-"""Files on their way at once because a message names them; the others wait."""
-WAITING: Final = 4096
-"""Files that wait for that; more are passed over, and count as failed."""
-ATTEMPTS: Final = 4
-"""How often a file that a message names is tried to be added."""
-AGAIN: Final = 10.0
-"""Seconds between two of these attempts."""
-FRUITLESS: Final = 10.0
-"""Seconds for which a block that IPFS did not give is not asked for again."""
-REMEMBERED: Final = 65_536
-"""Blocks of which it is remembered that they are parts, or that IPFS did not give them."""
+CONCURRENT_ANSWERS: Final = 32
+"""Block queries of the mesh that are answered from IPFS at once; others get no reply and are sent again."""
+CONCURRENT_TRANSFERS: Final = 8
+"""Files named in messages that are transferred at once; the others wait."""
+TASK_LIMIT: Final = 4096
+"""Files that may wait; more are skipped and count as failed."""
+ADD_RETRY: Final = RetryPolicy(initial=10.0, factor=1.0, ceiling=10.0, attempts=4)
+"""For files that a message names before the mesh has them."""
+UNAVAILABLE_FOR: Final = 10.0
+"""Seconds for which a block that IPFS did not have is not requested again."""
+REMEMBERED_BLOCKS: Final = 65_536
+"""Blocks known to be parts of files, or to be unavailable."""
 
 
 class ContentBridge:
-    """Gives the mesh what IPFS has, and IPFS what the mesh has: `async with ContentBridge(...) as content`.
+    """Transfers files between the mesh and IPFS: `async with ContentBridge(...) as content`.
 
-    Inside, a block that somebody in the mesh asks for and that `store` does not hold is asked of `sources`, and the
-    file that it begins is kept. `daemon` is where files are added; `providers` are further nodes that pin them.
-    `size_limit` is in bytes of a file, `timeout` in seconds for a file, `again` in seconds between two attempts to add
-    one. What is used stays the caller's to close.
+    Inside, queries of the mesh for blocks that `store` lacks are answered from `sources`, and the file that such a
+    block begins is fetched and stored. Files are added to `daemon`; `providers` are further nodes that pin them.
+    `size_limit` is in bytes of a file, `timeout` in seconds for a file; `add_retry` applies to `schedule_add`. The
+    caller closes what is passed in.
     """
 
     def __init__(
@@ -62,13 +62,13 @@ class ContentBridge:
         session: zenoh.Session,
         store: Store,
         exchange: Exchange,
-        sources: Sources,
+        sources: ContentSources,
         daemon: Daemon,
         *,
         providers: tuple[Daemon, ...] = (),
         size_limit: int,
         timeout: float,
-        again: float = AGAIN,
+        add_retry: RetryPolicy = ADD_RETRY,
     ) -> None:
         self._session = session
         self._id = str(session.zid())
@@ -79,24 +79,24 @@ class ContentBridge:
         self._providers = providers
         self._size_limit = size_limit
         self._timeout = timeout
-        self._again = again
+        self._add_retry = add_retry
         self._parts: OrderedDict[str, None] = OrderedDict()
-        self._fruitless: OrderedDict[str, float] = OrderedDict()
+        self._unavailable: OrderedDict[str, float] = OrderedDict()
         self._tasks: set[asyncio.Task[None]] = set()
-        self._under_way: dict[str, asyncio.Task[Path]] = {}
+        self._fetches: dict[str, asyncio.Task[Path]] = {}
         self._answering = 0
-        self._transfers = asyncio.Semaphore(TRANSFERS)
+        self._transfers = asyncio.Semaphore(CONCURRENT_TRANSFERS)
         self._adding: set[str] = set()
         self._open = False
         self._counts = Counter[str]()
 
     async def __aenter__(self) -> Self:
         if self._open:
-            raise ClosedError("this content bridge is open already")
+            raise ClosedError("this content bridge is already open")
         self._open = True
         loop = asyncio.get_running_loop()
         self._queryable: Any = self._session.declare_queryable(
-            CID_SELECTOR, lambda query: call_in_loop(loop, self._answer_soon, query)
+            CID_SELECTOR, lambda query: call_in_loop(loop, self._accept, query)
         )
         return self
 
@@ -106,38 +106,38 @@ class ContentBridge:
         self._open = False
         if not self._session.is_closed():
             self._queryable.undeclare()
-        tasks = [*self._tasks, *self._under_way.values()]
+        tasks = [*self._tasks, *self._fetches.values()]
         for task in tasks:
             task.cancel()
         if tasks:
             await asyncio.wait(tasks)
 
     async def fetch(self, cid: str) -> Path:
-        """Where the file is in the store, from IPFS if it is not held. Asked for twice at once, it is fetched once.
+        """The file's path in the store, fetched from IPFS if necessary. Concurrent calls fetch it once.
 
-        Raises what `Sources.fetch` does.
+        Raises what `ContentSources.fetch` raises.
         """
-        under_way = self._under_way.get(cid)
-        if under_way is None:
-            under_way = asyncio.create_task(self._fetch(cid), name=f"fetch {cid} from IPFS")
-            self._under_way[cid] = under_way
-            under_way.add_done_callback(lambda _: self._under_way.pop(cid, None))
-        return await asyncio.shield(under_way)
+        fetching = self._fetches.get(cid)
+        if fetching is None:
+            fetching = asyncio.create_task(self._fetch(cid), name=f"fetch {cid} from IPFS")
+            self._fetches[cid] = fetching
+            fetching.add_done_callback(lambda _: self._fetches.pop(cid, None))
+        return await asyncio.shield(fetching)
 
     async def add(self, cid: str) -> None:
-        """Have the file, which the mesh has, added to IPFS under the same name, and pinned by the providers.
+        """Add a file of the mesh to IPFS under the same CID, and pin it on the providers.
 
-        Raises a `ContentError` when the mesh does not give it, `IpfsError` when the daemon does not take it.
+        Raises a `ContentError` when the mesh does not have it, `IpfsError` when the daemon does not accept it.
         """
-        self._adding.add(cid)  # it is the mesh that is asked now
+        self._adding.add(cid)  # this bridge must not answer its own query
         try:
             path = await self._exchange.fetch(cid, size_limit=self._size_limit, timeout=self._timeout)
         finally:
             self._adding.discard(cid)
         try:
             size = (await asyncio.to_thread(path.stat)).st_size
-            as_file = await add_as_named(self._daemon, self._store, path, cid, timeout=self._timeout)
-        except OSError as error:  # the store had to make room meanwhile
+            as_file = await add_file(self._daemon, self._store, path, cid, timeout=self._timeout)
+        except OSError as error:  # the store evicted it meanwhile
             raise ContentUnavailable(cid, f"it can't be read: {error.strerror}") from error
         self._counts.update(added=1, added_bytes=size, by_blocks=0 if as_file else 1)
         for provider in self._providers:
@@ -145,23 +145,24 @@ class ContentBridge:
                 await provider.pin(cid, timeout=self._timeout)
                 self._counts["pinned"] += 1
             except IpfsError as error:
-                log.warning("%s is not pinned: %s", cid, error)
+                failed = log_event("pin-failed", cid=cid, provider=provider.api, code=error.code)
+                log.warning("%s is not pinned: %s", cid, error, extra=failed)
 
-    def fetch_soon(self, cid: str) -> None:
-        """As `fetch`, without waiting; what fails is logged and counted."""
+    def schedule_fetch(self, cid: str) -> None:
+        """Like `fetch`, in the background; a failure is logged and counted."""
         self._start(self._try_to_fetch(cid), f"fetch {cid}")
 
-    def add_soon(self, cid: str) -> None:
-        """As `add`, without waiting; what is not there or not taken is tried again, what fails logged and counted."""
+    def schedule_add(self, cid: str) -> None:
+        """Like `add`, in the background and with retries; a failure is logged and counted."""
         self._start(self._try_to_add(cid), f"add {cid}")
 
-    def figures(self) -> ContentMetrics:
-        """What was done so far."""
+    def metrics(self) -> ContentMetrics:
+        """The counts so far."""
         counts = self._counts
         return ContentMetrics(
             fetched=counts["fetched"],
             fetched_bytes=self._sources.bytes,
-            lies=self._sources.lies.total(),
+            lies=self._sources.corrupt.total(),
             answered=counts["answered"],
             added=counts["added"],
             added_bytes=counts["added_bytes"],
@@ -172,7 +173,7 @@ class ContentBridge:
 
     async def _fetch(self, cid: str) -> Path:
         path = await self._sources.fetch(
-            self._store, cid, size_limit=self._size_limit, timeout=self._timeout, patience=PATIENCE
+            self._store, cid, size_limit=self._size_limit, timeout=self._timeout, block_timeout=BLOCK_TIMEOUT
         )
         self._counts["fetched"] += 1
         return path
@@ -183,38 +184,43 @@ class ContentBridge:
                 await self.fetch(cid)
         except AiraError as error:
             self._counts["failed"] += 1
-            log.info("not fetched from IPFS: %s", error)
+            failed = log_event("fetch-failed", cid=cid, code=error.code)
+            log.info("not fetched from IPFS: %s", error, extra=failed)
 
     async def _try_to_add(self, cid: str) -> None:
-        for left in reversed(range(ATTEMPTS)):
+        backoff = Backoff(self._add_retry)
+        while True:
             try:
                 async with self._transfers:
                     await self.add(cid)
                 return
             except AiraError as error:
-                if not left or not isinstance(error, ContentUnavailable | IpfsError):
+                delay = backoff.next_delay() if isinstance(error, ContentUnavailable | IpfsError) else None
+                if delay is None:
                     self._counts["failed"] += 1
-                    log.warning("not added to IPFS: %s", error)
+                    failed = log_event("add-failed", cid=cid, code=error.code)
+                    log.warning("not added to IPFS: %s", error, extra=failed)
                     return
-                log.debug("not added to IPFS yet: %s", error)
-            await asyncio.sleep(self._again)
+                retried = log_event("add-retried", cid=cid, code=error.code)
+                log.debug("not added to IPFS yet: %s", error, extra=retried)
+            await asyncio.sleep(delay)
 
     def _start(self, work: Coroutine[Any, Any, None], name: str) -> None:
-        if not self._open or len(self._tasks) >= WAITING:
+        if not self._open or len(self._tasks) >= TASK_LIMIT:
             self._counts["failed"] += 1
-            log.debug("too much at once: no %s", name)
+            log.debug("too many tasks, skipped: %s", name)
             work.close()
             return
         task = asyncio.create_task(work, name=name)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    def _answer_soon(self, query: zenoh.Query) -> None:
-        """Take up a question, if it is one for a block and there is room for it."""
-        cid = _asked_for(query)
+    def _accept(self, query: zenoh.Query) -> None:
+        """Answer a query for a block, unless there are too many."""
+        cid = _requested_cid(query)
         mine = str(query.parameters.get(HOLDER, self._id)) == self._id
-        busy = self._answering >= ANSWERS or len(self._tasks) >= WAITING
-        if not self._open or cid is None or not mine or busy or cid in self._adding or self._is_fruitless(cid):
+        busy = self._answering >= CONCURRENT_ANSWERS or len(self._tasks) >= TASK_LIMIT
+        if not self._open or cid is None or not mine or busy or cid in self._adding or self._is_unavailable(cid):
             query.drop()  # type: ignore[no-untyped-call]
             return
         self._answering += 1
@@ -224,21 +230,21 @@ class ContentBridge:
         try:
             with query:
                 if await asyncio.to_thread(self._store.get_block, cid) is not None:
-                    return  # the exchange answers
+                    return  # the exchange replies
                 try:
-                    block = await self._sources.block(cid, timeout=PATIENCE)
+                    block = await self._sources.block(cid, timeout=BLOCK_TIMEOUT)
                 except ContentUnavailable as error:
                     log.debug("%s", error)
-                    _remember(self._fruitless, cid, asyncio.get_running_loop().time())
+                    _remember(self._unavailable, cid, asyncio.get_running_loop().time())
                     return
                 query.reply(query.key_expr, block, encoding=zenoh.Encoding.APPLICATION_OCTET_STREAM)
                 self._counts["answered"] += 1
-            self._keep(cid, block)
+            self._fetch_file_of(cid, block)
         finally:
             self._answering -= 1
 
-    def _keep(self, cid: str, block: bytes) -> None:
-        """Fetch all of the file whose first block was asked for."""
+    def _fetch_file_of(self, cid: str, block: bytes) -> None:
+        """Fetch the whole file if the block is its root."""
         try:
             links = parse_block(block).links
         except InputError:
@@ -246,15 +252,15 @@ class ContentBridge:
         for link in links:
             _remember(self._parts, link.cid, None)
         if cid not in self._parts:
-            self.fetch_soon(cid)
+            self.schedule_fetch(cid)
 
-    def _is_fruitless(self, cid: str) -> bool:
-        asked = self._fruitless.get(cid)
-        return asked is not None and asyncio.get_running_loop().time() - asked < FRUITLESS
+    def _is_unavailable(self, cid: str) -> bool:
+        asked = self._unavailable.get(cid)
+        return asked is not None and asyncio.get_running_loop().time() - asked < UNAVAILABLE_FOR
 
 
-def _asked_for(query: zenoh.Query) -> str | None:
-    """The one block that a query names; None for a wildcard, which nobody is to be answered."""
+def _requested_cid(query: zenoh.Query) -> str | None:
+    """The CID of the block that a query requests; None for a wildcard, which is not answered."""
     try:
         key = parse_key(str(query.key_expr))
     except InvalidKey:
@@ -265,5 +271,5 @@ def _asked_for(query: zenoh.Query) -> str | None:
 def _remember(known: OrderedDict[str, Any], cid: str, value: Any) -> None:
     known.pop(cid, None)
     known[cid] = value
-    if len(known) > REMEMBERED:
+    if len(known) > REMEMBERED_BLOCKS:
         known.popitem(last=False)

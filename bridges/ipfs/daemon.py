@@ -1,4 +1,4 @@
-"""An IPFS daemon by its HTTP RPC: publishing, subscribing, content, the swarm."""
+"""A client of an IPFS daemon's HTTP RPC: PubSub, content, the swarm."""
 
 from __future__ import annotations
 
@@ -11,9 +11,15 @@ import aiohttp
 import msgspec
 
 from bridges.ipfs.addresses import base_url, without_credentials
-from bridges.ipfs.dialects import Dialect, Event, Multibase, Version, dialect_of
-from bridges.ipfs.errors import AccessDenied, DaemonRefused, DaemonUnreachable, NoPeers, Overtaken, PubSubDisabled
-from bridges.ipfs.lines import lines_of
+from bridges.ipfs.errors import (
+    AccessDenied,
+    DaemonRefused,
+    DaemonUnreachable,
+    NoPeers,
+    PublishedOutOfOrder,
+    PubSubDisabled,
+)
+from bridges.ipfs.pubsub import DaemonVersion, MultibaseDialect, PubsubDialect, PubsubMessage, dialect_of, lines_of
 from mesh.errors import ClosedError
 
 if TYPE_CHECKING:
@@ -24,17 +30,17 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 CALL_TIMEOUT: Final = 15.0
-"""Seconds for a call that only asks or tells."""
+"""Seconds for a call that transfers no content."""
 CONNECT_TIMEOUT: Final = 5.0
-SPACING: Final = 0.02
-"""Seconds from one message to the next at a Kubo. Since 0.40 each node drops a message that it checks after a later one
-of the same origin, and it checks as many at once as it has cores: of 1000 that came without a pause 9 were lost. Where
-nothing else is done 2 ms are enough; this is for busy machines."""
-LONGEST_LINE: Final = 2 * 1024 * 1024
-"""Bytes of the longest line of a subscription: PubSub's own limit of 1 MiB, in base64 and with its envelope."""
-LONGEST_ANSWER: Final = 4 * 1024 * 1024
-LONGEST_REASON: Final = 300
-SETTINGS: Final = (
+PUBLISH_INTERVAL: Final = 0.02
+"""Seconds between two messages to a Kubo. Since 0.40 a node drops a message that it validates after a later one of the
+same origin, and it validates concurrently: of 1000 messages without a pause 9 were lost. 2 ms suffice on an idle
+machine; this is for busy ones."""
+LINE_LIMIT: Final = 2 * 1024 * 1024
+"""Bytes of a subscription's line, at most: PubSub's own limit of 1 MiB in base64, with its envelope."""
+RESPONSE_LIMIT: Final = 4 * 1024 * 1024
+REASON_LIMIT: Final = 300
+ADD_OPTIONS: Final = (
     ("cid-version", "0"),
     ("raw-leaves", "false"),
     ("chunker", "size-262144"),
@@ -42,8 +48,8 @@ SETTINGS: Final = (
     ("max-file-links", "174"),
     ("trickle", "false"),
 )
-"""How files have been chunked and named since 2015. Never left to the daemon: its own are about to change, and a
-Kubo of 2025 and later may be configured otherwise. Daemons that do not know one of them pass it over."""
+"""How files have been chunked and named since 2015. Stated in each call, because the daemon's defaults may be
+configured otherwise since 2025. Daemons ignore options that they do not know."""
 
 
 class _Refusal(msgspec.Struct):
@@ -55,7 +61,7 @@ class _Strings(msgspec.Struct):
 
 
 class Identity(msgspec.Struct, frozen=True):
-    """Who a daemon is in the swarm, and its addresses."""
+    """A daemon's peer id and addresses in the swarm."""
 
     id: str = msgspec.field(default="", name="ID")
     addresses: list[str] | None = msgspec.field(default=None, name="Addresses")
@@ -74,29 +80,29 @@ class _SwarmPeers(msgspec.Struct):
 
 
 class Daemon:
-    """The daemon at `api` (a multiaddr or a URL): `async with Daemon(api) as daemon`, then `greet`.
+    """The daemon at `api` (a multiaddr or a URL): `async with Daemon(api) as daemon`, then `detect_version`.
 
-    `authorization` is the value of the `Authorization` header that a protected API wants; `patience` is the time in
-    seconds for a call that only asks or tells. Opening asks nothing of the daemon, which may come later. Every call
-    raises `DaemonUnreachable` when it is not there or does not answer within its time, `DaemonRefused` with its own
-    words when it says no, and `ClosedError` outside `async with`.
+    `authorization` is the value of the `Authorization` header of a protected API; `call_timeout` is in seconds, for
+    calls that transfer no content. Opening makes no call, so the daemon may start later. Every call raises
+    `DaemonUnreachable` when the daemon does not answer in time, `DaemonRefused` with the daemon's message when it
+    answers with an error, and `ClosedError` outside `async with`.
     """
 
-    def __init__(self, api: str, *, authorization: str = "", patience: float = CALL_TIMEOUT) -> None:
+    def __init__(self, api: str, *, authorization: str = "", call_timeout: float = CALL_TIMEOUT) -> None:
         self._base = base_url(api)
-        self._patience = patience
+        self._call_timeout = call_timeout
         self._publishing = asyncio.Lock()
         self._published = -math.inf
         self.api: Final = without_credentials(self._base)
         self._headers = {"Authorization": authorization} if authorization else {}
         self._http: aiohttp.ClientSession | None = None
-        self.version: Version | None = None
-        """What the daemon said it is when it was last greeted."""
-        self._dialect: Dialect = Multibase()
+        self.version: DaemonVersion | None = None
+        """The result of the last `detect_version`."""
+        self._dialect: PubsubDialect = MultibaseDialect()
 
     async def __aenter__(self) -> Self:
         if self._http is not None:
-            raise ClosedError("this daemon's client is open already")
+            raise ClosedError("this daemon's client is already open")
         self._http = aiohttp.ClientSession(headers=self._headers)
         return self
 
@@ -107,9 +113,9 @@ class Daemon:
         if http is not None:
             await http.close()
 
-    async def greet(self) -> Version:
-        """Ask what the daemon is, and speak its dialect from now on. After every loss: it may be another one."""
-        self.version = await self._ask("version", Version)
+    async def detect_version(self) -> DaemonVersion:
+        """Ask for the daemon's version and use its dialect from now on. Call it after every reconnection."""
+        self.version = await self._call("version", DaemonVersion)
         self._dialect = dialect_of(self.version)
         return self.version
 
@@ -119,99 +125,99 @@ class Daemon:
         return self._dialect.name
 
     async def identity(self) -> Identity:
-        """Who the daemon is in the swarm."""
-        return await self._ask("id", Identity)
+        """The daemon's peer id and addresses."""
+        return await self._call("id", Identity)
 
     async def publish(self, topic: str, data: bytes) -> None:
-        """Publish `data` on `topic`, one after the other whatever the topics, and not faster than nodes check them.
+        """Publish `data` on `topic`. Concurrent calls are serialized, and spaced for a Kubo.
 
-        Raises `NoPeers` when the daemon says that nobody would hear it. Others do not say so: see `listeners`.
-        Raises `Overtaken` when it is to be published again: a Kubo since 0.40 numbers a message first and checks it
-        later, and takes none that is checked after one with a higher number.
+        Raises `NoPeers` when the daemon reports that there are no listeners (not all do, see `listeners`), and
+        `PublishedOutOfOrder` when the message must be published again: a Kubo since 0.40 numbers a message before
+        validating it, and drops one that it validates after a higher number.
         """
         more, content = self._dialect.publication(data)
         form = None if content is None else _form(content)
         clock = asyncio.get_running_loop().time
         async with self._publishing:
             if self.version is not None and not self.version.is_js:
-                await asyncio.sleep(self._published + SPACING - clock())
+                await asyncio.sleep(self._published + PUBLISH_INTERVAL - clock())
             async with self._post("pubsub/pub", ("arg", self._dialect.topic(topic)), *more, body=form):
                 self._published = clock()
 
     @asynccontextmanager
-    async def subscribe(self, topic: str) -> AsyncGenerator[AsyncIterator[Event | None]]:
-        """What is said on `topic` from now on, by this daemon too; None for a line that can't be read.
+    async def subscribe(self, topic: str) -> AsyncGenerator[AsyncIterator[PubsubMessage | None]]:
+        """Subscribe to `topic`: an iterator over its messages, this daemon's own included; None for an unreadable line.
 
-        The subscription stands when the body begins. Its iterator raises `DaemonUnreachable` when the daemon breaks it
-        off; there is no other end.
+        The subscription is active when the body begins. The iterator ends only by `DaemonUnreachable`, when the daemon
+        ends the subscription.
         """
         arguments = (("arg", self._dialect.topic(topic)), *self._dialect.subscription)
         async with self._post("pubsub/sub", *arguments, timeout=math.inf) as answer:
-            yield self._events(answer)
+            yield self._messages(answer)
 
     async def listeners(self, topic: str) -> list[str]:
-        """The other nodes which this one knows to listen to `topic`."""
-        found = await self._ask("pubsub/peers", _Strings, ("arg", self._dialect.topic(topic)))
+        """The other nodes on `topic` that the daemon knows."""
+        found = await self._call("pubsub/peers", _Strings, ("arg", self._dialect.topic(topic)))
         return found.strings or []
 
-    async def neighbours(self) -> list[str]:
-        """The nodes to which this one is connected."""
-        found = await self._ask("swarm/peers", _SwarmPeers)
+    async def swarm_peers(self) -> list[str]:
+        """The peer ids of the nodes to which the daemon is connected."""
+        found = await self._call("swarm/peers", _SwarmPeers)
         return [peer.peer for peer in found.peers or []]
 
     async def connect(self, address: str) -> None:
-        """Connect to the node at a multiaddr that ends in `/p2p/` (or `/ipfs/`) and its identity."""
-        await self._ask("swarm/connect", _Strings, ("arg", address))
+        """Connect to the node at a multiaddr that ends in `/p2p/` (or `/ipfs/`) and its peer id."""
+        await self._call("swarm/connect", _Strings, ("arg", address))
 
     async def add(self, path: Path, *, timeout: float = CALL_TIMEOUT) -> str:
-        """Add and pin a file, with `SETTINGS`; the CID is the daemon's. Raises `OSError` when it can't be read."""
+        """Add and pin a file with `ADD_OPTIONS`; returns the daemon's CID. Raises `OSError` when it can't be read."""
         with await asyncio.to_thread(path.open, "rb") as stream:
             form = aiohttp.FormData()
             form.add_field("file", stream, filename=path.name, content_type="application/octet-stream")
-            added = await self._ask(
-                "add", _Added, *SETTINGS, ("pin", "true"), ("progress", "false"), body=form, timeout=timeout
+            added = await self._call(
+                "add", _Added, *ADD_OPTIONS, ("pin", "true"), ("progress", "false"), body=form, timeout=timeout
             )
         return added.name
 
     async def put_block(self, data: bytes) -> None:
-        """Give the daemon a block of a file with a CIDv0, not pinned.
+        """Put a block of a CIDv0 file, unpinned.
 
-        A daemon finds its blocks by their hash, so that one in which `format` has gone the way of all deprecated
-        options gives it another name, and has it under the right one too.
+        A daemon that no longer knows the deprecated `format` returns another CID, but finds the block by its hash all
+        the same.
         """
-        await self._ask("block/put", msgspec.Raw, ("format", "v0"), ("mhtype", "sha2-256"), body=_form(data))
+        await self._call("block/put", msgspec.Raw, ("format", "v0"), ("mhtype", "sha2-256"), body=_form(data))
 
     async def pin(self, cid: str, *, timeout: float = CALL_TIMEOUT) -> None:
-        """Have the daemon fetch a file and keep it. `timeout` in seconds is for all of it."""
-        await self._ask("pin/add", msgspec.Raw, ("arg", cid), timeout=timeout)
+        """Make the daemon fetch and keep a file. `timeout` is in seconds for the whole file."""
+        await self._call("pin/add", msgspec.Raw, ("arg", cid), timeout=timeout)
 
     async def unpin(self, cid: str) -> None:
-        """Let the daemon forget a file that was pinned, when it next tidies up."""
-        await self._ask("pin/rm", msgspec.Raw, ("arg", cid))
+        """Unpin a file, so that the daemon may collect it."""
+        await self._call("pin/rm", msgspec.Raw, ("arg", cid))
 
     async def block(self, cid: str, *, limit: int, timeout: float = CALL_TIMEOUT) -> bytes:
-        """A block by its name, unchecked, as the daemon has it or finds it within `timeout` seconds.
+        """A block by its CID, unverified, which the daemon holds or finds within `timeout` seconds.
 
-        Raises `DaemonRefused` when it does not find it or it is of more than `limit` bytes.
+        Raises `DaemonRefused` when it does not find it, or when it has more than `limit` bytes.
         """
         async with self._post("block/get", ("arg", cid), timeout=timeout) as answer:
             return await self._read(answer, limit)
 
-    async def _events(self, answer: aiohttp.ClientResponse) -> AsyncIterator[Event | None]:
+    async def _messages(self, answer: aiohttp.ClientResponse) -> AsyncIterator[PubsubMessage | None]:
         try:
-            async for line in lines_of(answer.content.iter_any(), limit=LONGEST_LINE):
+            async for line in lines_of(answer.content.iter_any(), limit=LINE_LIMIT):
                 try:
-                    event = self._dialect.event(line)
+                    message = self._dialect.message(line)
                 except ValueError:
                     yield None
                     continue
-                if event is not None:
-                    yield event
+                if message is not None:
+                    yield message
         except (aiohttp.ClientError, TimeoutError) as error:
             raise DaemonUnreachable(self.api, f"the subscription broke off: {_words(error)}") from error
         raise DaemonUnreachable(self.api, "the daemon ended the subscription")
 
-    async def _ask(
+    async def _call(
         self,
         call: str,
         kind: type[T],
@@ -220,11 +226,11 @@ class Daemon:
         timeout: float | None = None,
     ) -> T:
         async with self._post(call, *arguments, body=body, timeout=timeout) as answer:
-            content = await self._read(answer, LONGEST_ANSWER)
+            content = await self._read(answer, RESPONSE_LIMIT)
         try:
             return msgspec.json.decode(content, type=kind)
         except (msgspec.DecodeError, UnicodeDecodeError) as error:
-            raise DaemonRefused(self.api, 200, f"its answer to {call} is not what it should be: {error}") from None
+            raise DaemonRefused(self.api, 200, f"unexpected answer to {call}: {error}") from None
 
     @asynccontextmanager
     async def _post(
@@ -234,24 +240,24 @@ class Daemon:
         body: aiohttp.FormData | None = None,
         timeout: float | None = None,
     ) -> AsyncGenerator[aiohttp.ClientResponse]:
-        """The answer to a call, if it is a good one. Errors of the body are the body's.
+        """The successful response to a call; other responses raise.
 
-        `timeout` is in seconds for all of it, by default the daemon's patience; one that is infinite is for the body
-        only: a frozen daemon still takes connections, and never begins to answer.
+        `timeout` is in seconds for the whole response, by default `call_timeout`. With an infinite one the response
+        must still begin within `call_timeout`, because a frozen daemon accepts connections but never answers.
         """
         if self._http is None:
             raise ClosedError("the client of the IPFS daemon is not open", hint="use it inside `async with`")
         url = f"{self._base}/api/v0/{call}"
-        total = self._patience if timeout is None else timeout
+        total = self._call_timeout if timeout is None else timeout
         limits = aiohttp.ClientTimeout(total=None if total == math.inf else total, connect=CONNECT_TIMEOUT)
         try:
-            async with asyncio.timeout(self._patience if total == math.inf else None):
+            async with asyncio.timeout(self._call_timeout if total == math.inf else None):
                 answer = await self._http.post(url, params=arguments, data=body, timeout=limits, allow_redirects=False)
         except (aiohttp.ClientError, TimeoutError) as error:
             raise DaemonUnreachable(self.api, f"{call}: {_words(error)}") from error
         async with answer:
             if answer.status != 200:
-                raise self._refused(answer.status, await self._read(answer, LONGEST_ANSWER))
+                raise self._refused(answer.status, await self._read(answer, RESPONSE_LIMIT))
             yield answer
 
     async def _read(self, answer: aiohttp.ClientResponse, limit: int) -> bytes:
@@ -270,13 +276,13 @@ class Daemon:
             why = msgspec.json.decode(content, type=_Refusal).message
         except (msgspec.DecodeError, UnicodeDecodeError):
             why = content.decode(errors="replace").strip()
-        why = why[:LONGEST_REASON] or f"HTTP {status}"
+        why = why[:REASON_LIMIT] or f"HTTP {status}"
         if status in (401, 403):
             return AccessDenied(self.api, status, why)
         if "InsufficientPeers" in why:
             return NoPeers(self.api, status, why)
         if "validation ignored" in why:
-            return Overtaken(self.api, status, why)
+            return PublishedOutOfOrder(self.api, status, why)
         if "pubsub" in why.lower() and "not enabled" in why.lower():
             return PubSubDisabled(self.api, status, why)
         return DaemonRefused(self.api, status, why)

@@ -1,4 +1,4 @@
-"""What can go wrong between the mesh and IPFS."""
+"""Errors of the IPFS bridge."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 class IpfsError(RemoteError):
-    """An IPFS daemon or gateway failed or is not there; `api` is its address."""
+    """An IPFS daemon or gateway failed or is unreachable; `api` is its address, `why` the cause."""
 
     code = "ipfs-error"
 
@@ -22,7 +22,7 @@ class IpfsError(RemoteError):
 
 
 class DaemonUnreachable(IpfsError):
-    """The daemon does not answer, or broke off in the middle; it may be there again later."""
+    """The daemon does not answer, or the connection broke; it may be back later."""
 
     code = "daemon-unreachable"
 
@@ -31,7 +31,7 @@ class DaemonUnreachable(IpfsError):
 
 
 class DaemonRefused(IpfsError):
-    """The daemon answered a call with an error: `status` is HTTP's, `why` the daemon's own words."""
+    """The daemon answered a call with an error: `status` is the HTTP status, `why` the daemon's message."""
 
     code = "daemon-refused"
 
@@ -41,7 +41,7 @@ class DaemonRefused(IpfsError):
 
 
 class AccessDenied(DaemonRefused):
-    """The daemon wants other credentials."""
+    """The daemon requires other credentials."""
 
     code = "access-denied"
 
@@ -50,15 +50,15 @@ class AccessDenied(DaemonRefused):
             api,
             status,
             why,
-            hint="name a file with the value of the Authorization header (--ipfs-authorization-file); it must open"
-            " version, id, pubsub, swarm, add, block and pin below /api/v0/",
+            hint="put the value of the Authorization header into a file and pass --ipfs-authorization-file; it must"
+            " allow version, id, pubsub, swarm, add, block and pin below /api/v0/",
         )
 
 
 class PubSubDisabled(DaemonRefused):
     """The daemon runs without PubSub."""
 
-    code = "pub-sub-disabled"
+    code = "pubsub-disabled"
 
     def __init__(self, api: str, status: int, why: str) -> None:
         super().__init__(
@@ -67,26 +67,27 @@ class PubSubDisabled(DaemonRefused):
 
 
 class NoPeers(DaemonRefused):
-    """Nobody whom the daemon knows listens to the topic. Keep the message and publish it later."""
+    """The daemon knows no other subscriber of the topic. Keep the message and publish it later."""
 
     code = "no-peers"
 
 
-class Overtaken(DaemonRefused):
-    """The daemon has checked a later message of its own first, and so takes this one for a replay: publish it again."""
+class PublishedOutOfOrder(DaemonRefused):
+    """The daemon validated a later message of its own first and dropped this one as a replay. Publish it again."""
 
-    code = "overtaken"
+    code = "published-out-of-order"
 
 
 class JournalFailed(AiraError):
-    """A bridge can't read or write what it must remember."""
+    """A bridge can't read or write its journal."""
 
     code = "journal-failed"
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(
             f"the journal {path} can't be used: {why}",
-            hint="free some space; if it is damaged, stop the bridge and delete it: messages may then cross once more",
+            hint="free some disk space; if the file is damaged, stop the bridge and delete it (some messages may then"
+            " be relayed twice)",
         )
         self.path = path
         self.why = why

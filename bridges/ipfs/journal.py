@@ -1,4 +1,4 @@
-"""What a bridge must know when it starts again: which messages have crossed, and which still wait."""
+"""Deduplication: the messages a bridge has seen on each side, in memory, and its journal on disk across restarts."""
 
 from __future__ import annotations
 
@@ -6,19 +6,25 @@ import fcntl
 import os
 import sqlite3
 import time
+from collections import OrderedDict
+from enum import Enum
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from bridges.ipfs.errors import JournalFailed
-from bridges.ipfs.gate import Passenger
-from bridges.ipfs.memory import LASTS, Side
-from bridges.ipfs.outbox import Waiting
+from bridges.ipfs.publish_queue import QueuedMessage
+from bridges.ipfs.validation import RelayMessage
 from mesh.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
     from types import TracebackType
 
+DEDUPLICATION_WINDOW: Final = 600.0
+"""Seconds for which a message that is on both sides is not relayed again. After that a repeated message is relayed: its
+sender still waits for an effect, and a legacy peer that joined meanwhile has not received it."""
+DEDUPLICATION_LIMIT: Final = 131_072
+"""Messages remembered per side, at most; the oldest are forgotten first."""
 _TABLES: Final = """
     CREATE TABLE IF NOT EXISTS crossed (fingerprint BLOB PRIMARY KEY, at REAL NOT NULL) WITHOUT ROWID;
     CREATE TABLE IF NOT EXISTS waiting (
@@ -27,12 +33,50 @@ _TABLES: Final = """
 """
 
 
-class Journal:
-    """A file for one bridge at a time: `with Journal(path) as journal`.
+class Side(Enum):
+    """A side of the bridge."""
 
-    What was written is there after `kill -9`; after a power cut the last moments may be missing. Calls take some tens
-    of microseconds and are made on the event loop. Raises `ConfigurationError` when another bridge uses the file, and
-    `JournalFailed`.
+    MESH = "mesh"
+    IPFS = "ipfs"
+
+    @property
+    def other(self) -> Side:
+        """The opposite side."""
+        return Side.IPFS if self is Side.MESH else Side.MESH
+
+
+class SeenMessages:
+    """The fingerprints of messages seen on each side within the deduplication window. `clock` returns seconds."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._seen: dict[Side, OrderedDict[bytes, float]] = {side: OrderedDict() for side in Side}
+
+    def add(self, fingerprint: bytes, side: Side, *, age: float = 0.0) -> None:
+        """Record that the message was on `side` `age` seconds ago. Recording it again keeps the first time."""
+        seen = self._seen[side]
+        if self.contains(fingerprint, side):
+            return
+        seen.pop(fingerprint, None)
+        seen[fingerprint] = self._clock() - age
+        if len(seen) > DEDUPLICATION_LIMIT:
+            seen.popitem(last=False)
+
+    def contains(self, fingerprint: bytes, side: Side) -> bool:
+        """Whether the message was seen on that side within the window."""
+        seen = self._seen[side].get(fingerprint)
+        return seen is not None and self._clock() - seen < DEDUPLICATION_WINDOW
+
+    def __len__(self) -> int:
+        """The number of messages remembered, on the side with more."""
+        return max(len(seen) for seen in self._seen.values())
+
+
+class RelayJournal:
+    """The SQLite file of one bridge: `with RelayJournal(path) as journal`.
+
+    Writes survive `kill -9`; a power failure may lose the last moments. Calls take tens of microseconds and run on the
+    event loop. Raises `ConfigurationError` when another bridge uses the file, and `JournalFailed`.
     """
 
     def __init__(self, path: Path) -> None:
@@ -43,7 +87,7 @@ class Journal:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._lock = os.open(self._path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         except OSError as error:
-            raise ConfigurationError(f"can't keep a journal in {self._path.parent}: {error.strerror}") from None
+            raise ConfigurationError(f"can't write a journal in {self._path.parent}: {error.strerror}") from None
         try:
             self._open()
         except BaseException:
@@ -54,56 +98,56 @@ class Journal:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._base.close()
+        self._database.close()
         os.close(self._lock)
 
-    def wait(self, to: Side, waiting: Waiting) -> None:
-        """The message waits to be carried."""
-        row = (*waiting.passenger, to.value, waiting.shared)
+    def add_waiting(self, to: Side, queued: QueuedMessage) -> None:
+        """The message waits to be sent to side `to`."""
+        row = (*queued.message, to.value, queued.shared)
         self._do("INSERT OR REPLACE INTO waiting VALUES (?, ?, ?, ?, ?, ?)", *row)
 
-    def crossed(self, fingerprint: bytes) -> None:
+    def mark_relayed(self, fingerprint: bytes) -> None:
         """The message is on both sides."""
         self._do("INSERT OR REPLACE INTO crossed VALUES (?, ?)", fingerprint, time.time())
         self._do("DELETE FROM waiting WHERE fingerprint = ?", fingerprint)
 
-    def given_up(self, fingerprint: bytes) -> None:
-        """The message will not be carried."""
+    def remove_waiting(self, fingerprint: bytes) -> None:
+        """The message will not be sent."""
         self._do("DELETE FROM waiting WHERE fingerprint = ?", fingerprint)
 
-    def tidy(self) -> None:
-        """Forget what crossed so long ago that it may cross again."""
-        self._do("DELETE FROM crossed WHERE at < ?", time.time() - LASTS)
+    def prune(self) -> None:
+        """Delete messages that were relayed before the deduplication window."""
+        self._do("DELETE FROM crossed WHERE at < ?", time.time() - DEDUPLICATION_WINDOW)
 
-    def known(self) -> Iterator[tuple[bytes, float]]:
-        """The messages that have crossed, oldest first, and how many seconds ago."""
+    def relayed(self) -> Iterator[tuple[bytes, float]]:
+        """The fingerprints of relayed messages, oldest first, with their age in seconds."""
         now = time.time()
         for fingerprint, at in self._do("SELECT fingerprint, at FROM crossed ORDER BY at"):
             yield fingerprint, now - at
 
-    def left_over(self) -> Iterator[tuple[Side, Waiting]]:
-        """The messages that waited, in the order in which they came."""
+    def waiting(self) -> Iterator[tuple[Side, QueuedMessage]]:
+        """The waiting messages with their destination, in their order of arrival."""
         rows = self._do("SELECT fingerprint, key, payload, legacy, side, shared FROM waiting ORDER BY rowid")
-        for *passenger, side, shared in rows:
-            yield Side(side), Waiting(Passenger(*passenger), bool(shared), None, 0.0)
+        for *message, side, shared in rows:
+            yield Side(side), QueuedMessage(RelayMessage(*message), bool(shared), None, 0.0)
 
     def _open(self) -> None:
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise ConfigurationError(
-                f"another bridge uses {self._path}", hint="give this one a folder of its own with --data-dir"
+                f"another bridge uses {self._path}", hint="give this bridge a folder of its own with --data-dir"
             ) from None
-        self._base = sqlite3.connect(self._path, isolation_level=None, check_same_thread=False)
+        self._database = sqlite3.connect(self._path, isolation_level=None, check_same_thread=False)
         try:
-            self._base.executescript("PRAGMA journal_mode=WAL; PRAGMA synchronous=NORMAL;" + _TABLES)
-            self.tidy()
+            self._database.executescript("PRAGMA journal_mode=WAL; PRAGMA synchronous=NORMAL;" + _TABLES)
+            self.prune()
         except sqlite3.Error as error:
-            self._base.close()
+            self._database.close()
             raise JournalFailed(self._path, str(error)) from error
 
     def _do(self, statement: str, *values: object) -> list[tuple[Any, ...]]:
         try:
-            return self._base.execute(statement, values).fetchall()
+            return self._database.execute(statement, values).fetchall()
         except sqlite3.Error as error:
             raise JournalFailed(self._path, str(error)) from error

@@ -1,4 +1,4 @@
-"""All of the IPFS bridge as the settings describe it, for one process."""
+"""The IPFS bridge of one process, as the settings describe it."""
 
 from __future__ import annotations
 
@@ -9,13 +9,10 @@ from typing import TYPE_CHECKING, Final
 from bridges.ipfs.channel import ChannelBridge
 from bridges.ipfs.content import ContentBridge
 from bridges.ipfs.daemon import Daemon
-from bridges.ipfs.gate import Gate
-from bridges.ipfs.gateway import Gateway
-from bridges.ipfs.journal import Journal
-from bridges.ipfs.market import Markets
-from bridges.ipfs.memory import Side
-from bridges.ipfs.metrics import bridge_families, content_families, parts_of
-from bridges.ipfs.sources import Sources
+from bridges.ipfs.journal import RelayJournal, Side
+from bridges.ipfs.status import bridge_families, content_families, health_parts
+from bridges.ipfs.transfers import ContentSources, Gateway
+from bridges.ipfs.validation import ChainView, RelayValidator
 from mesh.content import Exchange, Store
 from mesh.errors import ConfigurationError
 from mesh.network.metrics import network_families
@@ -26,20 +23,19 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
     from contextlib import AbstractAsyncContextManager, AsyncExitStack
 
-    from bridges.ipfs.gate import Passenger
+    from bridges.ipfs.validation import RelayMessage
     from mesh.chain import Chain
     from mesh.network import Network
-    from mesh.settings import Settings
+    from mesh.settings import IpfsSettings, Settings
     from mesh.telemetry.metrics import MetricFamily
 
 
 class IpfsBridge(Role):
-    """The channels of `lighthouses` (ENS names) and the content: `async with IpfsBridge(...) as bridge`, then `run`.
+    """Bridges the channels of `lighthouses` (ENS names) and content: `async with IpfsBridge(...)`, then `run`.
 
-    With `chain`, which makes a client of it that is not open yet, ENS names in messages are looked up, orders must be
-    of the lighthouse's address, and those whose deadline has passed do not cross: from the moment on when its node was
-    reached. `address` is the bridge's name on the mesh, by default a new one for each channel. The network stays the
-    caller's to close.
+    `chain` creates an unopened client of the chain. With it, and once its node is reachable, ENS names in messages are
+    resolved, orders must name the lighthouse's address, and expired orders are rejected. `address` identifies the
+    bridge on the mesh, by default a random one per channel. The caller closes the network.
     """
 
     title = "IPFS bridge"
@@ -56,7 +52,7 @@ class IpfsBridge(Role):
         self._network = network
         self._settings = settings
         self._lighthouses = tuple(name.lower() for name in lighthouses or (settings.lighthouse_contract,))
-        self._markets = chain and Markets(chain, self._lighthouses, interval=max(settings.poll_interval, 1.0))
+        self._chain = chain and ChainView(chain, self._lighthouses, interval=max(settings.poll_interval, 1.0))
         self._address = address
         self.channels: tuple[ChannelBridge, ...] = ()
         self.daemon: Final = Daemon(settings.ipfs_http_provider, authorization=authorization_of(settings))
@@ -70,20 +66,20 @@ class IpfsBridge(Role):
         async with asyncio.TaskGroup() as tasks:
             for channel in self.channels:
                 tasks.create_task(channel.run(), name=f"bridge of {channel.lighthouse}")
-            if self._markets is not None:
-                tasks.create_task(self._markets.run(), name="bridge: the chain")
+            if self._chain is not None:
+                tasks.create_task(self._chain.run(), name="bridge: the chain")
 
     async def measure(self) -> Iterable[MetricFamily]:
-        """Its figures: of each channel, of the content, and of its session."""
+        """The metrics of each channel, of content and of the session."""
         return (
-            *bridge_families(channel.standing() for channel in self.channels),
-            *content_families(self.content.figures()),
+            *bridge_families(channel.health() for channel in self.channels),
+            *content_families(self.content.metrics()),
             *network_families(self._network),
         )
 
     def parts(self) -> Mapping[str, str]:
-        """The state of each of its parts: the router, and for each channel the daemon."""
-        return parts_of(channel.standing() for channel in self.channels)
+        """The health of each part: the router, and the daemon for each channel."""
+        return health_parts(channel.health() for channel in self.channels)
 
     @property
     def _directory(self) -> Path:
@@ -107,7 +103,7 @@ class IpfsBridge(Role):
                 self._network.session,
                 store,
                 exchange,
-                Sources(self.daemon, *gateways),
+                ContentSources(self.daemon, *gateways),
                 self.daemon,
                 providers=providers,
                 size_limit=settings.objective_size_limit,
@@ -120,39 +116,39 @@ class IpfsBridge(Role):
             ChannelBridge(
                 self._network,
                 self.daemon,
-                self._gate(lighthouse),
-                stack.enter_context(Journal(self._directory / f"{lighthouse}.sqlite")),
+                self._validator(lighthouse),
+                stack.enter_context(RelayJournal(self._directory / f"{lighthouse}.sqlite")),
                 lighthouse=lighthouse,
-                neighbours=self._settings.ipfs_swarm_connect,
+                swarm_peers=self._settings.ipfs_swarm_connect,
                 address=self._address,
-                carried=self._carried,
-                content=self.content.figures,
+                published=self._published,
+                content=self.content.metrics,
             )
         )
 
-    def _gate(self, lighthouse: str) -> Gate:
-        markets = self._markets
-        if markets is None:
-            return Gate(lighthouse)
-        return Gate(
+    def _validator(self, lighthouse: str) -> RelayValidator:
+        chain = self._chain
+        if chain is None:
+            return RelayValidator(lighthouse)
+        return RelayValidator(
             lighthouse,
-            address=lambda: markets.address(lighthouse),
-            resolver=markets.resolve,
-            head=lambda: markets.head,
+            address=lambda: chain.address(lighthouse),
+            resolver=chain.resolve,
+            head=lambda: chain.head,
         )
 
-    def _carried(self, side: Side, passenger: Passenger) -> None:
-        """Content goes the way of the messages that name it."""
-        match decode(passenger.payload):
+    def _published(self, side: Side, message: RelayMessage) -> None:
+        """Transfer the file that a message names to the side to which the message was sent."""
+        match decode(message.payload):
             case Demand(objective=cid) | Result(result=cid):
                 if side is Side.IPFS:
-                    self.content.add_soon(cid)
+                    self.content.schedule_add(cid)
                 else:
-                    self.content.fetch_soon(cid)
+                    self.content.schedule_fetch(cid)
 
 
-def authorization_of(settings: Settings) -> str:
-    """The `Authorization` header that the daemon wants, none if empty. Raises `ConfigurationError`."""
+def authorization_of(settings: IpfsSettings) -> str:
+    """The daemon's `Authorization` header, empty if it needs none. Raises `ConfigurationError`."""
     if not settings.ipfs_authorization_file:
         return ""
     path = Path(settings.ipfs_authorization_file).expanduser()
@@ -161,5 +157,7 @@ def authorization_of(settings: Settings) -> str:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"can't read the IPFS credentials in {path}: {error}") from None
     if not value.isascii() or not value.isprintable():
-        raise ConfigurationError(f"{path} holds no value of a header", hint="one line, such as Bearer … or Basic …")
+        raise ConfigurationError(
+            f"{path} does not hold the value of a header", hint="one line, such as Bearer … or Basic …"
+        )
     return value

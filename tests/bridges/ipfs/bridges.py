@@ -1,4 +1,4 @@
-"""Bridges for tests, with all that they stand on."""
+"""Bridges for tests, with their network, daemon and journal."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from bridges.ipfs import ChannelBridge, Daemon, Gate, Journal
+from bridges.ipfs import ChannelBridge, Daemon, RelayJournal, RelayValidator
 from bridges.ipfs.daemon import CALL_TIMEOUT
 from mesh.background import Background
 from mesh.network import Channel, Endpoints, Network, Pump
@@ -24,13 +24,18 @@ if TYPE_CHECKING:
 async def bridging(
     endpoint: str, api: str, topic: str, journal: Path, *, patience: float = CALL_TIMEOUT, **options: Any
 ) -> AsyncIterator[ChannelBridge]:
-    """A bridge at work between the router at `endpoint` and the daemon at `api`."""
+    """A running bridge between the router at `endpoint` and the daemon at `api`."""
     async with AsyncExitStack() as stack:
         network = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,))))
-        daemon = await stack.enter_async_context(Daemon(api, patience=patience))
-        notes = stack.enter_context(Journal(journal))
+        daemon = await stack.enter_async_context(Daemon(api, call_timeout=patience))
+        relay_journal = stack.enter_context(RelayJournal(journal))
         bridge = ChannelBridge(
-            network, daemon, Gate(topic, address=lambda: LIGHTHOUSE), notes, lighthouse=topic, **options
+            network,
+            daemon,
+            RelayValidator(topic, address=lambda: LIGHTHOUSE),
+            relay_journal,
+            lighthouse=topic,
+            **options,
         )
         await stack.enter_async_context(bridge)
         tasks = await stack.enter_async_context(Background())
@@ -40,7 +45,7 @@ async def bridging(
 
 @dataclass
 class Mesh:
-    """Somebody on the mesh's side: `heard` is every sample, with its key, however often it came."""
+    """A client on the mesh: `heard` is every sample received, with its key, duplicates included."""
 
     network: Network
     channel: Channel
@@ -48,13 +53,13 @@ class Mesh:
 
     @property
     def payloads(self) -> list[bytes]:
-        """What was heard, without the keys."""
+        """The payloads received, without the keys."""
         return [payload for _, payload in self.heard]
 
 
 @asynccontextmanager
 async def on_mesh(endpoint: str, topic: str) -> AsyncIterator[Mesh]:
-    """A client of the router that listens to all of a market."""
+    """A client of the router that receives everything on a market."""
 
     def read(sample: zenoh.Sample) -> tuple[str, bytes]:
         return str(sample.key_expr), sample.payload.to_bytes()
@@ -76,7 +81,7 @@ async def on_mesh(endpoint: str, topic: str) -> AsyncIterator[Mesh]:
 
 
 async def until_seen(mesh: Mesh, *addresses: str) -> None:
-    """Return when these bridges (or any one) have shown that they are there: from then on they hear the mesh."""
+    """Return when these bridges (or any one) are present, after which they receive what is published."""
 
     async def are_there() -> bool:
         present = {key.agent for key in await mesh.channel.present() if key.role == "bridge"}

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.bridges.ipfs.legacy import Bare
+from tests.bridges.ipfs.legacy import LegacyClient
 from tests.support.ipfs import JsIpfs, Kubo, LibraryNode
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ class Swarm:
 
     async def join(self) -> None:
         """Connect them, which lasts until one of them stops."""
-        async with Bare(self.b.api) as client:
+        async with LegacyClient(self.b.api) as client:
             await client.call("swarm/connect", ("arg", self.a.swarm_address))
 
 
@@ -69,7 +69,7 @@ def topic() -> str:
 
 
 @pytest.fixture
-async def bob(swarm: Swarm) -> AsyncIterator[Bare]:
+async def bob(swarm: Swarm) -> AsyncIterator[LegacyClient]:
     """A legacy client of daemon B."""
-    async with Bare(swarm.b.api, pause=0.02 if isinstance(swarm.b, Kubo) else 0.002) as client:
+    async with LegacyClient(swarm.b.api, pause=0.02 if isinstance(swarm.b, Kubo) else 0.002) as client:
         yield client

@@ -19,7 +19,7 @@ from mesh.errors import ConfigurationError
         ("https://example.org/behind/a/proxy", "https://example.org/behind/a/proxy"),
     ],
 )
-def test_a_daemon_is_named_by_a_multiaddr_or_a_url(text: str, url: str) -> None:
+def test_an_address_is_a_multiaddr_or_a_url(text: str, url: str) -> None:
     assert base_url(text) == url
 
 
@@ -42,7 +42,7 @@ def test_a_daemon_is_named_by_a_multiaddr_or_a_url(text: str, url: str) -> None:
         "/unix/run/ipfs.sock",
     ],
 )
-def test_other_texts_are_refused_with_an_example(text: str) -> None:
+def test_invalid_addresses_are_rejected_with_an_example(text: str) -> None:
     with pytest.raises(ConfigurationError) as refused:
         base_url(text)
     assert "/ip4/127.0.0.1/tcp/5001" in refused.value.hint

@@ -6,12 +6,12 @@ import asyncio
 import signal
 from typing import TYPE_CHECKING
 
-from bridges.ipfs.writing import legacy_json
+from bridges.ipfs.validation import legacy_json
 from mesh.identity.roster import Member
 from mesh.network import Channel, Network
 from schemas import encode
 from tests.bridges.ipfs.bridges import on_mesh, until_seen
-from tests.bridges.ipfs.pages import health
+from tests.bridges.ipfs.statuses import health
 from tests.support.commands import AIRA, Serving, aira
 from tests.support.orders import PERSON, demand, offer
 from tests.support.ports import free_port
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from tests.bridges.ipfs.bridges import Mesh
     from tests.bridges.ipfs.conftest import Swarm
-    from tests.bridges.ipfs.legacy import Bare
+    from tests.bridges.ipfs.legacy import LegacyClient
     from tests.support.routers import EmbeddedRouter
 
 MARKET = "airalab.lighthouse.3.robonomics.eth"
@@ -46,7 +46,7 @@ def command(router: EmbeddedRouter, folder: Path, *more: str) -> tuple[str, ...]
     return (*AIRA, "bridge", "ipfs", *where, *more)
 
 
-def test_the_bridge_runs_without_a_daemon_says_so_and_ends_by_a_signal(router: EmbeddedRouter, tmp_path: Path) -> None:
+def test_the_bridge_runs_without_a_daemon_and_stops_on_a_signal(router: EmbeddedRouter, tmp_path: Path) -> None:
     api = f"/ip4/127.0.0.1/tcp/{free_port()}"
     line = command(router, tmp_path, "--api", api, "--lighthouse", MARKET, "--lighthouse", OTHER)
     with Serving(*line, says="Cannot connect") as bridge:
@@ -58,12 +58,12 @@ def test_the_bridge_runs_without_a_daemon_says_so_and_ends_by_a_signal(router: E
     assert "Traceback" not in said
 
 
-def test_the_bridge_comes_up_without_the_chains_node_and_says_what_it_does_not_check(
+def test_the_bridge_starts_without_the_chains_node_and_logs_the_consequence(
     router: EmbeddedRouter, tmp_path: Path
 ) -> None:
     line = command(router, tmp_path, "--api", f"/ip4/127.0.0.1/tcp/{free_port()}", "--lighthouse", MARKET)
     node = ("--web3-http-provider", f"http://127.0.0.1:{free_port()}", "--ens-contract", f"0x{'12' * 20}")
-    with Serving(*line, *node, says="are not checked until the chain's node is there") as bridge:
+    with Serving(*line, *node, says="are not checked until the chain's node is reachable") as bridge:
         assert f"carries {MARKET}" in bridge.log()
         code, _ = bridge.end(signal.SIGTERM)
         said = bridge.log()
@@ -86,13 +86,20 @@ async def test_the_bridge_waits_for_a_router(router: EmbeddedRouter, tmp_path: P
         assert bridge.log().count("waits for a router") == 1
 
 
-async def test_on_a_locked_site_the_bridge_is_the_holder_of_its_certificate(tmp_path: Path) -> None:
+async def test_on_a_locked_site_the_bridge_has_the_address_of_its_certificate(tmp_path: Path) -> None:
     site = Site(tmp_path)
-    door = site.enlist(Member(address=BRIDGE, name="door", roles=("bridge",)))
+    bridge_files = site.enlist(Member(address=BRIDGE, name="bridge", roles=("bridge",)))
     human = site.enlist(Member(address=PERSON.address, name="human", roles=("person",)))
     where = ("--connect", site.endpoint, "--data-dir", tmp_path, "--api", f"/ip4/127.0.0.1/tcp/{free_port()}")
     chain = ("--web3-http-provider", "", "--web3-ws-provider", "", "--lighthouse", SITE_MARKET)
-    identity = ("--tls-ca", door.ca, "--tls-certificate", door.certificate, "--tls-key", door.key)
+    identity = (
+        "--tls-ca",
+        bridge_files.ca,
+        "--tls-certificate",
+        bridge_files.certificate,
+        "--tls-key",
+        bridge_files.key,
+    )
     with site.open_router("wheel"):
         line = (*AIRA, "bridge", "ipfs", *where, *chain, *identity)
         async with (
@@ -107,8 +114,8 @@ async def test_on_a_locked_site_the_bridge_is_the_holder_of_its_certificate(tmp_
             await until_found(is_seen, what="the bridge's token", seconds=60)
 
 
-async def test_a_bridge_that_was_killed_goes_on_and_carries_nothing_twice(
-    router: EmbeddedRouter, swarm: Swarm, bob: Bare, topic: str, tmp_path: Path
+async def test_a_killed_bridge_continues_and_sends_nothing_twice(
+    router: EmbeddedRouter, swarm: Swarm, bob: LegacyClient, topic: str, tmp_path: Path
 ) -> None:
     await bob.listen(topic)
     line = command(router, tmp_path, "--api", swarm.a.api, "--lighthouse", topic)

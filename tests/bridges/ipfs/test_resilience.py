@@ -1,4 +1,4 @@
-"""What a bridge bears: daemons and routers that go and come, nobody who listens, its own end, another one's end."""
+"""Resilience: outages of daemons and routers, no listeners, restarts of the bridge, failover to another bridge."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from bridges.ipfs import Journal
-from bridges.ipfs.writing import legacy_json
+from bridges.ipfs import RelayJournal
+from bridges.ipfs.validation import legacy_json
 from mesh.errors import ConfigurationError
 from schemas import TransactionFeedback, encode
 from tests.bridges.ipfs.bridges import bridging, on_mesh, until_seen
-from tests.bridges.ipfs.legacy import Bare
+from tests.bridges.ipfs.legacy import LegacyClient
 from tests.support.orders import demand, offer
 from tests.support.waiting import until, until_found
 
@@ -32,8 +32,8 @@ SECONDS = 90.0
 
 
 @pytest.fixture
-def mortal(kind: type[JsIpfs | Kubo]) -> Iterator[JsIpfs | Kubo]:
-    """A daemon of this test's own, not running yet."""
+def own_daemon(kind: type[JsIpfs | Kubo]) -> Iterator[JsIpfs | Kubo]:
+    """A daemon of this test's own, not started yet."""
     with ExitStack() as stack:
         daemon = kind()
         stack.callback(daemon.close)
@@ -46,62 +46,74 @@ async def mesh(router: EmbeddedRouter, topic: str) -> AsyncIterator[Mesh]:
         yield mesh
 
 
-async def test_a_daemon_that_comes_late_goes_and_comes_back_costs_nothing_that_was_accepted(
-    mortal: JsIpfs | Kubo, swarm: Swarm, bob: Bare, mesh: Mesh, router: EmbeddedRouter, topic: str, tmp_path: Path
+async def test_no_accepted_message_is_lost_by_outages_of_the_daemon(
+    own_daemon: JsIpfs | Kubo,
+    swarm: Swarm,
+    bob: LegacyClient,
+    mesh: Mesh,
+    router: EmbeddedRouter,
+    topic: str,
+    tmp_path: Path,
 ) -> None:
     await bob.listen(topic)
     orders = [demand(cost=number) for number in range(60)]
     neighbours = (swarm.b.swarm_address,)
-    async with bridging(router.endpoint, mortal.api, topic, tmp_path / "journal", neighbours=neighbours) as bridge:
+    async with bridging(router.endpoint, own_daemon.api, topic, tmp_path / "journal", swarm_peers=neighbours) as bridge:
         await until_seen(mesh, bridge.address)
         for order in orders[:20]:
             mesh.channel.publish(order)
         await until(lambda: bridge.status().to_ipfs.waiting == 20, seconds=SECONDS)
         assert bridge.status().state == "no daemon"
-        assert mortal.api in bridge.status().last_error
+        assert own_daemon.api in bridge.status().last_error
 
-        await asyncio.to_thread(mortal.start)
-        await until(lambda: len(set(bob.heard)) == 20, what="what waited for the daemon", seconds=SECONDS)
+        await asyncio.to_thread(own_daemon.start)
+        await until(lambda: len(set(bob.heard)) == 20, what="the waiting messages", seconds=SECONDS)
         assert (bridge.status().state, bridge.status().last_error) == ("connected", "")
 
         for order in orders[20:40]:
             mesh.channel.publish(order)
             if order is orders[30]:
-                await asyncio.to_thread(mortal.kill)
+                await asyncio.to_thread(own_daemon.kill)
         await until(lambda: bridge.status().state == "no daemon", seconds=SECONDS)
         for order in orders[40:]:
             mesh.channel.publish(order)
-        await asyncio.to_thread(mortal.start)
-        await until(lambda: len(set(bob.heard)) == 60, what="what was accepted meanwhile", seconds=SECONDS)
+        await asyncio.to_thread(own_daemon.start)
+        await until(lambda: len(set(bob.heard)) == 60, what="the messages accepted meanwhile", seconds=SECONDS)
         assert bridge.status().losses == 1
 
         await bob.publish(topic, legacy_json(answer := offer()))
         await until(lambda: encode(answer) in mesh.payloads, seconds=SECONDS)
-    # What was on its way when the daemon died may have gone out, and what was said before it was known again who
-    # listens; nobody can know, and all who listen drop what they know. All else goes out once.
+    # Messages in flight when the daemon died, and those sent before it knew its listeners again, may arrive twice:
+    # receivers drop duplicates. Every other message arrives once.
     assert len(bob.heard) - 1 - len(set(bob.heard[:-1])) <= 10
 
 
-async def test_a_daemon_that_is_frozen_is_lost_and_taken_up_again_when_it_goes_on(
-    mortal: JsIpfs | Kubo, swarm: Swarm, bob: Bare, mesh: Mesh, router: EmbeddedRouter, topic: str, tmp_path: Path
+async def test_a_frozen_daemon_is_detected_and_used_again_afterwards(
+    own_daemon: JsIpfs | Kubo,
+    swarm: Swarm,
+    bob: LegacyClient,
+    mesh: Mesh,
+    router: EmbeddedRouter,
+    topic: str,
+    tmp_path: Path,
 ) -> None:
     await bob.listen(topic)
-    await asyncio.to_thread(mortal.start)
+    await asyncio.to_thread(own_daemon.start)
     one, two, answer = demand(), demand(), offer()
-    await bob.call("swarm/connect", ("arg", mortal.swarm_address))
-    async with bridging(router.endpoint, mortal.api, topic, tmp_path / "journal", patience=3.0) as bridge:
+    await bob.call("swarm/connect", ("arg", own_daemon.swarm_address))
+    async with bridging(router.endpoint, own_daemon.api, topic, tmp_path / "journal", call_timeout=3.0) as bridge:
         await ready(bridge, mesh)
         mesh.channel.publish(one)
         await until(lambda: bob.heard, seconds=SECONDS)
-        mortal.pause()
+        own_daemon.pause()
         try:
             await until(lambda: bridge.status().state == "no daemon", seconds=SECONDS)
             mesh.channel.publish(two)
             await until(lambda: bridge.status().to_ipfs.waiting == 1, seconds=SECONDS)
-            # It still takes connections, and answers nothing.
-            await until(lambda: mortal.api in bridge.status().last_error, seconds=SECONDS)
+            # It still accepts connections, but answers nothing.
+            await until(lambda: own_daemon.api in bridge.status().last_error, seconds=SECONDS)
         finally:
-            mortal.resume()
+            own_daemon.resume()
         await until(lambda: legacy_json(two) in bob.heard, seconds=SECONDS)
         await until_found(lambda: bob.peers(topic), seconds=SECONDS)
         await bob.publish(topic, legacy_json(answer))
@@ -109,19 +121,25 @@ async def test_a_daemon_that_is_frozen_is_lost_and_taken_up_again_when_it_goes_o
         assert bridge.status().losses >= 1
 
 
-async def test_what_nobody_hears_goes_out_once_when_somebody_comes(
-    mortal: JsIpfs | Kubo, swarm: Swarm, bob: Bare, mesh: Mesh, router: EmbeddedRouter, topic: str, tmp_path: Path
+async def test_messages_without_listeners_are_sent_once_there_is_one(
+    own_daemon: JsIpfs | Kubo,
+    swarm: Swarm,
+    bob: LegacyClient,
+    mesh: Mesh,
+    router: EmbeddedRouter,
+    topic: str,
+    tmp_path: Path,
 ) -> None:
-    await asyncio.to_thread(mortal.start)
+    await asyncio.to_thread(own_daemon.start)
     orders = [demand(cost=number) for number in range(5)]
-    async with bridging(router.endpoint, mortal.api, topic, tmp_path / "journal") as bridge:
+    async with bridging(router.endpoint, own_daemon.api, topic, tmp_path / "journal") as bridge:
         await until(lambda: bridge.status().state == "alone", seconds=SECONDS)
         await until_seen(mesh, bridge.address)
         for order in orders:
             mesh.channel.publish(order)
         await until(lambda: bridge.status().to_ipfs.unheard == 5, seconds=SECONDS)
         await bob.listen(topic)
-        await bob.call("swarm/connect", ("arg", mortal.swarm_address))
+        await bob.call("swarm/connect", ("arg", own_daemon.swarm_address))
         await until(lambda: len(bob.heard) >= 5, seconds=SECONDS)
         await until(lambda: bridge.status().to_ipfs.unheard == bridge.status().to_ipfs.waiting == 0, seconds=SECONDS)
         mesh.channel.publish(last := offer())
@@ -129,8 +147,14 @@ async def test_what_nobody_hears_goes_out_once_when_somebody_comes(
     assert bob.heard == [*map(legacy_json, orders), legacy_json(last)]
 
 
-async def test_a_bridge_that_starts_again_carries_what_waited_and_nothing_twice(
-    mortal: JsIpfs | Kubo, swarm: Swarm, bob: Bare, mesh: Mesh, router: EmbeddedRouter, topic: str, tmp_path: Path
+async def test_a_restarted_bridge_sends_what_waited_and_nothing_twice(
+    own_daemon: JsIpfs | Kubo,
+    swarm: Swarm,
+    bob: LegacyClient,
+    mesh: Mesh,
+    router: EmbeddedRouter,
+    topic: str,
+    tmp_path: Path,
 ) -> None:
     await bob.listen(topic)
     known, waited = demand(), demand()
@@ -139,10 +163,10 @@ async def test_a_bridge_that_starts_again_carries_what_waited_and_nothing_twice(
         await ready(bridge, mesh)
         mesh.channel.publish(known)
         await until(lambda: bob.heard, seconds=SECONDS)
-    async with bridging(router.endpoint, mortal.api, topic, journal) as bridge:  # whose daemon does not run
+    async with bridging(router.endpoint, own_daemon.api, topic, journal) as bridge:  # its daemon is not running
         await until_seen(mesh, bridge.address)
         mesh.channel.publish(waited)
-        mesh.channel.publish(known)  # as its sender does until it has an effect
+        mesh.channel.publish(known)  # senders repeat a message until it has an effect
         await until(lambda: bridge.status().to_ipfs.known == 1, seconds=SECONDS)
         assert bridge.status().to_ipfs.waiting == 1
     async with bridging(router.endpoint, swarm.a.api, topic, journal) as bridge:
@@ -156,22 +180,28 @@ async def test_a_bridge_that_starts_again_carries_what_waited_and_nothing_twice(
     assert bob.heard == [legacy_json(order) for order in (known, waited, last)]
 
 
-async def test_another_bridge_carries_at_once_when_the_first_one_loses_its_daemon(
-    mortal: JsIpfs | Kubo, swarm: Swarm, bob: Bare, mesh: Mesh, router: EmbeddedRouter, topic: str, tmp_path: Path
+async def test_another_bridge_takes_over_when_the_active_one_loses_its_daemon(
+    own_daemon: JsIpfs | Kubo,
+    swarm: Swarm,
+    bob: LegacyClient,
+    mesh: Mesh,
+    router: EmbeddedRouter,
+    topic: str,
+    tmp_path: Path,
 ) -> None:
     await bob.listen(topic)
-    await asyncio.to_thread(mortal.start)
-    await bob.call("swarm/connect", ("arg", mortal.swarm_address))
-    async with bridging(router.endpoint, mortal.api, topic, tmp_path / "one") as first:
+    await asyncio.to_thread(own_daemon.start)
+    await bob.call("swarm/connect", ("arg", own_daemon.swarm_address))
+    async with bridging(router.endpoint, own_daemon.api, topic, tmp_path / "one") as first:
         await ready(first, mesh)
         async with bridging(router.endpoint, swarm.a.api, topic, tmp_path / "two") as second:
             await ready(second, mesh)
-            await until(lambda: first.traffic.others and second.traffic.others, seconds=SECONDS)
+            await until(lambda: first.relay.others and second.relay.others, seconds=SECONDS)
             assert (first.status().carries, second.status().carries) == (True, False)
-            await until_passed_on(mortal.api, topic, second)
+            await until_forwarded(own_daemon.api, topic, second)
             mesh.channel.publish(one := demand())
             await until(lambda: second.status().to_ipfs.left == 1, seconds=SECONDS)
-            await asyncio.to_thread(mortal.kill)
+            await asyncio.to_thread(own_daemon.kill)
             await until(lambda: second.status().carries, seconds=SECONDS)
             mesh.channel.publish(two := demand())
             await until(lambda: legacy_json(two) in bob.heard, seconds=SECONDS)
@@ -179,8 +209,8 @@ async def test_another_bridge_carries_at_once_when_the_first_one_loses_its_daemo
             assert second.status().to_ipfs.carried == 1
 
 
-async def test_what_comes_from_ipfs_waits_for_the_router(
-    swarm: Swarm, bob: Bare, router: EmbeddedRouter, topic: str, tmp_path: Path
+async def test_messages_from_ipfs_wait_for_the_router(
+    swarm: Swarm, bob: LegacyClient, router: EmbeddedRouter, topic: str, tmp_path: Path
 ) -> None:
     async with bridging(router.endpoint, swarm.a.api, topic, tmp_path / "journal") as bridge:
         await until_found(lambda: bob.peers(topic), seconds=SECONDS)
@@ -198,10 +228,10 @@ async def test_what_comes_from_ipfs_waits_for_the_router(
         assert order.signature
 
 
-async def test_a_full_outbox_accepts_nothing_more_and_counts_it(
-    mortal: JsIpfs | Kubo, mesh: Mesh, router: EmbeddedRouter, topic: str, tmp_path: Path
+async def test_a_full_queue_rejects_messages_and_counts_them(
+    own_daemon: JsIpfs | Kubo, mesh: Mesh, router: EmbeddedRouter, topic: str, tmp_path: Path
 ) -> None:
-    async with bridging(router.endpoint, mortal.api, topic, tmp_path / "journal", limit=3) as bridge:
+    async with bridging(router.endpoint, own_daemon.api, topic, tmp_path / "journal", limit=3) as bridge:
         await until_seen(mesh, bridge.address)
         for number in range(5):
             mesh.channel.publish(demand(cost=number))
@@ -210,19 +240,19 @@ async def test_a_full_outbox_accepts_nothing_more_and_counts_it(
         assert bridge.status().to_ipfs.dropped == {"no-room": 2}
 
 
-async def test_a_journal_is_one_bridges_own(tmp_path: Path) -> None:
+async def test_a_journal_belongs_to_one_bridge(tmp_path: Path) -> None:
     with (
-        Journal(tmp_path / "journal.sqlite"),
-        pytest.raises(ConfigurationError, match="another bridge") as refused,
-        Journal(tmp_path / "journal.sqlite"),
+        RelayJournal(tmp_path / "journal.sqlite"),
+        pytest.raises(ConfigurationError) as refused,
+        RelayJournal(tmp_path / "journal.sqlite"),
     ):
         pass
     assert "--data-dir" in refused.value.hint
 
 
-async def until_passed_on(api: str, topic: str, bridge: ChannelBridge) -> None:
-    """Return when what the daemon at `api` says comes to `bridge` through others, which takes them a heartbeat."""
-    async with Bare(api) as client:
+async def until_forwarded(api: str, topic: str, bridge: ChannelBridge) -> None:
+    """Return when messages of the daemon at `api` reach `bridge` through other nodes, which takes a heartbeat."""
+    async with LegacyClient(api) as client:
 
         async def comes() -> bool:
             await client.publish(topic, legacy_json(TransactionFeedback(tx=secrets.token_hex(32))))

@@ -1,4 +1,4 @@
-"""The whole bridge, as the settings describe it."""
+"""The whole bridge, built from settings."""
 
 from __future__ import annotations
 
@@ -23,14 +23,12 @@ if TYPE_CHECKING:
 ADDRESS = "0x" + "12" * 20
 
 
-def test_lists_are_written_with_commas_in_variables() -> None:
+def test_environment_variables_hold_lists_with_commas() -> None:
     settings = load(environ={"AIRA_IPFS_PUBLIC_PROVIDERS": "http://one:5001, http://two:5001"})
     assert settings.ipfs_public_providers == ("http://one:5001", "http://two:5001")
 
 
-async def test_it_carries_several_channels_with_the_credentials_of_a_file(
-    router: EmbeddedRouter, tmp_path: Path
-) -> None:
+async def test_several_channels_with_credentials_from_a_file(router: EmbeddedRouter, tmp_path: Path) -> None:
     (tmp_path / "secret").write_text("Bearer right\n")
     async with OldDaemon(authorization="Bearer right") as daemon:
         settings = Settings(
@@ -49,7 +47,7 @@ async def test_it_carries_several_channels_with_the_credentials_of_a_file(
 
 
 @pytest.mark.parametrize("secret", [b"two\nlines", b"\xff", "Schlüssel".encode()])
-async def test_credentials_that_no_header_can_hold_are_refused_and_not_shown(
+async def test_invalid_credentials_are_rejected_and_not_shown(
     router: EmbeddedRouter, tmp_path: Path, secret: bytes
 ) -> None:
     (tmp_path / "secret").write_bytes(secret)
@@ -61,7 +59,7 @@ async def test_credentials_that_no_header_can_hold_are_refused_and_not_shown(
     assert "lines" not in str(refused.value)
 
 
-async def test_wrong_credentials_are_told_in_the_status(router: EmbeddedRouter, tmp_path: Path) -> None:
+async def test_wrong_credentials_appear_in_the_status(router: EmbeddedRouter, tmp_path: Path) -> None:
     async with OldDaemon(authorization="Bearer right") as daemon:
         settings = Settings(data_dir=str(tmp_path), ipfs_http_provider=daemon.api)
         async with (
@@ -73,8 +71,8 @@ async def test_wrong_credentials_are_told_in_the_status(router: EmbeddedRouter, 
             await until(lambda: "Unauthorized" in bridge.channels[0].status().last_error, seconds=60)
 
 
-async def test_settings_that_name_no_daemon_are_refused_at_once(router: EmbeddedRouter, tmp_path: Path) -> None:
+async def test_an_invalid_daemon_address_is_rejected_at_once(router: EmbeddedRouter, tmp_path: Path) -> None:
     settings = Settings(data_dir=str(tmp_path), ipfs_http_provider=f"localhost:{free_port()}")
     async with Network(Endpoints(connect=(router.endpoint,))) as network:
-        with pytest.raises(ConfigurationError, match="no address of an IPFS"):
+        with pytest.raises(ConfigurationError):
             IpfsBridge(network, settings)

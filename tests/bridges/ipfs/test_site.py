@@ -1,11 +1,11 @@
-"""The bridge on a locked site: it may do what its role is for, and nothing keeps it from that."""
+"""The bridge on a locked site: its role's rights suffice for both directions."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from bridges.ipfs import ChannelBridge, Daemon, Gate, Journal
-from bridges.ipfs.writing import legacy_json
+from bridges.ipfs import ChannelBridge, Daemon, RelayJournal, RelayValidator
+from bridges.ipfs.validation import legacy_json
 from mesh.background import Background
 from mesh.identity.roster import Member
 from mesh.network import Channel, Network
@@ -22,15 +22,15 @@ SECONDS = 60.0
 BRIDGE = "0x" + "ab" * 20
 
 
-async def test_a_bridge_with_its_role_carries_both_ways_on_a_locked_site(tmp_path: Path) -> None:
+async def test_a_bridge_relays_both_ways_on_a_locked_site(tmp_path: Path) -> None:
     site = Site(tmp_path)
-    door = site.enlist(Member(address=BRIDGE, name="door", roles=("bridge",)))
+    bridge_files = site.enlist(Member(address=BRIDGE, name="bridge", roles=("bridge",)))
     human = site.enlist(Member(address=PERSON.address, name="human", roles=("person",)))
     async with OldDaemon() as here, OldDaemon() as there:
         here.others, there.others = [there], [here]
-        with site.open_router("wheel"), Journal(tmp_path / "journal") as journal:
+        with site.open_router("wheel"), RelayJournal(tmp_path / "journal") as journal:
             async with (
-                Network(site.client(door)) as network,
+                Network(site.client(bridge_files)) as network,
                 Network(site.client(human)) as person,
                 Channel(person.session, MARKET, address=LIGHTHOUSE) as channel,
                 channel.subscribe(Offer) as offers,
@@ -38,7 +38,7 @@ async def test_a_bridge_with_its_role_carries_both_ways_on_a_locked_site(tmp_pat
                 ChannelBridge(
                     network,
                     daemon,
-                    Gate(MARKET, address=lambda: LIGHTHOUSE),
+                    RelayValidator(MARKET, address=lambda: LIGHTHOUSE),
                     journal,
                     lighthouse=MARKET,
                     address=BRIDGE,
@@ -50,7 +50,7 @@ async def test_a_bridge_with_its_role_carries_both_ways_on_a_locked_site(tmp_pat
                 channel.publish(order := demand())
                 await until(lambda: bridge.status().to_ipfs.carried == 1, seconds=SECONDS)
                 async with Daemon(there.api) as legacy:
-                    await legacy.greet()
+                    await legacy.detect_version()
                     await legacy.publish(MARKET, legacy_json(answer := offer()))
                     heard = await anext(offers)
                 assert heard == verify_message(answer)

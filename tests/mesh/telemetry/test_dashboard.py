@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import pytest
 
-from bridges.ipfs.metrics import Standing, bridge_families, content_families
+from bridges.ipfs.status import BridgeHealth, bridge_families, content_families
 from bridges.serial.dialect import LineCounters
 from bridges.serial.metrics import EdgeStatistics, families_of
 from mesh.market.provider import Provider, ProviderProcess
@@ -18,7 +18,7 @@ from mesh.telemetry.health import health_metrics
 from mesh.telemetry.metrics import labelled
 from mesh.telemetry.server import render_metrics
 from schemas.status import ContentMetrics
-from tests.bridges.ipfs.statuses import status, way
+from tests.bridges.ipfs.statuses import direction, status
 from tests.support.scraping import Scrape
 
 if TYPE_CHECKING:
@@ -64,8 +64,11 @@ def edge_families() -> tuple[MetricFamily, ...]:
 
 
 def bridge() -> tuple[MetricFamily, ...]:
-    ways = way(invalid={"hash": 1}, dropped={"no-room": 1}, kinds={"demand": 1})
-    return (*bridge_families([Standing(status(to_ipfs=ways, to_mesh=ways), True, True)]), *content_families(CONTENT))
+    ways = direction(invalid={"hash": 1}, dropped={"no-room": 1}, kinds={"demand": 1})
+    return (
+        *bridge_families([BridgeHealth(status(to_ipfs=ways, to_mesh=ways), True, True)]),
+        *content_families(CONTENT),
+    )
 
 
 async def role_families(place: Place) -> list[MetricFamily]:

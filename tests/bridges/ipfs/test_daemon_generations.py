@@ -1,20 +1,22 @@
-"""What daemons of today answer otherwise."""
+"""Daemons of 2018 and of today, as replays of their RPC."""
 
 from __future__ import annotations
 
 import asyncio
+import json
+from base64 import b64decode
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
 import aiohttp
 import pytest
 
-from bridges.ipfs import AccessDenied, Daemon, Overtaken, PubSubDisabled
-from bridges.ipfs.writing import legacy_json
+from bridges.ipfs import AccessDenied, Daemon, PublishedOutOfOrder, PubSubDisabled
+from bridges.ipfs.validation import legacy_json
 from schemas import encode
 from tests.bridges.ipfs.bridges import bridging, on_mesh, until_seen
-from tests.bridges.ipfs.legacy import Bare
-from tests.bridges.ipfs.replays import RecentDaemon
+from tests.bridges.ipfs.legacy import LegacyClient
+from tests.bridges.ipfs.replays import OldDaemon, RecentDaemon
 from tests.support.orders import demand, offer
 from tests.support.waiting import until
 
@@ -26,17 +28,74 @@ if TYPE_CHECKING:
     from tests.bridges.ipfs.bridges import Mesh
     from tests.support.routers import EmbeddedRouter
 
+
 SECONDS = 60.0
+
+
+@pytest.fixture
+async def pair() -> AsyncIterator[tuple[OldDaemon, OldDaemon]]:
+    async with OldDaemon() as one, OldDaemon() as two:
+        one.others, two.others = [two], [one]
+        yield one, two
+
+
+async def test_the_old_dialect_is_detected_by_the_version(pair: tuple[OldDaemon, OldDaemon]) -> None:
+    async with Daemon(pair[0].api) as daemon:
+        assert str(await daemon.detect_version()) == "go-ipfs 0.4.18"
+        assert daemon.dialect == "plain"
+
+
+async def test_messages_pass_both_ways_in_the_old_dialect(
+    pair: tuple[OldDaemon, OldDaemon], router: EmbeddedRouter, topic: str, tmp_path: Path
+) -> None:
+    one, two = pair
+    order, answer = demand(), offer()
+    async with (
+        asyncio.timeout(SECONDS),
+        aiohttp.ClientSession() as http,
+        http.get(f"{two.api}/api/v0/pubsub/sub", params={"arg": topic}) as heard,
+        on_mesh(router.endpoint, topic) as mesh,
+        bridging(router.endpoint, one.api, topic, tmp_path / "journal.sqlite") as bridge,
+    ):
+        await until(lambda: bridge.status().state == "connected", seconds=SECONDS)
+        await until_seen(mesh, bridge.address)
+        assert bridge.status().ipfs_peers == (two.peer_id,)
+        # As the clients of 2018 published: everything in the address.
+        await http.get(f"{two.api}/api/v0/pubsub/pub", params=[("arg", topic), ("arg", legacy_json(order).decode())])
+        await until(lambda: mesh.heard, seconds=SECONDS)
+        assert mesh.payloads == [encode(order)]
+        mesh.channel.publish(answer)
+        lines = [json.loads(await heard.content.readline()) for _ in range(2)]
+        assert [b64decode(line["data"]) for line in lines] == [legacy_json(order), legacy_json(answer)]
+        assert lines[1]["topicIDs"] == [topic]
+
+
+async def test_an_old_daemon_without_pubsub(topic: str) -> None:
+    async with OldDaemon(pubsub=False) as old, Daemon(old.api) as daemon:
+        await daemon.detect_version()
+        with pytest.raises(PubSubDisabled) as refused:
+            await daemon.publish(topic, b"hello")
+        assert "--enable-pubsub-experiment" in refused.value.hint
+
+
+async def test_a_protected_old_daemon_requires_the_right_header() -> None:
+    async with OldDaemon(authorization="Bearer right") as old:
+        async with Daemon(old.api, authorization="Bearer right") as daemon:
+            await daemon.detect_version()
+        async with Daemon(old.api, authorization="Bearer wrong") as daemon:
+            with pytest.raises(AccessDenied) as denied:
+                await daemon.detect_version()
+            assert "wrong" not in str(denied.value)
 
 
 @asynccontextmanager
 async def bridged(
     one: RecentDaemon, two: RecentDaemon, endpoint: str, topic: str, folder: Path
-) -> AsyncIterator[tuple[Bare, Mesh, ChannelBridge]]:
-    """Somebody at the second of two daemons, the mesh, and a bridge between that and the first."""
+) -> AsyncIterator[tuple[LegacyClient, Mesh, ChannelBridge]]:
+    """A legacy client of daemon `two`, a client on the mesh, and a bridge at daemon `one`."""
     one.others, two.others = [two], [one]
     async with (
-        Bare(two.api) as bob,
+        LegacyClient(two.api) as bob,
         on_mesh(endpoint, topic) as mesh,
         bridging(endpoint, one.api, topic, folder / "journal.sqlite") as bridge,
     ):
@@ -46,7 +105,9 @@ async def bridged(
         yield bob, mesh, bridge
 
 
-async def test_messages_pass_both_ways(router: EmbeddedRouter, topic: str, tmp_path: Path) -> None:
+async def test_messages_pass_both_ways_in_the_current_dialect(
+    router: EmbeddedRouter, topic: str, tmp_path: Path
+) -> None:
     async with (
         RecentDaemon() as one,
         RecentDaemon() as two,
@@ -61,14 +122,14 @@ async def test_messages_pass_both_ways(router: EmbeddedRouter, topic: str, tmp_p
         assert bob.heard == [legacy_json(order), legacy_json(answer)]
 
 
-async def test_several_channels_do_not_overtake_each_other_at_one_daemon() -> None:
+async def test_concurrent_channels_publish_in_order_at_one_daemon() -> None:
     async with RecentDaemon(slow=0.05) as recent, Daemon(recent.api) as daemon:
-        await daemon.greet()
+        await daemon.detect_version()
         await asyncio.gather(*(daemon.publish(f"topic {number}", b"hello") for number in range(6)))
         assert recent.overtaken == 0
 
 
-async def test_a_flood_of_the_mesh_comes_to_other_nodes_that_check_it_in_the_wrong_order(
+async def test_a_flood_reaches_nodes_that_validate_out_of_order(
     router: EmbeddedRouter, topic: str, tmp_path: Path
 ) -> None:
     async with (
@@ -84,17 +145,17 @@ async def test_a_flood_of_the_mesh_comes_to_other_nodes_that_check_it_in_the_wro
         assert bob.heard == [legacy_json(order) for order in orders]
 
 
-async def test_what_somebody_else_has_overtaken_is_published_again(
+async def test_a_message_published_out_of_order_is_published_again(
     router: EmbeddedRouter, topic: str, tmp_path: Path
 ) -> None:
     async with RecentDaemon(slow=0.2) as recent, Daemon(recent.api) as daemon, Daemon(recent.api) as other:
-        await daemon.greet()
-        with pytest.raises(Overtaken) as refused:
+        await daemon.detect_version()
+        with pytest.raises(PublishedOutOfOrder) as refused:
             await asyncio.gather(daemon.publish(topic, b"one"), other.publish(topic, b"two"))
         assert refused.value.status == 500
         async with (
             on_mesh(router.endpoint, topic) as mesh,
-            Bare(recent.api) as bob,
+            LegacyClient(recent.api) as bob,
             bridging(router.endpoint, recent.api, topic, tmp_path / "journal.sqlite") as bridge,
         ):
             await bob.listen(topic)
@@ -108,26 +169,26 @@ async def test_what_somebody_else_has_overtaken_is_published_again(
             assert bridge.status().to_ipfs.dropped == {}
 
 
-async def test_a_daemon_without_pubsub_says_so(topic: str) -> None:
+async def test_a_recent_daemon_without_pubsub(topic: str) -> None:
     async with RecentDaemon(pubsub=False) as recent, Daemon(recent.api) as daemon:
-        await daemon.greet()
-        with pytest.raises(PubSubDisabled, match="not enabled") as refused:
+        await daemon.detect_version()
+        with pytest.raises(PubSubDisabled) as refused:
             await daemon.publish(topic, b"hello")
         assert "Pubsub.Enabled true" in refused.value.hint
 
 
-async def test_what_the_secret_of_a_protected_daemon_must_open_is_told() -> None:
+async def test_a_protected_recent_daemon_names_the_paths_it_must_allow() -> None:
     async with RecentDaemon(authorization="Bearer right") as recent:
         async with Daemon(recent.api, authorization="Bearer right") as daemon:
-            await daemon.greet()
+            await daemon.detect_version()
         async with Daemon(recent.api, authorization="Bearer wrong") as daemon:
-            with pytest.raises(AccessDenied, match="Access Denied") as denied:
-                await daemon.greet()
+            with pytest.raises(AccessDenied) as denied:
+                await daemon.detect_version()
             assert "pubsub" in denied.value.hint
             assert "wrong" not in str(denied.value)
 
 
-async def test_the_replay_keeps_browsers_and_get_out_as_a_kubo_does(topic: str) -> None:
+async def test_the_replay_rejects_browsers_and_get_like_a_kubo(topic: str) -> None:
     async with RecentDaemon() as recent, aiohttp.ClientSession() as http:
         async with http.get(f"{recent.api}/api/v0/version") as answer:
             assert answer.status == 405

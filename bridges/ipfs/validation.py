@@ -1,0 +1,244 @@
+"""Validation of relayed messages, whichever side they come from; the chain data it needs; the legacy JSON encoding."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from hashlib import sha256
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import msgspec
+
+from mesh.errors import AiraError, ChainError, InvalidMessage
+from mesh.network.validation import key_of
+from mesh.outage_log import OutageLog
+from mesh.retry import REMOTE, Backoff, RetryPolicy
+from mesh.telemetry.context import log_event
+from schemas import (
+    Demand,
+    FeedbackKey,
+    Message,
+    Offer,
+    OrderFeedback,
+    PendingKey,
+    Result,
+    SignedMessage,
+    TransactionFeedback,
+    decode,
+    encode,
+    keccak256,
+    message_hash,
+    names_in,
+    resolve_names,
+    verify_hashed,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+    from contextlib import AbstractAsyncContextManager
+
+    from mesh.chain import Chain
+
+    Resolver = Callable[[str], Awaitable[str]]
+
+log = logging.getLogger(__name__)
+
+FINGERPRINT_BYTES: Final = 16
+_ENCODER: Final = msgspec.json.Encoder()
+_LEGACY_FIELDS: Final[dict[tuple[type[Message], int], tuple[tuple[str, str], ...]]] = {}
+"""Kind and generation → (attribute, field on the wire), in the order in which legacy clients wrote them."""
+
+
+def _legacy_order(kind: type[Message], generation: int, names: str) -> None:
+    attributes = {field.encode_name: field.name for field in msgspec.structs.fields(kind)}
+    _LEGACY_FIELDS[kind, generation] = tuple((attributes[name], name) for name in names.split())
+
+
+_legacy_order(Demand, 3, "model objective token cost validator lighthouse deadline nonce signature validatorFee")
+_legacy_order(Offer, 3, "model objective token cost validator lighthouse deadline nonce signature lighthouseFee")
+_legacy_order(Demand, 5, "model objective token cost lighthouse validator validatorFee deadline sender nonce signature")
+_legacy_order(Offer, 5, "model objective token cost validator lighthouse lighthouseFee deadline sender nonce signature")
+_legacy_order(Result, 0, "liability result success signature")
+_legacy_order(OrderFeedback, 0, "order accepted signature")
+
+
+def legacy_json(message: Message) -> bytes:
+    """The JSON of a message byte for byte as legacy clients wrote it: compact, with the fields in their order.
+
+    Readers should not depend on the order, but some may. Raises `InvalidMessage` (`signature`) for an unsigned message
+    of a signed kind.
+    """
+    generation = message.generation if isinstance(message, Demand | Offer) else 0
+    fields = _LEGACY_FIELDS.get((type(message), generation), (("tx", "tx"),))
+    if not getattr(message, "signature", "transaction feedback is unsigned"):
+        raise InvalidMessage("signature", "the message is not signed")
+    return _ENCODER.encode({name: getattr(message, attribute) for attribute, name in fields})
+
+
+class RelayMessage(NamedTuple):
+    """A valid message. Its fingerprint is the same on both sides, whatever the encoding.
+
+    `key` and `payload` are for the mesh, `legacy` is the JSON for IPFS.
+    """
+
+    fingerprint: bytes
+    key: str
+    payload: bytes
+    legacy: bytes
+
+    @property
+    def kind(self) -> str:
+        """The kind in its key: demand, offer, result, feedback or pending."""
+        return self.key.split("/", 3)[2]
+
+
+class RelayValidator:
+    """Validates the messages of one lighthouse (ENS name): `await validator.validate(payload)`.
+
+    `address` returns the address that orders must name as their lighthouse, None while it isn't known; `resolver`
+    resolves ENS names in messages; `head` returns the latest block number, or 0 while it isn't known (then no deadline
+    is checked).
+    """
+
+    def __init__(
+        self,
+        lighthouse: str,
+        *,
+        address: Callable[[], str | None] = lambda: None,
+        resolver: Resolver | None = None,
+        head: Callable[[], int] = lambda: 0,
+    ) -> None:
+        self._lighthouse = lighthouse
+        self._address = address
+        self._resolver = resolver
+        self._head = head
+
+    async def validate(self, payload: bytes, *, key: str | None = None) -> RelayMessage:
+        """The message in `payload`: well-formed, for this market, before its deadline, correctly signed.
+
+        `key`, if given, must be the one that the message requires. The signature of order feedback is not verified,
+        because what it covers is undocumented. Raises only `InvalidMessage`; its `reason` is one of `schemas.decode`,
+        or `name`, `lighthouse`, `deadline`, `signature`, `sender`, `key`.
+        """
+        message = decode(payload)
+        canonical = encode(message)
+        own_key = await self._key(message, canonical)
+        if key is not None and not _is_key_of(message, key, own_key):
+            raise InvalidMessage("key", f"the message does not belong on {key}")
+        fingerprint = sha256(canonical).digest()[:FINGERPRINT_BYTES]
+        return RelayMessage(fingerprint, key or own_key, canonical, legacy_json(message))
+
+    async def _key(self, message: Message, canonical: bytes) -> str:
+        match message:
+            case OrderFeedback():
+                return str(FeedbackKey(self._lighthouse, message.order, keccak256(canonical).hex()))
+            case TransactionFeedback():
+                return str(PendingKey(self._lighthouse, message.tx))
+        resolved = await self._resolved(message)
+        self._check_order(resolved)
+        digest = message_hash(resolved)
+        verify_hashed(resolved, digest)
+        return key_of(self._lighthouse, resolved, digest)
+
+    async def _resolved(self, message: SignedMessage) -> SignedMessage:
+        names = names_in(message)
+        if not names:
+            return message
+        if self._resolver is None:
+            raise InvalidMessage("name", f"this bridge can't resolve {', '.join(sorted(names))}")
+        try:
+            return resolve_names(message, {name: await self._resolver(name) for name in names})
+        except AiraError as error:
+            raise InvalidMessage("name", str(error)) from error
+
+    def _check_order(self, order: SignedMessage) -> None:
+        if isinstance(order, Result):
+            return
+        if (address := self._address()) is not None and order.lighthouse != address:
+            raise InvalidMessage("lighthouse", f"made for {order.lighthouse}, not for this market")
+        if order.deadline <= self._head():
+            raise InvalidMessage("deadline", f"block {order.deadline} has passed")
+
+
+def _is_key_of(message: Message, key: str, own_key: str) -> bool:
+    """The end of a feedback's key is its sender's choice; every other key follows from the content."""
+    if isinstance(message, OrderFeedback):
+        return key.rpartition("/")[0] == own_key.rpartition("/")[0]
+    return key == own_key
+
+
+class ChainAwaited(ChainError):
+    """The chain's node was not reached yet."""
+
+    code = "chain-awaited"
+
+
+class ChainView:
+    """What validation needs from the chain: the lighthouses' addresses, ENS names and the latest block.
+
+    `chain` creates an unopened client; `lighthouses` are ENS names; `interval` is in seconds between two reads of the
+    latest block. Start `run` as a task. Until the node is reached nothing is known, which is logged once; what was read
+    stays known.
+    """
+
+    def __init__(
+        self,
+        chain: Callable[[], AbstractAsyncContextManager[Chain]],
+        lighthouses: tuple[str, ...],
+        *,
+        interval: float,
+        retry: RetryPolicy = REMOTE,
+    ) -> None:
+        self._make_chain = chain
+        self._interval = interval
+        self._retry = retry
+        self._outage = OutageLog(log, "chain")
+        self._chain: Chain | None = None
+        self._addresses: dict[str, str | None] = dict.fromkeys(lighthouses)
+        self.head = 0
+        """The latest block number; 0 while it isn't known."""
+        self.error = ""
+        """The last error, empty while all is well."""
+
+    def address(self, lighthouse: str) -> str | None:
+        """The lighthouse's address, None while it isn't known."""
+        return self._addresses[lighthouse]
+
+    async def resolve(self, name: str) -> str:
+        """The address of an ENS name. Raises `ChainError`."""
+        if self._chain is None:
+            raise ChainAwaited("the chain's node was not reached yet")
+        return await self._chain.names.address(name)
+
+    async def run(self) -> None:
+        """Follow the chain until cancelled. Raises `ConfigurationError` for a chain that contradicts the settings."""
+        backoff = Backoff(self._retry)
+        while True:
+            try:
+                async with self._make_chain() as self._chain:
+                    log.info("the chain's node is reachable", extra=log_event("chain-connected"))
+                    backoff.reset()
+                    while True:
+                        await self._read(self._chain)
+                        await asyncio.sleep(self._interval)
+            except ChainError as error:
+                self._failed(error, "deadlines and ENS names are not checked until the chain's node is reachable")
+            finally:
+                self._chain = None
+            await backoff.wait()
+
+    async def _read(self, chain: Chain) -> None:
+        """Read the head and unknown addresses. After an outage of the node, its client reconnects by itself."""
+        try:
+            self.head = await chain.block_number()
+            for name in [name for name, address in self._addresses.items() if address is None]:
+                self._addresses[name] = await chain.names.address(name)
+        except ChainError as error:
+            self._failed(error, "the latest block or a lighthouse's address could not be read")
+        else:
+            self.error = ""
+            self._outage.recovered("deadlines and ENS names are checked")
+
+    def _failed(self, error: ChainError, consequence: str) -> None:
+        self._outage.failed(error, consequence)
+        self.error = str(error)

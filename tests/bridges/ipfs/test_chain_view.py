@@ -1,0 +1,62 @@
+"""The bridge's view of the chain during outages of its node."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+import pytest
+
+from bridges.ipfs.validation import ChainAwaited, ChainView
+from mesh.background import Background
+from mesh.chain import Chain, Timing
+from mesh.devchain import JsonRpcServer
+from mesh.retry import RetryPolicy
+from tests.support.market import founded, place
+from tests.support.ports import free_port
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from tests.support.market import Place
+
+__all__ = ["founded", "place"]
+
+SECONDS = 60.0
+UNKNOWN = "nobody.lighthouse.3.robonomics.eth"
+
+
+async def test_chain_data_is_read_once_the_node_is_reachable_and_kept_during_an_outage(
+    place: Place, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.WARNING, "bridges.ipfs.validation")
+    deployment, port = place.market.deployment, free_port()
+    name = deployment.lighthouse_name
+
+    attempts: list[int] = []
+
+    def chain() -> Chain:
+        attempts.append(port)
+        return Chain(f"http://127.0.0.1:{port}", ens=deployment.ens, timing=Timing(poll_interval=0.05))
+
+    retry = RetryPolicy(initial=0.1, ceiling=0.1)
+    view = ChainView(chain, (name, UNKNOWN), interval=0.05, retry=retry)
+    async with Background() as tasks:
+        tasks.start(view.run(), "the chain")
+        await until(lambda: len(attempts) == 3, seconds=SECONDS)
+        assert (view.address(name), view.head) == (None, 0)
+        with pytest.raises(ChainAwaited):
+            await view.resolve(name)
+
+        async with JsonRpcServer(place.node.provider, host="127.0.0.1", port=port):
+            await until(lambda: view.address(name), seconds=SECONDS)
+            assert view.address(name) == deployment.lighthouse
+            assert view.head > 0
+            assert await view.resolve(name) == deployment.lighthouse
+            # An unknown lighthouse does not affect the others.
+            await until(lambda: UNKNOWN in view.error, seconds=SECONDS)
+            assert view.address(UNKNOWN) is None
+
+        await until(lambda: UNKNOWN not in view.error, what="the loss of the node", seconds=SECONDS)
+        assert view.address(name) == deployment.lighthouse
+    outages = [record for record in caplog.records if record.__dict__.get("event") == "chain-outage"]
+    assert len([record for record in outages if "until the chain's node is reachable" in record.getMessage()]) == 1
