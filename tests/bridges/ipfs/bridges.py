@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
 @asynccontextmanager
 async def bridging(
-    endpoint: str, api: str, topic: str, journal: Path, *, patience: float = CALL_TIMEOUT, **options: Any
+    endpoint: str, api: str, topic: str, journal: Path, *, call_timeout: float = CALL_TIMEOUT, **options: Any
 ) -> AsyncIterator[ChannelBridge]:
     """A running bridge between the router at `endpoint` and the daemon at `api`."""
     async with AsyncExitStack() as stack:
         network = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,))))
-        daemon = await stack.enter_async_context(Daemon(api, call_timeout=patience))
+        daemon = await stack.enter_async_context(Daemon(api, call_timeout=call_timeout))
         relay_journal = stack.enter_context(RelayJournal(journal))
         bridge = ChannelBridge(
             network,
