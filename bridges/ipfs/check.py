@@ -1,4 +1,4 @@
-"""The checks of the IPFS daemon for `aira doctor`: whether it answers, accepts our credentials, has PubSub and peers."""
+"""The checks of the IPFS daemon for `aira doctor`: that it answers, accepts us, has PubSub and peers."""
 
 from __future__ import annotations
 
