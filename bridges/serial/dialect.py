@@ -12,9 +12,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from bridges.serial.errors import BoardBusy, UnknownDialect
+from mesh.plugins import entry_points
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -232,19 +233,13 @@ class Dialect(ABC):
 
 def dialect_names() -> list[str]:
     """The names of the installed dialects."""
-    return sorted(_entry_points())
+    return sorted(entry_points(ENTRY_POINTS))
 
 
 def load_dialect(name: str) -> type[Dialect]:
     """The installed dialect of that name, imported now. Raises `UnknownDialect`."""
-    installed = _entry_points()
+    installed = entry_points(ENTRY_POINTS)
     if name not in installed:
         raise UnknownDialect(name, sorted(installed))
     dialect: type[Dialect] = installed[name].load()
     return dialect
-
-
-def _entry_points() -> dict[str, Any]:
-    from importlib.metadata import entry_points  # takes 30 ms, which only those who choose a dialect pay
-
-    return {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}

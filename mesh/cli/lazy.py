@@ -19,7 +19,8 @@ from mesh.running import INTERRUPTED, fail
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from importlib.metadata import EntryPoint
+
+    from mesh.plugins import EntryPoint
 
 ENTRY_POINTS: Final = "aira.commands"
 HELP_WIDTH: Final = 100
@@ -32,7 +33,7 @@ class BrokenCommand(ConfigurationError):
     code = "command-broken"
 
     def __init__(self, name: str, entry: EntryPoint, error: Exception) -> None:
-        package = entry.dist.name if entry.dist is not None else "an installed package"
+        package = entry.package
         super().__init__(
             f"can't load the command {name!r} of {package}: {type(error).__name__}: {error}",
             hint=f"reinstall or uninstall {package}; other commands work without it",
@@ -62,15 +63,15 @@ class LazyGroup(click.Group):
 
     @cached_property
     def _installed(self) -> dict[str, EntryPoint]:
-        """The installed commands of this group. Reading them takes about 30 ms, so only what needs them does."""
+        """The installed commands of this group. Reading them takes a few ms, so only what needs them does."""
         if self._prefix is None:
             return {}
-        from importlib.metadata import entry_points
+        from mesh.plugins import entry_points
 
         found = {
-            entry.name.removeprefix(self._prefix): entry
-            for entry in entry_points(group=ENTRY_POINTS)
-            if entry.name.startswith(self._prefix)
+            name.removeprefix(self._prefix): entry
+            for name, entry in entry_points(ENTRY_POINTS).items()
+            if name.startswith(self._prefix)
         }
         return {name: entry for name, entry in found.items() if " " not in name}
 

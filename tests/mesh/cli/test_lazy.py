@@ -168,6 +168,6 @@ def test_small_commands_read_no_entry_points(tmp_path: Path) -> None:
     program = (
         "import sys; from mesh.cli import main\n"
         f"main(['cid', {str(tmp_path / 'file')!r}], standalone_mode=False)\n"
-        "print('importlib.metadata' in sys.modules)"
+        "print('mesh.plugins' in sys.modules)"
     )
     assert run(sys.executable, "-c", program).stdout.splitlines()[-1] == "False"
