@@ -1,17 +1,17 @@
-"""Simulated boards for tests, with firmware that each process which runs tests compiles once."""
+"""Simulated boards for tests. Firmware is compiled once for all processes and runs, until a source changes."""
 
 from __future__ import annotations
 
-import atexit
-import shutil
+import fcntl
+import hashlib
+import os
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import TYPE_CHECKING
 
+from bridges.serial import firmware as compiler
 from bridges.serial.boards import SimulatedBoard
-from bridges.serial.firmware import compile_sketch
 from tests.support.commands import AIRA, Serving
 from tests.support.peers import require
 
@@ -27,12 +27,28 @@ ROSSERIAL_ECHO = "tests/support/firmware/rosserial_echo"
 
 @cache
 def firmware(sketch: str, *defines: str) -> Path:
-    """The compiled sketch in this folder of the project. Skips the test where the tools are missing."""
+    """The compiled sketch in this folder of the project. Skips the test if the tools are missing.
+
+    It is kept in the cache folder of the tests' programs, under a hash of everything that it is made of.
+    """
     for tool in ("avr-gcc", "arduino-core", "libsimavr"):
         require(tool)
-    folder = mkdtemp(prefix="aira-firmware-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return compile_sketch(ROOT / sketch, Path(folder) / "firmware.elf", libraries=[LIBRARIES], defines=defines)
+    folder = Path(os.environ.get("AIRA_PEERS_CACHE") or "~/.cache/aira-mesh").expanduser() / "firmware"
+    folder.mkdir(parents=True, exist_ok=True)
+    elf = folder / f"{Path(sketch).name}-{_digest(ROOT / sketch, defines)}.elf"
+    with open(folder / "lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # the other processes wait rather than compile the same
+        if not elf.exists():
+            compiled = elf.with_suffix(f".{os.getpid()}")
+            compiler.compile_sketch(ROOT / sketch, compiled, libraries=[LIBRARIES], defines=defines)
+            compiled.replace(elf)
+    return elf
+
+
+def _digest(sketch: Path, defines: tuple[str, ...]) -> str:
+    sources = [Path(compiler.__file__), *(path for top in (sketch, LIBRARIES) for path in sorted(top.rglob("*")))]
+    parts = [repr(defines).encode(), *(path.read_bytes() for path in sources if path.is_file())]
+    return hashlib.sha256(b"\0".join(parts)).hexdigest()[:12]
 
 
 def board(sketch: str, *defines: str) -> SimulatedBoard:
@@ -42,7 +58,7 @@ def board(sketch: str, *defines: str) -> SimulatedBoard:
 
 @contextmanager
 def edge(port: Path, agent: str, endpoint: str, *options: str) -> Iterator[Serving]:
-    """`aira edge` for a board, as a process of its own; the board may not be ready yet."""
+    """`aira edge` for a board, as a process of its own. The board may not be ready yet."""
     command: tuple[str | Path, ...] = ("edge", port, "--agent", agent, "--connect", endpoint, *options)
     with Serving(*AIRA, *command, says="edge of 0x") as serving:
         yield serving

@@ -1,3 +1,5 @@
+"""The jobs that an edge agent sees."""
+
 from __future__ import annotations
 
 from bridges.serial.calls import JobTracker
@@ -10,7 +12,7 @@ def event(liability: str, name: str) -> str:
     return f"aira/agent/{AGENT}/liability/{liability}/{name}"
 
 
-def test_the_first_job_that_is_ready_goes_on_until_it_is_complete() -> None:
+def test_the_first_ready_job_is_current_until_it_is_complete() -> None:
     jobs = JobTracker()
     assert jobs.current == ""
     for liability in (FIRST, SECOND):
@@ -23,7 +25,7 @@ def test_the_first_job_that_is_ready_goes_on_until_it_is_complete() -> None:
     assert jobs.current == ""
 
 
-def test_a_command_of_another_job_makes_that_the_one_that_goes_on() -> None:
+def test_a_command_of_another_job_makes_that_job_current() -> None:
     jobs = JobTracker()
     jobs.handle_event(event(FIRST, "ready"))
     jobs.begin(SECOND)
@@ -32,7 +34,7 @@ def test_a_command_of_another_job_makes_that_the_one_that_goes_on() -> None:
     assert jobs.current == FIRST
 
 
-def test_what_is_no_event_changes_nothing() -> None:
+def test_other_keys_change_nothing() -> None:
     jobs = JobTracker()
     for key in ("aira/x", event(FIRST, "objective/ready"), event("robot", "ready")):
         jobs.handle_event(key)

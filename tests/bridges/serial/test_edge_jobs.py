@@ -32,13 +32,13 @@ LONG = 60.0
 OTHER_MODEL = cid_of_bytes(b"what the second robot of the test can do")
 
 
-def is_at_work(uno: SimulatedBoard) -> bool:
-    """Whether the counter is within /slow."""
+def is_working(uno: SimulatedBoard) -> bool:
+    """Whether the counter is in /slow."""
     return bool(uno.changes(13)) and uno.changes(13)[-1].high
 
 
 def counting(robot: Agent) -> Agent:
-    """A robot that has its board count one, slowly, for each message on /work."""
+    """A robot whose board counts one, slowly, for each message on /work."""
     device = Device(robot, patience=LONG)
 
     @robot.on("/work")
@@ -49,18 +49,18 @@ def counting(robot: Agent) -> Agent:
 
 
 def recorded(recording: Path, topic: str) -> list[Any]:
-    """What a recording has on a topic."""
+    """The values on a topic of a recording."""
     messages = open_objective(recording).messages()
     return [decode_value(message.payload, message.type) for message in messages if message.topic == topic]
 
 
-async def test_a_job_goes_on_when_the_cable_is_in_again_and_its_recording_shows_the_gap(place: Place) -> None:
+async def test_a_job_continues_after_an_unplugged_cable_and_its_recording_shows_the_gap(place: Place) -> None:
     robot = counting(place.agent("robot"))
     source = place.save(objective(("/work", Empty()), ("/work", Empty()), ("/work", Empty())))
     with board(COUNTER) as uno, edge(uno.port, place.address("robot"), place.endpoint):
         async with place.at_work(robot) as person:
             contract = await person.demand(source, cost=1)
-            await until(lambda: is_at_work(uno), what="the job", seconds=LONG)
+            await until(lambda: is_working(uno), what="the job", seconds=LONG)
             await asyncio.to_thread(uno.unplug)
             await asyncio.to_thread(uno.plug)
             assert (await contract.outcome()).success
@@ -76,7 +76,7 @@ async def test_a_job_whose_board_was_reset_fails_and_never_hangs(place: Place) -
     with board(COUNTER) as uno, edge(uno.port, place.address("robot"), place.endpoint) as process:
         async with place.at_work(robot) as person:
             contract = await person.demand(source, cost=1)
-            await until(lambda: is_at_work(uno), what="the job", seconds=LONG)
+            await until(lambda: is_working(uno), what="the job", seconds=LONG)
             await asyncio.to_thread(uno.reset)
             assert not (await contract.outcome()).success
             recording = await contract.recording()
@@ -106,7 +106,7 @@ async def test_a_ros_bag_is_an_objective_for_a_board(place: Place) -> None:
     assert recorded(recording, "/added") == [2, 3]
 
 
-async def test_of_devices_with_the_same_topics_a_call_reaches_the_one_that_it_names(place: Place) -> None:
+async def test_among_devices_with_the_same_topics_a_call_reaches_the_one_it_names(place: Place) -> None:
     robot = obliging(place.agent("robot"))
     left, right = Device(robot, "left", patience=LONG), Device(robot, "right", patience=LONG)
     address = place.address("robot")
@@ -133,7 +133,7 @@ async def test_of_devices_with_the_same_topics_a_call_reaches_the_one_that_it_na
     assert sorted(recorded(recording, "/added")) == [5, 7]
 
 
-async def test_a_command_in_a_job_reaches_only_the_device_whose_topics_are_called_so(place: Place) -> None:
+async def test_a_command_in_a_job_reaches_only_the_device_with_that_topic_name(place: Place) -> None:
     robot = obliging(place.agent("robot"))
     left, right = Device(robot, "left", patience=LONG), Device(robot, "right", patience=LONG)
     address = place.address("robot")

@@ -1,3 +1,5 @@
+"""The codec of our own frames."""
+
 from __future__ import annotations
 
 import pytest
@@ -12,11 +14,11 @@ frames = st.builds(
 )
 
 
-def test_the_check_is_crc_16_ccitt_false() -> None:
+def test_the_checksum_is_crc_16_ccitt_false() -> None:
     assert crc16(b"123456789") == 0x29B1
 
 
-def test_a_frame_is_the_bytes_that_its_specification_shows() -> None:
+def test_a_frame_is_encoded_as_in_its_specification() -> None:
     assert encode_frame(Frame(FrameKind.CALL, 1, 0, b"\xa3red")).hex(" ") == "02 31 07 a3 72 65 64 03 7b 00"
 
 
@@ -42,7 +44,7 @@ def test_the_frame_after_noise_and_its_end_is_found(noise: bytes, frame: Frame) 
     assert FrameDecoder(counters).feed(noise + b"\0" + encode_frame(frame))[-1] == frame
 
 
-def test_what_is_damaged_is_counted() -> None:
+def test_damaged_frames_are_counted() -> None:
     counters = LineCounters()
     line = bytearray(encode_frame(Frame(FrameKind.EVENT, 0, 1, b"abc")))
     line[3] ^= 1
@@ -50,7 +52,7 @@ def test_what_is_damaged_is_counted() -> None:
     assert (counters.damaged, counters.received) == (1, 0)
 
 
-def test_a_payload_beyond_the_longest_is_refused() -> None:
+def test_a_payload_that_is_too_long_is_refused() -> None:
     with pytest.raises(ValueError, match="97 bytes"):
         encode_frame(Frame(FrameKind.CALL, 0, 0, bytes(97)))
 

@@ -1,3 +1,5 @@
+"""Serial ports."""
+
 from __future__ import annotations
 
 import os
@@ -22,12 +24,13 @@ def test_a_port_is_found_by_its_path(tmp_path: Path) -> None:
 
 
 def test_a_usb_device_that_is_not_plugged_in_is_missing() -> None:
-    with pytest.raises(PortMissing, match="no such device"):
+    with pytest.raises(PortMissing) as caught:
         PortName("usb:dead:beef").find()
+    assert caught.value.port == "usb:dead:beef"
 
 
 @pytest.mark.parametrize("text", ["", "ttyUSB0", "usb:2341", "usb:23410043", "COM3"])
-def test_what_names_no_port_is_refused(text: str) -> None:
+def test_a_text_that_names_no_port_is_refused(text: str) -> None:
     with pytest.raises(InputError):
         PortName(text)
 
@@ -40,7 +43,7 @@ def test_a_file_that_is_no_terminal_is_refused(tmp_path: Path) -> None:
             SerialPort(each, baud=57_600)
 
 
-def test_a_port_is_for_one_process_alone_and_tells_when_it_is_pulled_out(tmp_path: Path) -> None:
+def test_a_port_is_locked_and_reports_when_it_is_unplugged(tmp_path: Path) -> None:
     master, slave = os.openpty()
     path = PortName(os.ttyname(slave)).find()
     os.close(slave)

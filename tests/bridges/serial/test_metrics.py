@@ -1,4 +1,4 @@
-"""What an edge agent tells of itself: its line, its board, its calls; and how it is."""
+"""The metrics and health of an edge agent: its line, its board, its calls."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ LONG = 60.0
 WELL = {"channel": ALIVE, "line": ALIVE, "board": ALIVE}
 
 
-async def is_so(url: str, expected: tuple[int, dict[str, str]]) -> bool:
+async def health_is(url: str, expected: tuple[int, dict[str, str]]) -> bool:
     return await health(url) == expected
 
 
-async def test_calls_move_the_figures_of_the_line_by_their_endings(place: Place) -> None:
+async def test_calls_are_counted_by_their_outcome(place: Place) -> None:
     listen = f"127.0.0.1:{free_port()}"
     url = f"http://{listen}"
     with (
         board(COUNTER) as uno,
         edge(uno.port, place.address("robot"), place.endpoint, "--metrics-listen", listen),
     ):
-        await until_found(lambda: is_so(url, (200, WELL)), what="the board", seconds=LONG)
+        await until_found(lambda: health_is(url, (200, WELL)), what="the board", seconds=LONG)
         async with place.agent("robot") as robot:
             before = await scraped(url)
             assert (await Device(robot).call("/add", 5)).value == 5
@@ -56,22 +56,22 @@ async def test_calls_move_the_figures_of_the_line_by_their_endings(place: Place)
         assert after("aira_edge_frame_faults_total", reason="damaged") == 0
 
 
-async def test_a_board_that_goes_is_told(place: Place) -> None:
+async def test_a_lost_board_is_reported(place: Place) -> None:
     listen = f"127.0.0.1:{free_port()}"
     url = f"http://{listen}"
     with ExitStack() as stack:
         with board(COUNTER) as uno:
             options = ("--metrics-listen", listen)
             stack.enter_context(edge(uno.port, place.address("robot"), place.endpoint, *options))
-            await until_found(lambda: is_so(url, (200, WELL)), what="the board", seconds=LONG)
+            await until_found(lambda: health_is(url, (200, WELL)), what="the board", seconds=LONG)
         gone = {**WELL, "line": "waits for the port", "board": "is absent"}
-        await until_found(lambda: is_so(url, (503, gone)), what="the loss", seconds=LONG)
+        await until_found(lambda: health_is(url, (503, gone)), what="the loss", seconds=LONG)
         figures = await scraped(url)
         assert (figures("aira_edge_board_present"), figures("aira_edge_board_losses_total")) == (0, 1)
         assert figures("aira_part_up", part="board") == 0
 
 
-async def test_an_edge_agent_that_waits_for_its_router_says_that_it_has_not_begun(tmp_path: Path) -> None:
+async def test_an_edge_agent_that_waits_for_its_router_reports_that_it_starts(tmp_path: Path) -> None:
     listen, router = f"127.0.0.1:{free_port()}", f"tcp/127.0.0.1:{free_port()}"
     options = ("--agent", "0x" + "11" * 20, "--connect", router, "--connect-timeout", "-1", "--metrics-listen", listen)
     with Serving(*AIRA, "edge", tmp_path / "port", *options, says="metrics at"):

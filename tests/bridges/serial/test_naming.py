@@ -1,3 +1,5 @@
+"""Names of topics in the mesh."""
+
 from __future__ import annotations
 
 import pytest
@@ -6,21 +8,21 @@ from bridges.serial.naming import TopicNames
 from mesh.errors import InputError, InvalidKey
 
 
-def test_topics_have_their_own_names_unless_others_are_given() -> None:
+def test_topics_keep_their_names_unless_renamed() -> None:
     assert TopicNames().of("/led") == "/led"
     assert TopicNames([("/lamp", "/x")]).of("/lamps") == "/lamps"
 
 
-def test_a_name_stands_for_all_beneath_it_and_the_longest_counts() -> None:
+def test_a_name_also_renames_all_below_it_and_the_longest_applies() -> None:
     names = TopicNames([("/", "/left"), ("/arm", "/hand"), ("/arm/finger", "/")])
     given = ("/led", "/arm", "/arm/joint", "/arm/finger/tip", "/arm/finger")
     assert [names.of(name) for name in given] == ["/left/led", "/hand", "/hand/joint", "/tip", "/arm/finger"]
 
 
-def test_what_can_be_no_name_is_refused() -> None:
+def test_invalid_names_are_refused() -> None:
     with pytest.raises(InvalidKey):
         TopicNames([("/a b", "/c")])
     with pytest.raises(InvalidKey):
         TopicNames([("/a", "c")])
-    with pytest.raises(InputError, match="two names"):
+    with pytest.raises(InputError):
         TopicNames([("/a", "/b"), ("/a", "/c")])

@@ -1,3 +1,5 @@
+"""The codec of rosserial, and the types of std_msgs."""
+
 from __future__ import annotations
 
 import logging
@@ -47,7 +49,7 @@ def test_messages_are_the_bytes_of_rosserial(message: RosserialMessage, line: st
     assert RosserialDecoder(LineCounters()).feed(bytes.fromhex(line)) == [message]
 
 
-def test_the_question_for_topics_is_an_empty_message() -> None:
+def test_the_request_for_topics_is_an_empty_message() -> None:
     assert encode_message(RosserialMessage(PUBLISHER)) == ASK_TOPICS
 
 
@@ -60,7 +62,7 @@ def test_messages_are_found_again_in_pieces_of_any_size(sent: list[RosserialMess
 
 
 @given(messages, st.integers(1, 4))
-def test_a_message_right_after_a_beginning_that_has_no_end_is_found(message: RosserialMessage, cut: int) -> None:
+def test_a_message_after_an_incomplete_one_is_found(message: RosserialMessage, cut: int) -> None:
     cut_off = encode_message(RosserialMessage(200, b"x" * 4))[:cut]
     assert RosserialDecoder(LineCounters()).feed(cut_off + encode_message(message)) == [message]
 
@@ -74,13 +76,13 @@ def test_no_single_damaged_byte_of_a_string_passes(place: int, difference: int) 
     assert counters.noise > 0
 
 
-def test_a_stray_ff_before_a_message_is_noise_of_one_byte() -> None:
+def test_a_stray_ff_before_a_message_is_one_byte_of_noise() -> None:
     counters = LineCounters()
     assert RosserialDecoder(counters).feed(b"\xff" + encode_message(RosserialMessage(100))) == [RosserialMessage(100)]
     assert counters.noise == 1
 
 
-def test_a_board_that_announces_is_read() -> None:
+def test_an_announcement_is_decoded() -> None:
     data = (125).to_bytes(2, "little") + text("chatter") + text("std_msgs/String") + text("992ce8a1") + b"\x18\x01\0\0"
     info = decode_topic_info(data)
     assert (info.id, info.name, info.type, info.md5, info.buffer) == (
@@ -97,7 +99,7 @@ def test_a_board_that_announces_is_read() -> None:
         decode_topic_info(data + b"x")
 
 
-def test_a_log_line_that_is_no_text_is_told_all_the_same() -> None:
+def test_a_log_line_that_is_not_text_is_decoded_with_replacements() -> None:
     assert decode_log(b"\x02" + text("hot")) == (logging.WARNING, "hot")
     assert decode_log(b"\x03\x02\0\0\0\xff\xfe") == (logging.ERROR, "\ufffd\ufffd")
     assert decode_log(b"") == (logging.INFO, "")
@@ -122,14 +124,14 @@ def test_parameters_are_lists_of_integers_floats_and_texts(value: object, data: 
     assert encode_parameter(value).data == bytes.fromhex(data)
 
 
-def test_a_parameter_is_asked_for_by_name() -> None:
+def test_a_parameter_is_requested_by_name() -> None:
     assert decode_parameter_name(text("~rate")) == "~rate"
     with pytest.raises(MalformedMessage):
         decode_parameter_name(b"\x05\0\0\0ab")
 
 
 @pytest.mark.parametrize(("baud", "characters"), [(57_600, 111), (115_200, 220)])
-def test_the_longest_string_is_what_a_board_was_seen_to_take(baud: int, characters: int) -> None:
+def test_the_longest_string_is_the_one_measured_on_a_board(baud: int, characters: int) -> None:
     assert len(encode_message(RosserialMessage(100, String("x" * characters).encode()))) == longest_frame(baud)
 
 
@@ -146,7 +148,7 @@ def test_the_types_have_the_md5_sums_of_ros() -> None:
     assert known_type("sensor_msgs/Range") is None
 
 
-def test_a_payload_of_the_wrong_length_is_none_of_its_type() -> None:
+def test_a_payload_of_the_wrong_length_is_invalid() -> None:
     number, string = known_type("std_msgs/UInt16"), known_type("std_msgs/String")
     assert number is not None
     assert string is not None
