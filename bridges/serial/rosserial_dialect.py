@@ -67,10 +67,16 @@ class RosserialDialect(Dialect):
     """rosserial. `parameters` are what a sketch may request, by name; `clock` gives the time that boards ask for."""
 
     def __init__(
-        self, *, baud: int, parameters: Mapping[str, object] | None = None, clock: Callable[[], float] = time.time
+        self,
+        *,
+        baud: int,
+        parameters: Mapping[str, object] | None = None,
+        clock: Callable[[], float] = time.time,
+        settle_time: float = SETTLE_TIME,
     ) -> None:
         super().__init__(baud=baud, parameters=parameters)
         self._clock = clock
+        self._settle_time = settle_time
         self._decoder = RosserialDecoder(self.counters)
         self._topics = TopicTable(rosserial.longest_frame(baud))
         self._last_announced: tuple[int, int] | None = None
@@ -167,10 +173,10 @@ class RosserialDialect(Dialect):
             self._lose_board("the board has other topics now")
             self._topics.add(kind, info)
         if self.info is not None and self._active is not None and self._active.topic.flow is Flow.SUBSCRIBES:
-            self._settled_at, self._answers_expected = now + SETTLE_TIME, self._active.requests
+            self._settled_at, self._answers_expected = now + self._settle_time, self._active.requests
             self._finish(CallStatus.READ, "", "", now)
         if self.info is None or self._settled_at is not None:
-            self._settled_at = now + SETTLE_TIME
+            self._settled_at = now + self._settle_time
             self._answers_expected -= (kind, info.id) == self._last_announced
             if self.info is not None and self._answers_expected <= 0:
                 self._settle(now)

@@ -1,9 +1,8 @@
-"""Settings of the property tests."""
+"""Settings of the property tests: a busy machine is no reason to fail."""
 
 from __future__ import annotations
 
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
-# A busy machine is no reason to fail.
-settings.register_profile("schemas", deadline=None)
+settings.register_profile("schemas", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("schemas")

@@ -1,4 +1,4 @@
-"""A line to a simulated board, served by a thread, for tests that talk to firmware without a mesh."""
+"""A line to a simulated board, served by a thread, for tests that client to firmware without a mesh."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ SECONDS = 60.0
 H = TypeVar("H")
 
 
-class Talk:
-    """`with Talk(board, dialect, baud=57600) as talk`: opened, and the board is ready."""
+class LineClient:
+    """`with LineClient(board, dialect, baud=57600) as client`: opened, and the board is ready."""
 
     def __init__(self, board: SimulatedBoard, dialect: Dialect, *, baud: int) -> None:
         self.dialect = dialect
-        self.happened: list[LineEvent] = []
+        self.events: list[LineEvent] = []
         self._arrived: queue.SimpleQueue[LineEvent] = queue.SimpleQueue()
         self.line = SerialLine(PortName(str(board.port)), dialect, baud=baud, on_event=self._arrived.put)
         self._thread = threading.Thread(target=self.line.run, name="line", daemon=True)
@@ -40,19 +40,19 @@ class Talk:
         self._thread.join(SECONDS)
 
     def next(self, kind: type[H], *, seconds: float = SECONDS) -> H:
-        """The next happening of this kind; those before it are in `happened`."""
+        """The next event of this type; earlier ones are in `events`."""
         deadline = time.monotonic() + seconds
         while True:
             try:
-                happening = self._arrived.get(timeout=max(0.0, deadline - time.monotonic()))
+                event = self._arrived.get(timeout=max(0.0, deadline - time.monotonic()))
             except queue.Empty:
                 raise AssertionError(f"no {kind.__name__} within {seconds:g} s; {self.dialect.counters}") from None
-            self.happened.append(happening)
-            if isinstance(happening, kind):
-                return happening
+            self.events.append(event)
+            if isinstance(event, kind):
+                return event
 
     def submit(self, topic: str, payload: bytes = b"", *, seconds: float = SECONDS) -> Command:
-        """Have the board do something, in its turn."""
+        """Submit a command."""
         command = Command(topic, payload, time.monotonic() + seconds)
         self.line.call_soon(lambda: self._submit(command))
         return command
@@ -64,7 +64,7 @@ class Talk:
             self._arrived.put(CommandFinished(command, CallStatus.FAILED, reason="unfit", detail=str(error)))
 
     def call(self, topic: str, payload: bytes = b"") -> CommandFinished:
-        """Have the board do something, and wait for the end of it."""
+        """Submit a command and wait for its outcome."""
         command = self.submit(topic, payload)
         while (ended := self.next(CommandFinished)).command is not command:
             pass
