@@ -11,34 +11,32 @@ import click
 
 from mesh.cli.amounts import ETH, XRT
 from mesh.cli.chain_client import address_in_keyfile, open_chain, required_address
-from mesh.cli.options import with_chain_settings, with_json
+from mesh.cli.errors import FileExists, FileUnwritable, InvalidOptions, InvalidPrivateKey, PasswordFileUnusable
+from mesh.cli.options import FILE, with_chain_settings, with_json
 from mesh.cli.output import print_facts, print_json, print_line
-from mesh.errors import AiraError, ConfigurationError, InputError
+from mesh.errors import AiraError
 from mesh.running import fail, run_to_end
 
 if TYPE_CHECKING:
     from mesh.settings import Settings
 
 
-FILE = click.Path(dir_okay=False, path_type=Path)
-
-
 @click.group("account")
 def command() -> None:
-    """Make, import and look at accounts: keyfiles in the Web3 secret storage format."""
+    """Create, import and show accounts: keyfiles in the Web3 secret storage format."""
 
 
-@command.command("new", short_help="make an account")
+@command.command("new", short_help="create an account")
 @click.argument("keyfile", type=FILE)
 @click.option(
     "--password-file",
     required=True,
     type=FILE,
-    help="file with the password; made with a random one when it does not exist",
+    help="file with the password; created with a random one if missing",
 )
 @with_json
 def new(keyfile: Path, password_file: Path, as_json: bool) -> None:
-    """Make an account and write its key, encrypted, to KEYFILE. Prints the address. Nothing is overwritten."""
+    """Create an account and write its encrypted key to KEYFILE. Prints the address. Never overwrites a file."""
     from mesh.chain import new_private_key, write_keyfile
 
     try:
@@ -54,17 +52,17 @@ def new(keyfile: Path, password_file: Path, as_json: bool) -> None:
     "--password-file",
     required=True,
     type=FILE,
-    help="file with the password of the new KEYFILE; made with a random one when it does not exist",
+    help="file with the password of the new KEYFILE; created with a random one if missing",
 )
 @click.option("--private-key-file", type=FILE, help="file with the private key, 64 hexadecimal digits")
-@click.option("--from-keyfile", type=FILE, help="another keyfile, whose key is to be taken")
-@click.option("--from-password-file", type=FILE, help="file with the password of that one [it is asked for]")
+@click.option("--from-keyfile", type=FILE, help="another keyfile to take the key from")
+@click.option("--from-password-file", type=FILE, help="file with the password of that keyfile [asked for]")
 @with_json
 def import_account(keyfile: Path, password_file: Path, as_json: bool, **source: Any) -> None:
-    """Write a key that there is already, encrypted, to KEYFILE. Prints the address. Nothing is overwritten.
+    """Write an existing key, encrypted, to KEYFILE. Prints the address. Never overwrites a file.
 
-    The key comes from --private-key-file, or from another keyfile. With neither, it is read from the standard input, or
-    asked for on a terminal without being shown. It is never an argument: those are seen by everybody on the machine.
+    The key comes from --private-key-file or from another keyfile. Without either, it is read from standard input; a
+    terminal asks for it and does not show it. It is never an argument, as everyone on the machine can see those.
     """
     try:
         _check_no_key(keyfile)
@@ -82,14 +80,14 @@ def _import(
     from_keyfile: Path | None,
     from_password_file: Path | None,
 ) -> str:
-    """Write the keyfile from one of the sources of a key; its address. Raises `InputError`, `ConfigurationError`."""
+    """Write the keyfile with the key from the given source; returns its address."""
     from mesh.chain import copy_keyfile, write_keyfile
 
     if private_key_file is not None and from_keyfile is not None:
-        raise InputError("a key comes from --private-key-file or from --from-keyfile, not from both")
+        raise InvalidOptions("a key comes from --private-key-file or from --from-keyfile, not from both")
     if from_keyfile is None:
         if from_password_file is not None:
-            raise InputError("--from-password-file goes with --from-keyfile")
+            raise InvalidOptions("--from-password-file goes with --from-keyfile")
         key = private_key_in(private_key_file)
         return write_keyfile(keyfile, key, password_in(password_file))
     opened_by, where = password_of(from_keyfile, from_password_file)
@@ -98,22 +96,22 @@ def _import(
 
 
 def _check_no_key(keyfile: Path) -> None:
-    """Raise `InputError` for a private key in the place of a file's name."""
+    """Raise `InvalidPrivateKey` if someone typed a private key instead of a file's name."""
     digits = keyfile.name.removeprefix("0x")
     if len(digits) == 64 and not digits.strip("0123456789abcdefABCDEF"):
-        raise InputError(
-            "that looks like a private key, and is no name for a keyfile",
-            hint="give it on the standard input; it is in your shell's history now, so better take a new one",
+        raise InvalidPrivateKey(
+            "this looks like a private key, not like the name of a keyfile",
+            hint="give the key on standard input; it is in your shell's history now, so better use a new one",
         )
 
 
 @command.command("show", short_help="print the address, and what the account holds")
 @click.argument("file", metavar="[KEYFILE]", required=False, type=FILE)
-@click.option("--balance", is_flag=True, help="ask the chain for its ETH, XRT and the nonce of its next order")
+@click.option("--balance", is_flag=True, help="also ask the chain for its ETH, its XRT and its next order nonce")
 @with_json
 @with_chain_settings()
 def show(settings: Settings, file: Path | None, balance: bool, as_json: bool) -> None:
-    """Print the address of the account in KEYFILE (by default the settings'); needs no password."""
+    """Print the address of the account in KEYFILE (by default the settings'). Needs no password."""
     try:
         address = required_address(settings) if file is None else address_in_keyfile(file)
     except AiraError as error:
@@ -146,7 +144,7 @@ async def _show_balance(settings: Settings, address: str, as_json: bool) -> None
 
 
 def print_account(address: str, keyfile: Path, as_json: bool) -> None:
-    """Print an account's address; for programs also where its key is."""
+    """Print an account's address, in JSON with its keyfile."""
     if as_json:
         print_json({"address": address, "keyfile": str(keyfile)})
     else:
@@ -157,18 +155,18 @@ KEY_DIGITS = 64
 
 
 def free_path(keyfile: Path) -> Path:
-    """The same path, its folder made. Raises `ConfigurationError` for a name that is taken."""
+    """Return the path after creating its folder. Raises `FileExists`, `FileUnwritable`."""
     if keyfile.exists():
-        raise ConfigurationError(f"{keyfile} exists already", hint="no keyfile is overwritten; choose another name")
+        raise FileExists(f"{keyfile} exists already", hint="keyfiles are never overwritten; choose another name")
     try:
         keyfile.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigurationError(f"can't make the folder of {keyfile}: {error.strerror}") from None
+        raise FileUnwritable(f"can't make the folder of {keyfile}: {error.strerror}") from None
     return keyfile
 
 
 def password_in(path: Path) -> str:
-    """The password in a file, its first line; the file is made, readable by its owner only, when it is missing."""
+    """The password in a file: its first line. A missing file is created with a random one, for its owner only."""
     import secrets
 
     try:
@@ -177,17 +175,19 @@ def password_in(path: Path) -> str:
             with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
                 file.write(secrets.token_urlsafe(24) + "\n")
     except OSError as error:
-        raise ConfigurationError(f"can't use the password file {path}: {error.strerror}") from None
+        raise PasswordFileUnusable(f"can't use the password file {path}: {error.strerror}") from None
     password = _first_line(path, what="password file")
     if not password:
-        raise ConfigurationError(f"the password file {path} is empty", hint="write one line with the password into it")
+        raise PasswordFileUnusable(
+            f"the password file {path} is empty", hint="write one line with the password into it"
+        )
     return password
 
 
 def private_key_in(path: Path | None) -> bytes:
-    """The private key in a file; without one, that on the standard input, or typed unseen on a terminal.
+    """The private key in a file; without a file, from standard input or typed unseen on a terminal.
 
-    Raises `InputError` for what is no private key, `ConfigurationError` for a file that can't be read.
+    Raises `InvalidPrivateKey`, which never shows the text, and `PasswordFileUnusable` for a file that can't be read.
     """
     if path is None:
         text, where = _asked("private key: "), "what was given"
@@ -196,24 +196,25 @@ def private_key_in(path: Path | None) -> bytes:
     digits = text.strip().removeprefix("0x")
     try:
         key = bytes.fromhex(digits)
-    except ValueError:  # whose own text shows where in the key it went wrong
+    except ValueError:  # its message would show a part of the key
         key = b""
     if len(digits) != KEY_DIGITS or len(key) != KEY_DIGITS // 2:
-        raise InputError(
-            f"{where} is not a private key", hint="a private key is 64 hexadecimal digits, 0x before them or not"
+        raise InvalidPrivateKey(
+            f"{where} is not a private key",
+            hint="a private key has 64 hexadecimal digits, with or without 0x before them",
         )
     return key
 
 
 def password_of(keyfile: Path, path: Path | None) -> tuple[str, str]:
-    """The password that opens a keyfile, and where it is from: a file, the standard input or a terminal."""
+    """The password of a keyfile, and where it came from: a file, standard input or a terminal."""
     if path is not None:
         return _first_line(path, what="password file"), str(path)
     return _asked(f"password of {keyfile}: "), "the answer"
 
 
 def _asked(question: str) -> str:
-    """A line of the standard input; from a terminal it is asked for, and not shown."""
+    """A line of standard input. A terminal asks for it and does not show it."""
     import getpass
 
     try:
@@ -222,17 +223,17 @@ def _asked(question: str) -> str:
         line = ""
     line = line.rstrip("\r\n")
     if not line:
-        raise InputError(
-            f"nothing was given for the {question.removesuffix(': ')}", hint="give one line on the standard input"
+        raise InvalidPrivateKey(
+            f"nothing was entered for the {question.removesuffix(': ')}", hint="give one line on the standard input"
         )
     return line
 
 
 def _first_line(path: Path, *, what: str) -> str:
-    """The first line of a file. Raises `ConfigurationError`, which shows nothing of it."""
+    """The first line of a file. Raises `PasswordFileUnusable`, which shows nothing of the file."""
     try:
         return path.read_text(encoding="utf-8").split("\n", 1)[0].rstrip("\r")
     except OSError as error:
-        raise ConfigurationError(f"can't use the {what} {path}: {error.strerror}") from None
-    except UnicodeDecodeError:  # whose own text shows a part of the secret
-        raise ConfigurationError(f"can't use the {what} {path}: it is not UTF-8 text") from None
+        raise PasswordFileUnusable(f"can't use the {what} {path}: {error.strerror}") from None
+    except UnicodeDecodeError:  # its message would show a part of the secret
+        raise PasswordFileUnusable(f"can't use the {what} {path}: it is not UTF-8 text") from None

@@ -10,11 +10,12 @@ import click
 
 from mesh.cli.amounts import ETH, XRT, Unit
 from mesh.cli.chain_client import open_chain, own_address
+from mesh.cli.errors import AlreadyDeployed
 from mesh.cli.lazy import LazyGroup
 from mesh.cli.lighthouse import check_lighthouse
 from mesh.cli.options import with_chain_settings, with_json, with_lighthouse_options, with_signing_settings
 from mesh.cli.output import print_facts, print_json, print_line, printable
-from mesh.errors import ChainError, ConfigurationError
+from mesh.errors import ChainError
 from mesh.running import run_to_end
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 
 DEPLOYMENT_GAS: Final = 9_500_000
-"""A little more than what a deployment takes in all; an account that can't pay for it is told so before it begins."""
+"""Slightly more than a whole deployment uses. An account that can't pay for this much is refused at the start."""
 
 
 command = LazyGroup(
@@ -41,16 +42,16 @@ command = LazyGroup(
     type=click.IntRange(1, 2**32 - 1),
     default=50_400,
     show_default=True,
-    help="blocks until an unfinished job's money can be had back; it can't be changed later",
+    help="blocks until the cost of an unfinished job can be refunded; can't be changed later",
 )
-@click.option("--again", is_flag=True, help="deploy though the chain has contracts; the old ones stay as they are")
+@click.option("--again", is_flag=True, help="deploy even if the chain has the contracts; the old ones stay as they are")
 @with_json
 @with_signing_settings()
 def deploy_contracts(settings: Settings, **options: Any) -> None:
-    """Put the contracts on the chain: ENS registry and names, XRT, factory, and a first lighthouse.
+    """Deploy the contracts: ENS registry and names, XRT, factory, and a first lighthouse.
 
-    The settings' account pays the gas, owns the names and gets the first million XRT. About twenty transactions are
-    sent, one after another. What to put into the settings of those who use them is printed.
+    The settings' account pays the gas, owns the names and gets the first million XRT. Sends about twenty transactions,
+    one after another, and prints the settings for those who use the contracts.
     """
     run_to_end(lambda: _deploy(settings, **options))
 
@@ -74,7 +75,9 @@ async def _deploy(
         timeout_blocks=timeout_blocks,
         refund_delay=refund_delay,
     )
-    check_lighthouse(plan.lighthouse, minimal_stake=plan.minimal_stake)  # which comes last, and would be refused then
+    check_lighthouse(
+        plan.lighthouse, minimal_stake=plan.minimal_stake
+    )  # it is created last, which is late for an error
     account = await asyncio.to_thread(load_account, settings)
     node = chain_of(settings, account).node
     async with node:
@@ -94,10 +97,9 @@ async def _check_not_deployed(settings: Settings, node: Node) -> None:
 
     try:
         async with chain_of(settings, None) as chain:
-            raise ConfigurationError(
+            raise AlreadyDeployed(
                 f"the chain {node.chain_id} has the contracts already (factory {chain.factory})",
-                hint="use those, or deploy a second set with --again; the lighthouse of another name: "
-                "`aira lighthouse create`",
+                hint="use them, or deploy a second set with --again; for another lighthouse: `aira lighthouse create`",
             )
     except NoContracts:
         return
@@ -154,16 +156,16 @@ GWEI: Final = Unit("gwei", 9, "wei")
 
 
 CONTRACT_FACTS: Final = ("ens", "factory", "xrt", "isOurCode", "lighthouse", "lighthouseName", "wn")
-"""What is null, for programs, as long as there are no contracts."""
+"""The fields that are null in JSON if the chain has no contracts."""
 
 
 @command.command("status", short_help="show the node, the contracts and the account's money")
 @with_json
 @with_chain_settings("lighthouse_contract")
 def status(settings: Settings, as_json: bool) -> None:
-    """Show what there is: the node and its chain, the contracts and whose they are, the account's money.
+    """Show the node and its chain, the contracts and whose code they have, and the account's balances.
 
-    What could be learned is shown in any case; the exit code is 1 when the chain has no contracts.
+    The exit code is 1 if the chain has no contracts; the rest is shown all the same.
     """
     run_to_end(lambda: _status(settings, as_json))
 
@@ -221,8 +223,8 @@ async def _contract_facts(chain: Chain, lighthouse: str, account: str | None) ->
 
 
 def _readable_status(facts: dict[str, Any]) -> dict[str, str | None]:
-    """The same as people read it."""
-    spoken: dict[str, str | None] = {
+    """The status for people."""
+    shown: dict[str, str | None] = {
         "node": f"{facts['node']}  {facts['client']}",
         "chain id": str(facts["chainId"]),
         "block": f"{facts['blockNumber']:,}, {_ago(facts['blockTime'])}",
@@ -231,7 +233,7 @@ def _readable_status(facts: dict[str, Any]) -> dict[str, str | None]:
     if facts["factory"] is not None:
         whose = "this project's, by their code" if facts["isOurCode"] else "not this project's code"
         there = facts["lighthouse"] or "none of that name"
-        spoken |= {
+        shown |= {
             "contracts": whose,
             "ENS registry": facts["ens"],
             "factory": facts["factory"],
@@ -242,12 +244,12 @@ def _readable_status(facts: dict[str, Any]) -> dict[str, str | None]:
         amounts = [ETH.show(int(facts["wei"]))]
         if facts["wn"] is not None:
             amounts.append(XRT.show(int(facts["wn"])))
-        spoken["account"] = f"{facts['account']}  {', '.join(amounts)}"
-    return spoken
+        shown["account"] = f"{facts['account']}  {', '.join(amounts)}"
+    return shown
 
 
 def _ago(timestamp: int) -> str:
-    """How long ago a block was made, in the unit that says it best."""
+    """How long ago a block was made, in a unit that fits."""
     seconds = max(0, int(time.time()) - timestamp)
     for name, length in (("day", 86_400), ("hour", 3_600), ("minute", 60)):
         if seconds >= 2 * length:

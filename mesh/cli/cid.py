@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from mesh.errors import InputError
+from mesh.cli.errors import FileUnreadable
 from mesh.running import fail
 from schemas import cid_of_file, cid_of_stream
 
@@ -15,9 +15,9 @@ from schemas import cid_of_file, cid_of_stream
 @click.command("cid")
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path, allow_dash=True))
 def command(files: tuple[Path, ...]) -> None:
-    """Print the CIDv0 of FILES, the name that IPFS and the mesh know them by; `-` reads the standard input.
+    """Print the CIDv0 of FILES, their name on IPFS and in the mesh; `-` reads standard input.
 
-    One file: its CID alone. Several: a line each, the CID and the file.
+    One file gives its CID alone; several give a line each, with the CID and the file.
     """
     for path in files:
         cid = _cid(path)
@@ -30,4 +30,4 @@ def _cid(path: Path) -> str:
             return cid_of_stream(sys.stdin.buffer)
         return cid_of_file(path)
     except OSError as error:
-        fail(InputError(f"can't read {path}: {error.strerror}"))
+        fail(FileUnreadable(f"can't read {path}: {error.strerror}"))

@@ -1,4 +1,4 @@
-"""`aira demand`: a person's side of the market."""
+"""`aira demand`: publishes a demand and waits until its liability has ended."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from mesh.cli.amounts import AMOUNT, XRT
+from mesh.cli.errors import FileUnwritable, InvalidOptions, JobNotDone, NotAFileOrCid, OutputFailed
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import print_json, print_line
-from mesh.errors import AiraError, ConfigurationError, InputError, RemoteError
+from mesh.errors import AiraError
 from mesh.running import run_to_end
 from mesh.settings import ChainSettings, NetworkSettings, options_of
 from schemas import InvalidCid, parse_cid
@@ -24,12 +25,12 @@ if TYPE_CHECKING:
 
 
 class Amount(click.ParamType[str]):
-    """An amount as people write it. What is none is refused at once; how much it is depends on the token."""
+    """An amount as people write it. Its syntax is checked here; how much it is depends on the token."""
 
     name = "amount"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """The same text."""
+        """Return the text. Fails for one that is not an amount."""
         if AMOUNT.fullmatch(str(value).strip()) is None:
             self.fail(
                 f"{str(value)[:40]!r} is not an amount; write 1.5 for one and a half XRT, or 1500000wn", param, ctx
@@ -38,18 +39,18 @@ class Amount(click.ParamType[str]):
 
 
 @click.command("demand")
-@click.option("--model", required=True, help="CID or ENS name of the behaviour that is wanted")
+@click.option("--model", required=True, help="CID or ENS name of the behaviour that you want")
 @click.option("--objective", required=True, help="file to play, or its CID")
 @click.option(
     "--cost",
     type=Amount(),
     default="0",
     show_default=True,
-    help="what it may cost: 1.5 counts whole tokens (XRT), 1500000000wn (units for other tokens) the smallest unit",
+    help="what you pay: 1.5 counts whole tokens (XRT), 1500000000wn (units for other tokens) the smallest unit",
 )
-@click.option("--validator", default="", help="address or ENS name of who is to judge the result [nobody]")
+@click.option("--validator", default="", help="address or ENS name of the validator of the result [none]")
 @click.option(
-    "--validator-fee", type=Amount(), default="0", show_default=True, help="what the validator gets, in XRT (or wn)"
+    "--validator-fee", type=Amount(), default="0", show_default=True, help="the validator's fee, in XRT (or wn)"
 )
 @click.option(
     "--lifetime",
@@ -69,36 +70,36 @@ class Amount(click.ParamType[str]):
     *options_of(ChainSettings),
 )
 def command(settings: Settings, **order: Any) -> None:
-    """Publish a Demand, wait for the contract, the work and the payment. Ctrl-C stops waiting; the contract goes on.
+    """Publish a demand and wait for the contract, the work and the payment. Ctrl-C stops waiting; the contract goes on.
 
-    The exit code is 1 when it was not done and the money came back, and when the recording (--out) can't be had.
-    With --json one object is printed when the contract has ended, whichever way; it has an `error` if the code is 1.
+    The exit code is 1 if the work was not done and the cost was returned, or if the recording (--out) is not
+    available. With --json one object is printed when the contract has ended; it has an `error` if the code is 1.
     """
-    run_to_end(lambda: _demand(settings, **order))
+    run_to_end(lambda: demand(settings, **order))
 
 
-async def _demand(
+async def demand(
     settings: Settings, *, objective: str, validator_fee: str, out: Path | None, as_json: bool, **terms: Any
 ) -> None:
     from mesh.agent import Agent
 
     settings.keyfile_and_password()
-    source = await asyncio.to_thread(_source, objective)
+    source = await asyncio.to_thread(_file_or_cid, objective)
     fee = XRT.parse(validator_fee)
     if fee and not terms["validator"]:
-        raise InputError("a validator's fee without a validator", hint="name the validator with --validator")
+        raise InvalidOptions("--validator-fee needs --validator", hint="name the validator, or leave the fee out")
     if out is not None:
         await asyncio.to_thread(_check_writable, out)
-    # Metrics are a server's, and one may run beside this with the same settings.
+    # A server with the same settings may run beside this and serve metrics at the same port.
     async with Agent(terms.pop("model"), settings=replace(settings, metrics_listen="")) as agent:
         contract = await _contract(agent, source, validator_fee=fee, quiet=as_json, **terms)
-        await _ending(contract, out, as_json=as_json)
+        await _wait_for_end(contract, out, as_json=as_json)
 
 
 async def _contract(
     agent: Agent, source: str | Path, *, cost: str, validator_fee: int, quiet: bool, **terms: Any
 ) -> Contract:
-    """The contract that comes of the demand; what may be said is said."""
+    """Publish the demand and wait for its contract. Prints both unless `quiet`."""
     from mesh.cli.chain_client import check_balance, unit_of
 
     chain, token = agent.parts.chain, agent.settings.erc20_token
@@ -113,21 +114,23 @@ async def _contract(
     return contract
 
 
-async def _ending(contract: Contract, out: Path | None, *, as_json: bool) -> None:
-    """Wait for the end, fetch the recording, and tell of both. Raises why there is none after telling the end."""
+async def _wait_for_end(contract: Contract, out: Path | None, *, as_json: bool) -> None:
+    """Wait for the end, fetch the recording, and print both. Then raises what failed."""
     outcome = await contract.outcome()
     facts: dict[str, Any] = {"liability": contract.address, "success": outcome.success, "result": outcome.result}
     if not as_json:
         print_line(f"{'paid' if outcome.success else 'refunded'}, result {outcome.result or 'none'}")
     failure: AiraError | None = None
     if not outcome.success:
-        failure = RemoteError("the job was not done, and its cost came back", hint=_why(contract, outcome.result))
+        failure = JobNotDone(
+            "the job was not done; its cost was returned", hint=_failure_hint(contract, outcome.result)
+        )
         facts["error"] = str(failure)
     if out is not None:
         facts["recording"] = None
         try:
             if outcome.result:
-                await _keep(contract, out)
+                await _save_recording(contract, out)
                 facts["recording"] = str(out)
         except AiraError as error:
             failure, facts["error"] = error, str(error)
@@ -139,38 +142,38 @@ async def _ending(contract: Contract, out: Path | None, *, as_json: bool) -> Non
         raise failure
 
 
-def _why(contract: Contract, result: str) -> str:
-    """Where to look for the reason."""
+def _failure_hint(contract: Contract, result: str) -> str:
+    """Where to look for the reason of a failure."""
     if result:
         return f"its recording may say why: aira objective show {result}"
     return f"it ended without a result: aira liability show {contract.address}"
 
 
-async def _keep(contract: Contract, out: Path) -> None:
-    """Write the recording to a file. Raises a `ContentError` when it can't be had, `AiraError` when not written."""
+async def _save_recording(contract: Contract, out: Path) -> None:
+    """Write the recording to a file. Raises `ContentError` if it can't be fetched, `OutputFailed` if not written."""
     recording = await contract.recording()
     try:
         await asyncio.to_thread(shutil.copyfile, recording, out)
     except OSError as error:
-        raise AiraError(
-            f"can't write the recording to {out}: {error.strerror}", hint=f"it was fetched, and is in {recording}"
+        raise OutputFailed(
+            f"can't write the recording to {out}: {error.strerror}", hint=f"it was fetched to {recording}"
         ) from None
 
 
-def _source(objective: str) -> str | Path:
-    """A file where there is one of that name, else a CID."""
+def _file_or_cid(objective: str) -> str | Path:
+    """The path of the file with that name if there is one, else the CID. Raises `NotAFileOrCid`."""
     path = Path(objective)
     if path.is_file():
         return path
     try:
         parse_cid(objective)
     except InvalidCid:
-        raise InputError(f"the objective {objective!r} is neither a file nor a CID") from None
+        raise NotAFileOrCid(f"the objective {objective!r} is neither a file nor a CID") from None
     return objective
 
 
 def _check_writable(out: Path) -> None:
-    """Before anything is paid for, not after; leaves nothing behind."""
+    """Check that a file can be written there, before anything is paid. Leaves no file behind."""
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         there = out.exists()
@@ -179,4 +182,4 @@ def _check_writable(out: Path) -> None:
         if not there:
             out.unlink()
     except OSError as error:
-        raise ConfigurationError(f"can't write the recording to {out}: {error.strerror}") from None
+        raise FileUnwritable(f"can't write the recording to {out}: {error.strerror}") from None

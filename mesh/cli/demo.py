@@ -13,13 +13,13 @@ from mesh.running import run_to_end
 @click.option("--objective", type=click.Path(path_type=Path), help="MCAP file or ROS 1 bag to play [three blinks]")
 @click.option("--generation", type=click.Choice(["3", "5"]), default="3", help="generation of the messages [3]")
 @click.option(
-    "--out", type=click.Path(file_okay=False, path_type=Path), help="folder that keeps objective and recording"
+    "--out", type=click.Path(file_okay=False, path_type=Path), help="folder to keep the objective and the recording in"
 )
-@click.option("--json", "as_json", is_flag=True, help="print a JSON object a line, the last one sums up")
+@click.option("--json", "as_json", is_flag=True, help="print a JSON object on each line; the last one is a summary")
 def command(objective: Path | None, generation: str, out: Path | None, as_json: bool) -> None:
-    """Show one whole job: a person's Demand and a robot's Offer meet, a contract holds the money, the robot plays the
-    objective to its device, records it and signs the Result, the contract pays. Everything is real and local: Zenoh
-    sessions, an EVM, signatures, files."""
+    """Run one whole job: a person's demand and a robot's offer match, a contract holds the cost, the robot plays the
+    objective to its device, records it and signs the result, and the contract pays. Everything is real and local:
+    Zenoh sessions, an EVM, signatures, files."""
     from mesh.demo.demo import Demo
     from mesh.demo.narration import JsonNarrator, TextNarrator
 

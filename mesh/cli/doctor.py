@@ -1,4 +1,4 @@
-"""`aira doctor`: what stands in the way of a role on this machine."""
+"""`aira doctor`: checks whether this machine can run a role."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any, Final, get_args
 
 import click
 
+from mesh.cli.errors import InvalidOptions
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import plural, print_json, print_line, printable
 from mesh.doctor.checks import CheckStatus
 from mesh.doctor.context import DoctorContext, Role, SerialSettings, with_identity
-from mesh.errors import AiraError, InputError
+from mesh.errors import AiraError
 from mesh.running import fail, run_to_end
 from mesh.settings import ChainSettings, NetworkSettings, options_of
 
@@ -22,11 +23,15 @@ if TYPE_CHECKING:
 
 COLOURS: Final = {CheckStatus.OK: "green", CheckStatus.WARN: "yellow", CheckStatus.FAIL: "red"}
 MARK: Final = 6
-"""Columns of the mark before each line."""
+"""Columns of the status before each line."""
 
 
 @click.command("doctor")
-@click.option("--role", type=click.Choice(get_args(Role)), help="what this machine is to be [what the settings imply]")
+@click.option(
+    "--role",
+    type=click.Choice(get_args(Role)),
+    help="the role that this machine should run [inferred from the settings]",
+)
 @click.option(
     "--timeout",
     type=click.FloatRange(0, 600, min_open=True),
@@ -34,12 +39,14 @@ MARK: Final = 6
     show_default=True,
     help="seconds for all checks together",
 )
-@click.option("--chain-id", type=click.IntRange(1), help="number of the chain that it should be (EIP-155)")
-@click.option("--port", default="", help="of an edge agent: its serial port, as in `aira edge PORT`")
-@click.option("--protocol", type=click.Choice(["frames", "rosserial"]), default="frames", help="what its board speaks")
+@click.option("--chain-id", type=click.IntRange(1), help="the chain id that the node should have (EIP-155)")
+@click.option("--port", default="", help="for an edge agent: its serial port, as in `aira edge PORT`")
+@click.option(
+    "--protocol", type=click.Choice(["frames", "rosserial"]), default="frames", help="the protocol of its board"
+)
 @click.option("--baud", type=click.IntRange(300, 4_000_000), default=57_600, help="bits per second of its port")
-@click.option("--agent", default="", help="of an edge agent: address of the agent whose device it serves")
-@click.option("--device", default="", help="of an edge agent: name of that device")
+@click.option("--agent", default="", help="for an edge agent: address of the agent that its device belongs to")
+@click.option("--device", default="", help="for an edge agent: name of that device")
 @with_json
 @with_settings(
     *options_of(NetworkSettings),
@@ -79,7 +86,7 @@ def _case(settings: Settings, role: Role | None, **options: Any) -> DoctorContex
     """Who is examined. Raises `InputError` for options that can't be meant together."""
     agent, device = options["agent"], options["device"]
     if bool(agent) != bool(device):
-        raise InputError("of --agent and --device one is missing")
+        raise InvalidOptions("--agent and --device go together, and one is missing")
     return with_identity(
         DoctorContext(
             settings=settings,

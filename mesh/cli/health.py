@@ -1,4 +1,4 @@
-"""`aira health`: how a server on this machine is, or another one whose metrics can be reached."""
+"""`aira health`: asks a server with metrics for its health, as a container's health check does."""
 
 from __future__ import annotations
 
@@ -8,37 +8,38 @@ from urllib.parse import urlsplit
 
 import click
 
+from mesh.cli.errors import HealthUnavailable, InvalidServerAddress
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import print_facts, print_json, printable
-from mesh.errors import AiraError, ConfigurationError, RemoteError
+from mesh.errors import AiraError
 from mesh.running import fail
 
 if TYPE_CHECKING:
     from mesh.settings import Settings
     from mesh.telemetry.health import Health
 
-ANYWHERE: Final = {"0.0.0.0": "127.0.0.1", "::": "::1"}
-"""Where who listens everywhere is asked."""
-LONGEST: Final = 65_536
-"""Bytes of an answer at most."""
+LOOPBACK_OF: Final = {"0.0.0.0": "127.0.0.1", "::": "::1"}
+"""The address to ask a server that listens on all interfaces."""
+LARGEST_ANSWER: Final = 65_536
+"""The most bytes of an answer that are read."""
 
 
 @click.command("health")
-@click.option("--url", help="whom to ask, as http://HOST:PORT [where the settings' metrics_listen is]")
+@click.option("--url", help="the server, as http://HOST:PORT [the settings' metrics_listen]")
 @click.option(
     "--timeout", type=click.FloatRange(min=0, min_open=True), default=8.0, show_default=True, help="seconds to wait"
 )
 @with_json
 @with_settings("metrics_listen")
 def command(settings: Settings, url: str | None, timeout: float, as_json: bool) -> None:
-    """Show how a server is: the state of each of its parts. It has to be run with --metrics-listen HOST:PORT.
+    """Show the state of each part of a server, which must run with --metrics-listen HOST:PORT.
 
-    The exit code is 0 if all parts are alive, and 1 if one is not or nobody answers, as a check of a container's health
-    wants it.
+    The exit code is 0 if all parts are alive, and 1 if one is not or nothing answers, as container health checks
+    expect.
     """
     try:
-        host, port = _place(url, settings)
-        health = _asked(host, port, timeout=timeout)
+        host, port = _server_address(url, settings)
+        health = _fetch_health(host, port, timeout=timeout)
     except AiraError as error:
         fail(error)
     if as_json:
@@ -48,34 +49,34 @@ def command(settings: Settings, url: str | None, timeout: float, as_json: bool) 
     sys.exit(0 if health.ok else 1)
 
 
-def _place(url: str | None, settings: Settings) -> tuple[str, int]:
-    """Host and port of whom to ask. Raises `ConfigurationError`."""
+def _server_address(url: str | None, settings: Settings) -> tuple[str, int]:
+    """Host and port of the server. Raises `ConfigurationError`."""
     from mesh.telemetry.health import listen_address
 
     if url is not None:
-        return _place_of(url)
+        return _parse_url(url)
     if not settings.metrics_listen:
-        raise ConfigurationError(
-            "nothing says where the server tells its health",
-            hint="give --url http://HOST:PORT, or the metrics_listen that the server was given",
+        raise InvalidServerAddress(
+            "no server is named",
+            hint="give --url http://HOST:PORT, or the same metrics_listen as the server",
         )
     host, port = listen_address(settings.metrics_listen)
-    return ANYWHERE.get(host, host), port
+    return LOOPBACK_OF.get(host, host), port
 
 
-def _place_of(url: str) -> tuple[str, int]:
+def _parse_url(url: str) -> tuple[str, int]:
     try:
         parts = urlsplit(url)
         found = parts.hostname, parts.port
     except ValueError:
         parts, found = None, (None, None)
     if parts is None or parts.scheme != "http" or not found[0] or not found[1]:
-        raise ConfigurationError(f"{url!r} is not the address of a server", hint="give --url http://HOST:PORT")
+        raise InvalidServerAddress(f"{url!r} is not the address of a server", hint="give --url http://HOST:PORT")
     return found[0], found[1]
 
 
-def _asked(host: str, port: int, *, timeout: float) -> Health:
-    """What the server answers. Raises `RemoteError`."""
+def _fetch_health(host: str, port: int, *, timeout: float) -> Health:
+    """The server's answer. Raises `HealthUnavailable`."""
     from http.client import HTTPConnection, HTTPException
 
     import msgspec
@@ -86,14 +87,14 @@ def _asked(host: str, port: int, *, timeout: float) -> Health:
     where = f"{host}:{port}"
     try:
         connection.request("GET", "/health")
-        return Health.decode(connection.getresponse().read(LONGEST))
+        return Health.decode(connection.getresponse().read(LARGEST_ANSWER))
     except (OSError, HTTPException, UnicodeError) as error:
         why = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        raise RemoteError(
-            f"nobody tells its health at {where}: {why}",
-            hint="does the server run, and with --metrics-listen HOST:PORT?",
+        raise HealthUnavailable(
+            f"no server answers at {where}: {why}",
+            hint="is the server running, with --metrics-listen HOST:PORT?",
         ) from None
     except msgspec.MsgspecError:
-        raise RemoteError(f"what answers at {where} is no server of the mesh", hint="give its --url") from None
+        raise HealthUnavailable(f"the server at {where} is not one of the mesh", hint="give its --url") from None
     finally:
         connection.close()

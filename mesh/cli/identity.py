@@ -1,4 +1,4 @@
-"""`aira identity`: who belongs to a site: its certificate, and those of its members."""
+"""`aira identity`: the certificates of a site and of its members."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mesh.cli.options import with_json, with_settings
+from mesh.cli.errors import IdentityMissing, InvalidOptions, PackageMissing
+from mesh.cli.options import FILE, FOLDER, with_json, with_settings
 from mesh.cli.output import print_facts, print_json, printable
-from mesh.errors import AiraError, ConfigurationError, InputError
+from mesh.errors import AiraError
 from mesh.identity.roster import ROLES
 from mesh.running import fail, report, run_to_end
 from mesh.settings import NetworkSettings, options_of
@@ -21,28 +22,26 @@ if TYPE_CHECKING:
     from mesh.identity.roster import Member
     from mesh.settings import Settings
 
-FOLDER = click.Path(file_okay=False, path_type=Path)
-FILE = click.Path(dir_okay=False, path_type=Path)
 DAYS = click.FloatRange(0, 36_500, min_open=True)
-SITE = click.option("--site", required=True, type=FOLDER, help="folder of the site, made by `aira identity site`")
-ROSTER = click.option("--roster", type=FILE, help="roster of the site, which is brought up to date")
+SITE = click.option("--site", required=True, type=FOLDER, help="folder of the site, created by `aira identity site`")
+ROSTER = click.option("--roster", type=FILE, help="roster of the site, which is updated")
 
 
 @click.group("identity")
 def command() -> None:
-    """Make certificates by which a site's routers know who connects, and look at them.
+    """Create and show the certificates by which a site's routers identify who connects.
 
-    The common name of a certificate is an account's address. What its holder may do is said by the roster, a TOML file:
-    put `revoked = true` there to shut a member out.
+    The common name of a certificate is an account's address. The roster, a TOML file, says what its holder may do; put
+    `revoked = true` there to exclude a member.
     """
 
 
-@command.command("site", short_help="begin a site")
+@command.command("site", short_help="create a site")
 @click.argument("folder", type=FOLDER)
-@click.option("--name", default="AIRA mesh site", show_default=True, help="what the site is called")
+@click.option("--name", default="AIRA mesh site", show_default=True, help="the site's name")
 @click.option("--days", type=DAYS, default=3650, show_default=True, help="how long its certificate is valid")
 def site(folder: Path, name: str, days: float) -> None:
-    """Make the certificate and the key of a site in FOLDER. Whoever has the key can let in anybody."""
+    """Create the certificate and the key of a site in FOLDER. Anyone with the key can admit members."""
     try:
         authority = _site(folder)
         authority.make(name=_text(name), days=days)
@@ -51,26 +50,26 @@ def site(folder: Path, name: str, days: float) -> None:
     print_facts({"certificate": authority.certificate, "key": authority.key})
 
 
-@command.command("new", short_help="make a member's certificate and key")
+@command.command("new", short_help="create a member's certificate and key")
 @click.argument("folder", type=FOLDER)
 @SITE
-@click.option("--name", required=True, help="what the member is called; of an edge agent, also its device's name")
-@click.option("--address", help="the account's address [a router needs none]")
+@click.option("--name", required=True, help="the member's name; for an edge agent, also its device's name")
+@click.option("--address", help="the account's address [not needed for a router]")
 @click.option("--keyfile", type=FILE, help="the account's keyfile, instead of its address")
 @click.option("--role", "roles", multiple=True, required=True, type=click.Choice(list(ROLES)), help="one or more")
-@click.option("--host", "hosts", multiple=True, help="name or IP address at which a router is reached")
-@click.option("--agent", default="", help="address of the agent whose device an edge agent serves")
-@click.option("--device", default="", help="name of that device [the member's]")
+@click.option("--host", "hosts", multiple=True, help="a router's name or IP address")
+@click.option("--agent", default="", help="for an edge agent: address of the agent that its device belongs to")
+@click.option("--device", default="", help="name of that device [the member's name]")
 @click.option("--days", type=DAYS, default=90, show_default=True, help="how long the certificate is valid")
 @ROSTER
 @with_json
 def new(folder: Path, site: Path, days: float, roster: Path | None, as_json: bool, **about: Any) -> None:
-    """Make a key and a certificate in FOLDER, and print what the roster has to say of the member.
+    """Create a key and a certificate in FOLDER, and print the member's entry for the roster.
 
-    With --roster it is written there. Nothing is overwritten, and no key is shown.
+    With --roster the entry is written there. Never overwrites a file or shows a key.
     """
     try:
-        facts, member = _make(folder, _site(site), days, roster, **about)
+        facts, member = _create_member(folder, _site(site), days, roster, **about)
     except AiraError as error:
         fail(error)
     _print(facts, as_json)
@@ -80,36 +79,35 @@ def new(folder: Path, site: Path, days: float, roster: Path | None, as_json: boo
         click.echo(f"\n# for the roster:\n{entry_of(member)}", nl=False)
 
 
-@command.command("show", short_help="say whose a certificate is")
+@command.command("show", short_help="show whose a certificate is")
 @click.argument("folder", type=FOLDER)
-@click.option("--roster", type=FILE, help="roster of the site: is the member in it?")
+@click.option("--roster", type=FILE, help="roster of the site, to look the member up in")
 @with_json
 def show(folder: Path, roster: Path | None, as_json: bool) -> None:
     """Print name, address, roles, validity and fingerprint of the identity in FOLDER."""
     try:
         facts = _member(folder).facts()
-        standing = _standing(facts, roster) if roster is not None else None
+        standing = _roster_state(facts, roster) if roster is not None else None
     except AiraError as error:
         fail(error)
     _print(facts, as_json, standing)
 
 
-@command.command("renew", short_help="make a new certificate for the same member and key")
+@command.command("renew", short_help="issue a new certificate for the same member and key")
 @click.argument("folders", metavar="FOLDER...", nargs=-1, required=True, type=FOLDER)
 @SITE
-@click.option("--within", type=DAYS, help="only those that expire within so many days [all]")
+@click.option("--within", type=DAYS, help="only certificates that expire within this many days [all]")
 @click.option("--days", type=DAYS, default=90, show_default=True, help="how long the new certificate is valid")
 @ROSTER
 @with_json
 def renew(
     folders: tuple[Path, ...], site: Path, within: float | None, days: float, roster: Path | None, as_json: bool
 ) -> None:
-    """Put a new certificate in the place of the one in each FOLDER, for the same member and key; keys need not be
-    there.
+    """Replace the certificate in each FOLDER by a new one for the same member and key. The keys need not be there.
 
-    Sessions go on: they take the new one when they connect the next time. With --within it is for a timer: what lasts
-    longer is left as it is. When one fails, the others are renewed all the same. With --roster nobody who was revoked
-    gets a new one. --json prints an object a FOLDER.
+    Sessions go on, and use the new certificate when they next connect. --within is for timers: certificates that last
+    longer stay. If one fails, the others are still renewed. With --roster, revoked members get no new certificate.
+    --json prints an object for each FOLDER.
     """
     failed: AiraError | None = None
     for folder in folders:
@@ -130,19 +128,19 @@ def renew(
         fail(failed)
 
 
-@command.command("check", short_help="ask the router whether it admits an identity")
-@click.option("--agent", default="", help="of an edge agent: address of the agent whose device it serves")
-@click.option("--device", default="", help="of an edge agent: name of that device")
+@command.command("check", short_help="check what the router allows an identity")
+@click.option("--agent", default="", help="for an edge agent: address of the agent that its device belongs to")
+@click.option("--device", default="", help="for an edge agent: name of that device")
 @with_settings(*options_of(NetworkSettings))
 def check(settings: Settings, agent: str, device: str) -> None:
-    """Connect as the settings say, and see whether what this identity does has an effect.
+    """Connect with the settings' certificate, and check that the router accepts what this identity sends.
 
-    A router does not tell whom it denies something: it drops it. Exits 1 for who is not let in or not heeded.
+    A router drops what it does not allow without an error. Exits with 1 if it does not admit or allow this identity.
     """
     try:
         address = _own_address(settings)
         if bool(agent) != bool(device):
-            raise InputError("of --agent and --device one is missing")
+            raise InvalidOptions("--agent and --device go together, and one is missing")
     except AiraError as error:
         fail(error)
     run_to_end(lambda: _check(settings, address, agent, device))
@@ -159,7 +157,7 @@ async def _check(settings: Settings, address: str, agent: str, device: str) -> N
 def _own_address(settings: Settings) -> str:
     """The address in the settings' certificate."""
     if not settings.tls_certificate:
-        raise ConfigurationError("there is no identity", hint="give --tls-ca, --tls-certificate and --tls-key")
+        raise IdentityMissing("no certificate is set", hint="give --tls-ca, --tls-certificate and --tls-key")
     _check_installed()
     from mesh.identity.certificates import facts_of, read_certificate
 
@@ -167,7 +165,7 @@ def _own_address(settings: Settings) -> str:
     return facts_of(read_certificate(path), path).holder.address
 
 
-def _make(
+def _create_member(
     folder: Path, site: SiteFolder, days: float, roster: Path | None, **about: Any
 ) -> tuple[CertificateFacts, Member]:
     from msgspec.structs import replace
@@ -177,13 +175,13 @@ def _make(
     from mesh.identity.roster import Member, entry_of, roster_from
 
     if "router" in about["roles"] and not about["hosts"]:
-        raise InputError("clients check where they connect to", hint="give the router's name or IP address by --host")
+        raise InvalidOptions("a router needs --host", hint="clients check the name or IP address in its certificate")
     name, agent, device = (_text(about[field]) for field in ("name", "agent", "device"))
     roles = tuple(dict.fromkeys(about["roles"]))
     member = Member(name=name, address=_address(about), roles=roles, agent=agent, device=device)
     member = roster_from(entry_of(member), where="entry").member[0]
     if roster is not None:
-        with_member(roster, member)  # raises for one that it can't hold
+        with_member(roster, member)  # raises if the roster can't hold the member
     holder = Holder(address=member.address, name=member.name, roles=member.roles, hosts=about["hosts"])
     facts = _member(folder).make(holder, site=site, days=days)
     member = replace(member, fingerprint=facts.fingerprint)
@@ -199,7 +197,7 @@ def _renew(folder: Path, site: SiteFolder, days: float, roster: Path | None) -> 
     before: CertificateFacts = member.facts()
     address, old = before.holder.address, before.fingerprint
     if roster is not None:
-        with_fingerprint(roster, address, old=old, new=old)  # raises for who may have none
+        with_fingerprint(roster, address, old=old, new=old)  # raises for a revoked member
     facts: CertificateFacts = member.renew(site=site, days=days)
     if roster is not None:
         write_roster(roster, with_fingerprint(roster, address, old=old, new=facts.fingerprint))
@@ -213,17 +211,17 @@ def _address(about: dict[str, Any]) -> str:
         from mesh.cli.chain_client import address_in_keyfile
 
         if about["address"] is not None:
-            raise InputError("both --address and --keyfile are given", hint="give one of them")
+            raise InvalidOptions("both --address and --keyfile are given", hint="give one of them")
         return address_in_keyfile(about["keyfile"])
     if about["address"] is not None:
         return str(about["address"])
     if set(about["roles"]) == {"router"}:
-        return "0x" + secrets.token_hex(20)  # it has no account; nobody else must have its name
-    raise InputError("whose certificate is it to be?", hint="give the account's --address or its --keyfile")
+        return "0x" + secrets.token_hex(20)  # a router has no account, but its name must be unique
+    raise InvalidOptions("the certificate needs an address", hint="give the account's --address or its --keyfile")
 
 
-def _standing(facts: CertificateFacts, path: Path) -> str:
-    """What the roster says of the certificate's holder."""
+def _roster_state(facts: CertificateFacts, path: Path) -> str:
+    """The state of the certificate's holder in the roster."""
     from mesh.identity import read_roster
 
     member = read_roster(path).find(facts.holder.address)
@@ -270,7 +268,7 @@ def _print(facts: CertificateFacts, as_json: bool, standing: str | None = None) 
 
 def _text(text: str) -> str:
     if not text.isprintable() or len(text) > 64:
-        raise InputError("a name is at most 64 printable characters")
+        raise InvalidOptions("a name is at most 64 printable characters")
     return text
 
 
@@ -292,4 +290,4 @@ def _check_installed() -> None:
     from importlib.util import find_spec
 
     if find_spec("cryptography") is None:
-        raise ConfigurationError("certificates need the package cryptography", hint="pip install 'aira-mesh[identity]'")
+        raise PackageMissing("certificates need the package cryptography", hint="pip install 'aira-mesh[identity]'")

@@ -48,24 +48,24 @@ command = LazyGroup(
 
 @command.command("list", short_help="list those of an account, or all")
 @click.option("--account", help="address or ENS name of a promisee or promisor [the settings' account]")
-@click.option("--all", "everybody", is_flag=True, help="those of everybody")
+@click.option("--all", "everybody", is_flag=True, help="those of all accounts")
 @click.option(
     "--state",
     type=click.Choice(["any", "open", "finalized"]),
     default="any",
     show_default=True,
-    help="only those that are open, or that have ended",
+    help="only open ones, or only those that have ended",
 )
 @click.option(
-    "--from-block", type=click.IntRange(min=0), default=0, show_default=True, help="only those made since this block"
+    "--from-block", type=click.IntRange(min=0), default=0, show_default=True, help="only those created since this block"
 )
 @with_json
 @with_chain_settings()
 def list_liabilities(settings: Settings, **what: Any) -> None:
     """List the liabilities of an account, first those that it pays for, then those that it works for; or all.
 
-    Each kind is in the order in which they were made. Without an account in the settings, all are listed. A long chain
-    takes its time to be read: --from-block shortens that.
+    Each kind is listed oldest first. Without an account in the settings, all are listed. Reading a long chain takes
+    time; --from-block shortens it.
     """
     run_to_end(lambda: _list(settings, **what))
 
@@ -80,7 +80,7 @@ async def _list(
         if state != "any":
             found = [liability for liability in found if liability.is_finalized == (state == "finalized")]
         if as_json:
-            print_json([facts_of(liability) for liability in found])
+            print_json([liability_json(liability) for liability in found])
             return
         units = await units_of(chain, found)
     if not found:
@@ -100,7 +100,7 @@ async def _list(
 
 
 async def _liabilities_of(chain: Chain, whose: str | None, from_block: int) -> Sequence[Liability]:
-    """All liabilities, or those of an account in either part; one with itself once."""
+    """All liabilities, or those in which an account is promisee or promisor."""
     if whose is None:
         return await chain.liabilities.list(from_block=from_block)
     paid = await chain.liabilities.list(from_block=from_block, promisee=whose)
@@ -113,8 +113,8 @@ async def _liabilities_of(chain: Chain, whose: str | None, from_block: int) -> S
 @with_json
 @with_chain_settings()
 def show(settings: Settings, address: str, as_json: bool) -> None:
-    """Show the liability at ADDRESS: who does what for whom, for how much, how it stands, and from when on the money
-    can be had back."""
+    """Show the liability at ADDRESS: its parties, its terms, its cost, its state, and from which block on it can be
+    refunded."""
     run_to_end(lambda: _show(settings, address, as_json))
 
 
@@ -125,18 +125,18 @@ async def _show(settings: Settings, address: str, as_json: bool) -> None:
 
 
 async def print_liability(chain: Chain, liability: Liability, *, own: str | None, as_json: bool) -> None:
-    """Print all that there is to say of a liability."""
+    """Print all facts about a liability."""
     refund = await refund_state(chain, liability)
     if as_json:
-        print_json(facts_of(liability) | {"refundableFrom": None if refund is None else refund.refundable_from})
+        print_json(liability_json(liability) | {"refundableFrom": None if refund is None else refund.refundable_from})
         return
     units = await units_of(chain, [liability])
     words = None if refund is None else refund_words(refund)
-    print_facts(spoken(liability, units[liability.token], own=own, refundable=words))
+    print_facts(describe_liability(liability, units[liability.token], own=own, refundable=words))
 
 
 async def refund_state(chain: Chain, liability: Liability) -> RefundState | None:
-    """From when on an open liability's money can be had back; None for one that has ended, or where it never can."""
+    """When an open liability can be refunded; None if it has ended, or its contracts offer no refund."""
     from mesh.chain import NotOffered
 
     try:
@@ -146,7 +146,7 @@ async def refund_state(chain: Chain, liability: Liability) -> RefundState | None
 
 
 def refund_words(refund: RefundState) -> str:
-    """When the promisee can have the money back, in words."""
+    """When the promisee can get a refund, for people."""
     if refund.is_refundable:
         return "possible now, by `aira liability cancel --refund`"
     blocks = refund.refundable_from - refund.block_number
@@ -155,14 +155,14 @@ def refund_words(refund: RefundState) -> str:
 
 @command.command("watch", short_help="follow one until it has ended, or all of them")
 @click.argument("address", required=False)
-@click.option("--from-block", type=click.IntRange(min=0), help="without ADDRESS: begin at this block [the next]")
+@click.option("--from-block", type=click.IntRange(min=0), help="without ADDRESS: start at this block [the next]")
 @with_json
 @with_chain_settings("confirmations", "poll_interval")
 def watch(settings: Settings, address: str | None, from_block: int | None, as_json: bool) -> None:
-    """Follow the liability at ADDRESS until it has ended, and show it then. A node that is lost is waited for.
+    """Follow the liability at ADDRESS until it has ended, and show it. If the node is lost, wait for it.
 
-    Without ADDRESS, tell of each liability that is made, and of each that ends, until Ctrl-C; with --json an object a
-    line.
+    Without ADDRESS, print each liability that is created and each that ends, until Ctrl-C; with --json an object on
+    each line.
     """
     if address is None:
         run_to_end(lambda: _watch_all(settings, from_block, as_json))
@@ -185,16 +185,16 @@ async def _watch_all(settings: Settings, from_block: int | None, as_json: bool) 
         cursor = await chain.block_number() + 1 if from_block is None else from_block
         if not as_json:
             click.echo(f"watching from block {cursor:,} on; Ctrl-C ends it", err=True)
-        async for happening in _follow(chain, cursor):
+        async for event in _follow(chain, cursor):
             if as_json:
-                print_json(happening.facts())
+                print_json(event.json())
             else:
-                print_line(happening.words(own=own))
+                print_line(event.line(own=own))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Happening:
-    """A liability was made, or ended; `liability` is its record by now, `unit` that of its token."""
+class LiabilityEvent:
+    """A liability was created, or ended. `liability` is its current record, `unit` the unit of its token."""
 
     event: str
     block_number: int
@@ -202,13 +202,13 @@ class Happening:
     liability: Liability
     unit: Unit
 
-    def facts(self) -> dict[str, Any]:
-        """It, for programs."""
+    def json(self) -> dict[str, Any]:
+        """The event for JSON."""
         about = {"event": self.event, "blockNumber": self.block_number, "tx": self.tx}
-        return about | {"liability": facts_of(self.liability)}
+        return about | {"liability": liability_json(self.liability)}
 
-    def words(self, *, own: str | None) -> str:
-        """It, for people."""
+    def line(self, *, own: str | None) -> str:
+        """The event in a line for people."""
         promisor, promisee = (
             short_address(address, own=own) for address in (self.liability.promisor, self.liability.promisee)
         )
@@ -218,19 +218,19 @@ class Happening:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TakenBack:
-    """The chain was reorganised: the making or the end of a liability did not happen after all."""
+class LiabilityReverted:
+    """A reorganisation reverted the creation or the end of a liability."""
 
     what: str
     liability: str
     tx: str
 
-    def facts(self) -> dict[str, Any]:
-        """It, for programs."""
+    def json(self) -> dict[str, Any]:
+        """The event for JSON."""
         return {"event": "taken-back", "what": self.what, "liability": self.liability, "tx": self.tx}
 
-    def words(self, *, own: str | None) -> str:
-        """It, for people."""
+    def line(self, *, own: str | None) -> str:
+        """The event in a line for people."""
         return f"the chain was reorganised: {self.liability} was not {self.what} after all"
 
 
@@ -252,34 +252,34 @@ class _PrintedOutages(OutageLog):
         self._has_failed = False
 
 
-async def _follow(chain: Chain, cursor: int) -> AsyncIterator[Happening | TakenBack]:
+async def _follow(chain: Chain, cursor: int) -> AsyncIterator[LiabilityEvent | LiabilityReverted]:
     """What happens to liabilities from a block on. Waits while the node is lost, and prints that once."""
     outages = _PrintedOutages()
     async with aclosing(chain.follow(cursor, outages=outages)) as blocks:
         async for block in blocks:
-            for happening in await chain.retrying(partial(_happenings, chain, block), outages=outages):
-                yield happening
+            for event in await chain.retrying(partial(_liability_events, chain, block), outages=outages):
+                yield event
 
 
-async def _happenings(chain: Chain, block: BlockEvents) -> list[Happening | TakenBack]:
-    """What a block, or its going, means for liabilities, in order."""
+async def _liability_events(chain: Chain, block: BlockEvents) -> list[LiabilityEvent | LiabilityReverted]:
+    """The events of liabilities in a block or a reorganisation, in order."""
     from mesh.chain import Finalized, NewLiability, NoContracts, Reorganisation
 
     words = {NewLiability: "made", Finalized: "ended"}
-    found: list[Happening | TakenBack] = []
+    found: list[LiabilityEvent | LiabilityReverted] = []
     for event in block.reverted_events if isinstance(block, Reorganisation) else ():
         if isinstance(event, NewLiability | Finalized):
-            found.append(TakenBack(what=words[type(event)], liability=event.liability, tx=event.tx))
+            found.append(LiabilityReverted(what=words[type(event)], liability=event.liability, tx=event.tx))
     for event in block.events:
         if not isinstance(event, NewLiability | Finalized):
             continue
         try:
             liability = await chain.liabilities.get(event.liability)
-        except NoContracts:  # the chain was reorganised meanwhile, which is told next
+        except NoContracts:  # reverted meanwhile: the reorganisation comes next
             continue
         unit = (await units_of(chain, [liability]))[liability.token]
         number, word = block.block_number, words[type(event)]
-        found.append(Happening(event=word, block_number=number, tx=event.tx, liability=liability, unit=unit))
+        found.append(LiabilityEvent(event=word, block_number=number, tx=event.tx, liability=liability, unit=unit))
     return found
 
 
@@ -289,7 +289,7 @@ OUTCOMES: Final[Mapping[str, str]] = {
     "failed": "failed: not done, and the promisee has the money back",
     "called-off": "called off without a result, and the promisee has the money back",
 }
-"""Every state that a liability can be in, and what it means."""
+"""The states of a liability, and what they mean."""
 
 
 def state_of(liability: Liability) -> str:
@@ -301,14 +301,16 @@ def state_of(liability: Liability) -> str:
     return "failed" if liability.result else "called-off"
 
 
-def facts_of(liability: Liability) -> dict[str, Any]:
-    """A liability for programs: its record as it is on the wire, and its state in a word."""
+def liability_json(liability: Liability) -> dict[str, Any]:
+    """A liability for JSON: its record as it is on the wire, and its state."""
     record: dict[str, Any] = json.loads(liability.encode())
     return record | {"state": state_of(liability)}
 
 
-def spoken(liability: Liability, unit: Unit, *, own: str | None, refundable: str | None) -> dict[str, str | None]:
-    """A liability as people read it, `own` being the address of who reads it."""
+def describe_liability(
+    liability: Liability, unit: Unit, *, own: str | None, refundable: str | None
+) -> dict[str, str | None]:
+    """A liability for people; `own` is the reader's address."""
     is_judged = liability.validator != ZERO_ADDRESS
     fee = XRT.show(liability.validator_fee)
     return {

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from mesh.cli.chain_client import notice_when_slow, open_signing_chain, units_of
-from mesh.cli.liability import OUTCOMES, facts_of, refund_words, state_of
+from mesh.cli.errors import InvalidSignature, LiabilityEnded, NotAParty, NotRefundable, SignatureMissing
+from mesh.cli.liability import OUTCOMES, liability_json, refund_words, state_of
 from mesh.cli.options import with_json, with_signing_settings
 from mesh.cli.output import print_facts, print_json, print_line
-from mesh.errors import ChainError, InputError, InvalidMessage
+from mesh.errors import InvalidMessage
 from mesh.running import run_to_end
 
 if TYPE_CHECKING:
@@ -23,21 +24,19 @@ if TYPE_CHECKING:
 
 @click.command("cancel")
 @click.argument("address")
-@click.option(
-    "--signature", "signatures", multiple=True, help="the other party's signature, as its own command printed it"
-)
-@click.option("--refund", is_flag=True, help="have the promisee paid back by the delay alone, without signatures")
+@click.option("--signature", "signatures", multiple=True, help="a party's signature, as printed by its own command")
+@click.option("--refund", is_flag=True, help="refund the promisee after the delay, without signatures")
 @with_json
 @with_signing_settings()
 def cancel(settings: Settings, address: str, signatures: tuple[str, ...], refund: bool, as_json: bool) -> None:
-    """Call off the work of the liability at ADDRESS: the promisee has its money back, nobody is paid.
+    """Cancel the liability at ADDRESS: the promisee gets the cost back, and nobody is paid.
 
-    Both parties have to agree. The first runs this without --signature: nothing is sent, its signature is printed. It
-    hands that to the other one, who runs this with --signature, which ends the liability. (Anybody else can send it
-    with the signatures of both.)
+    Both parties must agree. The first party runs this without --signature, which prints its signature and sends
+    nothing. The other party runs it with that --signature, which ends the liability. Anyone else can end it with both
+    signatures.
 
-    When the promisor has vanished, --refund has the promisee paid back once the contracts' delay has passed; anybody
-    may do that. `aira liability show` says from when on.
+    If the promisor has disappeared, --refund pays the promisee back once the refund delay has passed. Anyone may do
+    that; `aira liability show` says from which block on.
     """
     if refund and signatures:
         raise click.UsageError("--refund needs no --signature")
@@ -52,9 +51,9 @@ async def _refund(settings: Settings, address: str, as_json: bool) -> None:
         liability = await _open_liability(chain, address)
         state = await chain.liabilities.refund_state(liability.address)
         if not state.is_refundable:
-            raise ChainError(
-                f"the money of {liability.address} can't be had back yet: {refund_words(state)}",
-                hint="before that, both parties can call the work off: `aira liability cancel` without --refund",
+            raise NotRefundable(
+                f"{liability.address} can't be refunded yet: {refund_words(state)}",
+                hint="before that, both parties can cancel it: `aira liability cancel` without --refund",
             )
         with notice_when_slow():
             settled = await chain.liabilities.refund(liability.address)
@@ -73,26 +72,29 @@ async def _cancel(settings: Settings, address: str, signatures: Sequence[str], a
                 )
             await _print_end(chain, liability.address, settled, as_json)
         elif not signed:
-            raise ChainError(
+            raise NotAParty(
                 f"the account is neither promisee nor promisor of {liability.address}",
                 hint="give both parties' signatures, or the keyfile of one of them",
             )
         elif signatures:
-            raise ChainError(f"the signature of the {missing[0]} is missing", hint="it is from the other party")
+            raise SignatureMissing(
+                f"the signature of the {missing[0]} is missing",
+                hint="the other party prints it with `aira liability cancel`",
+            )
         else:
             _print_signature(chain, liability, signed, as_json)
 
 
 async def _open_liability(chain: Chain, address: str) -> Liability:
-    """The liability, which has not ended. Raises `ChainError`."""
+    """The liability. Raises `LiabilityEnded` if it is finalized."""
     liability = await chain.liabilities.get(address)
     if liability.is_finalized:
-        raise ChainError(f"{liability.address} has ended already: {OUTCOMES[state_of(liability)]}")
+        raise LiabilityEnded(f"{liability.address} has ended already: {OUTCOMES[state_of(liability)]}")
     return liability
 
 
 def _signed(chain: Chain, liability: Liability, signatures: Sequence[str]) -> dict[str, str]:
-    """The parties that agree, with their signatures (0x…): those given, and one's own if one is a party."""
+    """Party → signature (0x…): of the given signatures, and of the own account if it is a party."""
     from schemas import cancellation_hash, recover
 
     assert chain.account is not None
@@ -104,14 +106,14 @@ def _signed(chain: Chain, liability: Liability, signatures: Sequence[str]) -> di
         try:
             signer = recover(digest, signature)
         except InvalidMessage as error:
-            raise InputError(
-                f"that is no signature: {error.detail}", hint="a signature is 0x and 130 hexadecimal digits"
+            raise InvalidSignature(
+                f"not a signature: {error.detail}", hint="a signature is 0x and 130 hexadecimal digits"
             ) from None
         found = {party: signature for party, address in parties.items() if address == signer}
         if not found:
-            raise InputError(
-                f"the signature is of {signer}, or of another liability's cancellation",
-                hint=f"needed are those of {liability.promisee} and {liability.promisor}",
+            raise InvalidSignature(
+                f"the signature is by {signer}, or for another liability",
+                hint=f"it must be by {liability.promisee} or {liability.promisor}",
             )
         signed |= found
     return signed
@@ -134,7 +136,7 @@ def _print_signature(chain: Chain, liability: Liability, signed: dict[str, str],
 async def _print_end(chain: Chain, address: str, settled: Settled, as_json: bool) -> None:
     liability = await chain.liabilities.get(address)
     if as_json:
-        print_json(facts_of(liability) | {"tx": settled.tx, "gasUsed": settled.gas_used})
+        print_json(liability_json(liability) | {"tx": settled.tx, "gasUsed": settled.gas_used})
         return
     unit = (await units_of(chain, [liability]))[liability.token]
     facts: dict[str, Any] = {

@@ -9,10 +9,10 @@ import click
 
 from mesh.cli.amounts import XRT
 from mesh.cli.chain_client import notice_when_slow, open_chain, open_signing_chain
+from mesh.cli.errors import InvalidLighthouse, NameTaken, NotALighthouse
 from mesh.cli.lazy import LazyGroup
 from mesh.cli.options import with_chain_settings, with_json, with_lighthouse_options, with_signing_settings
 from mesh.cli.output import plural, print_facts, print_json, print_line, print_table, printable
-from mesh.errors import ChainError, InputError
 from mesh.running import run_to_end
 
 if TYPE_CHECKING:
@@ -22,25 +22,25 @@ if TYPE_CHECKING:
 
 command = LazyGroup(
     "lighthouse",
-    help="""Lighthouses, the markets: make one, look at them, become a provider of one.
+    help="""Lighthouses, the markets: create and show them, become a provider of one.
 
     Stakes are in XRT (1.5), or with the ending wn in its smallest unit (1500000000wn). A lighthouse is named by its
     label (airalab), its ENS name or its address.""",
     lazy={
-        "join": ("mesh.cli.lighthouse_stake:join", "stake, and be a provider"),
-        "leave": ("mesh.cli.lighthouse_stake:leave", "take the stake back, or a part of it"),
+        "join": ("mesh.cli.lighthouse_stake:join", "stake, and become a provider"),
+        "leave": ("mesh.cli.lighthouse_stake:leave", "withdraw the stake, or a part of it"),
     },
 )
 
 
 @command.command("list", short_help="list all lighthouses")
 @click.option(
-    "--from-block", type=click.IntRange(min=0), default=0, show_default=True, help="only those made since this block"
+    "--from-block", type=click.IntRange(min=0), default=0, show_default=True, help="only those created since this block"
 )
 @with_json
 @with_chain_settings()
 def list_lighthouses(settings: Settings, from_block: int, as_json: bool) -> None:
-    """List all lighthouses of the factory, in the order in which they were made."""
+    """List all lighthouses of the factory, oldest first."""
     run_to_end(lambda: _list(settings, from_block, as_json))
 
 
@@ -51,7 +51,7 @@ async def _list(settings: Settings, from_block: int, as_json: bool) -> None:
             for made in await chain.lighthouses.list(from_block=from_block)
         ]
     if as_json:
-        print_json([facts_of(name, state) for name, state in found])
+        print_json([lighthouse_json(name, state) for name, state in found])
         return
     rows = [
         (
@@ -71,12 +71,12 @@ async def _list(settings: Settings, from_block: int, as_json: bool) -> None:
         print_line("no lighthouse was made here" + (f" since block {from_block:,}" if from_block else ""))
 
 
-@command.command("info", short_help="show one: its terms, its providers, whose turn it is")
+@command.command("info", short_help="show one: its rules, its providers, whose turn it is")
 @click.argument("name", required=False)
 @with_json
 @with_chain_settings("lighthouse_contract")
 def info(settings: Settings, name: str | None, as_json: bool) -> None:
-    """Show a lighthouse (by default the settings'): its terms, its providers, and whose turn it is."""
+    """Show a lighthouse (by default the settings'): its rules, its providers, and whose turn it is."""
     run_to_end(lambda: _info(settings, name or settings.lighthouse_contract, as_json))
 
 
@@ -86,7 +86,7 @@ async def _info(settings: Settings, name: str, as_json: bool) -> None:
         block = await chain.block_number()
         may_send = {provider: await chain.lighthouses.is_turn(state.address, provider) for provider in state.stakes}
     if as_json:
-        facts = facts_of(name, state) | {"blockNumber": block}
+        facts = lighthouse_json(name, state) | {"blockNumber": block}
         for provider in facts["providers"]:
             provider["maySend"] = may_send[provider["provider"]]
         print_json(facts)
@@ -124,7 +124,7 @@ def _say_info(name: str, state: LighthouseState, block: int, may_send: dict[str,
 
 
 def _turn(state: LighthouseState) -> str | None:
-    """Whose turn it is, by address and place; None where nobody staked."""
+    """The provider whose turn it is, and its place; None if there is no provider."""
     if not state.stakes:
         return None
     providers = list(state.stakes)
@@ -132,13 +132,13 @@ def _turn(state: LighthouseState) -> str | None:
     return f"{state.current}  ({place}), {plural(state.quota, 'transaction')} left"
 
 
-@command.command("create", short_help="make a lighthouse")
+@command.command("create", short_help="create a lighthouse")
 @click.argument("name")
 @with_lighthouse_options
 @with_json
 @with_signing_settings()
 def create(settings: Settings, **plan: Any) -> None:
-    """Make a lighthouse called NAME: 1 to 32 letters a to z, digits and -. Whoever stakes there is its provider."""
+    """Create a lighthouse named NAME: 1 to 32 letters a to z, digits and -. Anyone can stake there as a provider."""
     run_to_end(lambda: _create(settings, **plan))
 
 
@@ -172,7 +172,7 @@ async def _check_free(chain: Chain, name: str) -> None:
         taken = await chain.names.address(name)
     except UnknownName:
         return
-    raise ChainError(f"the name {name} is taken, by {taken}", hint="choose another name")
+    raise NameTaken(f"the name {name} is taken by {taken}", hint="choose another name")
 
 
 LABEL: Final = re.compile(r"[a-z0-9-]{1,32}", re.ASCII)
@@ -182,29 +182,31 @@ LARGEST_STAKE: Final = 2**128 - 1
 
 
 def check_lighthouse(name: str, *, minimal_stake: int) -> None:
-    """Raise `InputError` for a name or a minimal stake (wn) that the factory would refuse."""
+    """Raise `InvalidLighthouse` for a name or a minimal stake (wn) that the factory would refuse."""
     if not LABEL.fullmatch(name):
-        raise InputError(
-            f"{name[:40]!r} can't be the name of a lighthouse",
+        raise InvalidLighthouse(
+            f"{name[:40]!r} is not a valid name for a lighthouse",
             hint="1 to 32 letters a to z, digits and -, such as `airalab`",
         )
     if not 1 <= minimal_stake <= LARGEST_STAKE:
-        raise InputError(f"a minimal stake of {XRT.show(minimal_stake)} can't be", hint="it is 1 wn at least")
+        raise InvalidLighthouse(
+            f"a minimal stake of {XRT.show(minimal_stake)} is out of range", hint="it is at least 1 wn"
+        )
 
 
 async def find_lighthouse(chain: Chain, name: str) -> str:
     """The address of a lighthouse, by its label, ENS name or address.
 
-    Raises `ChainError` for what is no lighthouse of the factory, `UnknownName`, `InvalidName`, `InvalidAddress`.
+    Raises `NotALighthouse`, `UnknownName`, `InvalidName`, `InvalidAddress`.
     """
     address = await chain.names.lighthouse(name)
     if not await chain.lighthouses.exists(address):
-        raise ChainError(f"{address} is not a lighthouse of this factory", hint="`aira lighthouse list` shows those")
+        raise NotALighthouse(f"{address} is not a lighthouse of this factory", hint="`aira lighthouse list` shows them")
     return address
 
 
-def facts_of(name: str, state: LighthouseState) -> dict[str, Any]:
-    """A lighthouse, for programs: stakes in wn."""
+def lighthouse_json(name: str, state: LighthouseState) -> dict[str, Any]:
+    """A lighthouse for JSON: stakes are text, in wn."""
     providers = list(state.stakes)
     return {
         "lighthouse": state.address,

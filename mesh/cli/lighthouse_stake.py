@@ -8,10 +8,10 @@ import click
 
 from mesh.cli.amounts import AMOUNT, XRT
 from mesh.cli.chain_client import check_balance, notice_when_slow, open_signing_chain
+from mesh.cli.errors import InvalidAmount, InvalidOptions, InvalidStake, NotAProvider
 from mesh.cli.lighthouse import find_lighthouse
 from mesh.cli.options import with_json, with_signing_settings
 from mesh.cli.output import plural, print_facts, print_json
-from mesh.errors import ChainError, InputError
 from mesh.running import run_to_end
 
 if TYPE_CHECKING:
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 @with_json
 @with_signing_settings("lighthouse_contract")
 def join(settings: Settings, words: tuple[str, ...], as_json: bool) -> None:
-    """Stake VALUE at LIGHTHOUSE (by default the settings'), on top of what is staked already, and be its provider.
+    """Add VALUE to the stake at LIGHTHOUSE (by default the settings') to be one of its providers.
 
-    What the lighthouse is not yet allowed to take is approved first. Each minimal stake is one transaction a turn.
+    Approves the amount for the lighthouse first if necessary. Each minimal stake allows one transaction a turn.
     """
     run_to_end(lambda: _join(settings, words, as_json))
 
@@ -36,7 +36,7 @@ def join(settings: Settings, words: tuple[str, ...], as_json: bool) -> None:
 async def _join(settings: Settings, words: Sequence[str], as_json: bool) -> None:
     name, value = lighthouse_and_value(words, settings)
     if value is None:
-        raise InputError("a VALUE is missing, what is to be staked", hint=f"say so: `aira lighthouse join {name} 20`")
+        raise InvalidOptions("the VALUE to stake is missing", hint=f"for example `aira lighthouse join {name} 20`")
     async with open_signing_chain(settings) as chain:
         assert chain.account is not None
         state = await chain.lighthouses.get(await find_lighthouse(chain, name))
@@ -49,13 +49,13 @@ async def _join(settings: Settings, words: Sequence[str], as_json: bool) -> None
 
 
 def _check_stake(state: LighthouseState, *, staked: int, added: int) -> None:
-    """Raise `InputError` for a stake that the lighthouse would refuse."""
+    """Raise `InvalidStake` for a stake that the lighthouse would refuse."""
     hint = f"stake {XRT.show(max(1, state.minimal_stake - staked))} or more"
     if not added:
-        raise InputError("a stake of nothing can't be added", hint=hint)
+        raise InvalidStake("the stake to add must be more than 0", hint=hint)
     if staked + added < state.minimal_stake:
         minimum = XRT.show(state.minimal_stake)
-        raise InputError(f"a stake of {XRT.show(staked + added)} is below the minimum of {minimum}", hint=hint)
+        raise InvalidStake(f"a stake of {XRT.show(staked + added)} is below the minimum of {minimum}", hint=hint)
 
 
 @click.command("leave")
@@ -63,10 +63,10 @@ def _check_stake(state: LighthouseState, *, staked: int, added: int) -> None:
 @with_json
 @with_signing_settings("lighthouse_contract")
 def leave(settings: Settings, words: tuple[str, ...], as_json: bool) -> None:
-    """Take VALUE off the stake at LIGHTHOUSE (by default the settings').
+    """Withdraw VALUE from the stake at LIGHTHOUSE (by default the settings').
 
-    Without VALUE, or when less than the minimum would remain, all of it is taken. Who has no stake is no provider any
-    more.
+    Without VALUE, or if less than the minimum would remain, all of it is withdrawn. Without a stake you stop being a
+    provider.
     """
     run_to_end(lambda: _leave(settings, words, as_json))
 
@@ -79,10 +79,11 @@ async def _leave(settings: Settings, words: Sequence[str], as_json: bool) -> Non
         state = await chain.lighthouses.get(await find_lighthouse(chain, name))
         staked = state.stakes.get(me)
         if staked is None:
-            raise ChainError(f"{me} has no stake at {name}", hint=f"see `aira lighthouse info {name}`")
+            raise NotAProvider(f"{me} has no stake at {name}", hint=f"see `aira lighthouse info {name}`")
         if value is not None and not 0 < value <= staked:
-            raise InputError(
-                f"{XRT.show(value)} can't be taken off a stake of {XRT.show(staked)}", hint="without VALUE all is taken"
+            raise InvalidStake(
+                f"can't withdraw {XRT.show(value)} from a stake of {XRT.show(staked)}",
+                hint="without VALUE, all of it is withdrawn",
             )
         with notice_when_slow():
             await chain.lighthouses.withdraw(state.address, staked if value is None else value)
@@ -91,9 +92,9 @@ async def _leave(settings: Settings, words: Sequence[str], as_json: bool) -> Non
 
 
 def lighthouse_and_value(words: Sequence[str], settings: Settings) -> tuple[str, int | None]:
-    """What `[LIGHTHOUSE] [VALUE]` means: a name, by default the settings', and an amount in wn, if there is one.
+    """Parse `[LIGHTHOUSE] [VALUE]`: a name, by default the settings', and an amount in wn, if one is given.
 
-    One word alone is a VALUE if it looks like one. Raises `InputError`.
+    One word alone is a VALUE if it looks like one. Raises `InvalidAmount`, `InvalidOptions`.
     """
     match words:
         case ():
@@ -103,14 +104,14 @@ def lighthouse_and_value(words: Sequence[str], settings: Settings) -> tuple[str,
         case (name,):
             return name, None
         case (value, name) if AMOUNT.fullmatch(value) and not AMOUNT.fullmatch(name):
-            raise InputError(f"{name!r} is not an amount", hint=f"the lighthouse comes first: {name} {value}")
+            raise InvalidAmount(f"{name!r} is not an amount", hint=f"the lighthouse comes first: {name} {value}")
         case (name, value):
             return name, XRT.parse(value)
-    raise InputError("there are too many words", hint="give a LIGHTHOUSE and a VALUE")
+    raise InvalidOptions("too many arguments", hint="give a LIGHTHOUSE and a VALUE")
 
 
 def print_stake(name: str, address: str, state: LighthouseState, *, as_json: bool) -> None:
-    """Print what an account has at the lighthouse that goes by `name`, after all."""
+    """Print the stake of an account at the lighthouse with this `name`."""
     stake = state.stakes.get(address, 0)
     quota = stake // state.minimal_stake
     if as_json:

@@ -1,4 +1,4 @@
-"""`aira logs`: the log of an agent, a provider, a bridge or a device, from elsewhere."""
+"""`aira logs`: reads the log of an agent, a provider, a bridge or a device over the mesh."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from mesh.cli.errors import NoAnswer
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import plural, print_line, printable, wait_for_broken_pipe
-from mesh.errors import RemoteError
 from mesh.running import run_to_end
 from mesh.settings import NetworkSettings, options_of
 from schemas import parse_address
@@ -23,21 +23,28 @@ if TYPE_CHECKING:
     from mesh.watching.logs import LogReader, Look
     from schemas.logs import LogEvent
 
-PAUSE: Final = 0.5
-"""Seconds between two looks at what is new."""
+POLL_INTERVAL: Final = 0.5
+"""Seconds between two requests for new events."""
 DEVICE_LOG: Final = "/log"
-"""The topic on which the edge agent of a device tells its log."""
+"""The topic on which an edge agent answers for its device's log."""
 
 
 @click.command("logs")
 @click.argument("address")
-@click.option("--device", help="of the edge agent that serves this device of the agent with ADDRESS")
-@click.option("--follow", "-f", is_flag=True, help="go on with what comes, until Ctrl-C")
-@click.option("--lines", "-n", type=click.IntRange(min=0), default=100, show_default=True, help="begin with so many")
+@click.option("--device", help="the log of the edge agent that serves this device of the agent")
+@click.option("--follow", "-f", is_flag=True, help="also show new events, until Ctrl-C")
 @click.option(
-    "--level", type=click.Choice(LEVELS[:-1]), default="debug", show_default=True, help="the least that is shown"
+    "--lines",
+    "-n",
+    type=click.IntRange(min=0),
+    default=100,
+    show_default=True,
+    help="the number of last events to show",
 )
-@click.option("--liability", default="", metavar="ADDRESS", help="only what concerns this contract")
+@click.option(
+    "--level", type=click.Choice(LEVELS[:-1]), default="debug", show_default=True, help="the lowest level to show"
+)
+@click.option("--liability", default="", metavar="ADDRESS", help="only events of this contract")
 @click.option(
     "--timeout", type=click.FloatRange(min=0, min_open=True), default=3.0, show_default=True, help="seconds to wait"
 )
@@ -54,10 +61,10 @@ def command(
     timeout: float,
     as_json: bool,
 ) -> None:
-    """Show the last events of whoever has ADDRESS: an agent, a provider, a bridge.
+    """Show the last log events of the agent, provider or bridge with ADDRESS.
 
-    Each keeps its last 2,000 events, of the levels that its setting log_level lets pass. With --json a JSON object a
-    line, as the role itself writes with log_format = "json".
+    Each keeps its last 2,000 events, from its log_level on. --json prints an object on each line, as the role itself
+    writes with log_format = "json".
     """
     from mesh.telemetry.events import human_line, json_line
 
@@ -89,9 +96,9 @@ async def _show(
         reader = LogReader(network.session, key, **wanted)
         look = await reader.look(timeout=timeout)
         if not look.answered:
-            raise RemoteError(
-                f"nobody tells its log at {key}",
-                hint="is it running, and on the same router? see `aira peers`; on a closed site operators may ask",
+            raise NoAnswer(
+                f"no log at {key}: nothing answers",
+                hint="is it running, on the same router? see `aira peers`; on a closed site only operators may ask",
             )
         _tell(look, line)
         while look.more:
@@ -102,13 +109,13 @@ async def _show(
 
 
 async def _follow(reader: LogReader, line: Callable[[LogEvent], str], *, timeout: float) -> None:
-    """Show what comes, and say to stderr when nobody answers any more, and when somebody does again."""
+    """Show new events. Prints to stderr when the answers stop, and when they are back."""
     from mesh.network import ServiceFailed
     from mesh.watching.logs import Look
 
     trouble = ""
     while True:
-        await asyncio.sleep(PAUSE)
+        await asyncio.sleep(POLL_INTERVAL)
         try:
             look = await reader.look(timeout=timeout)
             met = "" if look.answered else "nobody answers now; waiting"

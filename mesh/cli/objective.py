@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import click
 
 from mesh.cli.files import (
-    MESH,
-    STORE,
+    FETCH_SETTINGS,
+    STORE_SETTINGS,
     fetch,
     file_or_cid,
     open_store,
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 PIN = "user"
-"""The label under which files that a person added are kept until that person removes them."""
+"""The pin of files that a user added, which stay until the user removes them."""
 
 
 command = LazyGroup(
@@ -48,12 +48,12 @@ command = LazyGroup(
 @command.command("add", short_help="put files into the store, where robots can fetch them")
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
 @with_json
-@with_settings(*STORE)
+@with_settings(*STORE_SETTINGS)
 def add(settings: Settings, files: tuple[Path, ...], as_json: bool) -> None:
-    """Put FILES into the store and print their CIDs. Whoever asks the mesh for such a CID gets the file while an agent
-    with this store runs: with --keyfile, that of the account.
+    """Put FILES into the store and print their CIDs. The mesh can fetch them by CID while an agent with this store
+    runs; with --keyfile it is the store of that account.
 
-    A file that robots would refuse is put there all the same, with a word of warning.
+    Files that robots would refuse are added with a warning.
     """
     run_sync(lambda: _add(settings, files, as_json=as_json))
 
@@ -79,11 +79,11 @@ def _add(settings: Settings, files: tuple[Path, ...], *, as_json: bool) -> None:
 
 @command.command("get", short_help="fetch a file by its CID")
 @click.argument("cid")
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="file to write it to")
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="file to write")
 @with_json
-@with_settings(*MESH)
+@with_settings(*FETCH_SETTINGS)
 def get(settings: Settings, cid: str, out: Path, as_json: bool) -> None:
-    """Fetch the file of CID, from the store or from whoever in the mesh holds it, every block checked."""
+    """Fetch the file with CID from the store or the mesh. Every block is verified."""
     run_to_end(lambda: _get(settings, cid, out, as_json=as_json))
 
 
@@ -102,20 +102,20 @@ async def _get(settings: Settings, cid: str, out: Path, *, as_json: bool) -> Non
         click.echo(f"{out}  {format_size(size)}")
 
 
-CHECK_SETTINGS = (*STORE, "objective_size_limit", "objective_expanded_limit")
+CHECK_SETTINGS = (*STORE_SETTINGS, "objective_size_limit", "objective_expanded_limit")
 
 
 @command.command("check", short_help="whether a robot would take it; or the whole store")
 @click.argument("objective", required=False)
-@click.option("--topics", help="topics that the robot takes, separated by commas [any]")
+@click.option("--topics", help="topics that the robot accepts, separated by commas [any]")
 @with_json
 @with_settings(*CHECK_SETTINGS)
 def check(settings: Settings, objective: str | None, topics: str | None, as_json: bool) -> None:
-    """Look at OBJECTIVE, a file or a CID in the store, as a robot does before it takes a job: what it is, its size and
-    what it expands to, every checksum, its schemas, its topics.
+    """Check OBJECTIVE, a file or a CID in the store, as a robot does before it accepts a job: its format, its size and
+    expanded size, every checksum, its schemas, its topics.
 
-    Without an OBJECTIVE the whole store is checked: every file against its CID. Exit code 1: something is wrong, and
-    the reason is a word for programs.
+    Without OBJECTIVE, check every file of the store against its CID. The exit code is 1 if a check fails; the reason
+    is a word for programs.
     """
 
     def work() -> bool:
@@ -147,7 +147,7 @@ def _check(settings: Settings, store: Store, objective: str, *, topics: str | No
 
 
 def _find_file(store: Store, objective: str) -> tuple[Path, str]:
-    """The file that is meant, and its CID. One of the store is compared with its CID."""
+    """The file and its CID. A file in the store is verified against its CID."""
     named = file_or_cid(objective)
     if isinstance(named, str):
         with progress(f"hashing {named[:8]}…") as tell:
@@ -172,8 +172,8 @@ def _check_store(store: Store, *, as_json: bool) -> bool:
 @click.argument("out", type=click.Path(path_type=Path), required=False)
 @with_json
 def convert(bag: Path, out: Path | None, as_json: bool) -> None:
-    """Make the MCAP file OUT [BAG with the ending .mcap] of a ROS 1 bag: payloads, types, times, topics and what the
-    connections say stay as they are, and the bag's CID is noted. Prints the new file's CID."""
+    """Convert a ROS 1 bag to the MCAP file OUT [BAG with the suffix .mcap]. Keeps payloads, types, times, topics and
+    connection headers, and notes the bag's CID. Prints the new file's CID."""
     run_sync(lambda: _convert(bag, out or bag.with_suffix(".mcap"), as_json=as_json))
 
 
@@ -197,12 +197,12 @@ def _convert(bag: Path, out: Path, *, as_json: bool) -> None:
         click.echo(f"{cid}  {out}  {plural(made.count, 'message')}, {format_duration(made.duration_ns)}")
 
 
-@command.command("recover", short_help="save what is readable of a file that was cut")
+@command.command("recover", short_help="save what is readable of a damaged file")
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), help="file to write [NAME.recovered.mcap]")
 @with_json
 def recover_file(file: Path, out: Path | None, as_json: bool) -> None:
-    """Write what is readable of FILE, an MCAP file that was cut or has rotted, to a new, whole one, which says so."""
+    """Write what is readable of FILE, a truncated or damaged MCAP file, to a new file, which notes what is missing."""
     run_sync(lambda: _recover(file, out, as_json=as_json))
 
 

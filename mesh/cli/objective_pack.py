@@ -13,13 +13,15 @@ import click
 import zenoh
 
 import mesh
+from mesh.cli.errors import InvalidDestination, InvalidOptions, NothingRecorded
 from mesh.cli.files import require_new_file, require_readable, write_error
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import format_duration, format_size, plural, print_json, progress, run_sync
-from mesh.errors import InputError, InvalidKey, RemoteError
+from mesh.errors import InvalidKey
 from mesh.recording import GENEROUS, Recorder, RecordingAbout, bag_to_mcap, messages_in, open_objective, pack
 from mesh.running import run_until_stopped
 from mesh.settings import NetworkSettings, options_of
+from mesh.telemetry.context import log_event
 from schemas import cid_of_file
 from schemas.keys import DeviceTopicKey, LiabilityTopicKey, ObjectiveTopicKey, parse_key
 from schemas.payloads import payload_type
@@ -30,35 +32,33 @@ if TYPE_CHECKING:
     from mesh.recording import RecordingSummary
     from mesh.settings import Settings
 
-
 _BAG = b"#ROSBAG V"
 
 
 @click.command("pack")
 @click.argument("source", required=False, type=click.Path(path_type=Path, allow_dash=True))
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="MCAP file to write")
-@click.option("--hear", "keys", multiple=True, metavar="KEY", help="record what is said on KEY (may be repeated)")
-@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="how long to hear [until Ctrl-C]")
+@click.option("--hear", "keys", multiple=True, metavar="KEY", help="record the messages on KEY (may be repeated)")
+@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="how long to record [until Ctrl-C]")
 @with_json
 @with_settings(*options_of(NetworkSettings))
 def pack_objective(
     settings: Settings, source: Path | None, out: Path, keys: tuple[str, ...], seconds: float | None, as_json: bool
 ) -> None:
-    """Make an objective, an MCAP file, and print its CID.
+    """Create an objective, an MCAP file, and print its CID.
 
-    From SOURCE (`-`: the standard input): a ROS 1 bag, or JSON lines like
+    SOURCE (`-`: standard input) is a ROS 1 bag, or JSON lines such as
 
     \b
       {"topic": "/blink", "time": 0}
       {"topic": "/blink", "time": 0.5, "data": "blue"}
       {"topic": "/move", "time": 2, "data": {"x": 1.5}}
 
-    `topic`; `time`, seconds from the beginning (left out: that of the line before); `data`: nothing is a
-    std_msgs/Empty, a text a std_msgs/String, anything else JSON; `type`, where that is not meant: std_msgs/Empty,
-    std_msgs/String, json, json;NAME, or any other encoding (`ros1;my_msgs/Move`), whose payload is then `data` in
-    base64.
+    `time` is in seconds from the start, by default that of the previous line. `data` becomes a std_msgs/Empty if it is
+    missing, a std_msgs/String if it is text, else JSON. `type` sets another type: std_msgs/Empty, std_msgs/String,
+    json, json;NAME, or any other encoding (`ros1;my_msgs/Move`) with a base64 payload in `data`.
 
-    Or from what is said in the mesh now, by --hear: `aira/agent/ADDRESS/device/lamp/**` is what a device says.
+    --hear records live messages instead: `aira/agent/ADDRESS/device/lamp/**` are those of a device.
     """
     if (source is None) == (not keys):
         run_sync(_refuse)
@@ -69,7 +69,7 @@ def pack_objective(
 
 
 def _refuse() -> None:
-    raise InputError("an objective is made of a SOURCE or of what is heard", hint="name a file, or a key with --hear")
+    raise InvalidOptions("give either a SOURCE or --hear", hint="a SOURCE is a file, --hear takes a key")
 
 
 def _from_file(source: Path, out: Path, *, as_json: bool) -> None:
@@ -87,7 +87,7 @@ def _from_file(source: Path, out: Path, *, as_json: bool) -> None:
 
 
 def _is_bag(source: Path) -> bool:
-    """Whether a file begins as a ROS 1 bag does; what comes from the standard input are lines."""
+    """Whether a file is a ROS 1 bag by its first bytes; standard input never is."""
     if not source.is_file():
         return False
     with source.open("rb") as stream:
@@ -106,7 +106,7 @@ def _opened(source: Path) -> Iterator[BinaryIO]:
 def _lines_with_progress(
     stream: BinaryIO, tell: Callable[[int, int | None], None], total: int | None
 ) -> Iterator[bytes]:
-    """The lines of a stream, of `total` bytes; `tell` is told how far it was read."""
+    """The lines of a stream of `total` bytes; `tell` is called with the bytes read so far."""
     done = 0
     for line in stream:
         done += len(line)
@@ -133,7 +133,7 @@ async def _record(settings: Settings, keys: Sequence[str], out: Path, *, seconds
 
 
 def _print_if_made(out: Path, *, as_json: bool) -> None:
-    """What Ctrl-C has ended is a whole file, too."""
+    """Print the recording also when Ctrl-C ended it: the file is complete."""
     if out.exists():
         _print_made(out, as_json=as_json)
 
@@ -160,31 +160,21 @@ log = logging.getLogger(__name__)
 
 
 PROGRESS_INTERVAL = 0.1
-"""Seconds between two looks at how much was heard."""
-
-
-class NothingHeard(RemoteError):
-    """Nobody said anything on the keys."""
-
-    code = "nothing-heard"
-
-    def __init__(self, keys: Sequence[str]) -> None:
-        super().__init__(
-            f"nobody said anything on {', '.join(keys)}", hint="`aira/agent/ADDRESS/device/**` are an agent's devices"
-        )
-        self.keys = tuple(keys)
+"""Seconds between two updates of the progress bar."""
 
 
 def key_expression(text: str) -> str:
-    """The same text, if it is a key expression. Raises `InputError`."""
+    """Return the text if it is a key expression. Raises `InvalidDestination`."""
     try:
         return str(zenoh.KeyExpr(text))
     except zenoh.ZError as error:
-        raise InputError(f"{text!r} is no key expression: {error}", hint="`*` is any chunk, `**` any chunks") from None
+        raise InvalidDestination(
+            f"{text!r} is not a key expression: {error}", hint="`*` stands for one chunk, `**` for any number"
+        ) from None
 
 
 def topic_of(key: str) -> str:
-    """The topic that a key of a device or a job has; of any other key, the whole key."""
+    """The topic in the key of a device or a job; for any other key, the whole key."""
     try:
         parsed = parse_key(key)
     except InvalidKey:
@@ -202,24 +192,24 @@ async def record_keys(
     seconds: float | None = None,
     tell: Callable[[float], None] = lambda done: None,
 ) -> RecordingSummary:
-    """Record what is said on `keys` to a new file for so many `seconds`, or until cancelled: then, too, it is finished.
+    """Record the messages on `keys` to a new file for `seconds`, or until cancelled. The file is complete either way.
 
-    `tell` is told the seconds so far. Raises `NothingHeard`, and then leaves no file, `RecordingFailed`, and
-    `asyncio.CancelledError` never before the file is whole.
+    `tell` is called with the seconds so far. Raises `RecordingFailed`, and `NothingRecorded`, which leaves no file.
     """
     about = RecordingAbout(software=f"aira-mesh {mesh.__version__}")
     recorder = await asyncio.to_thread(Recorder, target, about)
 
-    def heard(sample: zenoh.Sample) -> None:
+    def record_sample(sample: zenoh.Sample) -> None:
         try:
             kind = payload_type(str(sample.encoding))
             recorder.record(topic_of(str(sample.key_expr)), sample.payload.to_bytes(), kind)
-        except Exception as error:  # nobody stands behind a callback
-            log.warning("not recorded from %s: %s", sample.key_expr, error)
+        except Exception as error:  # Zenoh ignores what its callbacks raise
+            fields = log_event("message-unrecorded", key=str(sample.key_expr))
+            log.warning("a message on %s was not recorded: %s", sample.key_expr, error, extra=fields)
 
     subscribers: list[Any] = []
     try:
-        subscribers.extend(session.declare_subscriber(key, heard) for key in keys)
+        subscribers.extend(session.declare_subscriber(key, record_sample) for key in keys)
         await _pass_time(seconds, tell)
     finally:
         for subscriber in subscribers:
@@ -228,7 +218,9 @@ async def record_keys(
         if not summary.messages:
             await asyncio.to_thread(target.unlink)
     if not summary.messages:
-        raise NothingHeard(keys)
+        raise NothingRecorded(
+            f"no message came on {', '.join(keys)}", hint="`aira/agent/ADDRESS/device/**` are an agent's devices"
+        )
     return summary
 
 

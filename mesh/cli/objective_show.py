@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from mesh.cli.files import MESH, fetch, file_or_cid, opened_store, require_readable, write_error
+from mesh.cli.errors import PackageMissing
+from mesh.cli.files import FETCH_SETTINGS, fetch, file_or_cid, opened_store, require_readable, write_error
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import (
     format_duration,
@@ -20,7 +21,6 @@ from mesh.cli.output import (
     progress,
     run_sync,
 )
-from mesh.errors import ConfigurationError
 from mesh.recording import GENEROUS, Objective, TopicRates, open_objective, rates_of
 from mesh.running import run_to_end
 from schemas import cid_of_file
@@ -44,13 +44,13 @@ BARS: Final = " ▁▂▃▄▅▆▇█"
 
 @click.command("show")
 @click.argument("objective")
-@click.option("--schemas", is_flag=True, help="print the schema of each type, too")
-@click.option("--png", type=click.Path(path_type=Path), help="draw the messages a second to this file")
+@click.option("--schemas", is_flag=True, help="also print the schema of each type")
+@click.option("--png", type=click.Path(path_type=Path), help="plot the messages per second to this file")
 @with_json
-@with_settings(*MESH)
+@with_settings(*FETCH_SETTINGS)
 def show(settings: Settings, objective: str, schemas: bool, png: Path | None, as_json: bool) -> None:
-    """Show what is in OBJECTIVE, a file or a CID: how long, which topics of which types, whose recording it says it is,
-    and how many messages come when."""
+    """Show what is in OBJECTIVE, a file or a CID: its duration, its topics and their types, its metadata, and when its
+    messages come."""
     path = run_sync(lambda: file_or_cid(objective))
     if isinstance(path, str):
         path = _fetched(settings, path)
@@ -112,7 +112,7 @@ def _objective_json(objective: Objective) -> dict[str, Any]:
 
 
 def _kinds(objective: Objective) -> dict[str, list[PayloadType]]:
-    """The types of each topic, mostly one."""
+    """The types of each topic, usually one."""
     kinds: dict[str, list[PayloadType]] = {}
     for topic in objective.topics:
         kinds.setdefault(topic.name, []).append(topic.type)
@@ -156,7 +156,7 @@ def _print_topics(objective: Objective) -> None:
 
 
 def _bars(counts: Sequence[int]) -> str:
-    """A bar for each count, the highest of them full; never nothing for something."""
+    """A bar for each count, the highest one full; a bar is empty only for 0."""
     most = max(counts, default=0)
     return "".join(BARS[-(-count * (len(BARS) - 1) // most)] if count else " " for count in counts)
 
@@ -169,14 +169,11 @@ def _print_schemas(objective: Objective) -> None:
 
 
 def draw(rates: TopicRates, path: Path, *, title: str) -> None:
-    """Draw the messages a second of each topic over time, to a PNG at `path`.
-
-    Raises `ConfigurationError` where matplotlib is missing or the file can't be written.
-    """
+    """Plot the messages per second of each topic to a PNG at `path`. Raises `PackageMissing`, `FileUnwritable`."""
     try:
         from matplotlib.figure import Figure
     except ImportError:
-        raise ConfigurationError(
+        raise PackageMissing(
             "drawing needs matplotlib, which is not installed", hint="pip install 'aira-mesh[plot]'"
         ) from None
     figure = Figure(figsize=(10, 4), layout="constrained")
@@ -196,6 +193,6 @@ def draw(rates: TopicRates, path: Path, *, title: str) -> None:
 
 
 def _plain_text(text: str) -> str:
-    """A stranger's text as text: a dollar begins a formula, a leading underscore hides a label."""
+    """Text from others for matplotlib, where a dollar starts a formula and a leading underscore hides a label."""
     shown = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
     return shown.replace("$", r"\$").lstrip("_")

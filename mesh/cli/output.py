@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import click
 import msgspec
 
+from mesh.cli.errors import OutputFailed
 from mesh.errors import AiraError
 from mesh.running import fail
 
@@ -47,7 +48,7 @@ def print_line(text: str = "") -> None:
     except OSError as error:
         with open(os.devnull, "w") as nowhere:  # flushing the rest of the buffer at exit would fail again
             os.dup2(nowhere.fileno(), sys.stdout.fileno())
-        fail(AiraError(f"can't write to stdout: {error.strerror}"))
+        fail(OutputFailed(f"can't write to stdout: {error.strerror}"))
 
 
 def print_json(value: Any) -> None:

@@ -1,4 +1,4 @@
-"""`aira provider`: the role that brings orders together."""
+"""`aira provider`: matches the orders of a lighthouse and settles them on the chain."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import click
+from msgspec.structs import asdict
 
 from mesh.background import Background
 from mesh.cli.options import with_settings
 from mesh.cli.output import announce
 from mesh.running import run_until_stopped
 from mesh.settings import ChainSettings, NetworkSettings, TelemetrySettings, options_of
-from mesh.telemetry.context import LogSource
+from mesh.telemetry.context import LogSource, log_event
 from mesh.telemetry.logs import set_process_source
 from mesh.telemetry.serving import Telemetry
 
@@ -29,8 +30,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-REPORT: Final = 600.0
-"""Seconds between two looks at what was earned."""
+REPORT_INTERVAL: Final = 600.0
+"""Seconds between two reports of the earnings."""
 
 
 @click.command("provider")
@@ -44,15 +45,15 @@ REPORT: Final = 600.0
     *options_of(TelemetrySettings),
 )
 def command(settings: Settings) -> None:
-    """Match the demands and offers of a lighthouse, make their contracts, finalize them. Ctrl-C ends it.
+    """Match the demands and offers of a lighthouse, create their contracts and finalize them. Ctrl-C ends it.
 
-    The account needs a stake at the lighthouse, and ETH for gas. What it earns and spends is logged every ten minutes
-    and at the end.
+    The account needs a stake at the lighthouse, and ETH for gas. Earnings and costs are logged every ten minutes and at
+    the end.
     """
-    run_until_stopped(lambda: _serve(settings), settings=settings, role="provider")
+    run_until_stopped(lambda: serve(settings), settings=settings, role="provider")
 
 
-async def _serve(settings: Settings) -> None:
+async def serve(settings: Settings) -> None:
     from mesh.composition import load_account
     from mesh.starting import open_when_ready, wait_for_files
 
@@ -62,7 +63,7 @@ async def _serve(settings: Settings) -> None:
         await wait_for_files(settings)
         account = await asyncio.to_thread(load_account, settings)
         set_process_source(LogSource("provider", account.address, lighthouse.lower()))
-        make = partial(_opened, settings, account, telemetry)
+        make = partial(_open_provider, settings, account, telemetry)
         network, provider = await open_when_ready(stack, settings, make, role="provider", on_wait=telemetry.starting)
         words = f"provider {provider.address} serves {lighthouse}, Zenoh id {network.id}"
         announce(log, "provider-started", words, provider=provider.address, zenoh=network.id)
@@ -72,10 +73,10 @@ async def _serve(settings: Settings) -> None:
 
 
 @asynccontextmanager
-async def _opened(
+async def _open_provider(
     settings: Settings, account: Account, telemetry: Telemetry
 ) -> AsyncIterator[tuple[Network, Provider]]:
-    """The provider with all that it needs: a node, contracts, a stake, a router; and with its figures to be seen."""
+    """The provider with its chain and network, and its metrics. Raises `AiraError` for what is not ready yet."""
     from mesh.composition import chain_of, endpoints_of
     from mesh.market.provider import Provider, ProviderProcess, check_account
     from mesh.network import Network
@@ -93,13 +94,18 @@ async def _opened(
 
 
 async def _report(earnings: Callable[[], Earnings]) -> None:
-    """Log what the work brought in and has cost: now and then, where it has changed, and at the end."""
-    told = None
+    """Log earnings and costs at intervals, if they have changed, and at the end."""
+    reported = None
     try:
         while True:
-            await asyncio.sleep(REPORT)
-            if (now := earnings()) != told:
-                log.info("%s", now)
-                told = now
+            await asyncio.sleep(REPORT_INTERVAL)
+            if (now := earnings()) != reported:
+                _log_earnings(now)
+                reported = now
     finally:
-        log.info("%s", earnings())
+        _log_earnings(earnings())
+
+
+def _log_earnings(earnings: Earnings) -> None:
+    fields = asdict(earnings) | {"rejected": sum(earnings.rejected.values())}
+    log.info("%s", earnings, extra=log_event("earnings-reported", **fields))

@@ -12,10 +12,10 @@ import zenoh
 from msgspec import Struct
 
 from mesh.cli.chain_client import open_chain, own_address
-from mesh.cli.files import MESH, fetch, file_or_cid, opened_store, require_readable
+from mesh.cli.errors import AccountMissing, InvalidDestination, NoRecording, UnknownTopic
+from mesh.cli.files import FETCH_SETTINGS, fetch, file_or_cid, opened_store, require_readable
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import format_duration, plural, print_json, progress
-from mesh.errors import ConfigurationError, InputError
 from mesh.recording import GENEROUS, AtOnce, RecordedTimes, open_objective, play
 from mesh.running import run_to_end
 from mesh.settings import ChainSettings, options_of
@@ -35,31 +35,33 @@ ROLES: Final = ("objective", "device", "agent")
 
 @click.command("replay")
 @click.argument("source")
-@click.option("--to", metavar="DEVICE", help="a device of this account, ADDRESS/DEVICE, or the beginning of a key")
-@click.option("--objective", "of_objective", is_flag=True, help="of a LIABILITY: its objective, not its recording")
-@click.option("--topics", help="only these topics, separated by commas")
-@click.option("--role", type=click.Choice(ROLES), help="only what was played, or what the device or the agent said")
+@click.option("--to", metavar="DEVICE", help="a device of this account, ADDRESS/DEVICE, or the prefix of a key")
 @click.option(
-    "--rate", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True, help="how much faster"
+    "--objective", "of_objective", is_flag=True, help="for a liability: its objective instead of its recording"
 )
-@click.option("--at-once", is_flag=True, help="without the pauses")
-@click.option("--from", "start", type=click.FloatRange(min=0), default=0.0, help="leave out so many seconds")
+@click.option("--topics", help="only these topics, separated by commas")
+@click.option("--role", type=click.Choice(ROLES), help="only messages of the objective, the device or the agent")
+@click.option(
+    "--rate", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True, help="speed factor"
+)
+@click.option("--at-once", is_flag=True, help="without pauses")
+@click.option("--from", "start", type=click.FloatRange(min=0), default=0.0, help="skip this many seconds")
 @with_json
-@with_settings(*dict.fromkeys((*MESH, *options_of(ChainSettings))))
+@with_settings(*dict.fromkeys((*FETCH_SETTINGS, *options_of(ChainSettings))))
 def command(settings: Settings, **options: Any) -> None:
-    """Play SOURCE again onto keys of the mesh: a file, a CID, or the recording of a liability, by its address.
+    """Publish the messages of SOURCE again: a file, a CID, or the recording of a liability, by its address.
 
-    --to says where: `lamp` is that device of the account in --keyfile, `0x…/lamp` one of another agent, and anything
-    longer (`lab/stage`) the beginning of keys to which the topics are added. Without it, what a liability that has
-    ended heard is said on its own topics again.
+    --to is the destination: `lamp` is that device of the account in --keyfile, `0x…/lamp` a device of another agent,
+    and anything longer (`lab/stage`) a key prefix to which the topics are added. Without it, the recording of a
+    liability that has ended is published on its own topics.
 
-    No contract comes of it, and nobody is paid. Ctrl-C ends it.
+    This creates no contract and pays nobody. Ctrl-C ends it.
     """
-    run_to_end(lambda: _replay(settings, Replay(**options)))
+    run_to_end(lambda: replay(settings, ReplayOptions(**options)))
 
 
-class Replay(Struct, frozen=True, kw_only=True):
-    """What was asked for."""
+class ReplayOptions(Struct, frozen=True, kw_only=True):
+    """The options of the command."""
 
     source: str
     to: str | None = None
@@ -73,15 +75,15 @@ class Replay(Struct, frozen=True, kw_only=True):
 
     @property
     def pace(self) -> Pace:
-        """How fast."""
+        """The pace of the playback."""
         return AtOnce() if self.at_once else RecordedTimes(speed=self.rate)
 
     def wants(self, message: Played, chosen: frozenset[str]) -> bool:
-        """Whether a message is to be played; `chosen` are the topics, none for all."""
+        """Whether to play a message; `chosen` are the topics, none for all."""
         return (not chosen or message.topic in chosen) and self.role in (None, message.role)
 
 
-async def _replay(settings: Settings, asked: Replay) -> None:
+async def replay(settings: Settings, asked: ReplayOptions) -> None:
     from mesh.composition import endpoints_of
     from mesh.network import Network
 
@@ -92,7 +94,7 @@ async def _replay(settings: Settings, asked: Replay) -> None:
             recording = await asyncio.to_thread(open_objective, path, GENEROUS, progress=tell)
         destination = given or own
         if destination is None:
-            raise InputError("a file says nothing of where it is to be played", hint="name a device or a key with --to")
+            raise InvalidDestination("a file needs a destination", hint="name a device or a key with --to")
         _check_topics(recording, destination, asked)
         async with Network(endpoints_of(settings)) as network:
             began = time.monotonic()
@@ -104,8 +106,8 @@ async def _replay(settings: Settings, asked: Replay) -> None:
         click.echo(f"{plural(played, 'message')} in {format_duration(int(seconds * 1e9))}")
 
 
-async def _source(settings: Settings, store: Store, asked: Replay) -> tuple[Path, Destination | None]:
-    """The file to play, and where it is played unless something else is asked for."""
+async def _source(settings: Settings, store: Store, asked: ReplayOptions) -> tuple[Path, Destination | None]:
+    """The file to play, and its default destination."""
     if not ADDRESS.fullmatch(asked.source):
         named = file_or_cid(asked.source)
         return (await fetch(settings, store, named) if isinstance(named, str) else require_readable(named)), None
@@ -113,7 +115,7 @@ async def _source(settings: Settings, store: Store, asked: Replay) -> tuple[Path
         liability = await chain.liabilities.get(asked.source)
     cid = liability.objective if asked.of_objective else liability.result
     if not cid:
-        raise InputError(
+        raise NoRecording(
             f"{liability.address} holds no recording" + ("" if liability.is_finalized else " yet: it has not ended"),
             hint="play its objective with --objective",
         )
@@ -121,25 +123,25 @@ async def _source(settings: Settings, store: Store, asked: Replay) -> tuple[Path
     return await fetch(settings, store, cid), own
 
 
-def _check_topics(recording: Objective, destination: Destination, asked: Replay) -> None:
-    """Make a key of every topic before the first message goes out. Raises `InvalidKey`, `InputError`."""
+def _check_topics(recording: Objective, destination: Destination, asked: ReplayOptions) -> None:
+    """Check that every topic gives a valid key, before anything is sent. Raises `InvalidKey`, `UnknownTopic`."""
     chosen = _chosen(asked)
     there = {topic.name for topic in recording.topics}
     missing = sorted(chosen - there)
     if missing:
-        raise InputError(
+        raise UnknownTopic(
             f"the recording has no topic {', '.join(missing)}", hint=f"it has {', '.join(sorted(there)) or 'none'}"
         )
     for topic in chosen or there:
         destination.key(topic, "")
 
 
-def _chosen(asked: Replay) -> frozenset[str]:
+def _chosen(asked: ReplayOptions) -> frozenset[str]:
     return frozenset(name.strip() for name in (asked.topics or "").split(",") if name.strip())
 
 
-async def _play(session: zenoh.Session, recording: Objective, destination: Destination, asked: Replay) -> int:
-    """Put every message that is wanted when it is due; how many that were."""
+async def _play(session: zenoh.Session, recording: Objective, destination: Destination, asked: ReplayOptions) -> int:
+    """Publish each selected message when it is due; returns their number."""
     chosen, played = _chosen(asked), 0
     drop = zenoh.CongestionControl.DROP
     with progress("playing") as tell:
@@ -162,20 +164,20 @@ ADDRESS: Final = re.compile(r"0x[0-9a-fA-F]{40}")
 
 
 class Destination(Protocol):
-    """Where messages go."""
+    """Where messages are published."""
 
     def key(self, topic: str, role: str) -> str:
-        """The key for a topic, and the role that a message has there. Raises `InvalidKey` for what no key may hold."""
+        """The key for a topic; `role` is the message's role in the recording. Raises `InvalidKey`."""
 
 
 class DeviceTopics(Struct, frozen=True):
-    """The topics of a device, outside any job."""
+    """The topics of a device, outside of jobs."""
 
     agent: str
     device: str
 
     def key(self, topic: str, role: str) -> str:
-        """Its topic."""
+        """The device's topic."""
         return str(DeviceTopicKey(self.agent, self.device, topic))
 
 
@@ -186,7 +188,7 @@ class JobTopics(Struct, frozen=True):
     liability: str
 
     def key(self, topic: str, role: str) -> str:
-        """Where it was when it was recorded."""
+        """The key on which the message was recorded."""
         family = ObjectiveTopicKey if role == "objective" else LiabilityTopicKey
         return str(family(self.agent, self.liability, topic))
 
@@ -197,18 +199,18 @@ class KeyPrefix(Struct, frozen=True):
     prefix: str
 
     def key(self, topic: str, role: str) -> str:
-        """Its topic."""
+        """The device's topic."""
         return self.prefix + topic_chunks(topic)
 
 
 def destination_of(settings: Settings, to: str) -> Destination:
-    """Where `--to` says. Raises `InputError`, `ConfigurationError`."""
+    """The destination that `--to` names. Raises `InvalidDestination`, `InvalidKey`, `AccountMissing`."""
     first, slash, rest = to.partition("/")
     if not slash:
         own = own_address(settings)
         if own is None:
-            raise ConfigurationError(
-                f"whose device {to!r} is can't be told without an account",
+            raise AccountMissing(
+                f"the device {to!r} needs an account",
                 hint="give --keyfile, or --to ADDRESS/DEVICE",
             )
         return _checked(DeviceTopics(own, to))
@@ -217,13 +219,13 @@ def destination_of(settings: Settings, to: str) -> Destination:
     try:
         prefix = str(zenoh.KeyExpr(to))
     except zenoh.ZError as error:
-        raise InputError(f"{to!r} is not the beginning of a key: {error}") from None
+        raise InvalidDestination(f"a key can't begin with {to!r}: {error}") from None
     if "*" in prefix or "$" in prefix:
-        raise InputError(f"{to!r} has a wildcard, and would reach everybody", hint="name one key")
+        raise InvalidDestination(f"{to!r} has a wildcard", hint="name one key")
     return KeyPrefix(prefix)
 
 
 def _checked(device: DeviceTopics) -> DeviceTopics:
-    """The same, if keys can be made with it. Raises `InvalidKey`."""
+    """Return the device if its keys are valid. Raises `InvalidKey`."""
     device.key("/any", "")
     return device

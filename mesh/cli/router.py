@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from mesh.cli.errors import FileUnwritable, RosterMissing
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import announce, print_json, print_table, printable
-from mesh.errors import AiraError, ConfigurationError
+from mesh.errors import AiraError
 from mesh.outage_log import OutageLog
 from mesh.running import fail, run_until_stopped
 from mesh.settings import TelemetrySettings, options_of
+from mesh.telemetry.context import log_event
 from mesh.telemetry.serving import Telemetry
 
 if TYPE_CHECKING:
@@ -28,35 +30,35 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-SITE: Final = ("listen", "link", "tls_ca", "tls_certificate", "tls_key", "roster")
-LOOK: Final = 1.0
-"""Seconds between two looks at the roster."""
+SITE_SETTINGS: Final = ("listen", "link", "tls_ca", "tls_certificate", "tls_key", "roster")
+ROSTER_INTERVAL: Final = 1.0
+"""Seconds between two checks of the roster."""
 
 
 @click.group("router", invoke_without_command=True)
-@with_settings(*SITE, *options_of(TelemetrySettings))
+@with_settings(*SITE_SETTINGS, *options_of(TelemetrySettings))
 @click.pass_context
 def command(context: click.Context, settings: Settings) -> None:
-    """Run a Zenoh router, the place where agents, providers and people meet. Ctrl-C ends it.
+    """Run a Zenoh router, through which agents, providers and people exchange messages. Ctrl-C ends it.
 
-    With a roster it lets in who has a certificate of the site, and each does what his role needs. Without one it
-    listens on loopback only. When the roster or its certificate changes, it begins anew by itself; clients come back
+    With a roster it admits clients with a certificate of the site, and allows each what its role needs. Without one it
+    listens on loopback only. When the roster or its certificate changes, it restarts by itself; clients reconnect
     within a second.
     """
     context.obj = settings
     if context.invoked_subcommand is None:
-        run_until_stopped(lambda: _serve(settings), settings=settings, role="router")
+        run_until_stopped(lambda: serve(settings), settings=settings, role="router")
 
 
-@command.command("acl", short_help="say who may do what")
-@click.option("--check", is_flag=True, help="a table for people, instead of Zenoh's rules")
+@command.command("acl", short_help="show who may do what")
+@click.option("--check", is_flag=True, help="print a table for people instead of Zenoh's rules")
 @click.option("--roster", type=click.Path(dir_okay=False, path_type=Path), help="roster [the settings']")
 @with_json
 @click.pass_obj
 def acl(settings: Settings, check: bool, roster: Path | None, as_json: bool) -> None:
-    """Print what the roster allows: as Zenoh's `access_control`, or with --check who may do what.
+    """Print what the roster allows, as Zenoh's `access_control`; with --check as a table.
 
-    What is not in the table is refused.
+    Everything else is denied.
     """
     from mesh.identity import access_control
 
@@ -82,10 +84,10 @@ def acl(settings: Settings, check: bool, roster: Path | None, as_json: bool) -> 
 @click.option("--out", required=True, type=click.Path(dir_okay=False, path_type=Path), help="file to write (JSON5)")
 @click.pass_obj
 def config(settings: Settings, out: Path) -> None:
-    """Write a configuration file for `zenohd`: the router that `aira router` with the same options is.
+    """Write a configuration file with which `zenohd` works as `aira router` with the same options.
 
-    Give those options before `config`. zenohd reads the file when it starts, and so has to be started anew after a
-    change of the roster.
+    Give those options before `config`. zenohd reads the file when it starts, so restart it after a change of the
+    roster.
     """
     from mesh.identity.routers import router_endpoints, zenohd_configuration
 
@@ -94,13 +96,13 @@ def config(settings: Settings, out: Path) -> None:
         try:
             out.write_text(text, encoding="utf-8")
         except OSError as error:
-            raise ConfigurationError(f"can't write {out}: {error.strerror}") from None
+            raise FileUnwritable(f"can't write {out}: {error.strerror}") from None
     except AiraError as error:
         fail(error)
     click.echo(f"zenohd --config {out}")
 
 
-async def _serve(settings: Settings) -> None:
+async def serve(settings: Settings) -> None:
     from mesh.identity.routers import router_endpoints
     from mesh.network import Network
     from mesh.starting import wait_for_files
@@ -109,7 +111,7 @@ async def _serve(settings: Settings) -> None:
         await wait_for_files(settings)
         endpoints = router_endpoints(settings)
         while True:
-            certificate = _contents(endpoints)
+            certificate = _own_certificate(endpoints)
             async with Network(endpoints) as network:
                 announce(
                     log,
@@ -117,14 +119,16 @@ async def _serve(settings: Settings) -> None:
                     f"router {network.id} listens at {', '.join(settings.listen)}",
                     zenoh=network.id,
                 )
-                announce(log, "access-loaded", _who_is_let_in(endpoints))
-                with _shown(telemetry, network):
-                    endpoints = await _changed(settings, endpoints, certificate)
-            log.info("the roster or the certificate has changed: the router begins anew")
+                announce(log, "access-loaded", _describe_access(endpoints))
+                with _serve_metrics(telemetry, network):
+                    endpoints = await _wait_for_change(settings, endpoints, certificate)
+            log.info(
+                "the roster or the certificate has changed: the router restarts", extra=log_event("router-restarted")
+            )
 
 
-def _shown(telemetry: Telemetry, network: Network) -> AbstractContextManager[None]:
-    """A router's figures and health: that it listens, and who is linked to it."""
+def _serve_metrics(telemetry: Telemetry, network: Network) -> AbstractContextManager[None]:
+    """Serve a router's metrics and health: that it listens, and its links."""
     from mesh.network.metrics import link_state, network_families
 
     async def measure() -> Iterable[MetricFamily]:
@@ -133,26 +137,26 @@ def _shown(telemetry: Telemetry, network: Network) -> AbstractContextManager[Non
     return telemetry.showing(measure=measure, health=lambda: {"router": link_state(network)})
 
 
-async def _changed(settings: Settings, endpoints: Endpoints, certificate: bytes) -> Endpoints:
-    """Where and how to listen, once it is something else; what can't work is reported and left alone."""
+async def _wait_for_change(settings: Settings, endpoints: Endpoints, certificate: bytes) -> Endpoints:
+    """Wait until the roster or the certificate changes; the new endpoints. Invalid changes are logged and ignored."""
     from mesh.identity.routers import router_endpoints
 
-    trouble = OutageLog(log, "roster")
+    outages = OutageLog(log, "roster")
     while True:
-        await asyncio.sleep(LOOK)
+        await asyncio.sleep(ROSTER_INTERVAL)
         try:
             found = await asyncio.to_thread(router_endpoints, settings)
             await asyncio.to_thread(found.config)
         except AiraError as error:
-            trouble.failed(error, "the router goes on as it is")
+            outages.failed(error, "the router goes on as it is")
             continue
-        trouble.recovered("the roster can be used again")
-        if found != endpoints or _contents(found) != certificate:
+        outages.recovered("the roster can be used again")
+        if found != endpoints or _own_certificate(found) != certificate:
             return found
 
 
-def _contents(endpoints: Endpoints) -> bytes:
-    """The router's own certificate, which Zenoh reads when it begins to listen."""
+def _own_certificate(endpoints: Endpoints) -> bytes:
+    """The router's own certificate, which Zenoh reads only when it starts to listen."""
     pair = endpoints.tls.pair if endpoints.tls is not None else None
     try:
         return pair[0].read_bytes() if pair is not None else b""
@@ -160,7 +164,7 @@ def _contents(endpoints: Endpoints) -> bytes:
         return b""
 
 
-def _who_is_let_in(endpoints: Endpoints) -> str:
+def _describe_access(endpoints: Endpoints) -> str:
     if endpoints.access is None:
         return "without a roster: only this machine reaches it, and everybody on it may do everything"
     return f"let in: {len(endpoints.access['subjects'])} of the roster, by certificate"
@@ -170,14 +174,12 @@ def _roster(settings: Settings, path: Path | None) -> Roster:
     from mesh.identity import read_roster
 
     if path is None and not settings.roster:
-        raise ConfigurationError(
-            "there is no roster", hint="give --roster; `aira identity new --roster FILE` begins one"
-        )
+        raise RosterMissing("no roster is set", hint="give --roster; `aira identity new --roster FILE` creates one")
     return read_roster(path or Path(settings.roster).expanduser())
 
 
 def _access(roster: Roster) -> list[dict[str, Any]]:
-    """Who may do what, the revoked among them with nothing."""
+    """The rights of each member; revoked members have none."""
     from mesh.identity import access_of
 
     found: dict[str, dict[str, list[str]]] = {member.address: {} for member in roster.member}

@@ -10,10 +10,10 @@ import click
 import msgspec
 
 from mesh.cli.amounts import ETH
+from mesh.cli.errors import InvalidArgument, UnknownJob, UnknownService
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import print_facts, print_json, print_line, print_table, printable
-from mesh.cli.status import spoken
-from mesh.errors import InputError
+from mesh.cli.status import describe_status
 from mesh.running import run_to_end
 from mesh.settings import NetworkSettings, options_of
 from schemas import InvalidRecord, Record, parse_address
@@ -35,7 +35,7 @@ ETH_BALANCES: Final = frozenset({"eth/eth_balance", "eth/account_eth_balance"})
 @click.argument("address", required=False)
 @click.argument("service", required=False)
 @click.argument("arguments", nargs=-1, metavar="[NAME=VALUE … | JSON]")
-@click.option("--list", "as_list", is_flag=True, help="list the services, what each is given and what it answers")
+@click.option("--list", "as_list", is_flag=True, help="list the services with their arguments and answers")
 @click.option(
     "--timeout",
     type=click.FloatRange(min=0, min_open=True),
@@ -57,22 +57,26 @@ def command(
 
     aira rpc 0x… start address=0x…
 
-    Amounts are in the smallest unit of the agent's token, which is XRT (wn) unless its settings say otherwise; with
-    --json those of ETH are in wei. Agents keep for themselves what signs, sends or spends (marked with * in --list)
-    unless their settings open it; one that works by itself keeps start, restart, resume and finish, too.
+    Amounts are in the smallest unit of the agent's token, which is XRT (wn) by default; with --json amounts of ETH are
+    in wei. Agents refuse services that sign, send or spend (marked with * in --list) unless their settings open them;
+    an agent with an executor also refuses start, restart, resume and finish.
     """
     if as_list:
         _list_services(as_json=as_json)
     elif address is None or service is None:
         raise click.UsageError("an ADDRESS and a SERVICE are needed; --list shows the services")
     else:
-        run_to_end(lambda: _call(settings, (address, service, arguments), timeout=timeout, as_json=as_json))
+        run_to_end(lambda: call_service(settings, (address, service, arguments), timeout=timeout, as_json=as_json))
 
 
 def _list_services(*, as_json: bool) -> None:
     if as_json:
         services = {
-            name: {"arguments": wanted(kinds.request), "answer": wanted(kinds.reply), "guarded": name in GUARDED}
+            name: {
+                "arguments": argument_names(kinds.request),
+                "answer": argument_names(kinds.reply),
+                "guarded": name in GUARDED,
+            }
             for name, kinds in SERVICES.items()
         }
         print_json(services)
@@ -85,11 +89,11 @@ def _list_services(*, as_json: bool) -> None:
 
 
 def _names(kind: type[Record], most: int) -> str:
-    names = wanted(kind)
+    names = argument_names(kind)
     return " ".join(names if len(names) <= most else [*names[:most], "…"]) or "none"
 
 
-async def _call(
+async def call_service(
     settings: Settings, called: tuple[str, str, tuple[str, ...]], *, timeout: float | None, as_json: bool
 ) -> None:
     from mesh.composition import endpoints_of
@@ -105,7 +109,7 @@ async def _call(
     if isinstance(reply, Done) and not reply.success:
         raise ServiceFailed(service, printable(reply.msg) or "it was not done")
     if isinstance(reply, LiabilityRead) and not reply.read:
-        raise InputError(f"{getattr(request, 'address', 'it')} is no job of the agent at {address}")
+        raise UnknownJob(f"the agent at {address} has no job for {getattr(request, 'address', 'it')}")
     if isinstance(reply, LogsRead) and not as_json:
         for event in reply.entries:
             print_line(human_line(event))
@@ -114,16 +118,16 @@ async def _call(
 
 
 def _balance_of(service: str, reply: Record) -> dict[str, str]:
-    """A balance of ETH. What a token's unit is only the agent knows, so all else is printed as it came."""
+    """A balance of ETH with its unit. Only the agent knows the unit of its token, so other balances stay numbers."""
     if service in ETH_BALANCES and isinstance(reply, Balance):
         return {"balance": ETH.show(reply.balance)}
     return {}
 
 
 def _describe(reply: Record) -> dict[str, str]:
-    """The fields of a reply as people read them; those of a record within it stand for that record."""
+    """The fields of a reply for people; the fields of a nested record are listed among them."""
     if isinstance(reply, Status):
-        return spoken(reply)
+        return describe_status(reply)
     told: dict[str, str] = {}
     for field in msgspec.structs.fields(reply):
         value = getattr(reply, field.name)
@@ -145,31 +149,30 @@ def _fact(value: object) -> str:
     return printable(str(value))
 
 
-TRUTHS: Final = {"true": True, "yes": True, "false": False, "no": False}
+BOOLEANS: Final = {"true": True, "yes": True, "false": False, "no": False}
 
 
-KINDS: Final[Mapping[Any, str]] = {
+TYPES: Final[Mapping[Any, str]] = {
     UInt256: "a whole number, in the smallest unit",
     bool: "true or false",
     int: "a whole number",
     str: "text",
 }
-"""What is to be written for a value that is not any text."""
+"""What to write for a value of each type."""
 
 
-def wanted(kind: type[Record]) -> list[str]:
-    """The names of a record's fields as they travel; those that may be left out are in brackets."""
+def argument_names(kind: type[Record]) -> list[str]:
+    """The names of a record's fields on the wire; optional ones are in brackets."""
     return [field.encode_name if field.required else f"[{field.encode_name}]" for field in _fields(kind)]
 
 
 def request_of(service: str, arguments: Sequence[str]) -> Record:
-    """The request to a service with these arguments.
-
-    Raises `InputError`, which says what is missing, unknown or of another kind.
-    """
+    """The request to a service with these arguments. Raises `UnknownService`, `InvalidArgument`."""
     if service not in SERVICES:
         near = difflib.get_close_matches(service, SERVICES, n=1, cutoff=0)[0]
-        raise InputError(f"there is no service {service[:60]!r}", hint=f"did you mean {near}? --list shows all")
+        raise UnknownService(
+            f"there is no service {service[:60]!r}", hint=f"did you mean {near}? --list shows all of them"
+        )
     kind = SERVICES[service].request
     given = _given(arguments)
     _check_names(service, kind, given)
@@ -177,58 +180,58 @@ def request_of(service: str, arguments: Sequence[str]) -> Record:
     try:
         return kind.decode(msgspec.json.encode(values))
     except InvalidRecord as error:
-        raise InputError(f"{service}: {error}") from None
+        raise InvalidArgument(f"{service}: {error}") from None
 
 
 def _given(arguments: Sequence[str]) -> dict[str, Any]:
-    """What was typed, by name."""
+    """The arguments by name."""
     if len(arguments) == 1 and arguments[0].lstrip().startswith("{"):
         try:
             found = json.loads(arguments[0])
         except (ValueError, RecursionError) as error:
-            raise InputError(f"the arguments are not JSON: {error}") from None
+            raise InvalidArgument(f"the arguments are not JSON: {error}") from None
         assert isinstance(found, dict)
         return found
     given: dict[str, Any] = {}
     for argument in arguments:
         name, equals, value = argument.partition("=")
         if not equals or not name:
-            raise InputError(f"{argument[:60]!r} is no argument", hint="write name=value, or one JSON object")
+            raise InvalidArgument(f"{argument[:60]!r} is not an argument", hint="write name=value, or one JSON object")
         if name in given:
-            raise InputError(f"{name[:60]} is given twice")
+            raise InvalidArgument(f"{name[:60]} is given twice")
         given[name] = value
     return given
 
 
 def _check_names(service: str, kind: type[Record], given: Mapping[str, Any]) -> None:
     known = [field.encode_name for field in _fields(kind)]
-    takes = f"{service} takes {', '.join(wanted(kind)) or 'no arguments'}"
+    takes = f"{service} takes {', '.join(argument_names(kind)) or 'no arguments'}"
     for name in given:
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1)
-            raise InputError(
+            raise InvalidArgument(
                 f"{service} has no argument {name[:60]!r}", hint=f"did you mean {near[0]}? {takes}" if near else takes
             )
     missing = [field.encode_name for field in _fields(kind) if field.required and field.encode_name not in given]
     if missing:
-        raise InputError(f"{service} needs {', '.join(missing)}", hint=takes)
+        raise InvalidArgument(f"{service} needs {', '.join(missing)}", hint=takes)
 
 
 def _value(service: str, field: msgspec.structs.FieldInfo, given: Any) -> Any:
-    """A value as it travels. In JSON an amount may be a number, though it travels as text."""
+    """A value as it is on the wire, where an amount is text; as an argument it may be a number."""
     kind: Any = field.type
     if kind is UInt256 and type(given) is int:
         given = str(given)
     if isinstance(given, str):
-        if kind is bool and given.lower() in TRUTHS:
-            return TRUTHS[given.lower()]
+        if kind is bool and given.lower() in BOOLEANS:
+            return BOOLEANS[given.lower()]
         if kind is int and given.isascii() and given.isdigit():
             return int(given)
         if kind is UInt256 and given.isascii() and given.isdigit():
             return given
-    if kind not in KINDS or (type(given) is kind and kind is not UInt256):
+    if kind not in TYPES or (type(given) is kind and kind is not UInt256):
         return given
-    raise InputError(f"{service}: {field.encode_name} is {str(given)[:60]!r}, and has to be {KINDS[kind]}")
+    raise InvalidArgument(f"{service}: {field.encode_name} is {str(given)[:60]!r}, and must be {TYPES[kind]}")
 
 
 def _fields(kind: type[Record]) -> tuple[msgspec.structs.FieldInfo, ...]:

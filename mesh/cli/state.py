@@ -1,37 +1,36 @@
-"""`aira state`: what agents remember, and how it is kept safe."""
+"""`aira state`: shows, backs up and restores the state of agents."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from mesh.cli.options import with_json, with_settings
+from mesh.cli.options import FILE, with_json, with_settings
 from mesh.cli.output import format_size, plural, print_facts, print_json, print_table, printable, run_sync
 from mesh.running import run_to_end
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from mesh.settings import Settings
     from mesh.state import ArchiveContents, Inventory
-
-FILE = click.Path(dir_okay=False, path_type=Path)
 
 
 @click.group("state")
 def command() -> None:
-    """Look at what the agents of a data folder remember: jobs, signed messages, recordings under way, files by CID; and
-    back it up and restore it. Keyfiles and passwords are never part of it.
+    """Show, back up and restore the state of the agents of a data folder: jobs, signed messages, unfinished recordings,
+    files by CID. Keyfiles and passwords are never part of it.
     """
 
 
-@command.command("show", short_help="what is there, or what is in a backup")
+@command.command("show", short_help="show the state, or what is in a backup")
 @click.argument("file", required=False, type=FILE)
 @with_json
 @with_settings("data_dir")
 def show(settings: Settings, file: Path | None, as_json: bool) -> None:
-    """Print what the agents of the data folder remember, while they run or not. With FILE, what that backup holds: it
-    is read to its end and compared with its checksums.
+    """Print the state of the agents of the data folder, which may run. With FILE, print what is in that backup, after
+    verifying its checksums.
     """
     if file is None:
         run_to_end(lambda: _show(settings.state_directory, as_json=as_json))
@@ -39,41 +38,41 @@ def show(settings: Settings, file: Path | None, as_json: bool) -> None:
         run_sync(lambda: _show_archive(file, as_json=as_json))
 
 
-@command.command("backup", short_help="write it to a file, while agents run")
+@command.command("backup", short_help="write the state to a file, also while agents run")
 @click.argument("file", type=FILE)
 @click.option(
     "--content",
     type=click.Choice(["needed", "all", "none"]),
     default="needed",
     show_default=True,
-    help="files by CID that go along: pinned ones and those that jobs need, all, or none",
+    help="files by CID to include: pinned ones and those that jobs need, all, or none",
 )
 @with_json
 @with_settings("data_dir")
 def backup(settings: Settings, file: Path, content: str, as_json: bool) -> None:
-    """Write what the agents of the data folder remember to FILE (tar.zst), which is replaced in the end.
+    """Write the state of the agents of the data folder to FILE (tar.zst), replacing it at the end.
 
-    The agents may run: the backup is what a crash at one moment would have left.
+    The agents may run: the backup is what a crash at one moment would leave.
     """
     run_to_end(lambda: _back_up(settings.state_directory, file, content, as_json=as_json))
 
 
-@command.command("restore", short_help="put a backup back")
+@command.command("restore", short_help="restore a backup")
 @click.argument("file", type=FILE)
 @click.option(
     "--existing",
     type=click.Choice(["refuse", "set-aside"]),
     default="refuse",
     show_default=True,
-    help="when there is a state already: do nothing, or keep the old one in the folder .replaced-TIME beside the new",
+    help="if there is a state already: refuse, or keep the old one in the folder .replaced-TIME",
 )
 @with_json
 @with_settings("data_dir")
 def restore(settings: Settings, file: Path, existing: str, as_json: bool) -> None:
-    """Put the backup FILE into the data folder, whose agents must not run.
+    """Restore the backup FILE to the data folder, whose agents must not run.
 
-    Nothing is changed unless all of FILE is sound. See to it that the agent from which the backup was taken never runs
-    again: two of one account would do every job twice.
+    Changes nothing unless all of FILE is valid. Make sure that the agent that the backup came from never runs again:
+    two agents of one account would do every job twice.
     """
     run_to_end(lambda: _restore(settings.state_directory, file, existing, as_json=as_json))
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from mesh.cli.amounts import ETH, XRT
+from mesh.cli.errors import NoAnswer
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import (
     format_duration,
@@ -19,7 +20,6 @@ from mesh.cli.output import (
     print_table,
     printable,
 )
-from mesh.errors import RemoteError
 from mesh.running import run_to_end
 from mesh.settings import NetworkSettings, options_of
 from schemas import parse_address
@@ -41,18 +41,18 @@ if TYPE_CHECKING:
 @with_json
 @with_settings(*options_of(NetworkSettings), "lighthouse_contract")
 def status(settings: Settings, address: str | None, timeout: float, as_json: bool) -> None:
-    """Show how whoever has ADDRESS is: an agent, a provider, a bridge. Whether its parts are alive, how far it has
-    read the chain, its jobs or its market.
+    """Show the status of the agent, provider or bridge with ADDRESS: whether its parts are alive, how far it has read
+    the chain, its jobs or its market.
 
-    Without ADDRESS, everybody who is on the lighthouse's channel, a line each; with --json an object for all.
+    Without ADDRESS, show everyone on the lighthouse's channel, a line each; with --json one object for all.
     """
     if address is None:
-        run_to_end(lambda: _everybody(settings, timeout=timeout, as_json=as_json))
+        run_to_end(lambda: show_all(settings, timeout=timeout, as_json=as_json))
     else:
-        run_to_end(lambda: _one(settings, address, timeout=timeout, as_json=as_json))
+        run_to_end(lambda: show_one(settings, address, timeout=timeout, as_json=as_json))
 
 
-async def _one(settings: Settings, named: str, *, timeout: float, as_json: bool) -> None:
+async def show_one(settings: Settings, named: str, *, timeout: float, as_json: bool) -> None:
     from mesh.agent.components import watching
     from mesh.watching import status_of
 
@@ -60,9 +60,9 @@ async def _one(settings: Settings, named: str, *, timeout: float, as_json: bool)
     async with watching(settings) as (network, channel):
         told = await status_of(network.session, address, channel.lighthouse, timeout=timeout)
     if not told:
-        raise RemoteError(
-            f"nobody answers at {address}",
-            hint="is it running, and on the same router? `aira peers` shows who is; a bridge needs its --lighthouse",
+        raise NoAnswer(
+            f"no answer from {address}",
+            hint="is it running, on the same router? `aira peers` lists who is; a bridge needs its --lighthouse",
         )
     if as_json:
         print_json([_status_json(how) for how in told])
@@ -70,10 +70,10 @@ async def _one(settings: Settings, named: str, *, timeout: float, as_json: bool)
     for place, how in enumerate(told):
         if place:
             print_line()
-        print_facts(spoken(how))
+        print_facts(describe_status(how))
 
 
-async def _everybody(settings: Settings, *, timeout: float, as_json: bool) -> None:
+async def show_all(settings: Settings, *, timeout: float, as_json: bool) -> None:
     from mesh.agent.components import watching
     from mesh.watching import present, statuses
 
@@ -84,14 +84,14 @@ async def _everybody(settings: Settings, *, timeout: float, as_json: bool) -> No
         people = [{"role": peer.role, "address": peer.address, "status": _status_json(told[peer])} for peer in peers]
         print_json({"lighthouse": channel.lighthouse, "peers": people})
     elif peers:
-        rows = [(peer.role, peer.address, in_short(told[peer])) for peer in peers]
+        rows = [(peer.role, peer.address, summarize_status(told[peer])) for peer in peers]
         print_table(("role", "address", "how it is"), rows)
     else:
         print_line(f"nobody on {channel.lighthouse}")
 
 
 def _status_json(how: How | None) -> dict[str, Any] | None:
-    """What somebody says of itself, as it travels."""
+    """A status as it is on the wire."""
     return None if how is None else json.loads(how.encode())
 
 
@@ -101,12 +101,12 @@ def _status_json(how: How | None) -> dict[str, Any] | None:
 def peers(settings: Settings, as_json: bool) -> None:
     """Show who is on the lighthouse's channel, by role and address, and how many nodes listen on the IPFS side.
 
-    Who only watches does not show itself. `aira status` asks each of them how it is.
+    Watchers are not listed. `aira status` shows the status of each peer.
     """
-    run_to_end(lambda: _peers(settings, as_json=as_json))
+    run_to_end(lambda: show_peers(settings, as_json=as_json))
 
 
-async def _peers(settings: Settings, *, as_json: bool) -> None:
+async def show_peers(settings: Settings, *, as_json: bool) -> None:
     from mesh.agent.components import watching
     from mesh.watching import present, statuses
     from schemas.status import BridgeStatus
@@ -134,7 +134,7 @@ def _peers_json(lighthouse: str, peers: list[Peer], states: dict[Peer, BridgeSta
 
 
 def _ipfs_side(bridges: list[Peer], states: dict[Peer, BridgeStatus]) -> str:
-    """How many nodes of the legacy network are on the channel, as a bridge says."""
+    """How many nodes of the legacy network are on the channel, according to a bridge."""
     best = _best(states)
     if best is None:
         return "nobody knows: no bridge answers" if bridges else "nobody knows: there is no bridge"
@@ -143,22 +143,22 @@ def _ipfs_side(bridges: list[Peer], states: dict[Peer, BridgeStatus]) -> str:
 
 
 def _best(states: dict[Peer, BridgeStatus]) -> BridgeStatus | None:
-    """The bridge to believe: the one that carries, or the one that sees most nodes."""
+    """The bridge whose count is used: the one that carries messages, or else the one that sees most nodes."""
     return max(states.values(), key=lambda how: (how.carries, len(how.ipfs_peers)), default=None)
 
 
 PHASES: Final = ("incoming", "ready", "running", "complete")
-"""Of jobs that are not at their end."""
+"""The phases of open jobs."""
 
 
-def spoken(how: How) -> dict[str, str]:
-    """All that somebody says of itself, by what it is about."""
-    told = _bridge(how) if isinstance(how, BridgeStatus) else _participant(how)
+def describe_status(how: How) -> dict[str, str]:
+    """A status for people, by names. Its texts come from others, so they are made printable."""
+    told = _describe_bridge(how) if isinstance(how, BridgeStatus) else _describe_participant(how)
     return {printable(name): printable(fact) for name, fact in told.items()}
 
 
-def in_short(how: How | None) -> str:
-    """The same in a line; None is somebody who does not say it."""
+def summarize_status(how: How | None) -> str:
+    """A status in one line; None is a peer that does not answer."""
     if how is None:
         return "does not answer"
     if isinstance(how, BridgeStatus):
@@ -174,15 +174,15 @@ def in_short(how: How | None) -> str:
     return printable(", ".join(words))
 
 
-def _participant(how: Status) -> dict[str, str]:
+def _describe_participant(how: Status) -> dict[str, str]:
     facts: dict[str, str] = {
         how.role: how.address,
         "lighthouse": how.lighthouse,
         **how.parts,
         "block": f"{how.head:,} of chain {how.chain_id}",
     }
-    facts |= {} if how.work is None else _work(how.work)
-    facts |= {} if how.market is None else _market(how.market)
+    facts |= {} if how.work is None else _describe_work(how.work)
+    facts |= {} if how.market is None else _describe_market(how.market)
     return facts | {
         "runs for": format_duration(int(how.uptime) * 10**9),
         "version": how.version,
@@ -190,7 +190,7 @@ def _participant(how: Status) -> dict[str, str]:
     }
 
 
-def _work(work: Work) -> dict[str, str]:
+def _describe_work(work: Work) -> dict[str, str]:
     open_jobs = ", ".join(f"{work.jobs[phase]:,} {phase}" for phase in PHASES if work.jobs.get(phase))
     store, quota = work.store, work.store.quota
     room = "" if quota is None else f" of {format_size(quota)}"
@@ -202,7 +202,7 @@ def _work(work: Work) -> dict[str, str]:
     }
 
 
-def _market(market: MarketStatus) -> dict[str, str]:
+def _describe_market(market: MarketStatus) -> dict[str, str]:
     return {
         "open orders": f"{market.open_orders:,}",
         "contracts": f"{market.created:,} made, {market.finalized:,} finalized",
@@ -212,7 +212,7 @@ def _market(market: MarketStatus) -> dict[str, str]:
     }
 
 
-def _bridge(how: BridgeStatus) -> dict[str, str]:
+def _describe_bridge(how: BridgeStatus) -> dict[str, str]:
     return {
         "bridge": parse_address(how.bridge),
         "lighthouse": how.lighthouse,
@@ -221,22 +221,22 @@ def _bridge(how: BridgeStatus) -> dict[str, str]:
         "daemon": f"{how.daemon or 'not reached yet'} at {how.api}" + (f", {how.dialect}" if how.dialect else ""),
         "IPFS side": plural(len(how.ipfs_peers), "node"),
         "mesh side": plural(len(how.mesh_peers), "peer"),
-        "to IPFS": _way(how.to_ipfs),
-        "to mesh": _way(how.to_mesh),
-        **({} if how.content is None else {"content": _content(how.content)}),
+        "to IPFS": _describe_direction(how.to_ipfs),
+        "to mesh": _describe_direction(how.to_mesh),
+        **({} if how.content is None else {"content": _describe_content(how.content)}),
         "losses": f"{how.losses:,} of the daemon",
         "last error": how.last_error or "none",
         "runs for": format_duration(int(how.uptime) * 10**9),
     }
 
 
-def _content(figures: ContentMetrics) -> str:
+def _describe_content(figures: ContentMetrics) -> str:
     brought = f"{plural(figures.fetched, 'file')} fetched ({format_size(figures.fetched_bytes)})"
     taken = f"{figures.added:,} added ({format_size(figures.added_bytes)})"
     return f"{brought}, {taken}, {plural(figures.answered, 'block')} given, {figures.lies:,} false ones refused"
 
 
-def _way(way: DirectionStatus) -> str:
+def _describe_direction(way: DirectionStatus) -> str:
     refused = f", {_counts(way.invalid)} refused" if way.invalid else ""
     return (
         f"{way.carried:,} carried ({way.per_second:.1f}/s), {way.waiting:,} waiting, "
@@ -245,7 +245,7 @@ def _way(way: DirectionStatus) -> str:
 
 
 def _counts(counts: Mapping[str, int]) -> str:
-    """How many in all, and of which kind."""
+    """The total, and the count of each kind."""
     kinds = ", ".join(f"{count:,} {kind}" for kind, count in sorted(counts.items()))
     return f"{sum(counts.values()):,}" + (f" ({kinds})" if kinds else "")
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from mesh.cli.errors import AnvilMissing
 from mesh.cli.options import BLOCK_TIME, PORT, with_json, with_settings
 from mesh.cli.output import announce, print_json
-from mesh.errors import ConfigurationError
 from mesh.running import run_until_stopped
 from mesh.settings import Settings, TelemetrySettings, options_of
 from mesh.telemetry.serving import Telemetry
@@ -22,33 +22,31 @@ if TYPE_CHECKING:
 
 
 def with_engine(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a command the options `engine`, `anvil` and `state`, which `chosen` understands."""
+    """Give a command the options `--engine`, `--anvil` and `--state`, the arguments of `find_engine`."""
     engine = click.option(
         "--engine",
         type=click.Choice(["auto", "anvil", "embedded"]),
         default="auto",
         show_default=True,
-        help="what runs the chain; auto takes anvil where it is found",
+        help="what runs the chain; auto uses anvil if it is found",
     )
-    anvil = click.option("--anvil", type=click.Path(path_type=Path), help="the program anvil [the one on the path]")
+    anvil = click.option("--anvil", type=click.Path(path_type=Path), help="the program anvil [found on the path]")
     kept = click.Path(dir_okay=False, path_type=Path)
-    state = click.option("--state", type=kept, help="file that anvil keeps the chain in")
+    state = click.option("--state", type=kept, help="file in which anvil keeps the chain")
     return engine(anvil(state(function)))
 
 
 def find_engine(*, engine: str, anvil: Path | None, state: Path | None) -> Path | None:
-    """The program anvil, or None for the embedded chain. Raises `ConfigurationError`."""
+    """The program anvil, or None for the embedded chain. Raises `AnvilMissing`."""
     from mesh.devchain.anvil import find_anvil
 
     program = None if engine == "embedded" else find_anvil(anvil)
     if engine == "anvil" and program is None:
-        raise ConfigurationError(
-            "anvil is not on the path", hint="name it with --anvil FILE, or take --engine embedded, which needs nothing"
-        )
+        raise AnvilMissing("anvil is not on the path", hint="name it with --anvil FILE, or use --engine embedded")
     if state is not None and program is None:
-        raise ConfigurationError(
-            "only anvil can keep the chain in a file, and the embedded chain was "
-            + ("asked for" if engine == "embedded" else "taken, as anvil is not on the path"),
+        raise AnvilMissing(
+            "--state needs anvil, and "
+            + ("--engine embedded was given" if engine == "embedded" else "anvil is not on the path"),
             hint="name anvil with --anvil FILE, or leave --state out",
         )
     return program
@@ -62,20 +60,24 @@ log = logging.getLogger(__name__)
     "--port", type=PORT, default=8545, show_default=True, help="port of the chain's JSON-RPC; 0 takes a free one"
 )
 @click.option(
-    "--block-time", type=BLOCK_TIME, default=1.0, show_default=True, help="mine an empty block every so many seconds"
+    "--block-time",
+    type=BLOCK_TIME,
+    default=1.0,
+    show_default=True,
+    help="seconds between blocks, which are mined also if empty",
 )
 @with_engine
 @with_settings("listen", "data_dir", *options_of(TelemetrySettings))
 def command(settings: Settings, port: int, block_time: float, **engine: Any) -> None:
-    """Run a market to develop on: a Zenoh router, a chain with the contracts, and a provider. Ctrl-C ends it.
+    """Run a market for development: a Zenoh router, a chain with the contracts, and a provider. Ctrl-C ends it, and
+    the chain is lost unless --state keeps it.
 
-    The chain is gone then, unless --state keeps it. The keyfiles of a robot and a person with money are written to the
-    data folder; what to do with them is printed.
+    Writes the keyfiles of a robot and a person with funds to the data folder, and prints how to use them.
     """
-    run_until_stopped(lambda: _serve_market(settings, port, block_time, **engine), settings=settings, role="up")
+    run_until_stopped(lambda: serve_market(settings, port, block_time, **engine), settings=settings, role="up")
 
 
-async def _serve_market(
+async def serve_market(
     settings: Settings,
     port: int,
     block_time: float,
@@ -116,17 +118,16 @@ log = logging.getLogger(__name__)
 @click.command("up")
 @click.option("--host", default="127.0.0.1", show_default=True, help="address to listen at")
 @click.option("--port", type=PORT, default=8545, show_default=True, help="port to listen at; 0 takes a free one")
-@click.option("--block-time", type=BLOCK_TIME, help="also mine an empty block every so many seconds")
+@click.option("--block-time", type=BLOCK_TIME, help="also mine an empty block at this interval, in seconds")
 @with_engine
 @with_json
 @with_settings("data_dir", *options_of(TelemetrySettings))
 def chain_up(settings: Settings, host: str, port: int, block_time: float | None, as_json: bool, **engine: Any) -> None:
-    """Serve a chain with the contracts on it, as JSON-RPC over HTTP and WebSocket.
+    """Serve a chain with the contracts on it, as JSON-RPC over HTTP and WebSocket. Ctrl-C ends it, and the chain is
+    lost unless --state keeps it.
 
-    It is gone when this ends (Ctrl-C), unless --state keeps it.
-
-    The keyfiles of three accounts with money (provider, robot, person) are written to the data folder. Their keys are
-    known to all the world: they are for development alone.
+    Writes the keyfiles of three accounts with funds (provider, robot, person) to the data folder. Their keys are
+    public: use them for development only.
     """
 
     async def serve() -> None:
@@ -149,7 +150,7 @@ def chain_up(settings: Settings, host: str, port: int, block_time: float | None,
 
 
 async def _show_health(url: str, telemetry: Telemetry) -> None:
-    """Tell how the chain at `url` is, if anybody is to be told, until cancelled."""
+    """Serve metrics and health of the chain at `url`, if the settings ask for it, until cancelled."""
     from mesh.chain import Node
     from mesh.devchain.monitor import ChainMonitor
 

@@ -1,8 +1,9 @@
-"""`aira verify`: a recording as evidence."""
+"""`aira verify`: checks a recording as evidence of a job."""
 
 from __future__ import annotations
 
 import asyncio
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -10,12 +11,13 @@ import click
 import msgspec
 
 from mesh.cli.chain_client import open_chain
-from mesh.cli.files import MESH, fetch, opened_store, require_readable
+from mesh.cli.errors import InvalidOptions
+from mesh.cli.files import FETCH_SETTINGS, fetch, opened_store, require_readable
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import plural, print_facts, print_json, print_table, printable, progress
-from mesh.errors import AiraError, InputError
+from mesh.errors import AiraError
 from mesh.evidence import Claim, Verdict, check_end, verify
-from mesh.running import run_to_end
+from mesh.running import report, run_to_end
 from mesh.settings import ChainSettings, options_of
 from schemas import parse_address
 
@@ -28,12 +30,12 @@ MARKS: Final = {True: "holds", False: "FAILS", None: "open"}
 
 @click.command("verify")
 @click.argument("liability", required=False)
-@click.option("--objective", type=FILE, help="the objective's file, instead of fetching it by its CID")
-@click.option("--result", type=FILE, help="the recording, instead of fetching it by its CID")
-@click.option("--message", type=FILE, help="the Result message as it travelled (JSON)")
-@click.option("--offline", is_flag=True, help="ask no chain; what only a contract can tell stays open")
+@click.option("--objective", type=FILE, help="the objective's file [fetched by its CID]")
+@click.option("--result", type=FILE, help="the recording's file [fetched by its CID]")
+@click.option("--message", type=FILE, help="the Result message as it was sent (JSON)")
+@click.option("--offline", is_flag=True, help="don't read the contract; checks that need it stay open")
 @with_json
-@with_settings(*dict.fromkeys((*MESH, *options_of(ChainSettings))))
+@with_settings(*dict.fromkeys((*FETCH_SETTINGS, *options_of(ChainSettings))))
 def command(
     settings: Settings,
     liability: str | None,
@@ -44,39 +46,44 @@ def command(
     as_json: bool,
 ) -> None:
     """Check the objective and the recording of LIABILITY, an address, against each other and against the contract: the
-    files by their CIDs, who signed, that the recording is whole and this job's, and that it plays what was asked for.
+    files by their CIDs, the signature, that the recording is complete and of this job, and that it plays the objective.
 
-    Without a LIABILITY it needs --objective and --result, no chain and no network.
+    Without LIABILITY it needs --objective and --result, but no chain and no network.
 
-    A line for each thing: it holds, fails, or stays open as nothing tells. Exit code 0: nothing fails; 1: something
-    does; 2: it could not be looked at.
+    Each check holds, fails, or stays open for lack of information. The exit code is 0 if none fails, 1 if one fails,
+    and 2 if they could not be made.
     """
-    holds = True
+    exit_code = 0
 
     async def main() -> None:
-        nonlocal holds
-        files = Files(objective=objective, result=result, message=message)
+        nonlocal exit_code
+        files = VerifiedFiles(objective=objective, result=result, message=message)
         try:
-            holds = await _verify(settings, liability, files, offline=offline, as_json=as_json)
-        except AiraError as error:  # whose fault it is does not matter here: exit code 1 is for what does not hold
-            raise InputError(str(error), hint=error.hint) from error
+            holds = await verify_job(settings, liability, files, offline=offline, as_json=as_json)
+            exit_code = 0 if holds else 1
+        except AiraError as error:  # of any kind: exit code 1 says that the recording does not hold
+            report(error)
+            exit_code = 2
 
     run_to_end(main)
-    if not holds:
-        raise SystemExit(1)
+    sys.exit(exit_code)
 
 
-class Files(msgspec.Struct, frozen=True, kw_only=True):
-    """The files that were given."""
+class VerifiedFiles(msgspec.Struct, frozen=True, kw_only=True):
+    """The files that the options name."""
 
     objective: Path | None
     result: Path | None
     message: Path | None
 
 
-async def _verify(settings: Settings, liability: str | None, files: Files, *, offline: bool, as_json: bool) -> bool:
+async def verify_job(
+    settings: Settings, liability: str | None, files: VerifiedFiles, *, offline: bool, as_json: bool
+) -> bool:
     if (liability is None or offline) and None in (files.objective, files.result):
-        raise InputError("without a contract there is nothing to fetch", hint="give --objective and --result")
+        raise InvalidOptions(
+            "without a liability to look up, both files are needed", hint="give --objective and --result"
+        )
     message = None if files.message is None else await asyncio.to_thread(require_readable(files.message).read_bytes)
     claim = await _claim(settings, liability, offline=offline)
     verdict = await _verdict(settings, claim, files, message)
@@ -96,7 +103,7 @@ async def _claim(settings: Settings, liability: str | None, *, offline: bool) ->
         return Claim.of_contract(await chain.liabilities.get(liability))
 
 
-async def _verdict(settings: Settings, claim: Claim, files: Files, message: bytes | None) -> Verdict:
+async def _verdict(settings: Settings, claim: Claim, files: VerifiedFiles, message: bytes | None) -> Verdict:
     if files.result is None and not claim.result:
         return Verdict((check_end(claim),))
     async with opened_store(settings) as store:

@@ -35,26 +35,28 @@ if TYPE_CHECKING:
 
 
 @click.command("watch")
-@click.option("--model", help="only what concerns this model (CID)")
-@click.option("--open", "with_open", is_flag=True, help="begin with the orders that are open now")
-@click.option("--readings", is_flag=True, help="show what Results without a contract hold, such as a sensor's readings")
+@click.option("--model", help="only events of this model (CID)")
+@click.option("--open", "with_open", is_flag=True, help="start with the orders that are open now")
+@click.option(
+    "--readings", is_flag=True, help="show the content of results without a contract, such as sensor readings"
+)
 @with_json
 @with_settings(*options_of(NetworkSettings), "lighthouse_contract", "xrt_contract")
 def command(settings: Settings, model: str | None, with_open: bool, readings: bool, as_json: bool) -> None:
-    """Tell what happens on a lighthouse, a line each: orders, rejections, contracts and their work, Results. Ctrl-C
+    """Print what happens on a lighthouse, a line each: orders, rejections, contracts and their work, results. Ctrl-C
     ends it.
 
-    It needs a router, no account and no chain. Orders and Results are shown when their signatures are right; what is
-    refused is counted, and said at the end, or when SIGUSR1 comes. With --json an object a line, amounts in the
-    token's smallest unit. With --model, Results are those of contracts whose agents have told of them meanwhile.
+    Needs a router, but no account and no chain. Only orders and results with valid signatures are shown; refused
+    messages are counted, and the counts printed at the end and on SIGUSR1. --json prints an object on each line, with
+    amounts in the token's smallest unit. With --model, results are those of contracts seen since the start.
 
-    That a contract was made is what agents say; `aira liability watch` asks the chain.
+    Contracts are reported by agents; `aira liability watch` reads them from the chain.
     """
     configure_logging(level="warning")
-    run_until_stopped(lambda: _watch(settings, model, with_open=with_open, readings=readings, as_json=as_json))
+    run_until_stopped(lambda: watch(settings, model, with_open=with_open, readings=readings, as_json=as_json))
 
 
-async def _watch(
+async def watch(
     settings: Settings, model: str | None, *, with_open: bool, as_json: bool, readings: bool = False
 ) -> None:
     from mesh.agent.components import watching
@@ -64,11 +66,11 @@ async def _watch(
         parse_cid(model)
     async with AsyncExitStack() as stack:
         network, channel = await stack.enter_async_context(watching(settings))
-        words = None if as_json else Words(await _xrt(settings, network.session, channel))
+        words = None if as_json else EventFormatter(await _xrt(settings, network.session, channel))
         tell = partial(_tell, words)
         looking = await stack.enter_async_context(Readings(network.session, tell)) if readings else None
         seen = await stack.enter_async_context(MarketWatch(network.session, channel, model=model or "*"))
-        tasks = await stack.enter_async_context(_beside(network, seen))
+        tasks = await stack.enter_async_context(_report_beside(network, seen))
         if not as_json:
             click.echo(f"watching {channel.lighthouse}; Ctrl-C ends it", err=True)
         if with_open:
@@ -79,8 +81,8 @@ async def _watch(
                 looking.see(something)
 
 
-def _tell(words: Words | None, something: Seen | Reading) -> None:
-    """Print what happened: in `words` for people, as JSON where there are none."""
+def _tell(words: EventFormatter | None, something: Seen | Reading) -> None:
+    """Print an event: with `words` for people, else as JSON."""
 
     now = datetime.now(UTC)
     if words is None:
@@ -90,8 +92,8 @@ def _tell(words: Words | None, something: Seen | Reading) -> None:
 
 
 @asynccontextmanager
-async def _beside(network: Network, seen: MarketWatch) -> AsyncIterator[Background]:
-    """Meanwhile say to stderr when the router is lost, and what was refused when SIGUSR1 asks for it and at the end."""
+async def _report_beside(network: Network, seen: MarketWatch) -> AsyncIterator[Background]:
+    """Print to stderr when the router is lost, and the counters on SIGUSR1 and at the end."""
     loop = asyncio.get_running_loop()
 
     def tell() -> None:
@@ -103,7 +105,7 @@ async def _beside(network: Network, seen: MarketWatch) -> AsyncIterator[Backgrou
             tasks.start(_say_losses(network), "network losses")
             tasks.start(wait_for_broken_pipe(), "readers of stdout")
             yield tasks
-    except asyncio.CancelledError:  # by Ctrl-C; who has closed the pipe wants to hear no more
+    except asyncio.CancelledError:  # by Ctrl-C; a closed pipe ends quietly
         tell()
         raise
     finally:
@@ -111,7 +113,7 @@ async def _beside(network: Network, seen: MarketWatch) -> AsyncIterator[Backgrou
 
 
 def format_counters(tally: Tally) -> str:
-    """What came by, in a line for people."""
+    """The counters in a line for people."""
     reasons = ", ".join(f"{count:,} {reason}" for reason, count in sorted(tally.refused.items()))
     refused = f"{sum(tally.refused.values()):,} refused" + (f" ({reasons})" if reasons else "")
     lost = f", {tally.lost:,} lost as this reader was too slow" if tally.lost else ""
@@ -125,9 +127,9 @@ async def _say_losses(network: Network) -> None:
 
 
 async def _xrt(settings: Settings, session: zenoh.Session, channel: Channel) -> str | None:
-    """The address of XRT: the one of the settings or, where these have a name, what the market's providers say.
+    """The address of XRT: from the settings or, if they have a name for it, from the market's providers.
 
-    None where nobody says it, or not all the same.
+    None if no provider answers, or they disagree.
     """
     from mesh.watching import present, statuses
     from schemas.status import Status
@@ -141,20 +143,20 @@ async def _xrt(settings: Settings, session: zenoh.Session, channel: Channel) -> 
     return named.pop() if len(named) == 1 else None
 
 
-LONGEST: Final = 200
-"""Letters of what somebody says that are shown."""
+LONGEST_TEXT: Final = 200
+"""The most characters of a text from others that are shown."""
 
 
-DIGITS: Final = 8
-"""Of an order's hash in a line; with --json there are all 64."""
+HASH_DIGITS: Final = 8
+"""Digits of an order's hash in a line; JSON has all 64."""
 
 
-KIND: Final = 9
-"""Letters of the longest word for what happened."""
+EVENT_WIDTH: Final = 9
+"""Columns of the event's name."""
 
 
 def event_json(seen: Seen | Reading, *, time: str) -> dict[str, Any]:
-    """Something that happened at `time` (ISO 8601), for programs. Amounts are text, in the smallest unit."""
+    """An event at `time` (ISO 8601) for JSON. Amounts are text, in the smallest unit."""
     match seen:
         case Verified():
             message = seen.message
@@ -193,29 +195,29 @@ def _order_facts(order: Demand | Offer) -> dict[str, Any]:
     }
 
 
-class Words:
-    """What happened, in a line for people. `xrt` is the address of XRT, as far as it is known."""
+class EventFormatter:
+    """Formats events as lines for people. `xrt` is the address of XRT, None if unknown."""
 
     def __init__(self, xrt: str | None) -> None:
         self._xrt = xrt
 
     def line(self, seen: Seen | Reading) -> str:
-        """The line, without the time."""
+        """The line of an event, without the time."""
         match seen:
             case Verified():
                 message, kind = seen.message, type(seen.message).__name__.lower()
                 words = self._result(message, seen.signer) if isinstance(message, Result) else self._order(seen)
             case Rejection():
-                why = printable(seen.detail[:LONGEST] or seen.reason[:LONGEST])
-                kind, words = "rejected", f"{seen.order[:DIGITS]} by {short_address(seen.provider)}: {why}"
+                why = printable(seen.detail[:LONGEST_TEXT] or seen.reason[:LONGEST_TEXT])
+                kind, words = "rejected", f"{seen.order[:HASH_DIGITS]} by {short_address(seen.provider)}: {why}"
             case Reading():
                 kind, words = "reading", f"{printable(seen.topic)}  {_shown(seen)}, from {short_address(seen.signer)}"
             case JobEvent(_, kind, liability):
                 words = self._work(liability)
-        return f"{kind:<{KIND}}  {words}"
+        return f"{kind:<{EVENT_WIDTH}}  {words}"
 
     def cost(self, amount: int, token: str) -> str:
-        """An amount of a token."""
+        """An amount of a token with its unit."""
         return (XRT if token == self._xrt else Unit(f"units of {short_address(token)}", 0)).show(amount)
 
     def _order(self, seen: Verified[Any]) -> str:
@@ -227,7 +229,7 @@ class Words:
             fee = f" and {XRT.show(order.lighthouse_fee)} to the provider" if order.lighthouse_fee else ""
         terms = f"{self.cost(order.cost, order.token)}{fee}, model {_short_cid(order.model)}"
         more = f"objective {_short_cid(order.objective)}, until block {order.deadline:,}"
-        return f"{seen.hash.hex()[:DIGITS]}  {seen.signer} {does} {terms}, {more}"
+        return f"{seen.hash.hex()[:HASH_DIGITS]}  {seen.signer} {does} {terms}, {more}"
 
     def _result(self, result: Result, signer: str) -> str:
         return f"{result.result}  {_ended(result.success)}, for {result.liability}, signed by {short_address(signer)}"
@@ -238,7 +240,7 @@ class Words:
 
 
 def _value(reading: Reading) -> Any:
-    """What was read as JSON has it; bytes become base64."""
+    """The value of a reading for JSON, in which bytes become base64."""
     match reading.value:
         case Empty():
             return None
@@ -251,11 +253,11 @@ def _value(reading: Reading) -> Any:
 def _shown(reading: Reading) -> str:
     value = _value(reading)
     text = value if isinstance(value, str) else msgspec.json.encode(value).decode()
-    return printable(text[:LONGEST] + ("…" if len(text) > LONGEST else ""))
+    return printable(text[:LONGEST_TEXT] + ("…" if len(text) > LONGEST_TEXT else ""))
 
 
 def _short_cid(cid: str) -> str:
-    """A CID in a line in which something else is the one to copy."""
+    """The ends of a CID, for a line in which another one is to be copied."""
     return f"{cid[:6]}…{cid[-4:]}"
 
 

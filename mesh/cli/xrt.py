@@ -25,25 +25,25 @@ if TYPE_CHECKING:
     from mesh.cli.amounts import Unit
     from mesh.settings import Settings
 
-with_token = click.option("--token", help="ENS name or address of another ERC-20, in whose own units amounts are [XRT]")
+with_token = click.option("--token", help="ENS name or address of another ERC-20, whose units amounts are in [XRT]")
 
 
 @click.group("xrt")
 def command() -> None:
-    """Tokens: XRT, which stakes and fees are paid in, or any other ERC-20.
+    """Tokens: XRT, in which stakes and fees are paid, or any other ERC-20.
 
-    An AMOUNT alone counts whole tokens: 1.5 is one and a half XRT. With the ending wn (10^-9 XRT), or units for any
-    token, it counts the smallest unit: 1500000000wn is the same. JSON has the smallest unit, as text.
+    An AMOUNT alone counts whole tokens: 1.5 is one and a half XRT. With the suffix wn (10^-9 XRT), or units for any
+    token, it counts the smallest unit: 1500000000wn is the same amount. JSON has the smallest unit, as text.
     """
 
 
-@command.command("balance", short_help="show what an account holds")
+@command.command("balance", short_help="show an account's balance")
 @click.argument("account", required=False)
 @with_token
 @with_json
 @with_chain_settings()
 def balance(settings: Settings, **what: Any) -> None:
-    """Show what ACCOUNT (an address or ENS name; by default the settings' account) holds."""
+    """Show the balance of ACCOUNT (an address or ENS name; by default the settings' account)."""
     run_to_end(lambda: _balance(settings, **what))
 
 
@@ -53,19 +53,19 @@ async def _balance(settings: Settings, *, account: str | None, token: str | None
         unit = await unit_of(chain, token)
         amount = await chain.tokens.balance(owner, token=token)
         if as_json:
-            print_json({"account": owner, **await _about(chain, token, unit), "balance": str(amount)})
+            print_json({"account": owner, **await _token_json(chain, token, unit), "balance": str(amount)})
         else:
             print_line(unit.show(amount))
 
 
-@command.command("allowance", short_help="show what somebody may take from an account")
+@command.command("allowance", short_help="show how much a spender may take from an account")
 @click.argument("spender", default=FACTORY)
-@click.option("--owner", help="address or ENS name of who allows it [the settings' account]")
+@click.option("--owner", help="address or ENS name of the owner [the settings' account]")
 @with_token
 @with_json
 @with_chain_settings()
 def allowance(settings: Settings, **what: Any) -> None:
-    """Show what SPENDER may take from the account: `factory` (the default), a lighthouse's name, or an address."""
+    """Show how much SPENDER may take from the account: `factory` (the default), a lighthouse's name, or an address."""
     run_to_end(lambda: _allowance(settings, **what))
 
 
@@ -75,22 +75,22 @@ async def _allowance(settings: Settings, *, spender: str, owner: str | None, tok
         unit = await unit_of(chain, token)
         amount = await chain.tokens.allowance(whose, by, token=token)
         if as_json:
-            about = await _about(chain, token, unit)
+            about = await _token_json(chain, token, unit)
             print_json({"owner": whose, "spender": by, **about, "allowance": str(amount)})
         else:
             print_line(unit.show(amount))
 
 
-@command.command("approve", short_help="let somebody take up to an amount")
+@command.command("approve", short_help="allow a spender to take up to an amount")
 @click.argument("spender")
 @click.argument("amount")
 @with_token
 @with_json
 @with_signing_settings()
 def approve(settings: Settings, **what: Any) -> None:
-    """Let SPENDER take up to AMOUNT from the account, instead of what it might take before; 0 takes it back.
+    """Allow SPENDER to take up to AMOUNT from the account, instead of the previous allowance; 0 revokes it.
 
-    SPENDER is `factory` (which takes costs and fees), a lighthouse's name (stakes), an ENS name or an address.
+    SPENDER is `factory` (for costs and fees), a lighthouse's name (for stakes), an ENS name or an address.
     """
     run_to_end(lambda: _approve(settings, **what))
 
@@ -102,7 +102,7 @@ async def _approve(settings: Settings, *, spender: str, amount: str, token: str 
         with notice_when_slow():
             tx = await chain.tokens.approve(by, value, token=token)
         if as_json:
-            print_json({"spender": by, **await _about(chain, token, unit), "allowance": str(value), "tx": tx})
+            print_json({"spender": by, **await _token_json(chain, token, unit), "allowance": str(value), "tx": tx})
         else:
             print_facts({"spender": by, "may take": unit.show(value), "transaction": tx})
 
@@ -127,13 +127,13 @@ async def _transfer(settings: Settings, *, to: str, amount: str, token: str | No
             tx = await chain.tokens.transfer(recipient, value, token=token)
         left = await chain.tokens.balance(token=token)
         if as_json:
-            about = await _about(chain, token, unit)
+            about = await _token_json(chain, token, unit)
             print_json({"to": recipient, **about, "amount": str(value), "balance": str(left), "tx": tx})
         else:
             print_facts({"sent": unit.show(value), "to": recipient, "left": unit.show(left), "transaction": tx})
 
 
-async def _about(chain: Chain, token: str | None, unit: Unit) -> dict[str, Any]:
-    """The token, for programs."""
+async def _token_json(chain: Chain, token: str | None, unit: Unit) -> dict[str, Any]:
+    """The token for JSON."""
     address = chain.xrt if token is None else await chain.names.address(token)
     return {"token": address, "symbol": unit.symbol, "decimals": unit.decimals}

@@ -1,4 +1,4 @@
-"""The command line in processes of its own: run to the end, interrupted, or serving."""
+"""The command line: run to its end in this process or its own, interrupted, or serving."""
 
 from __future__ import annotations
 
@@ -9,12 +9,19 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
+from click.testing import CliRunner
+
+from mesh.errors import ConfigurationError, InputError
 from tests.support.processes import Server
 from tests.support.waiting import wait_until
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
+
+    from click.testing import Result
+
+    from mesh.errors import AiraError
 
 AIRA = (sys.executable, "-m", "mesh")
 SECONDS = 120.0
@@ -27,10 +34,49 @@ def aira(*arguments: str | Path, **variables: str) -> subprocess.CompletedProces
     return run(*AIRA, *arguments, **variables)
 
 
+def invoke(*arguments: str | Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    """The same in this process, which takes a fraction of the time. Not for tests that run in an event loop."""
+    from mesh.cli import main
+
+    words = [str(word) for word in arguments]
+    inherited: dict[str, str | None] = {name: None for name in os.environ if name.startswith("AIRA_")}
+    done = CliRunner().invoke(main, words, env=inherited | variables, catch_exceptions=False)
+    return subprocess.CompletedProcess(words, done.exit_code, done.stdout, done.stderr)
+
+
 def run(*command: str | Path, **variables: str) -> subprocess.CompletedProcess[str]:
     """Run a command to its end."""
     words = [str(word) for word in command]
     return subprocess.run(words, env=environment(variables), capture_output=True, text=True, timeout=SECONDS)
+
+
+def refused(
+    done: subprocess.CompletedProcess[str] | Result,
+    error: type[AiraError],
+    *values: object,
+    exit_code: int | None = None,
+) -> str:
+    """Assert that a command failed with this error (or a subclass) in one line with its code and these values.
+
+    Returns the hint. The exit code must be the error's, unless another is given.
+    """
+    code = done.returncode if isinstance(done, subprocess.CompletedProcess) else done.exit_code
+    own = 2 if issubclass(error, InputError | ConfigurationError) else 1
+    lines = done.stderr.splitlines()
+    place = next((number for number, line in enumerate(lines) if line.startswith("aira: ")), len(lines))
+    assert code == (own if exit_code is None else exit_code), (done.stdout, done.stderr)
+    assert done.stdout == ""
+    assert len(lines) - place in (1, 2), done.stderr
+    assert lines[place].rpartition(" ")[2] in {f"[{one.code}]" for one in _with_subclasses(error)}, lines[place]
+    for value in values:
+        assert str(value) in lines[place], lines[place]
+    return lines[place + 1].strip() if lines[place + 1 :] else ""
+
+
+def _with_subclasses(error: type[AiraError]) -> Iterator[type[AiraError]]:
+    yield error
+    for subclass in error.__subclasses__():
+        yield from _with_subclasses(subclass)
 
 
 class Interrupted:

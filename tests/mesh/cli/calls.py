@@ -16,11 +16,3 @@ if TYPE_CHECKING:
 
 def call(*words: str | Path, given: bytes | None = None) -> Result:
     return CliRunner().invoke(main, ["objective", *map(str, words)], input=given)
-
-
-def refused(done: Result, said: str, *, code: int = 2) -> None:
-    """One clear line, and what to do."""
-    assert done.exit_code == code, done.output
-    (line,) = [line for line in done.stderr.splitlines() if line.startswith("aira: ")]
-    assert said in line
-    assert "Traceback" not in done.stderr

@@ -195,17 +195,6 @@ class Town:
                 await chain.tokens.approve(chain.factory, MONEY)
 
 
-def refused(done: Done, code: int, words: str) -> str:
-    """Assert that a command said what is wrong in a line, and perhaps what to do in another; that hint."""
-    line, *hint = done.stderr.splitlines()
-    assert done.exit_code == code, done.output
-    assert done.stdout == ""
-    assert line.startswith("aira: ")
-    assert words in line
-    assert len(hint) <= 1
-    return hint[0].strip() if hint else ""
-
-
 def columns(text: str) -> dict[str, str]:
     """What is printed in two columns, by the first one."""
     pairs = (line.split("  ", 1) for line in text.splitlines() if "  " in line)

@@ -16,9 +16,19 @@ import pytest
 from click.testing import CliRunner
 
 from mesh.chain import XRT, Account, WrongPassword
+from mesh.chain.accounts import KeyfileError
 from mesh.cli import main
+from mesh.cli.errors import (
+    AccountMissing,
+    FileExists,
+    FileUnwritable,
+    InvalidOptions,
+    InvalidPrivateKey,
+    PasswordFileUnusable,
+)
+from mesh.errors import AiraError, ConfigurationError, InputError
 from tests.mesh.cli.chains import PASSWORD, columns, write_quick_keyfile
-from tests.support.commands import AIRA
+from tests.support.commands import AIRA, refused
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -67,8 +77,7 @@ def test_a_keyfile_is_never_overwritten(made: tuple[Path, Path, Result], tmp_pat
     keyfile, _, _ = made
     before = keyfile.read_bytes()
     done = account("new", keyfile, "--password-file", tmp_path / "password")
-    assert done.exit_code == 2
-    assert done.stderr.startswith(f"aira: {keyfile} exists already\n")
+    refused(done, FileExists, keyfile)
     assert keyfile.read_bytes() == before
     assert not (tmp_path / "password").exists(), "no password without an account"
 
@@ -91,8 +100,7 @@ def test_an_empty_password_is_refused(tmp_path: Path, content: bytes) -> None:
     password = tmp_path / "password"
     password.write_bytes(content)
     done = account("new", tmp_path / "key.json", "--password-file", password)
-    assert done.exit_code == 2
-    assert done.stderr.startswith(f"aira: the password file {password} is empty\n")
+    refused(done, PasswordFileUnusable, password, "empty")
     assert not (tmp_path / "key.json").exists()
 
 
@@ -100,35 +108,30 @@ def test_a_password_file_that_can_not_be_read_is_one_clear_line(tmp_path: Path) 
     password = tmp_path / "password"
     password.write_bytes(b"\xff\xfe")
     done = account("new", tmp_path / "key.json", "--password-file", password)
-    assert done.exit_code == 2
-    assert done.stderr.startswith(f"aira: can't use the password file {password}: ")
-    assert len(done.stderr.splitlines()) == 1
+    refused(done, PasswordFileUnusable, password)
 
 
 def test_a_folder_that_can_not_be_made_is_one_clear_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     done = account("new", tmp_path / "file" / "key.json", "--password-file", tmp_path / "password")
-    assert done.exit_code == 2
-    assert len(done.stderr.splitlines()) == 1
+    refused(done, FileUnwritable)
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("content", "error"),
     [
-        (None, "can't read the keyfile"),
-        ("not json", "is not a keyfile"),
-        ("[]", "is not a keyfile"),
-        ("{}", "does not say its address"),
+        (None, KeyfileError),
+        ("not json", KeyfileError),
+        ("[]", KeyfileError),
+        ("{}", AccountMissing),
     ],
 )
-def test_what_is_no_keyfile_is_one_clear_line(tmp_path: Path, content: str | None, words: str) -> None:
+def test_what_is_no_keyfile_is_one_clear_line(tmp_path: Path, content: str | None, error: type[AiraError]) -> None:
     keyfile = tmp_path / "key.json"
     if content is not None:
         keyfile.write_text(content)
     done = account("show", keyfile)
-    assert done.exit_code == 2
-    assert words in done.stderr.splitlines()[0]
-    assert done.stdout == ""
+    refused(done, error, keyfile)
 
 
 KEY = "4c0883a69102937d6231471b5dbb6204fe5129617082792ae468d01a3f362318"
@@ -160,8 +163,7 @@ def test_new_and_show_speak_json(made: tuple[Path, Path, Result], tmp_path: Path
 def test_show_is_of_the_settings_account_unless_a_keyfile_is_given(made: tuple[Path, Path, Result]) -> None:
     assert account("show", "--keyfile", made[0]).stdout == made[2].stdout
     done = account("show")
-    assert (done.exit_code, done.stdout) == (2, "")
-    assert done.stderr.startswith("aira: no account is named, and keyfile is not set\n")
+    refused(done, AccountMissing)
 
 
 def test_show_asks_the_chain_for_what_the_account_holds(town: Town) -> None:
@@ -203,17 +205,14 @@ def test_the_password_of_the_other_keyfile_may_come_from_the_standard_input(tmp_
     assert_imported(tmp_path, done)
     (tmp_path / "key.json").unlink()
     done = imported(tmp_path, "--from-keyfile", old, given="guessed\n")
-    assert (done.exit_code, "does not open it" in done.stderr) == (2, True)
+    refused(done, WrongPassword)
     assert "guessed" not in done.output
 
 
 @pytest.mark.parametrize("given", ["", "\n", "a key", KEY[:-1], KEY + "00", "0" * 64, "g" + KEY[1:], "0x" + "é" * 64])
 def test_what_is_no_private_key_is_refused_without_showing_it(tmp_path: Path, given: str) -> None:
     done = imported(tmp_path, given=given)
-    assert (done.exit_code, done.stdout) == (2, "")
-    assert done.stderr.startswith("aira: ")
-    assert len(done.stderr.splitlines()) <= 2
-    assert "private key" in done.stderr.splitlines()[0]
+    refused(done, InputError, "private key")
     assert not given.strip() or given.strip() not in done.output
     assert not (tmp_path / "key.json").exists()
 
@@ -221,30 +220,29 @@ def test_what_is_no_private_key_is_refused_without_showing_it(tmp_path: Path, gi
 def test_a_key_is_not_taken_as_an_argument(tmp_path: Path) -> None:
     for written in (KEY, "0x" + KEY):
         done = account("import", tmp_path / written, "--password-file", tmp_path / "password")
-        assert (done.exit_code, KEY in done.output) == (2, False)
-        assert "looks like a private key" in done.stderr
+        refused(done, InvalidPrivateKey)
+        assert KEY not in done.output
     assert list(tmp_path.iterdir()) == []
 
 
 def test_an_import_overwrites_nothing_and_asks_for_nothing_then(tmp_path: Path) -> None:
     (tmp_path / "key.json").write_text("mine")
     done = imported(tmp_path)
-    assert (done.exit_code, "exists already" in done.stderr) == (2, True)
+    refused(done, FileExists, tmp_path / "key.json")
     assert (tmp_path / "key.json").read_text() == "mine"
 
 
 def test_a_key_has_one_source(tmp_path: Path) -> None:
     both = imported(tmp_path, "--private-key-file", tmp_path / "a", "--from-keyfile", tmp_path / "b")
-    assert (both.exit_code, "not from both" in both.stderr) == (2, True)
+    refused(both, InvalidOptions, "--private-key-file", "--from-keyfile")
     lone = imported(tmp_path, "--from-password-file", tmp_path / "a", given=KEY)
-    assert (lone.exit_code, "goes with --from-keyfile" in lone.stderr) == (2, True)
+    refused(lone, InvalidOptions, "--from-password-file", "--from-keyfile")
 
 
 def test_a_missing_source_is_one_clear_line(tmp_path: Path) -> None:
     for option in ("--private-key-file", "--from-keyfile"):
         done = imported(tmp_path, option, tmp_path / "missing", given="x")
-        assert done.exit_code == 2
-        assert "No such file" in done.stderr.splitlines()[0]
+        refused(done, ConfigurationError, "No such file")
 
 
 class Typing:

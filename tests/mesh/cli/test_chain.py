@@ -10,15 +10,20 @@ import pytest
 
 from mesh.chain import XRT, Account, Chain, TransactionSender, new_private_key
 from mesh.chain.artifacts import is_code_of, load_artifact
+from mesh.chain.errors import InsufficientFunds, NoContracts, NodeUnreachable
 from mesh.cli.chain import DEPLOYMENT_GAS
-from tests.mesh.cli.chains import Town, columns, refused, write_quick_keyfile
-from tests.support.commands import aira
+from mesh.cli.errors import AlreadyDeployed, InvalidAmount, InvalidLighthouse
+from mesh.errors import ConfigurationError, InvalidAddress
+from tests.mesh.cli.chains import Town, columns, write_quick_keyfile
+from tests.support.commands import invoke, refused
 from tests.support.nodes import Anvil
 from tests.support.ports import free_port
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
+
+    from mesh.errors import AiraError
 
 DEPLOY = ("chain", "deploy", "--lighthouse", "first", "--minimal-stake", "2.5", "--timeout-blocks", "7")
 
@@ -55,7 +60,7 @@ def test_a_deployment_says_all_addresses_and_can_be_used_with_the_settings_that_
 
 def test_a_second_deployment_has_to_be_asked_for(desert: Town) -> None:
     first = desert.told(*DEPLOY, by="provider")
-    hint = refused(desert.aira(*DEPLOY, by="provider"), 2, f"has the contracts already (factory {first['factory']})")
+    hint = refused(desert.aira(*DEPLOY, by="provider"), AlreadyDeployed, first["factory"])
     assert "--again" in hint
     second = desert.told(*DEPLOY, "--again", by="provider")
     assert second["factory"] != first["factory"]
@@ -74,30 +79,30 @@ def test_an_account_that_can_not_pay_for_all_of_it_deploys_nothing(desert: Town,
             await TransactionSender(node, desert.people["person"].account).send(to=address, data=b"", value=10**15)
 
     desert.run(give())
-    hint = refused(desert.aira(*DEPLOY, AIRA_KEYFILE=str(keyfile)), 1, f"{address} has 0.001 ETH")
+    hint = refused(desert.aira(*DEPLOY, AIRA_KEYFILE=str(keyfile)), InsufficientFunds, address, "0.001 ETH")
     assert "send ETH" in hint
     assert columns(desert.aira("chain", "status").stdout)["block"].startswith("1, ")
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "error", "value"),
     [
-        (("--lighthouse", "Bad Name"), "can't be the name of a lighthouse"),
-        (("--minimal-stake", "0"), "a minimal stake of 0 XRT"),
-        (("--minimal-stake", "much"), "'much' is not an amount"),
+        (("--lighthouse", "Bad Name"), InvalidLighthouse, "Bad Name"),
+        (("--minimal-stake", "0"), InvalidLighthouse, "0 XRT"),
+        (("--minimal-stake", "much"), InvalidAmount, "much"),
     ],
 )
 def test_what_the_factory_would_refuse_at_the_end_is_refused_before_the_beginning(
-    desert: Town, options: tuple[str, str], words: str
+    desert: Town, options: tuple[str, str], error: type[AiraError], value: str
 ) -> None:
-    refused(desert.aira(*DEPLOY, *options), 2, words)
+    refused(desert.aira(*DEPLOY, *options), error, value)
     assert columns(desert.aira("chain", "status").stdout)["block"].startswith("0, ")
 
 
 def test_a_deployment_needs_an_account_and_a_node(desert: Town) -> None:
-    refused(desert.aira(*DEPLOY, AIRA_KEYFILE=""), 2, "this needs an account")
+    refused(desert.aira(*DEPLOY, AIRA_KEYFILE=""), ConfigurationError, "account")
     nowhere = f"http://127.0.0.1:{free_port()}"
-    refused(desert.aira(*DEPLOY, AIRA_WEB3_HTTP_PROVIDER=nowhere), 1, "no Ethereum node answers")
+    refused(desert.aira(*DEPLOY, AIRA_WEB3_HTTP_PROVIDER=nowhere), NodeUnreachable, nowhere)
 
 
 def test_status_of_a_chain_without_contracts_tells_of_the_node_and_what_is_missing(desert: Town) -> None:
@@ -109,7 +114,7 @@ def test_status_of_a_chain_without_contracts_tells_of_the_node_and_what_is_missi
     assert said["account"] == f"{desert.people['person'].address}  1,000,000 ETH"
     assert "factory" not in said
     line, hint = done.stderr.splitlines()
-    assert "has no ENS registry" in line
+    assert line.endswith(f"[{NoContracts.code}]")
     assert "aira chain deploy" in hint
 
 
@@ -174,10 +179,10 @@ def test_contracts_can_be_deployed_to_a_node_of_others(tmp_path: Path) -> None:
             "AIRA_KEYFILE_PASSWORD_FILE": str(tmp_path / "password"),
             "AIRA_DATA_DIR": str(tmp_path / "state"),
         }
-        done = aira(*DEPLOY, "--json", **variables)
+        done = invoke(*DEPLOY, "--json", **variables)
         assert done.returncode == 0, done.stderr
         told = json.loads(done.stdout)
-        status = aira("chain", "status", "--json", **variables, AIRA_ENS_CONTRACT=told["ens"])
+        status = invoke("chain", "status", "--json", **variables, AIRA_ENS_CONTRACT=told["ens"])
         assert json.loads(status.stdout)["isOurCode"] is True
 
 
@@ -202,17 +207,17 @@ ON_A_CHAIN = [
 
 def test_a_chain_without_the_contracts_is_one_clear_line_in_every_command(desert: Town) -> None:
     for command in ON_A_CHAIN:
-        hint = refused(desert.aira(*command), 1, "has no ENS registry")
+        hint = refused(desert.aira(*command), NoContracts)
         assert "aira chain deploy" in hint, command
 
 
 @pytest.mark.parametrize("command", [ON_A_CHAIN[0], ON_A_CHAIN[8], ON_A_CHAIN[12], ("chain", "status")])
 def test_a_node_that_is_not_there_is_one_clear_line(town: Town, command: tuple[str, ...]) -> None:
     nowhere = f"http://127.0.0.1:{free_port()}"
-    hint = refused(town.aira(*command, AIRA_WEB3_HTTP_PROVIDER=nowhere), 1, f"no Ethereum node answers at {nowhere}")
+    hint = refused(town.aira(*command, AIRA_WEB3_HTTP_PROVIDER=nowhere), NodeUnreachable, nowhere)
     assert "aira chain up" in hint
 
 
 def test_what_is_no_node_is_one_clear_line(town: Town) -> None:
-    refused(town.aira("xrt", "balance", AIRA_WEB3_HTTP_PROVIDER="localhost"), 2, "'localhost' is not the address of")
-    refused(town.aira("xrt", "balance", AIRA_ENS_CONTRACT="0x12"), 2, "'0x12' is not an address")
+    refused(town.aira("xrt", "balance", AIRA_WEB3_HTTP_PROVIDER="localhost"), ConfigurationError, "localhost")
+    refused(town.aira("xrt", "balance", AIRA_ENS_CONTRACT="0x12"), InvalidAddress, "0x12")

@@ -16,10 +16,12 @@ from click.testing import CliRunner
 
 from mesh.chain import XRT, Chain
 from mesh.cli import main
+from mesh.cli.errors import AnvilMissing
 from mesh.devchain.development import serve_chain
+from mesh.errors import ConfigurationError
 from mesh.settings import Settings
-from tests.mesh.cli.chains import columns, refused
-from tests.support.commands import AIRA, SOON, Serving, aira
+from tests.mesh.cli.chains import columns
+from tests.support.commands import AIRA, SOON, Serving, aira, refused
 from tests.support.development import variables_of
 from tests.support.peers import require
 from tests.support.ports import answers, free_port
@@ -96,7 +98,7 @@ def test_a_crash_of_anvil_is_told_and_ends_the_command(tmp_path: Path) -> None:
     with up(tmp_path, "--anvil", require("anvil"), port=free_port()) as server:
         os.kill(child_of(server.pid), signal.SIGKILL)
         wait_until(lambda: not is_running(server.pid), what="the end of the command")
-        assert "aira: anvil ended by itself, by signal 9\n" in server.log()
+        assert "signal 9 [node-ended]\n" in server.log()
         assert "Traceback" not in server.log()
         assert server._running().wait(30) == 1
 
@@ -141,15 +143,15 @@ def test_the_embedded_chain_can_be_asked_for(tmp_path: Path, on_path: dict[str, 
 
 
 def test_anvil_that_is_not_there_is_one_clear_line(tmp_path: Path) -> None:
-    hint = refused(failing("--engine", "anvil", PATH=str(tmp_path)), 2, "anvil is not on the path")
+    hint = refused(failing("--engine", "anvil", PATH=str(tmp_path)), AnvilMissing)
     assert "--engine embedded" in hint
-    refused(failing("--anvil", tmp_path / "anvil"), 2, "is not a program that can be run")
+    refused(failing("--anvil", tmp_path / "anvil"), ConfigurationError, tmp_path / "anvil")
 
 
 def test_the_embedded_chain_can_not_be_kept(tmp_path: Path) -> None:
     state = ("--state", tmp_path / "chain.json")
-    assert "--anvil FILE" in refused(failing(*state, PATH=str(tmp_path)), 2, "only anvil can keep the chain in a file")
-    refused(failing(*state, "--engine", "embedded"), 2, "the embedded chain was asked for")
+    assert "--anvil FILE" in refused(failing(*state, PATH=str(tmp_path)), AnvilMissing, "--state")
+    refused(failing(*state, "--engine", "embedded"), AnvilMissing, "--engine embedded")
 
 
 @pytest.mark.parametrize("engine", ["anvil", "embedded"])
@@ -157,14 +159,14 @@ def test_a_taken_port_is_one_clear_line(tmp_path: Path, engine: str, on_path: di
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         done = failing("--engine", engine, "--port", str(port), "--data-dir", tmp_path, **on_path)
-        hint = refused(done, 2, f"can't listen on 127.0.0.1:{port}: Address already in use")
+        hint = refused(done, ConfigurationError, f"127.0.0.1:{port}", "Address already in use")
         assert "choose another port" in hint
 
 
 def test_a_state_that_is_none_is_one_clear_line(tmp_path: Path) -> None:
     (tmp_path / "state.json").write_text("garbage")
     options = ("--anvil", require("anvil"), "--state", tmp_path / "state.json", "--port", "0", "--data-dir", tmp_path)
-    refused(failing(*options), 2, "holds no chain of anvil")
+    refused(failing(*options), ConfigurationError)
 
 
 async def test_a_transaction_that_is_not_mined_can_be_left_and_is_not_sent_twice(tmp_path: Path) -> None:

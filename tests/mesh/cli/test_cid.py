@@ -11,8 +11,9 @@ import pytest
 from click.testing import CliRunner
 
 from mesh.cli import main
+from mesh.cli.errors import FileUnreadable
 from schemas import cid_of_bytes
-from tests.support.commands import aira, run
+from tests.support.commands import aira, refused, run
 
 if TYPE_CHECKING:
     from click.testing import Result
@@ -50,13 +51,12 @@ def test_a_dash_is_the_standard_input() -> None:
 def test_a_missing_file_is_one_clear_line(tmp_path: Path) -> None:
     missing = tmp_path / "missing"
     done = cid(missing)
-    assert done.exit_code == 2
-    assert done.stderr == f"aira: can't read {missing}: No such file or directory\n"
+    refused(done, FileUnreadable, missing, "No such file or directory")
 
 
 def test_a_folder_is_one_clear_line(tmp_path: Path) -> None:
     done = cid(tmp_path)
-    assert (done.exit_code, done.stderr) == (2, f"aira: can't read {tmp_path}: Is a directory\n")
+    refused(done, FileUnreadable, tmp_path, "Is a directory")
 
 
 def test_without_files_it_says_how_it_is_used() -> None:

@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from mesh.cli.errors import HealthUnavailable, InvalidServerAddress
+from mesh.errors import ConfigurationError
 from mesh.settings import Settings
 from schemas.status import ALIVE
-from tests.support.commands import AIRA, Serving, aira
+from tests.support.commands import AIRA, Serving, invoke, refused
 from tests.support.ports import free_port
 from tests.support.scraping import health, scraped
 from tests.support.waiting import until_found
@@ -55,11 +57,11 @@ def test_a_router_is_well_and_the_exit_code_says_so(listen: str) -> None:
     with Serving(
         *AIRA, "router", "--listen", f"tcp/127.0.0.1:{free_port()}", "--metrics-listen", listen, says="without a roster"
     ):
-        done = aira("health", "--url", f"http://{listen}")
+        done = invoke("health", "--url", f"http://{listen}")
         assert (done.returncode, done.stdout) == (0, "router  alive\n")
-        as_json = aira("health", "--json", AIRA_METRICS_LISTEN=listen)
+        as_json = invoke("health", "--json", AIRA_METRICS_LISTEN=listen)
         assert json.loads(as_json.stdout) == {"ok": True, "parts": {"router": "alive"}}
-        everywhere = aira("health", AIRA_METRICS_LISTEN=f"0.0.0.0:{listen.split(':')[1]}")
+        everywhere = invoke("health", AIRA_METRICS_LISTEN=f"0.0.0.0:{listen.split(':')[1]}")
         assert (everywhere.returncode, everywhere.stdout) == (0, "router  alive\n")
 
 
@@ -76,7 +78,7 @@ async def test_aira_up_tells_the_markets_of_both_generations_apart(listen: str, 
         figures = await scraped(url)
         assert figures.of_label("aira_orders_open", "lighthouse") == {THIRD, FIFTH}
         assert figures("aira_account_eth_wei") > 0
-        assert aira("health", "--url", url).returncode == 0
+        assert invoke("health", "--url", url).returncode == 0
 
 
 async def test_a_chain_tells_how_high_it_is(listen: str, tmp_path: Path) -> None:
@@ -94,7 +96,7 @@ async def test_a_chain_tells_how_high_it_is(listen: str, tmp_path: Path) -> None
 async def test_a_provider_that_waits_for_its_node_says_so(listen: str, tmp_path: Path) -> None:
     keyfile, password = tmp_path / "key.json", tmp_path / "password"
     password.write_text("open sesame\n")
-    assert aira("account", "new", keyfile, "--password-file", password).returncode == 0
+    assert invoke("account", "new", keyfile, "--password-file", password).returncode == 0
     node = f"http://127.0.0.1:{free_port()}"
     variables = {"AIRA_KEYFILE": str(keyfile), "AIRA_KEYFILE_PASSWORD_FILE": str(password)}
     options = ("--connect-timeout", "-1", "--web3-http-provider", node, "--data-dir", tmp_path)
@@ -106,7 +108,7 @@ async def test_a_provider_that_waits_for_its_node_says_so(listen: str, tmp_path:
         assert status == 503
         assert parts["start"].startswith("waits: ")
         assert node in parts["start"]
-        done = aira("health", "--url", url)
+        done = invoke("health", "--url", url)
         assert (done.returncode, done.stderr) == (1, "")
         assert done.stdout.startswith("start  waits: ")
 
@@ -115,37 +117,32 @@ async def test_a_provider_that_waits_for_its_node_says_so(listen: str, tmp_path:
 def test_a_port_that_is_taken_is_one_clear_line(command: tuple[str, ...], tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         place = f"127.0.0.1:{taken.getsockname()[1]}"
-        done = aira(
+        done = invoke(
             *command,
             "--metrics-listen",
             place,
             AIRA_DATA_DIR=str(tmp_path),
             AIRA_LISTEN=f"tcp/127.0.0.1:{free_port()}",
         )
-    assert done.returncode == 2
-    assert done.stderr.startswith(f"aira: can't tell metrics and health at {place}: Address already in use\n")
-    assert len(done.stderr.splitlines()) == 2
+    assert refused(done, ConfigurationError, place, "Address already in use")
 
 
 def test_a_place_that_is_none_is_one_clear_line() -> None:
-    done = aira("router", "--metrics-listen", "9464", AIRA_LISTEN=f"tcp/127.0.0.1:{free_port()}")
+    done = invoke("router", "--metrics-listen", "9464", AIRA_LISTEN=f"tcp/127.0.0.1:{free_port()}")
 
-    assert done.returncode == 2
-    assert done.stderr.startswith("aira: '9464' is no HOST:PORT to tell metrics at\n")
+    refused(done, ConfigurationError, "'9464'")
 
 
 def test_where_nobody_answers_is_one_clear_line_and_code_1(listen: str) -> None:
-    done = aira("health", "--url", f"http://{listen}")
+    done = invoke("health", "--url", f"http://{listen}")
 
-    assert done.returncode == 1
-    assert done.stderr.startswith(f"aira: nobody tells its health at {listen}: Connection refused\n")
+    refused(done, HealthUnavailable, listen, "Connection refused")
 
 
 def test_a_host_that_can_not_be_one_is_one_clear_line_and_code_1() -> None:
-    done = aira("health", "--url", "http://no..host:9464")
+    done = invoke("health", "--url", "http://no..host:9464")
 
-    assert done.returncode == 1
-    assert done.stderr.startswith("aira: nobody tells its health at no..host:9464: ")
+    refused(done, HealthUnavailable, "no..host:9464")
 
 
 def test_a_demand_leaves_metrics_to_the_servers_with_the_same_settings(listen: str, tmp_path: Path) -> None:
@@ -155,19 +152,16 @@ def test_a_demand_leaves_metrics_to_the_servers_with_the_same_settings(listen: s
     with socket.create_server((host, int(port))):
         options = ("--model", "Qm" + "a" * 44, "--objective", objective, "--keyfile", tmp_path / "none.json")
         password = ("--keyfile-password-file", tmp_path / "none")
-        done = aira("demand", *options, *password, AIRA_METRICS_LISTEN=listen)
+        done = invoke("demand", *options, *password, AIRA_METRICS_LISTEN=listen)
 
-    assert done.returncode != 0
-    assert "password file" in done.stderr
+    refused(done, ConfigurationError, "password file")
 
 
 def test_who_does_not_answer_in_time_is_one_clear_line_and_code_1() -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
-        done = aira("health", "--url", f"http://127.0.0.1:{silent.getsockname()[1]}", "--timeout", "0.2")
+        done = invoke("health", "--url", f"http://127.0.0.1:{silent.getsockname()[1]}", "--timeout", "0.2")
 
-    assert done.returncode == 1
-    assert done.stderr.startswith("aira: nobody tells its health at 127.0.0.1:")
-    assert "timed out" in done.stderr
+    refused(done, HealthUnavailable, "127.0.0.1:", "timed out")
 
 
 @pytest.mark.parametrize(
@@ -175,15 +169,14 @@ def test_who_does_not_answer_in_time_is_one_clear_line_and_code_1() -> None:
 )
 def test_what_is_no_server_of_the_mesh_is_one_clear_line_and_code_1(answer: bytes) -> None:
     with answering(answer) as url:
-        done = aira("health", "--url", url)
+        done = invoke("health", "--url", url)
 
-    assert done.returncode == 1
-    assert "is no server of the mesh" in done.stderr
+    refused(done, HealthUnavailable, url.removeprefix("http://"))
 
 
 def test_what_is_said_can_not_steer_the_terminal() -> None:
     with answering(b'HTTP/1.0 503 No\r\n\r\n{"ok": false, "parts": {"a\\u001b[2J": "b\\u001b[31m"}}') as url:
-        done = aira("health", "--url", url)
+        done = invoke("health", "--url", url)
 
     assert done.returncode == 1
     assert "\x1b" not in done.stdout
@@ -193,17 +186,15 @@ def test_what_is_said_can_not_steer_the_terminal() -> None:
     "url", ["127.0.0.1:9464", "https://127.0.0.1:9464", "http://127.0.0.1", "http://[", "http://:x"]
 )
 def test_an_address_that_is_none_is_one_clear_line_and_code_2(url: str) -> None:
-    done = aira("health", "--url", url)
+    done = invoke("health", "--url", url)
 
-    assert done.returncode == 2
-    assert done.stderr.startswith(f"aira: {url!r} is not the address of a server\n")
+    refused(done, InvalidServerAddress, repr(url))
 
 
 def test_without_an_address_it_says_what_to_give() -> None:
-    done = aira("health")
+    done = invoke("health")
 
-    assert done.returncode == 2
-    assert "--url" in done.stderr
+    assert "--url" in refused(done, InvalidServerAddress)
 
 
 def test_it_loads_little() -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from mesh.identity import read_roster
 from tests.mesh.cli.test_identity import ARM, OTHER, made, site
-from tests.support.commands import aira
+from tests.support.commands import invoke
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -23,7 +23,7 @@ def test_only_what_expires_soon_is_renewed_by_a_timer(tmp_path: Path, site: Path
     )
     command = ("identity", "renew", tmp_path / "soon", tmp_path / "later", "--site", site, "--roster", roster)
 
-    done = aira(*command, "--within", "30", "--json")
+    done = invoke(*command, "--within", "30", "--json")
 
     renewed, left = map(json.loads, done.stdout.splitlines())
     assert renewed["validUntil"] > str(soon["validUntil"])
@@ -32,14 +32,14 @@ def test_only_what_expires_soon_is_renewed_by_a_timer(tmp_path: Path, site: Path
         renewed["fingerprint"],
         later["fingerprint"],
     ]
-    again = aira(*command, "--within", "30").stdout
+    again = invoke(*command, "--within", "30").stdout
     assert again.splitlines() == ["arm is valid for 89 more days", "leg is valid for 30 more days"]
 
 
 def test_one_that_can_t_be_renewed_does_not_hold_up_the_others(tmp_path: Path, site: Path) -> None:
     made(tmp_path / "arm", site, "--address", ARM, "--role", "agent", "--days", "1")
 
-    done = aira("identity", "renew", tmp_path / "nobody", tmp_path / "arm", "--site", site, "--within", "30")
+    done = invoke("identity", "renew", tmp_path / "nobody", tmp_path / "arm", "--site", site, "--within", "30")
 
     assert done.returncode == 2
     assert f"{tmp_path}/nobody/identity.pem: it can't be read" in done.stderr
@@ -57,7 +57,7 @@ def test_the_revoked_are_not_renewed_and_each_failure_is_told(tmp_path: Path, si
     before = (tmp_path / "gone" / "identity.pem").read_bytes()
 
     folders = [tmp_path / "nobody", tmp_path / "gone", tmp_path / "leg"]
-    done = aira("identity", "renew", *folders, "--site", site, "--roster", roster, "--within", "30")
+    done = invoke("identity", "renew", *folders, "--site", site, "--roster", roster, "--within", "30")
 
     assert done.returncode == 2
     assert "nobody/identity.pem: it can't be read" in done.stderr
@@ -74,9 +74,9 @@ def test_a_certificate_is_renewed_where_its_key_is_not(tmp_path: Path, site: Pat
     key = (folder / "identity.key").read_bytes()
     (folder / "identity.key").unlink()
 
-    done = aira("identity", "renew", folder, "--site", site)
+    done = invoke("identity", "renew", folder, "--site", site)
 
     assert done.returncode == 0
     (folder / "identity.key").write_bytes(key)
-    shown = json.loads(aira("identity", "show", folder, "--json").stdout)  # the two are a pair
+    shown = json.loads(invoke("identity", "show", folder, "--json").stdout)  # the two are a pair
     assert shown["fingerprint"] != before["fingerprint"]

@@ -7,7 +7,19 @@ from itertools import count
 import pytest
 
 from mesh.chain import XRT
-from tests.mesh.cli.chains import Town, columns, refused
+from mesh.chain.errors import UnknownName
+from mesh.cli.errors import (
+    BalanceTooLow,
+    InvalidAmount,
+    InvalidLighthouse,
+    InvalidOptions,
+    InvalidStake,
+    NameTaken,
+    NotALighthouse,
+    NotAProvider,
+)
+from tests.mesh.cli.chains import Town, columns
+from tests.support.commands import refused
 
 _numbers = count(1)
 
@@ -110,47 +122,47 @@ def test_info_of_an_empty_lighthouse_says_how_to_join(town: Town, market: str) -
 
 def test_a_taken_name_is_one_clear_line(town: Town) -> None:
     done = town.aira("lighthouse", "create", "airalab")
-    assert refused(done, 1, "airalab.lighthouse.3.robonomics.eth is taken") == "choose another name"
+    assert refused(done, NameTaken, "airalab.lighthouse.3.robonomics.eth") == "choose another name"
 
 
 @pytest.mark.parametrize("name", ["Airalab", "a b", "a.b", "", "a" * 33])
 def test_a_name_that_can_not_be_is_one_clear_line(town: Town, name: str) -> None:
-    refused(town.aira("lighthouse", "create", name), 2, "can't be the name of a lighthouse")
+    refused(town.aira("lighthouse", "create", name), InvalidLighthouse, repr(name))
 
 
 @pytest.mark.parametrize("stake", ["0", "0wn", str(2**128) + "wn"])
 def test_a_minimal_stake_that_can_not_be_is_one_clear_line(town: Town, stake: str) -> None:
-    refused(town.aira("lighthouse", "create", "staked", "--minimal-stake", stake), 2, "a minimal stake of")
+    refused(town.aira("lighthouse", "create", "staked", "--minimal-stake", stake), InvalidLighthouse)
 
 
 def test_a_stake_below_the_minimum_is_one_clear_line(town: Town, market: str) -> None:
-    hint = refused(town.aira("lighthouse", "join", market, "1.5"), 2, "1.5 XRT is below the minimum of 2 XRT")
+    hint = refused(town.aira("lighthouse", "join", market, "1.5"), InvalidStake, "1.5 XRT", "2 XRT")
     assert hint == "stake 2 XRT or more"
-    refused(town.aira("lighthouse", "join", market, "0"), 2, "nothing can't be added")
+    refused(town.aira("lighthouse", "join", market, "0"), InvalidStake)
 
 
 def test_a_stake_that_the_account_does_not_have_is_one_clear_line(town: Town, market: str) -> None:
-    refused(town.aira("lighthouse", "join", market, "3", by="stranger"), 1, "has 0 XRT, and 3 XRT are needed")
+    refused(town.aira("lighthouse", "join", market, "3", by="stranger"), BalanceTooLow, "0 XRT", "3 XRT")
 
 
 def test_leaving_without_a_stake_is_one_clear_line(town: Town, market: str) -> None:
-    refused(town.aira("lighthouse", "leave", market), 1, f"has no stake at {market}")
+    refused(town.aira("lighthouse", "leave", market), NotAProvider, market)
 
 
 def test_taking_off_more_than_is_staked_is_one_clear_line(town: Town, market: str) -> None:
     town.told("lighthouse", "join", market, "3")
-    refused(town.aira("lighthouse", "leave", market, "3.5"), 2, "3.5 XRT can't be taken off a stake of 3 XRT")
+    refused(town.aira("lighthouse", "leave", market, "3.5"), InvalidStake, "3.5 XRT", "3 XRT")
 
 
 def test_an_unknown_lighthouse_is_one_clear_line(town: Town) -> None:
     for command in (("info", "nowhere"), ("join", "nowhere", "1"), ("leave", "nowhere")):
-        refused(town.aira("lighthouse", *command), 1, "'nowhere.lighthouse.3.robonomics.eth' is not known")
+        refused(town.aira("lighthouse", *command), UnknownName, "nowhere.lighthouse.3.robonomics.eth")
 
 
 def test_what_is_no_lighthouse_is_one_clear_line(town: Town) -> None:
     address = town.deployment.xrt
     for command in (("info", address), ("join", address, "1"), ("leave", address)):
-        refused(town.aira("lighthouse", *command), 1, f"{address} is not a lighthouse of this factory")
+        refused(town.aira("lighthouse", *command), NotALighthouse, address)
 
 
 def test_without_a_name_the_settings_lighthouse_is_joined_and_left(town: Town, market: str) -> None:
@@ -161,8 +173,8 @@ def test_without_a_name_the_settings_lighthouse_is_joined_and_left(town: Town, m
 
 
 def test_words_in_a_wrong_order_or_number_are_one_clear_line(town: Town, market: str) -> None:
-    hint = refused(town.aira("lighthouse", "join", "20", market), 2, f"'{market}' is not an amount")
+    hint = refused(town.aira("lighthouse", "join", "20", market), InvalidAmount, market)
     assert hint == f"the lighthouse comes first: {market} 20"
-    assert f"join {market} 20" in refused(town.aira("lighthouse", "join", market), 2, "a VALUE is missing")
-    refused(town.aira("lighthouse", "join", market, "much"), 2, "'much' is not an amount")
-    refused(town.aira("lighthouse", "leave", market, "1", "2"), 2, "too many words")
+    assert f"join {market} 20" in refused(town.aira("lighthouse", "join", market), InvalidOptions, "VALUE")
+    refused(town.aira("lighthouse", "join", market, "much"), InvalidAmount, "much")
+    refused(town.aira("lighthouse", "leave", market, "1", "2"), InvalidOptions)

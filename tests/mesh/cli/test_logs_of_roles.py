@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from mesh.cli.errors import InvalidArgument
 from schemas import cid_of_file
 from tests.mesh.cli.following import Follower
-from tests.support.commands import AIRA, SECONDS, Serving, aira
+from tests.support.commands import AIRA, SECONDS, Serving, aira, invoke, refused
 from tests.support.development import variables_of
 from tests.support.orders import ROBOT
 from tests.support.ports import free_port
@@ -67,18 +68,18 @@ class JsonMarket:
         return variables_of(role, self.folder, url=f"http://127.0.0.1:{self.port}", connect=self.endpoint)
 
     def address(self, role: str) -> str:
-        found: str = aira("account", "show", "--json", **self.variables(role)).stdout
+        found: str = invoke("account", "show", "--json", **self.variables(role)).stdout
         return str(json.loads(found)["address"])
 
     def logs(self, role: str, *options: str) -> list[dict[str, Any]]:
-        done = aira("logs", self.addresses[role], "--json", *options, AIRA_CONNECT=self.endpoint)
+        done = invoke("logs", self.addresses[role], "--json", *options, AIRA_CONNECT=self.endpoint)
         assert (done.returncode, done.stderr) == (0, "")
         return [json.loads(line) for line in done.stdout.splitlines()]
 
     def do_a_job(self) -> str:
         """Have a job done and paid; the address of its contract."""
         order = ("--model", cid_of_file(EXAMPLES / "model.md"), "--objective", EXAMPLES / "blink.mcap", "--cost", "1wn")
-        done = aira("demand", *order, **self.variables("person"))
+        done = invoke("demand", *order, **self.variables("person"))
         assert done.returncode == 0, done.stderr
         found = re.search(r"contract (0x\w{40})", done.stdout)
         assert found
@@ -134,7 +135,7 @@ def test_the_events_of_a_job_are_found_by_its_contract_with_agent_and_provider(m
 
 def test_people_read_the_same_as_in_the_roles_own_log_and_nothing_steers_their_terminal(market: JsonMarket) -> None:
     liability = market.do_a_job()
-    done = aira("logs", market.addresses["robot"], "--liability", liability, AIRA_CONNECT=market.endpoint)
+    done = invoke("logs", market.addresses["robot"], "--liability", liability, AIRA_CONNECT=market.endpoint)
     assert done.returncode == 0
     lines = done.stdout.splitlines()
     assert all(line.isprintable() for line in lines)
@@ -175,20 +176,20 @@ def test_following_goes_on_over_restarts_of_the_agent(market: JsonMarket) -> Non
 
 
 def test_the_service_can_be_called_as_any_other(market: JsonMarket) -> None:
-    done = aira("rpc", market.addresses["robot"], "logs", "lines=1", "level=info", AIRA_CONNECT=market.endpoint)
+    done = invoke("rpc", market.addresses["robot"], "logs", "lines=1", "level=info", AIRA_CONNECT=market.endpoint)
     assert done.returncode == 0, done.stderr
     events = [line for line in done.stdout.splitlines() if not line.startswith("    | ")]
     assert len(events) == 1
     assert all(re.match(r"\d\d:\d\d:\d\d (INFO   |ERROR  ) ", line) for line in events)
-    wrong = aira("rpc", market.addresses["robot"], "logs", "lines=many", AIRA_CONNECT=market.endpoint)
-    assert (wrong.returncode, "has to be a whole number" in wrong.stderr) == (2, True)
+    wrong = invoke("rpc", market.addresses["robot"], "logs", "lines=many", AIRA_CONNECT=market.endpoint)
+    refused(wrong, InvalidArgument, "lines")
 
 
 def test_an_edge_agent_tells_its_log_by_its_device(router: EmbeddedRouter, tmp_path: Path) -> None:
     command = ("edge", tmp_path / "no-board", "--agent", ROBOT.address.lower(), "--connect", router.endpoint)
     with Serving(*AIRA, *command, says="edge of 0x", variables={"AIRA_LOG_FORMAT": "json"}) as edge:
         edge.wait_until_said("waiting")
-        done = aira("logs", ROBOT.address, "--device", "board", "--json", AIRA_CONNECT=router.endpoint)
+        done = invoke("logs", ROBOT.address, "--device", "board", "--json", AIRA_CONNECT=router.endpoint)
         assert done.returncode == 0, done.stderr
         told = [json.loads(line) for line in done.stdout.splitlines()]
         written = [json.loads(line) for line in edge.log().splitlines()]
@@ -205,7 +206,7 @@ def test_a_bridge_tells_its_log_by_its_address(router: EmbeddedRouter, tmp_path:
         bridge.wait_until_said("warning")
         written = [json.loads(line) for line in bridge.log().splitlines()]
         address = next(one["bridge"] for one in written if "bridge" in one)
-        done = aira("logs", address, "--json", AIRA_CONNECT=router.endpoint)
+        done = invoke("logs", address, "--json", AIRA_CONNECT=router.endpoint)
     told = [json.loads(line) for line in done.stdout.splitlines()]
     assert [one["message"] for one in told][: len(written)] == [one["message"] for one in written]
     assert {(one["role"], one["address"].lower()) for one in told} == {("bridge", address)}

@@ -8,14 +8,27 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from mesh.cli.errors import (
+    FileExists,
+    FileUnreadable,
+    FileUnwritable,
+    FolderMissing,
+    InvalidDestination,
+    InvalidOptions,
+    NotAFileOrCid,
+    PackageMissing,
+)
 from mesh.content import Store
+from mesh.errors import AiraError, InvalidCid
 from mesh.recording import Recorder, RecordingAbout, open_objective
+from mesh.recording.errors import NotARecording, RecordingError, RecordingExists
+from mesh.recording.packing import InvalidLine
 from schemas import cid_of_bytes, cid_of_file
 from schemas.payloads import JSON, STRING, String
-from tests.mesh.cli.calls import call, refused
+from tests.mesh.cli.calls import call
 from tests.mesh.recording.files import T0, with_messages
 from tests.support.bags import Bag, BagMessage, string
-from tests.support.commands import run
+from tests.support.commands import refused, run
 from tests.support.objectives import objective
 
 if TYPE_CHECKING:
@@ -75,43 +88,43 @@ def test_a_bag_is_packed_without_losing_anything(tmp_path: Path) -> None:
 
 def test_a_line_that_is_wrong_is_named_and_nothing_is_written(tmp_path: Path) -> None:
     done = call("pack", "-", "--out", tmp_path / "it.mcap", given=LINES + b'{"topic": "blink"}\n')
-    refused(done, "aira: line 4: 'blink' is not a key of the mesh: a topic begins with /")
+    refused(done, InvalidLine, "line 4", "blink")
     assert not (tmp_path / "it.mcap").exists()
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "error", "value"),
     [
-        (["pack", "--out", "new"], "an objective is made of a SOURCE or of what is heard"),
-        (["pack", "-", "--hear", "a", "--out", "new"], "an objective is made of a SOURCE or of what is heard"),
-        (["pack", "missing", "--out", "new"], "can't read missing: No such file or directory"),
-        (["pack", "missing", "--out", "/"], "/ is there already"),
-        (["pack", "-", "--out", "nowhere/new"], "there is no folder nowhere"),
-        (["pack", "--hear", "a//b", "--out", "new"], "'a//b' is no key expression"),
-        (["show", "missing"], "'missing' is neither a file nor a CID"),
-        (["show", "."], "can't read .: it is a folder"),
-        (["convert", "missing"], "can't read missing: No such file or directory"),
-        (["add", "missing"], "can't read missing: No such file or directory"),
-        (["recover", "missing"], "can't read missing: No such file or directory"),
-        (["check", "missing"], "'missing' is neither a file nor a CID"),
-        (["get", "Qm", "--out", "new"], "'Qm' is not a CIDv0"),
+        (["pack", "--out", "new"], InvalidOptions, "SOURCE"),
+        (["pack", "-", "--hear", "a", "--out", "new"], InvalidOptions, "SOURCE"),
+        (["pack", "missing", "--out", "new"], FileUnreadable, "missing"),
+        (["pack", "missing", "--out", "/"], FileExists, "/"),
+        (["pack", "-", "--out", "nowhere/new"], FolderMissing, "nowhere"),
+        (["pack", "--hear", "a//b", "--out", "new"], InvalidDestination, "a//b"),
+        (["show", "missing"], NotAFileOrCid, "missing"),
+        (["show", "."], FileUnreadable, "."),
+        (["convert", "missing"], FileUnreadable, "missing"),
+        (["add", "missing"], FileUnreadable, "missing"),
+        (["recover", "missing"], FileUnreadable, "missing"),
+        (["check", "missing"], NotAFileOrCid, "missing"),
+        (["get", "Qm", "--out", "new"], InvalidCid, "Qm"),
     ],
 )
 def test_what_can_not_be_is_one_clear_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], said: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], error: type[AiraError], value: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    refused(call(*words), said)
+    refused(call(*words), error, value)
     assert {path.name for path in tmp_path.iterdir()} <= {"data"}
 
 
 def test_no_file_is_written_over(tmp_path: Path, sound: Path) -> None:
     before = sound.read_bytes()
     for words in (["pack", "-", "--out"], ["get", cid_of_bytes(b"x"), "--out"], ["recover", sound, "--out"]):
-        refused(call(*words, sound), f"{sound} is there already")
+        refused(call(*words, sound), FileExists, sound)
     bag = tmp_path / "it.bag"
     bag.write_bytes(Bag([BagMessage("/blink", string("blue"), T0)]).encode())
-    refused(call("convert", bag, sound), f"{sound} is there already")
+    refused(call("convert", bag, sound), FileExists, sound)
     assert sound.read_bytes() == before
 
 
@@ -151,19 +164,19 @@ def test_show_draws_a_plot(tmp_path: Path, sound: Path) -> None:
     done = call("show", sound, "--png", tmp_path / "it.png")
     assert done.exit_code == 0, done.output
     assert (tmp_path / "it.png").read_bytes().startswith(b"\x89PNG\r\n")
-    refused(call("show", sound, "--png", tmp_path / "nowhere" / "it.png"), "can't write")
+    refused(call("show", sound, "--png", tmp_path / "nowhere" / "it.png"), FileUnwritable)
 
 
 def test_without_matplotlib_it_says_how_to_get_it(tmp_path: Path, sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     done = call("show", sound, "--png", tmp_path / "it.png")
-    refused(done, "drawing needs matplotlib")
+    refused(done, PackageMissing, "matplotlib")
     assert "pip install 'aira-mesh[plot]'" in done.stderr
 
 
 def test_a_file_that_is_no_recording_can_not_be_shown(tmp_path: Path) -> None:
     (tmp_path / "text").write_bytes(b"hello")
-    refused(call("show", tmp_path / "text"), "text: it is neither an MCAP file nor a ROS 1 bag")
+    refused(call("show", tmp_path / "text"), NotARecording, "text")
 
 
 def test_a_bag_is_converted_beside_itself(tmp_path: Path) -> None:
@@ -180,7 +193,7 @@ def test_a_bag_is_converted_beside_itself(tmp_path: Path) -> None:
         "durationNs": 2,
     }
     assert [one.payload for one in open_objective(made).messages()] == [one.payload for one in sent]
-    refused(call("convert", made, tmp_path / "other.mcap"), "it.mcap: it is no ROS 1 bag")
+    refused(call("convert", made, tmp_path / "other.mcap"), NotARecording, "it.mcap")
 
 
 def test_added_files_are_in_the_store_and_stay(tmp_path: Path, sound: Path) -> None:
@@ -240,9 +253,9 @@ def test_what_is_readable_of_a_cut_file_is_saved(tmp_path: Path) -> None:
     saved = tmp_path / "it.recovered.mcap"
     assert (said["file"], said["cid"]) == (str(saved), cid_of_file(saved))
     assert 0 < said["messages"] == open_objective(saved).count < 500
-    refused(call("recover", tmp_path / "it.mcap"), "already exists")
+    refused(call("recover", tmp_path / "it.mcap"), RecordingExists)
     (tmp_path / "text").write_bytes(b"hello")
-    refused(call("recover", tmp_path / "text"), "it does not begin as an MCAP file does")
+    refused(call("recover", tmp_path / "text"), RecordingError, "text")
 
 
 def test_looking_at_files_loads_no_chain(sound: Path) -> None:

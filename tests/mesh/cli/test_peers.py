@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from mesh.cli.status import _peers
+from mesh.cli.status import show_peers
 from mesh.network import Channel, Endpoints, Network
 from mesh.settings import Settings
 from mesh.watching import present
@@ -51,7 +51,7 @@ async def bridging(router: EmbeddedRouter, *told: BridgeStatus) -> AsyncIterator
 
 
 async def test_nobody_is_told_in_a_line(router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]) -> None:
-    await _peers(Settings(connect=(router.endpoint,)), as_json=False)
+    await show_peers(Settings(connect=(router.endpoint,)), as_json=False)
     assert capsys.readouterr().out == f"nobody on {MARKET}; on the IPFS side nobody knows: there is no bridge\n"
 
 
@@ -60,14 +60,14 @@ async def test_everybody_is_told_by_role_and_address(
 ) -> None:
     connected = msgspec.structs.replace(bridge_status(), ipfs_peers=NODES, state="connected")
     async with bridging(router, connected) as settings:
-        await _peers(settings, as_json=False)
+        await show_peers(settings, as_json=False)
         assert capsys.readouterr().out.splitlines() == [
             "role    address",
             f"agent   {ROBOT.address}",
             f"bridge  {STRANGER.address}",
             f"2 on {MARKET}; on the IPFS side 3 nodes",
         ]
-        await _peers(settings, as_json=True)
+        await show_peers(settings, as_json=True)
         assert json.loads(capsys.readouterr().out) == {
             "lighthouse": MARKET,
             "peers": [
@@ -84,11 +84,11 @@ async def test_of_several_bridges_the_one_that_carries_is_believed(
     carries = msgspec.structs.replace(bridge_status(), ipfs_peers=NODES[:1], state="connected")
     stands_by = msgspec.structs.replace(bridge_status(bridge=PERSON.address), ipfs_peers=NODES, carries=False)
     async with bridging(router, stands_by, carries) as settings:
-        await _peers(settings, as_json=False)
+        await show_peers(settings, as_json=False)
     assert capsys.readouterr().out.endswith("on the IPFS side 1 node\n")
 
 
 async def test_a_bridge_without_its_daemon_says_so(router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]) -> None:
     async with bridging(router, msgspec.structs.replace(bridge_status(), state="no daemon")) as settings:
-        await _peers(settings, as_json=False)
+        await show_peers(settings, as_json=False)
     assert capsys.readouterr().out.endswith("on the IPFS side 0 nodes; the bridge says: no daemon\n")

@@ -9,12 +9,17 @@ import pytest
 import zenoh
 from click.testing import CliRunner
 
+from mesh.chain.errors import NodeUnreachable
 from mesh.cli import main
+from mesh.cli.errors import AccountMissing, FileUnreadable, InvalidDestination, NotAFileOrCid, UnknownTopic
 from mesh.content import Store
+from mesh.content.errors import ContentUnavailable
+from mesh.errors import AiraError, InvalidKey, NetworkUnavailable
 from mesh.recording import Recorder, RecordingAbout
+from mesh.recording.errors import NotARecording
 from schemas import String, cid_of_bytes
 from schemas.payloads import STRING
-from tests.support.commands import Interrupted
+from tests.support.commands import Interrupted, refused
 from tests.support.listening import Listener
 from tests.support.objectives import objective, timed
 from tests.support.ports import free_endpoint
@@ -135,40 +140,41 @@ def test_ctrl_c_ends_it(stage: Stage, listener: Listener) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "error", "value"),
     [
-        (["missing", "--to", "a/b"], "'missing' is neither a file nor a CID"),
-        ([".", "--to", "a/b"], "can't read .: it is a folder"),
-        (["it.mcap"], "a file says nothing of where it is to be played"),
-        (["it.mcap", "--to", "lamp"], "whose device 'lamp' is can't be told without an account"),
-        (["it.mcap", "--to", f"{ROBOT}/la mp"], "'la mp' is not a key of the mesh"),
-        (["it.mcap", "--to", "a/**"], "'a/**' has a wildcard, and would reach everybody"),
-        (["it.mcap", "--to", "a//b"], "'a//b' is not the beginning of a key"),
-        (["it.mcap", "--to", "a/b", "--topics", "/stop"], "the recording has no topic /stop"),
-        (["text", "--to", "a/b"], "text: it is neither an MCAP file nor a ROS 1 bag"),
-        (["odd.mcap", "--to", "a/b"], "'a b' is not a key of the mesh"),
+        (["missing", "--to", "a/b"], NotAFileOrCid, "missing"),
+        ([".", "--to", "a/b"], FileUnreadable, "."),
+        (["it.mcap"], InvalidDestination, "destination"),
+        (["it.mcap", "--to", "lamp"], AccountMissing, "lamp"),
+        (["it.mcap", "--to", f"{ROBOT}/la mp"], InvalidKey, "la mp"),
+        (["it.mcap", "--to", "a/**"], InvalidDestination, "a/**"),
+        (["it.mcap", "--to", "a//b"], InvalidDestination, "a//b"),
+        (["it.mcap", "--to", "a/b", "--topics", "/stop"], UnknownTopic, "/stop"),
+        (["text", "--to", "a/b"], NotARecording, "text"),
+        (["odd.mcap", "--to", "a/b"], InvalidKey, "a b"),
     ],
 )
 def test_what_can_not_be_is_one_clear_line_and_nothing_is_said(
-    stage: Stage, listener: Listener, monkeypatch: pytest.MonkeyPatch, words: list[str], said: str
+    stage: Stage,
+    listener: Listener,
+    monkeypatch: pytest.MonkeyPatch,
+    words: list[str],
+    error: type[AiraError],
+    value: str,
 ) -> None:
     monkeypatch.chdir(stage.path.parent)
     (stage.path.parent / "text").write_bytes(b"hello")
     (stage.path.parent / "odd.mcap").write_bytes(objective(("/fine", "x"), ("/a b", "x")))
     done = stage.play(*words)
-    assert done.exit_code == 2, done.output
-    assert done.stderr.startswith(f"aira: {said}")
+    refused(done, error, value)
     assert listener.heard(0) == []
 
 
 def test_no_router_nobody_who_has_it_and_no_chain_are_one_clear_line(stage: Stage) -> None:
     nowhere = Stage(free_endpoint(), stage.path.parent)
     done = nowhere.play(stage.path, "--to", "a/b", "--connect-timeout", "0.2")
-    assert (done.exit_code, done.stderr[:28]) == (1, "aira: no Zenoh router at tcp")
+    refused(done, NetworkUnavailable)
     done = stage.play(cid_of_bytes(b"nobody's"), "--to", "a/b", "--fetch-timeout", "0.2")
-    assert done.exit_code == 1
-    assert "is not available" in done.stderr
+    refused(done, ContentUnavailable)
     done = stage.play(ROBOT, "--web3-http-provider", "http://127.0.0.1:9")
-    assert done.exit_code == 1
-    assert done.stderr.startswith("aira: ")
-    assert "Traceback" not in done.stderr
+    refused(done, NodeUnreachable)

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.agent import Agent
-from mesh.cli.demand import _demand
-from mesh.cli.provider import _serve as serve_provider
-from mesh.cli.router import _serve as serve_router
-from mesh.cli.up import _serve_market as serve_up
+from mesh.cli.demand import demand
+from mesh.cli.errors import OutputFailed
+from mesh.cli.provider import serve as serve_provider
+from mesh.cli.router import serve as serve_router
+from mesh.cli.up import serve_market as serve_up
 from mesh.composition import load_account
-from mesh.errors import AiraError, ConfigurationError, NetworkUnavailable
+from mesh.errors import ConfigurationError, NetworkUnavailable
 from mesh.settings import Settings
 from schemas import cid_of_bytes, cid_of_file
 from tests.support.development import settings_of
@@ -82,17 +83,17 @@ async def test_a_job_from_up_to_the_recording(tmp_path: Path, printed: Printed) 
     path.write_bytes(objective(("/go", "there")))
     order: dict[str, Any] = ORDER | {"cost": "7wn"}
     async with obliging(moving(Agent(MODEL, settings=robot, account=load_account(robot)))), asyncio.timeout(60):
-        await _demand(person, objective=str(path), out=out, as_json=False, **order)
+        await demand(person, objective=str(path), out=out, as_json=False, **order)
         assert f"paid, result {cid_of_file(out)}\nrecording {out}\n" in printed
         assert f"demand by {load_account(person).address} for {MODEL}\ncontract 0x" in printed
         printed.text = ""
-        await _demand(person, objective=cid_of_file(path), out=None, as_json=True, **order)
+        await demand(person, objective=cid_of_file(path), out=None, as_json=True, **order)
         assert "}\n" in printed
         assert set(json.loads(printed.text)) == {"liability", "success", "result"}
         printed.text = ""
         full = Path("/dev/full")
-        with pytest.raises(AiraError, match=r"^can't write the recording to /dev/full: No space left") as caught:
-            await _demand(person, objective=cid_of_file(path), out=full, as_json=True, **order)
+        with pytest.raises(OutputFailed, match="/dev/full") as caught:
+            await demand(person, objective=cid_of_file(path), out=full, as_json=True, **order)
         assert "}\n" in printed
         told = json.loads(printed.text)
         assert (told["success"], told["recording"], told["error"]) == (True, None, str(caught.value))
@@ -130,7 +131,7 @@ async def test_a_demand_that_comes_to_nothing_leaves_no_recording_behind(tmp_pat
     order: dict[str, Any] = ORDER | {"objective": MODEL, "as_json": True}
     for path in (out, kept):
         with pytest.raises(NetworkUnavailable):
-            await _demand(nowhere, out=path, **order)
+            await demand(nowhere, out=path, **order)
     assert (out.exists(), kept.read_bytes()) == (False, b"an earlier one")
     await stopped(up)
 
@@ -143,7 +144,7 @@ async def test_what_can_not_listen_says_so_and_leaves_nothing_open(tmp_path: Pat
         serve_router(Settings(listen=(endpoint,))),
         serve_up(Settings(listen=(endpoint,), data_dir=str(tmp_path)), port=0, block_time=1.0),
     ):
-        with pytest.raises(ConfigurationError, match=f"^can't listen at {endpoint}: "):
+        with pytest.raises(ConfigurationError, match=endpoint):
             await server
     assert not (tmp_path / "development").exists()
     await stopped(router)

@@ -13,9 +13,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from mesh.chain.accounts import WrongPassword
+from mesh.chain.errors import NodeUnreachable, UnknownName
+from mesh.cli.errors import BalanceTooLow, FileUnwritable, InvalidAmount, InvalidOptions, NotAFileOrCid
+from mesh.errors import AiraError, ConfigurationError, InputError, NetworkUnavailable
 from mesh.recording import open_objective
 from schemas import cid_of_file
-from tests.support.commands import AIRA, SOON, Interrupted, Serving, aira
+from tests.support.commands import AIRA, SOON, Interrupted, Serving, aira, invoke, refused
 from tests.support.development import variables_of
 from tests.support.objectives import objective
 from tests.support.ports import free_port
@@ -70,6 +74,10 @@ class Development:
 
     def demand(self, *arguments: str | Path) -> CompletedProcess[str]:
         return aira("demand", *arguments, **self.variables("person"))
+
+    def refused(self, error: type[AiraError], *arguments: str | Path, value: object = "") -> str:
+        """Assert that a demand of the person is refused; the hint."""
+        return refused(invoke("demand", *arguments, "--json", **self.variables("person")), error, value)
 
     def agent(self, script: Path, *arguments: str, says: str) -> Serving:
         return Serving(sys.executable, script, *arguments, says=says, variables=self.variables("robot"))
@@ -167,14 +175,6 @@ def test_up_ends_at_a_ctrl_c(tmp_path: Path) -> None:
         assert "Traceback" not in up.log()
 
 
-def failed(done: CompletedProcess[str]) -> tuple[int, str]:
-    """Exit code and first line; there may be a hint, and nothing else."""
-    line, *hint = done.stderr.splitlines()
-    assert len(hint) <= 1, done.stderr
-    assert line.startswith("aira: ")
-    return done.returncode, line
-
-
 def test_ctrl_c_ends_the_waiting_for_a_contract(development: Development) -> None:
     interrupted = Interrupted(
         "demand", *ORDER, SOME_CID, at="demand by 0x", after=0.3, variables=development.variables("person")
@@ -184,81 +184,61 @@ def test_ctrl_c_ends_the_waiting_for_a_contract(development: Development) -> Non
 
 
 def test_a_demand_without_keyfile_is_one_clear_line() -> None:
-    code, line = failed(aira("demand", *ORDER, SOME_CID))
-    assert (code, "this needs an account" in line) == (2, True)
+    refused(invoke("demand", *ORDER, SOME_CID), ConfigurationError, "account")
 
 
-def test_an_objective_that_is_neither_file_nor_cid_is_one_clear_line(development: Development) -> None:
-    code, line = failed(development.demand(*ORDER, "blnk.mcap"))
-    assert (code, line) == (2, "aira: the objective 'blnk.mcap' is neither a file nor a CID")
+@pytest.mark.parametrize(
+    ("order", "error", "value"),
+    [
+        ((*ORDER, "blnk.mcap"), NotAFileOrCid, "'blnk.mcap'"),
+        (("--model", "blink", "--objective", SOME_CID), InputError, "'blink'"),
+        (("--model", "no.model.3.robonomics.eth", "--objective", SOME_CID), UnknownName, "no.model.3.robonomics.eth"),
+        ((*ORDER, SOME_CID, "--cost", str(10**30)), BalanceTooLow, "XRT"),
+        ((*ORDER, SOME_CID, "--cost", "1wei"), InvalidAmount, "'1wei'"),
+        ((*ORDER, SOME_CID, "--validator-fee", "1"), InvalidOptions, "--validator"),
+    ],
+)
+def test_an_order_that_can_not_be_is_one_clear_line(
+    development: Development, order: tuple[str, ...], error: type[AiraError], value: str
+) -> None:
+    development.refused(error, *order, value=value)
 
 
 def test_a_recording_that_can_not_be_written_is_found_before_anything_is_paid(
     development: Development, tmp_path: Path
 ) -> None:
     (tmp_path / "file").write_text("")
-    code, line = failed(development.demand(*ORDER, SOME_CID, "--out", tmp_path / "file" / "result.mcap"))
-    assert (code, "can't write the recording to" in line) == (2, True)
-
-
-def test_a_model_that_is_no_cid_and_no_name_is_one_clear_line(development: Development) -> None:
-    code, line = failed(development.demand("--model", "blink", "--objective", SOME_CID))
-    assert (code, "'blink'" in line) == (2, True)
-
-
-def test_an_unknown_model_name_is_one_clear_line(development: Development) -> None:
-    code, line = failed(development.demand("--model", "no.model.3.robonomics.eth", "--objective", SOME_CID))
-    assert (code, "no.model.3.robonomics.eth" in line) == (1, True)
+    out = tmp_path / "file" / "result.mcap"
+    development.refused(FileUnwritable, *ORDER, SOME_CID, "--out", out, value=out)
 
 
 def test_a_wrong_password_is_one_clear_line(development: Development, tmp_path: Path) -> None:
     (tmp_path / "password").write_text("guessed\n")
     variables = development.variables("person") | {"AIRA_KEYFILE_PASSWORD_FILE": str(tmp_path / "password")}
     for command in (("demand", *ORDER, SOME_CID), ("provider",)):
-        code, line = failed(aira(*command, **variables))
-        assert (code, "does not open it" in line) == (2, True)
-
-
-def test_too_dear_a_demand_is_one_clear_line(development: Development) -> None:
-    code, line = failed(development.demand(*ORDER, SOME_CID, "--cost", str(10**30)))
-    assert (code, "are needed" in line) == (1, True)
-
-
-@pytest.mark.parametrize(
-    ("terms", "why"),
-    [
-        (("--cost", "1wei"), "'1wei' is not an amount of XRT"),
-        (("--validator-fee", "1"), "a validator's fee without a validator"),
-    ],
-)
-def test_terms_that_can_not_be_are_one_clear_line(development: Development, terms: tuple[str, ...], why: str) -> None:
-    code, line = failed(development.demand(*ORDER, SOME_CID, *terms))
-    assert (code, why in line) == (2, True), line
+        refused(invoke(*command, **variables), WrongPassword)
 
 
 def test_no_router_is_one_clear_line(development: Development) -> None:
     nowhere = f"tcp/127.0.0.1:{free_port()}"
     variables = development.variables("person") | {"AIRA_CONNECT": nowhere, "AIRA_CONNECT_TIMEOUT": "0.2"}
-    code, line = failed(aira("demand", *ORDER, SOME_CID, **variables))
-    assert (code, line.startswith(f"aira: no Zenoh router at {nowhere}")) == (1, True), line
+    refused(invoke("demand", *ORDER, SOME_CID, **variables), NetworkUnavailable, nowhere)
 
 
 def test_no_node_is_one_clear_line(development: Development) -> None:
     nowhere = f"http://127.0.0.1:{free_port()}"
-    code, line = failed(aira("provider", **development.variables("person") | {"AIRA_WEB3_HTTP_PROVIDER": nowhere}))
-    assert (code, f"no Ethereum node answers at {nowhere}" in line) == (1, True)
+    variables = development.variables("person") | {"AIRA_WEB3_HTTP_PROVIDER": nowhere}
+    refused(invoke("provider", **variables), NodeUnreachable, nowhere)
 
 
 def test_a_taken_port_is_one_clear_line(development: Development, tmp_path: Path) -> None:
-    code, line = failed(aira("router", "--listen", development.endpoint))
-    assert (code, f"can't listen at {development.endpoint}" in line) == (2, True)
-    code, line = failed(aira("chain", "up", "--port", str(development.port), "--data-dir", tmp_path))
-    assert (code, f"can't listen on 127.0.0.1:{development.port}" in line) == (2, True)
+    refused(invoke("router", "--listen", development.endpoint), ConfigurationError, development.endpoint)
+    done = invoke("chain", "up", "--port", str(development.port), "--data-dir", tmp_path)
+    refused(done, ConfigurationError, f"127.0.0.1:{development.port}")
 
 
 def test_what_is_no_endpoint_is_one_clear_line() -> None:
-    code, line = failed(aira("router", "--listen", "localhost:7447"))
-    assert (code, "is not a Zenoh endpoint" in line) == (2, True)
+    refused(invoke("router", "--listen", "localhost:7447"), ConfigurationError, "localhost:7447")
 
 
 def test_ctrl_c_while_a_router_is_waited_for_ends_the_waiting() -> None:

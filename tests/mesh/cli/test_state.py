@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 from click.testing import CliRunner
 
 from mesh.cli import main
+from mesh.state.layout import StateExists, StateInUse
 from mesh.work import Ledger
 from tests.mesh.state.conftest import ADDRESS, CHAIN, JOB, Folder, folder
-from tests.support.commands import aira
+from tests.support.commands import aira, refused
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -73,9 +74,7 @@ def test_programs_are_told_the_same_in_json(folder: Folder, tmp_path: Path) -> N
 def test_an_existing_state_is_a_refusal_that_says_what_to_do(folder: Folder, tmp_path: Path) -> None:
     call("backup", tmp_path / "it", "--data-dir", folder.path)
     done = call("restore", tmp_path / "it", "--data-dir", folder.path)
-    assert done.exit_code == 2
-    assert done.stderr.splitlines()[0].startswith(f"aira: {folder.path} has a state already: ")
-    assert "--existing set-aside" in done.stderr
+    assert "--existing set-aside" in refused(done, StateExists, folder.path)
     again = call("restore", tmp_path / "it", "--data-dir", folder.path, "--existing", "set-aside")
     assert again.exit_code == 0
     assert f"before that     {folder.path}/.replaced-" in again.stdout
@@ -87,8 +86,7 @@ async def test_a_state_in_use_is_refused_whatever_is_asked(folder: Folder, tmp_p
     async with Ledger(folder.ledger):
         assert aira(*backup).returncode == 0
         done = aira(*restore)
-    assert done.returncode == 2
-    assert done.stderr.startswith(f"aira: {folder.ledger} is in use [state-in-use]\n")
+    refused(done, StateInUse, folder.ledger)
 
 
 def test_mistakes_are_one_line_and_a_hint(folder: Folder, tmp_path: Path) -> None:

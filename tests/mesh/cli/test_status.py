@@ -11,9 +11,10 @@ import pytest
 import mesh
 from mesh.agent import Agent
 from mesh.chain import Chain
-from mesh.cli.status import _everybody, _one, in_short, spoken
+from mesh.cli.errors import NoAnswer
+from mesh.cli.status import describe_status, show_all, show_one, summarize_status
 from mesh.devchain import JsonRpcServer
-from mesh.errors import InvalidAddress, RemoteError
+from mesh.errors import InvalidAddress
 from mesh.settings import Settings
 from schemas.status import ContentMetrics, MarketStatus, Status, StoreUse, Work
 from tests.mesh.cli.chains import columns
@@ -47,7 +48,7 @@ MARKET_FACTS = MarketStatus(
 
 async def told(place: Place, role: str, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     """What the status of a role is, for programs."""
-    await _one(place.settings("watcher"), place.address(role), timeout=5.0, as_json=True)
+    await show_one(place.settings("watcher"), place.address(role), timeout=5.0, as_json=True)
     (how,) = json.loads(capsys.readouterr().out)
     assert isinstance(how, dict)
     return how
@@ -86,7 +87,7 @@ async def test_an_executor_that_is_off_is_not_alive(place: Place, capsys: pytest
     async with place.agent("robot", enable_executor=False):
         how = await told(place, "robot", capsys)
     assert how["parts"]["executor"] == "off"
-    assert in_short(Status.decode(json.dumps(how).encode())).startswith("alive, block ")
+    assert summarize_status(Status.decode(json.dumps(how).encode())).startswith("alive, block ")
 
 
 async def test_a_node_that_is_lost_is_said_by_those_who_wait_for_it(
@@ -111,7 +112,7 @@ async def test_a_provider_tells_its_orders_and_what_it_earned(place: Place, caps
     async with place.at_work(careless(place.agent("robot"))) as person:
         await person.demand(place.save(objective(("/go", "x"))), cost=1)
         how = await told(place, "provider", capsys)
-        await _one(place.settings("watcher"), place.address("provider"), timeout=5.0, as_json=False)
+        await show_one(place.settings("watcher"), place.address("provider"), timeout=5.0, as_json=False)
         shown = columns(capsys.readouterr().out)
     assert (how["role"], how["market"]["created"], how["market"]["openOrders"]) == ("provider", 1, 0)
     assert int(how["market"]["spent"]) > 0
@@ -123,12 +124,12 @@ async def test_everybody_on_the_lighthouse_is_a_line(place: Place, capsys: pytes
     async with place.at_work(place.agent("robot")):
 
         async def all_there() -> bool:
-            await _everybody(place.settings("watcher"), timeout=5.0, as_json=True)
+            await show_all(place.settings("watcher"), timeout=5.0, as_json=True)
             people = json.loads(capsys.readouterr().out)["peers"]
             return len(people) == 3 and all(person["status"] for person in people)
 
         await until_found(all_there, what="three peers", seconds=30)
-        await _everybody(place.settings("watcher"), timeout=5.0, as_json=False)
+        await show_all(place.settings("watcher"), timeout=5.0, as_json=False)
     head, *rows = capsys.readouterr().out.splitlines()
     assert head.split() == ["role", "address", "how", "it", "is"]
     assert sorted(row.split()[0] for row in rows) == ["agent", "agent", "provider"]
@@ -140,7 +141,7 @@ async def test_who_shows_itself_and_says_nothing_is_told_too(place: Place, capsy
         robot.channel.announce("person", STRANGER.address)
 
         async def is_there() -> bool:
-            await _everybody(place.settings("watcher"), timeout=5.0, as_json=False)
+            await show_all(place.settings("watcher"), timeout=5.0, as_json=False)
             return f"person  {STRANGER.address}  does not answer\n" in capsys.readouterr().out
 
         await until_found(is_there, what="the silent one", seconds=30)
@@ -148,16 +149,16 @@ async def test_who_shows_itself_and_says_nothing_is_told_too(place: Place, capsy
 
 async def test_nobody_is_one_clear_line(router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]) -> None:
     settings = Settings(connect=(router.endpoint,))
-    with pytest.raises(RemoteError, match=f"^nobody answers at {STRANGER.address}$"):
-        await _one(settings, STRANGER.address, timeout=1.0, as_json=False)
+    with pytest.raises(NoAnswer, match=STRANGER.address):
+        await show_one(settings, STRANGER.address, timeout=1.0, as_json=False)
     with pytest.raises(InvalidAddress):
-        await _one(settings, "robot", timeout=1.0, as_json=False)
-    await _everybody(settings, timeout=1.0, as_json=False)
+        await show_one(settings, "robot", timeout=1.0, as_json=False)
+    await show_all(settings, timeout=1.0, as_json=False)
     assert capsys.readouterr().out == f"nobody on {MARKET}\n"
 
 
 def test_work_in_words() -> None:
-    shown = spoken(msgspec.structs.replace(status(), work=WORK, uptime=75.5))
+    shown = describe_status(msgspec.structs.replace(status(), work=WORK, uptime=75.5))
     assert shown["agent"] == ROBOT.address
     assert (shown["open jobs"], shown["done"]) == ("2 ready, 1 running", "12,345")
     assert (shown["to be sent"], shown["store"]) == ("1 message", "3 files, 2.0 KiB of 10.0 GiB")
@@ -165,7 +166,7 @@ def test_work_in_words() -> None:
 
 
 def test_a_market_in_words() -> None:
-    shown = spoken(msgspec.structs.replace(status(role="provider"), market=MARKET_FACTS))
+    shown = describe_status(msgspec.structs.replace(status(role="provider"), market=MARKET_FACTS))
     assert shown["contracts"] == "3 made, 2 finalized"
     assert shown["rejected"] == "3 (1 WrongSigner, 2 expired)"
     assert shown["earned"] == "1.5 XRT, 1 XRT of it fees"
@@ -174,27 +175,29 @@ def test_a_market_in_words() -> None:
 
 def test_a_bridge_in_words() -> None:
     way = msgspec.structs.replace(WAY, carried=12, per_second=0.5, dropped={"no-room": 3}, waiting=4)
-    shown = spoken(msgspec.structs.replace(bridge_status(), to_ipfs=way, last_error="refused", losses=2))
+    shown = describe_status(msgspec.structs.replace(bridge_status(), to_ipfs=way, last_error="refused", losses=2))
     assert (shown["bridge"], shown["state"], shown["carries"]) == (STRANGER.address, "alone", "yes")
     assert shown["to IPFS"] == "12 carried (0.5/s), 4 waiting, 3 (3 no-room) dropped"
     assert (shown["losses"], shown["last error"]) == ("2 of the daemon", "refused")
     assert "content" not in shown
     figures = dict.fromkeys(ContentMetrics.__struct_fields__, 0) | {"fetched": 2, "fetched_bytes": 2048, "lies": 1}
-    content = spoken(msgspec.structs.replace(bridge_status(), content=ContentMetrics(**figures)))["content"]
+    content = describe_status(msgspec.structs.replace(bridge_status(), content=ContentMetrics(**figures)))["content"]
     assert content == "2 files fetched (2.0 KiB), 0 added (0 bytes), 0 blocks given, 1 false ones refused"
 
 
 def test_what_is_wrong_comes_first_in_the_line() -> None:
     ill = msgspec.structs.replace(status(), parts={"channel": "alive", "listener": "waits for the node"}, work=WORK)
-    assert in_short(ill) == "listener waits for the node, block 7, 3 open jobs"
-    assert in_short(msgspec.structs.replace(status(), market=MARKET_FACTS)) == (
+    assert summarize_status(ill) == "listener waits for the node, block 7, 3 open jobs"
+    assert summarize_status(msgspec.structs.replace(status(), market=MARKET_FACTS)) == (
         "alive, block 7, 7 open orders, 3 contracts"
     )
-    assert in_short(bridge_status()) == "alone, carries, 0 nodes on the IPFS side"
+    assert summarize_status(bridge_status()) == "alone, carries, 0 nodes on the IPFS side"
 
 
 def test_what_somebody_says_does_not_steer_the_terminal() -> None:
     evil = msgspec.structs.replace(status(), parts={"\x1b[2J": "\x1b[2J"}, version="\x1b]0;x\x07")
-    shown = f"{spoken(evil)} {in_short(evil)}"
-    assert "\x1b" not in "".join(f"{name}{fact}" for name, fact in spoken(evil).items()) + in_short(evil)
+    shown = f"{describe_status(evil)} {summarize_status(evil)}"
+    assert "\x1b" not in "".join(f"{name}{fact}" for name, fact in describe_status(evil).items()) + summarize_status(
+        evil
+    )
     assert "\ufffd" in shown

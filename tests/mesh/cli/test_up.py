@@ -10,8 +10,9 @@ from click.testing import CliRunner
 
 from mesh.chain import Node
 from mesh.cli import main
-from tests.mesh.cli.chains import columns, refused
-from tests.support.commands import AIRA, Serving
+from mesh.cli.errors import AnvilMissing
+from tests.mesh.cli.chains import columns
+from tests.support.commands import AIRA, Serving, refused
 from tests.support.peers import require
 from tests.support.ports import free_port
 
@@ -57,4 +58,4 @@ async def test_the_chain_is_kept_in_a_file(tmp_path: Path) -> None:
 def test_a_chain_that_nothing_can_keep_is_one_clear_line(tmp_path: Path) -> None:
     options = ["--engine", "embedded", "--state", str(tmp_path / "chain.json")]
     done = CliRunner().invoke(main, ["up", "--listen", f"tcp/127.0.0.1:{free_port()}", *options])
-    refused(done, 2, "only anvil can keep the chain in a file")
+    refused(done, AnvilMissing, "--state")

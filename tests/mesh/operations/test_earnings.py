@@ -37,7 +37,7 @@ async def test_logged_earnings_are_what_the_account_gained_and_spent(
     )
     async with site.chain("provider") as chain, site.robot([]), site.agent("person") as person:
         start, xrt, wei = await chain.block_number(), await chain.tokens.balance(), await chain.tokens.eth_balance()
-        serving = asyncio.create_task(command._serve(settings))
+        serving = asyncio.create_task(command.serve(settings))
         async with asyncio.timeout(60):
             for word in ("one", "two"):
                 contract = await person.demand(site.job(word), cost=COST)
