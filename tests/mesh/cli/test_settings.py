@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from mesh.cli import main
 from mesh.errors import ConfigurationError
-from mesh.settings import OPTIONS, Settings, load
+from mesh.settings import MEANING, OPTIONS, Settings, load
 from tests.support.commands import refused
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def test_the_plain_form_is_a_settings_file(tmp_path: Path) -> None:
     assert loaded.poll_interval == 0.5
     assert loaded.enable_executor is False
     assert set(tomllib.loads(done.stdout)) == set(OPTIONS)
-    assert "# seconds between two looks for new blocks\n" in done.stdout
+    assert f"# {MEANING['poll_interval']}\npoll_interval = 0.5\n" in done.stdout
 
 
 def test_flags_win_over_variables_and_variables_over_the_file(tmp_path: Path) -> None:
