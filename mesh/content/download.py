@@ -287,5 +287,5 @@ class Download:
         what = "its root" if cid == self._cid else f"its block {cid}"
         senders = self._requester.corrupt_blocks
         if senders:
-            return ContentCorrupt(self._cid, f"nobody sent the right bytes of {what}", holders=senders)
-        return ContentUnavailable(self._cid, f"nobody sent {what} within {self._patience:g} s")
+            return ContentCorrupt(self._cid, f"all replies for {what} were wrong", holders=senders)
+        return ContentUnavailable(self._cid, f"no holder sent {what} within {self._patience:g} s")

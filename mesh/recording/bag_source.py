@@ -72,7 +72,8 @@ def _outline(path: Path, file: BinaryIO, size: int, limits: Limits) -> list[Reco
     expansion, defined = ExpansionCounter(path, limits), 0
     for number, record in enumerate(bag_records(path, file, size)):
         if number > limits.messages // 2:  # each takes as long as several in a chunk
-            raise RecordingTooLarge(path, f"more than {limits.messages // 2} records outside its chunks")
+            why = f"more than {limits.messages // 2} records outside its chunks"
+            raise RecordingTooLarge(path, why, limit="messages")
         match record.opcode:
             case BagOp.CHUNK:
                 block = _chunk_block(path, record, limits)
@@ -96,7 +97,7 @@ def _add_message(path: Path, found: list[RecordingBlock | BagRecord], record: Ba
     """Add a message outside any chunk, to the last block if it is adjacent."""
     whole = record.offset + record.length - record.begin
     if whole > limits.record:
-        raise RecordingTooLarge(path, f"a message of {whole} bytes")
+        raise RecordingTooLarge(path, f"a message of {whole} bytes", limit="record")
     last = found[-1] if found else record
     adjacent = isinstance(last, RecordingBlock) and not last.compression and last.offset + last.stored == record.begin
     if isinstance(last, RecordingBlock) and adjacent and last.stored + whole <= _RUN:
@@ -174,6 +175,7 @@ def _messages_of_chunk(path: Path, data: bytes) -> Iterator[RecordedMessage]:
 def _chunk_block(path: Path, record: BagRecord, limits: Limits) -> RecordingBlock:
     size = number_of(path, record, b"size")
     if max(size, record.length) > limits.record:
-        raise RecordingTooLarge(path, f"a chunk expands to {size} bytes, more than the {limits.record} allowed")
+        why = f"a chunk expands to {size} bytes, more than the {limits.record} allowed"
+        raise RecordingTooLarge(path, why, limit="record")
     compression = text_of(path, record.fields.get(b"compression", b""))
     return RecordingBlock(record.offset, record.length, size, compression)

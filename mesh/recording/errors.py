@@ -43,11 +43,16 @@ class CorruptRecording(RecordingError):
 
 
 class RecordingTooLarge(RecordingError):
-    """A recording is over a limit. `reason` is `too-large` for the file, `expands-too-much` for its content."""
+    """A recording is over a limit; `limit` is the field of `Limits`.
+
+    `reason` is `too-large` for the size of the file, `expands-too-much` for any other limit.
+    """
 
     code = "recording-too-large"
 
-    def __init__(self, path: Path, why: str, *, reason: str = "expands-too-much") -> None:
+    def __init__(self, path: Path, why: str, *, limit: str) -> None:
+        reason = "too-large" if limit == "size" else "expands-too-much"
+        self.limit = limit
         super().__init__(path, why, reason=reason, hint="raise the limits, or use a smaller recording")
 
 

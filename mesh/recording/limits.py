@@ -70,28 +70,28 @@ class ExpansionCounter:
         """Count a block. Raises `RecordingTooLarge`."""
         self.size += block.size
         if self.size > self.limits.expanded:
-            raise RecordingTooLarge(
-                self.path, f"its chunks expand to more than the {self.limits.expanded} bytes allowed"
-            )
+            why = f"its chunks expand to more than the {self.limits.expanded} bytes allowed"
+            raise RecordingTooLarge(self.path, why, limit="expanded")
         self.bz2 += block.size if block.compression == "bz2" else 0
         if self.bz2 > self.limits.bz2:
-            raise RecordingTooLarge(
-                self.path, f"its bz2 chunks expand to more than the {self.limits.bz2} bytes allowed; lz4 is faster"
-            )
+            why = f"its bz2 chunks expand to more than the {self.limits.bz2} bytes allowed; lz4 is faster"
+            raise RecordingTooLarge(self.path, why, limit="bz2")
 
 
 def check_counts(path: Path, limits: Limits, *, records: int, blocks: int) -> None:
     """Raise `RecordingTooLarge` over `limits.messages` records in blocks, or over `limits.blocks` blocks."""
     if records > limits.messages:
-        raise RecordingTooLarge(path, f"more than {limits.messages} messages and definitions")
+        raise RecordingTooLarge(path, f"more than {limits.messages} messages and definitions", limit="messages")
     if blocks > limits.blocks:
-        raise RecordingTooLarge(path, f"more than {limits.blocks} blocks of messages and attachments")
+        raise RecordingTooLarge(path, f"more than {limits.blocks} blocks of messages and attachments", limit="blocks")
 
 
 def check_definitions(path: Path, limits: Limits, *, channels: int, size: int) -> None:
     """Raise `RecordingTooLarge` over `limits.channels` channels, or over `limits.definitions` bytes."""
-    if size > limits.definitions or channels > limits.channels:
-        raise RecordingTooLarge(path, f"{channels} channels, {size} bytes of definitions")
+    if size > limits.definitions:
+        raise RecordingTooLarge(path, f"more than {limits.definitions} bytes of definitions", limit="definitions")
+    if channels > limits.channels:
+        raise RecordingTooLarge(path, f"more than {limits.channels} channels", limit="channels")
 
 
 def check_window(path: Path, segments: Iterable[Segment], limits: Limits) -> None:
@@ -104,4 +104,5 @@ def check_window(path: Path, segments: Iterable[Segment], limits: Limits) -> Non
         heapq.heappush(open_segments, (segment.end, segment.cost))
         held += segment.cost
         if held > limits.window:
-            raise RecordingTooLarge(path, f"its messages are out of order: blocks of {held} bytes overlap in time")
+            why = f"its messages are out of order: blocks of {held} bytes overlap in time"
+            raise RecordingTooLarge(path, why, limit="window")

@@ -86,7 +86,9 @@ def read_record(path: Path, file: BinaryIO, header: McapRecordHeader, *, limits:
 def check_record_size(path: Path, size: int, limits: Limits) -> None:
     """Raise `RecordingTooLarge` if a record of `size` bytes is over `limits.record`."""
     if size > limits.record:
-        raise RecordingTooLarge(path, f"a record of {size} bytes, more than the {limits.record} allowed")
+        raise RecordingTooLarge(
+            path, f"a record of {size} bytes, more than the {limits.record} allowed", limit="record"
+        )
 
 
 def chunk_header(path: Path, file: BinaryIO, header: McapRecordHeader, *, limits: Limits) -> ChunkHeader:

@@ -215,7 +215,7 @@ def _check_outline(path: Path, file: BinaryIO, size: int, limits: Limits) -> tup
     expansion, data_end, footer, statistics = ExpansionCounter(path, limits), None, None, None
     for number, header in enumerate(mcap_records(path, file, size)):
         if number > 2 * limits.messages:
-            raise RecordingTooLarge(path, f"more than {2 * limits.messages} records")
+            raise RecordingTooLarge(path, f"more than {2 * limits.messages} records", limit="messages")
         if header.opcode == Opcode.CHUNK:
             expansion.add(chunk_header(path, file, header, limits=limits).block)
         elif header.opcode == Opcode.DATA_END and data_end is None:

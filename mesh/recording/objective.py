@@ -116,7 +116,7 @@ def open_source(
     """Like `open_objective`, but returns the source, and calls `on_message` for each message while checking."""
     size, magic = _size_and_magic(path)
     if size > limits.size:
-        raise RecordingTooLarge(path, f"it has {size} bytes, more than the {limits.size} allowed", reason="too-large")
+        raise RecordingTooLarge(path, f"it has {size} bytes, more than the {limits.size} allowed", limit="size")
     if magic.startswith(mcap_records.MAGIC):
         source = open_mcap(path, size, limits, on_message=on_message, progress=progress)
     elif magic.startswith(bag_records.MAGIC):

@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[2]
 
 
 class RandomStream(io.RawIOBase):
-    """A stream of `size` bytes that are made as they are read; `fail_at` is where it breaks."""
+    """A stream of `size` random bytes. Reading raises `OSError` once only `fail_at` bytes are left."""
 
     def __init__(self, size: int, fail_at: int | None = None) -> None:
         self.left = size
@@ -42,7 +42,7 @@ class RandomStream(io.RawIOBase):
 
 
 def leftovers(directory: Path) -> list[str]:
-    """Files that are neither content nor the store's own."""
+    """Files in a store's directory that are neither content nor its own."""
     own = {".lock", ".open", ".pins", ".blocks.sqlite", ".blocks.sqlite-wal", ".blocks.sqlite-shm"}
     return sorted(name for name in os.listdir(directory) if name not in own and not name.startswith("Qm"))
 
@@ -66,7 +66,7 @@ def requested_cid(query: zenoh.Query) -> str:
 
 
 def put_tree(store: Store, blocks: list[UnixfsBlock]) -> str:
-    """Have a store hold the file of a tree, the root last."""
+    """Store the file of a tree, given with the root last."""
     by_cid = {block.cid: block.data for block in blocks}
     with store.assemble(blocks[-1].cid) as assembly:
         waiting = [assembly.root]
@@ -78,7 +78,7 @@ def put_tree(store: Store, blocks: list[UnixfsBlock]) -> str:
 
 
 def block_of(data: bytes) -> UnixfsBlock:
-    """A block under its true name."""
+    """The block with these bytes."""
     return UnixfsBlock(cid_of_digest(sha256(data).digest()), data)
 
 
@@ -90,7 +90,7 @@ def leaf(data: bytes) -> UnixfsBlock:
 def parent(
     children: Sequence[tuple[UnixfsBlock, int]], *, data: bytes = b"", sizes: Sequence[int] | None = None
 ) -> UnixfsBlock:
-    """A node over these blocks, each with its bytes of the file; `sizes` are those it claims instead."""
+    """A node over these blocks with their sizes; `sizes` are stated instead if given."""
     links = b"".join(write_bytes(2, write_bytes(1, b"\x12\x20" + digest(block))) for block, _ in children)
     claimed = [size for _, size in children] if sizes is None else list(sizes)
     unixfs = write_number(1, 2) + (write_bytes(2, data) if data else b"") + write_number(3, len(data) + sum(claimed))
@@ -112,7 +112,7 @@ def digest(block: UnixfsBlock) -> bytes:
 
 @contextmanager
 def answer_queries(session: zenoh.Session, answer: Callable[[zenoh.Query], None]) -> Iterator[None]:
-    """Somebody on `aira/cid/*` who is not one of us."""
+    """Answer queries on `aira/cid/*` as a foreign holder would."""
 
     def reply(query: zenoh.Query) -> None:
         with query:
@@ -124,7 +124,7 @@ def answer_queries(session: zenoh.Session, answer: Callable[[zenoh.Query], None]
 
 
 async def until_matched(session: zenoh.Session) -> None:
-    """Return once somebody who answers for content is known to `session`."""
+    """Return once `session` knows a queryable for content."""
     querier = session.declare_querier("aira/cid/*")
     while not querier.matching_status:
         await asyncio.sleep(0.01)
@@ -132,7 +132,7 @@ async def until_matched(session: zenoh.Session) -> None:
 
 
 async def until_held(session: zenoh.Session, cid: str, *, holders: int) -> None:
-    """Return once that many holders answer `session` when it asks for a block."""
+    """Return once so many holders answer a query of `session` for the block."""
 
     def answers() -> int:
         replies = session.get(
@@ -150,5 +150,5 @@ async def until_held(session: zenoh.Session, cid: str, *, holders: int) -> None:
 
 
 def sample_bytes(size: int) -> bytes:
-    """Bytes, always the same."""
+    """Reproducible random bytes."""
     return random.Random(1).randbytes(size)

@@ -1,4 +1,4 @@
-"""Stores and sessions of their own for each test."""
+"""Stores and sessions for each test."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ if TYPE_CHECKING:
 
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[Store]:
-    """An empty store: of who wants a file."""
+    """An empty store, for the side that fetches."""
     with Store(tmp_path / "store") as opened:
         yield opened
 
 
 @pytest.fixture
 def holder_store(tmp_path: Path) -> Iterator[Store]:
-    """An empty store: of who has a file."""
+    """An empty store, for the side that serves."""
     with Store(tmp_path / "holder") as opened:
         yield opened
 
 
 @pytest.fixture
 def session(router: EmbeddedRouter) -> Iterator[zenoh.Session]:
-    """A session of who wants a file."""
+    """The session of the side that fetches."""
     with zenoh.open(client_config(router.endpoint)) as opened:
         yield opened
 
 
 @pytest.fixture
 def other_session(router: EmbeddedRouter) -> Iterator[zenoh.Session]:
-    """A session of who has a file."""
+    """The session of the side that serves."""
     with zenoh.open(client_config(router.endpoint)) as opened:
         yield opened
 
 
 @pytest.fixture
 def third_session(router: EmbeddedRouter) -> Iterator[zenoh.Session]:
-    """A session of somebody else."""
+    """A third session."""
     with zenoh.open(client_config(router.endpoint)) as opened:
         yield opened

@@ -29,7 +29,7 @@ def main(repository: str, file: str, sizes: list[int]) -> None:
 
 
 def work_alone(file: Path) -> None:
-    """Have the node look for nobody: it opens the repository anew for each file, and would wait for others."""
+    """Configure the node to look for no peers: it reopens the repository for each file, and would wait for them."""
     config = json.loads(file.read_text())
     config["Bootstrap"] = []
     config["Discovery"]["MDNS"]["Enabled"] = False

@@ -143,7 +143,7 @@ def test_damaged_blocks_of_an_earlier_attempt_are_not_used(store: Store) -> None
     part = next(store.directory.glob(".part-*"))
     part.write_bytes(b"\0" + part.read_bytes()[1:] + b"longer than the file will be" * 100_000)
     with store.assemble(cid) as assembly:
-        assert put_all(assembly, blocks) == 2, "the leaf that has rotted, and the one that had not come"
+        assert put_all(assembly, blocks) == 2, "the damaged leaf and the missing one"
         assert assembly.finish().read_bytes() == data
 
 

@@ -23,24 +23,24 @@ async def test_a_corrupt_reply_is_counted_by_sender_and_another_holder_used(
 ) -> None:
     data = sample_bytes(3 * CHUNK_SIZE)
     cid = holder_store.put_bytes(data)
-    lied = 0
+    sent = 0
 
-    def lie(query: zenoh.Query) -> None:
-        nonlocal lied
+    def send_corrupt(query: zenoh.Query) -> None:
+        nonlocal sent
         query.reply(query.key_expr, b"not what was asked for")
-        lied += 1
+        sent += 1
 
-    with answer_queries(third_session, lie):
+    with answer_queries(third_session, send_corrupt):
         async with Exchange(session, store) as exchange:
-            # The liar is alone at first, so that its answer is the one that comes.
+            # At first this is the only holder, so that its reply is used.
             fetching = asyncio.create_task(exchange.fetch(cid))
-            while not lied:
+            while not sent:
                 await asyncio.sleep(0.01)
             async with Exchange(other_session, holder_store):
                 assert (await fetching).read_bytes() == data
-            lies = exchange.statistics().corrupt_blocks
-    assert list(lies) == [str(third_session.zid())]
-    assert lies[str(third_session.zid())] >= 1
+            corrupt = exchange.statistics().corrupt_blocks
+    assert list(corrupt) == [str(third_session.zid())]
+    assert corrupt[str(third_session.zid())] >= 1
 
 
 async def test_a_holder_that_sends_corrupt_parts_is_replaced_by_another(
@@ -55,20 +55,20 @@ async def test_a_holder_that_sends_corrupt_parts_is_replaced_by_another(
     root = holder_store.get_block(cid)
     assert root is not None
     true_root = root
-    lied = asyncio.Event()
+    sent = asyncio.Event()
     loop = asyncio.get_running_loop()
 
-    def half_lie(query: zenoh.Query) -> None:
+    def send_corrupt_parts(query: zenoh.Query) -> None:
         if str(query.key_expr).endswith(cid):
             query.reply(query.key_expr, true_root)
         else:
             query.reply(query.key_expr, true_root[:-1])
-            loop.call_soon_threadsafe(lied.set)
+            loop.call_soon_threadsafe(sent.set)
 
-    with answer_queries(third_session, half_lie):
+    with answer_queries(third_session, send_corrupt_parts):
         async with Exchange(session, store) as exchange:
             fetching = asyncio.create_task(exchange.fetch(cid))
-            await lied.wait()
+            await sent.wait()
             async with Exchange(other_session, holder_store):
                 assert (await fetching).read_bytes() == data
             assert str(third_session.zid()) in exchange.statistics().corrupt_blocks
@@ -99,7 +99,7 @@ async def test_a_silent_holder_does_not_delay_another(
     kept: list[zenoh.Query] = []
     silent = third_session.declare_queryable("aira/cid/*", kept.append)
     async with Exchange(session, store) as exchange:
-        # The silent one is alone at first, so that it is asked; its answer would be waited for to the end.
+        # At first the silent one is the only holder, so that it is asked and waited for.
         fetching = asyncio.create_task(exchange.fetch(cid, timeout=600))
         await until(lambda: kept, what="a query", seconds=30)
         async with Exchange(other_session, holder_store):

@@ -1,4 +1,4 @@
-"""Every read is checked; what has rotted is found, named, set aside and had again."""
+"""Every read is checked: damaged files are detected, reported, set aside and fetched again."""
 
 from __future__ import annotations
 
@@ -88,10 +88,10 @@ def test_a_copy_is_complete_or_leaves_the_target_unchanged(store: Store, tmp_pat
     target = tmp_path / "out" / "copy.bin"
     target.parent.mkdir()
     target.write_bytes(b"what was there")
-    told: list[tuple[int, int | None]] = []
-    assert store.copy(cid, target, progress=lambda done, total: told.append((done, total))) == target
+    reported: list[tuple[int, int | None]] = []
+    assert store.copy(cid, target, progress=lambda done, total: reported.append((done, total))) == target
     assert target.read_bytes() == data
-    assert told[-1] == (len(data), len(data))
+    assert reported[-1] == (len(data), len(data))
     assert os.access(target, os.W_OK)
     flip_bit(store.directory / cid, CHUNK_SIZE)
     with pytest.raises(ContentCorrupt):
@@ -108,12 +108,12 @@ def test_checking_the_store_reports_exactly_the_damaged_files(store: Store) -> N
     bad = sorted([cids[2], cids[4]])
     flip_bit(store.directory / cids[2], 999)
     flip_bit(store.directory / cids[4], 0)
-    told: list[tuple[int, int | None]] = []
-    found = store.check(progress=lambda done, total: told.append((done, total)))
+    reported: list[tuple[int, int | None]] = []
+    found = store.check(progress=lambda done, total: reported.append((done, total)))
     assert list(found.damaged) == bad
     assert (found.files, found.bytes) == (6, 0 + 5 + 1000 + CHUNK_SIZE + 1 + 700_000 + 9000)
-    assert told == sorted(told)
-    assert told[-1][1] == found.bytes
+    assert reported == sorted(reported)
+    assert reported[-1][1] == found.bytes
     assert store.damaged() == tuple(bad)
     assert set(store.list()) == {*cids, other} - set(bad)
     assert store.check().damaged == ()
@@ -132,13 +132,13 @@ def test_putting_a_damaged_file_again_repairs_it(store: Store) -> None:
 def test_a_put_reports_progress(store: Store, tmp_path: Path) -> None:
     source = tmp_path / "source"
     source.write_bytes(sample_bytes(3 * CHUNK_SIZE + 1))
-    told: list[tuple[int, int | None]] = []
-    store.put_file(source, progress=lambda done, total: told.append((done, total)))
-    assert told == sorted(told)
-    assert told.pop() == (3 * CHUNK_SIZE + 1, 3 * CHUNK_SIZE + 1)
+    reported: list[tuple[int, int | None]] = []
+    store.put_file(source, progress=lambda done, total: reported.append((done, total)))
+    assert reported == sorted(reported)
+    assert reported.pop() == (3 * CHUNK_SIZE + 1, 3 * CHUNK_SIZE + 1)
     with source.open("rb") as stream:
-        store.put_stream(stream, progress=lambda done, total: told.append((done, total)))
-    assert told.pop() == (3 * CHUNK_SIZE + 1, None)
+        store.put_stream(stream, progress=lambda done, total: reported.append((done, total)))
+    assert reported.pop() == (3 * CHUNK_SIZE + 1, None)
 
 
 async def test_only_the_damaged_block_of_a_file_is_fetched_again(
@@ -174,9 +174,7 @@ async def test_a_holder_sets_its_damaged_file_aside_and_another_holder_serves_it
             await until(lambda: holder_store.damaged() == (cid,), what="the damage found", seconds=60)
             async with Exchange(third_session, good_store):
                 assert (await fetching).read_bytes() == data
-                assert exchange.statistics().corrupt_blocks == {}, (
-                    "who finds its own file damaged gives nothing: it is no liar"
-                )
+                assert exchange.statistics().corrupt_blocks == {}, "a holder with a damaged file sends nothing corrupt"
                 assert (await damaged.fetch(cid)).read_bytes() == data
     assert holder_store.check().damaged == ()
     assert holder_store.list() == (cid,)

@@ -1,4 +1,4 @@
-"""Several holders at once: all give, a liar is named, and what was interrupted is gone on with."""
+"""Downloads from several holders, interrupted downloads, and trees that are refused."""
 
 from __future__ import annotations
 
@@ -66,14 +66,14 @@ async def test_all_holders_of_a_file_serve_parts_of_it(tmp_path: Path, store: St
         exchange = await stack.enter_async_context(Exchange(session, store))
         await until_held(session, cid, holders=3)
         before = [holder.statistics().served for holder in holders]
-        told: list[tuple[int, int | None]] = []
-        path = await exchange.fetch(cid, progress=lambda done, total: told.append((done, total)))
+        reported: list[tuple[int, int | None]] = []
+        path = await exchange.fetch(cid, progress=lambda done, total: reported.append((done, total)))
         assert path.read_bytes() == data
         served = [holder.statistics().served - count for holder, count in zip(holders, before, strict=True)]
-        assert min(served) >= 5, f"one of them has hardly been asked: {served}"
-        assert sum(served) <= 61 + 10, "only the root is asked of everybody"
-        assert told == sorted(told)
-        assert told[-1] == (len(data), len(data))
+        assert min(served) >= 5, f"one of them was hardly asked: {served}"
+        assert sum(served) <= 61 + 10, "only the root is requested from all"
+        assert reported == sorted(reported)
+        assert reported[-1] == (len(data), len(data))
 
 
 async def test_a_holder_with_every_tenth_block_corrupt_is_named(
@@ -88,24 +88,24 @@ async def test_a_holder_with_every_tenth_block_corrupt_is_named(
     cid, blocks = holder_store.put_bytes(data), blocks_by_cid(data)
     answers: Counter[str] = Counter()
 
-    def lie_sometimes(query: zenoh.Query) -> None:
+    def corrupt_every_tenth(query: zenoh.Query) -> None:
         if not is_meant(query, third_session):
             return
         answers["all"] += 1
         block = blocks[requested_cid(query)]
         if answers["all"] % 10 == 0:
-            answers["lies"] += 1
+            answers["corrupt"] += 1
             block = block[:-1] + bytes([block[-1] ^ 1])
         query.reply(query.key_expr, block)
 
-    with answer_queries(third_session, lie_sometimes):
+    with answer_queries(third_session, corrupt_every_tenth):
         async with Exchange(other_session, holder_store) as honest, Exchange(session, store, width=2) as exchange:
             await until_held(session, cid, holders=2)
             answers.clear()
             assert (await exchange.fetch(cid)).read_bytes() == data
-            assert exchange.statistics().corrupt_blocks == {str(third_session.zid()): answers["lies"]}
+            assert exchange.statistics().corrupt_blocks == {str(third_session.zid()): answers["corrupt"]}
             assert honest.statistics().served > 0
-    assert answers["lies"] >= 1
+    assert answers["corrupt"] >= 1
     events = [record for record in caplog.records if getattr(record, "event", "") == "content-block-corrupt"]
     assert {record.facts["holder"] for record in events} == {str(third_session.zid())}  # type: ignore[attr-defined]
     assert str(other_session.zid()) not in exchange.statistics().corrupt_blocks
@@ -142,7 +142,7 @@ async def test_another_process_continues_a_killed_fetch(
     assert done.stdout.startswith("fetched")
     again = [name for name in given if name in first]
     assert cid not in given
-    assert len(again) <= 4, "what was on its way at the moment of the kill, at most"
+    assert len(again) <= 4, "at most the blocks under way when the process was killed"
     assert set(first) | set(given) == set(blocks)
     assert max(given.values()) == 1
     with Store(tmp_path / "fetched") as store:

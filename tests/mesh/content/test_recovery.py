@@ -31,13 +31,13 @@ CALLS = {"execute", "executemany", "pwrite", "fsync", "rename", "ftruncate", "fc
 
 def kill_before(step):
     left = step
-    def look(frame, event, function):
+    def on_event(frame, event, function):
         nonlocal left
         if event == "c_call" and function.__name__ in CALLS:
             left -= 1
             if left < 0:
                 os.kill(os.getpid(), signal.SIGKILL)
-    return look
+    return on_event
 
 def work(directory):
     with Store(directory, quota=QUOTA) as store:
@@ -71,8 +71,8 @@ with Store(sys.argv[1], quota=QUOTA) as store:
 
 
 def killed_at_each_step(directory: Path, work: str, *, check: Callable[[Path], None] | None = None) -> int:
-    """Do the work again and again, killed a step later each time, with a look at the store after each; the steps."""
-    look = check or check_consistent
+    """Repeat the work, killed one step later each time, and check the store after each. Returns the number of steps."""
+    check_store = check or check_consistent
     script = STEPPER.replace("QUOTA", str(QUOTA)).replace("WORK", work)
     with subprocess.Popen(
         [sys.executable, "-c", script, str(directory)],
@@ -86,7 +86,7 @@ def killed_at_each_step(directory: Path, work: str, *, check: Callable[[Path], N
         for step in range(2000):
             print(step, file=stepper.stdin, flush=True)
             outcome = stepper.stdout.readline().strip()
-            look(directory)
+            check_store(directory)
             if outcome == "done":
                 stepper.stdin.close()
                 return step
@@ -134,15 +134,15 @@ def test_eviction_and_removal_killed_at_any_step_leave_a_consistent_store(tmp_pa
 
 
 def test_setting_aside_killed_at_any_step_leaves_a_consistent_store(tmp_path: Path) -> None:
-    rotten, sound = bytes(range(256)) * (2 * CHUNK_SIZE // 256 + 1), b"is as it was"
+    damaged, sound = bytes(range(256)) * (2 * CHUNK_SIZE // 256 + 1), b"is as it was"
 
     def damage(directory: Path) -> None:
         with Store(directory, quota=QUOTA) as store:
-            cid = store.put_bytes(rotten)
+            cid = store.put_bytes(damaged)
             assert store.damaged() == ()
         flip_bit(directory / cid, CHUNK_SIZE + 1)
 
-    def look(directory: Path) -> None:
+    def check_set_aside(directory: Path) -> None:
         with Store(directory, quota=QUOTA) as store:
             held, aside = store.list(), store.damaged()
             (cid,) = {*held, *aside} - {kept}
@@ -150,7 +150,7 @@ def test_setting_aside_killed_at_any_step_leaves_a_consistent_store(tmp_path: Pa
             assert store.check().damaged == (() if aside else (cid,))
             assert store.list() == (kept,)
             assert store.damaged() == (cid,)
-            assert store.usage().bytes == len(sound) + len(rotten)
+            assert store.usage().bytes == len(sound) + len(damaged)
             assert store.usage().files == 1
             assert store.get_block(kept) is not None
         damage(directory)
@@ -158,7 +158,7 @@ def test_setting_aside_killed_at_any_step_leaves_a_consistent_store(tmp_path: Pa
     with Store(tmp_path, quota=QUOTA) as store:
         kept = store.put_bytes(sound)
     damage(tmp_path)
-    assert killed_at_each_step(tmp_path, "store.check()", check=look) > 10
+    assert killed_at_each_step(tmp_path, "store.check()", check=check_set_aside) > 10
 
 
 @pytest.mark.parametrize("seed", range(3))

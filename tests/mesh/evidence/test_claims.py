@@ -57,13 +57,13 @@ def test_two_files_alone_leave_the_other_findings_open(job: JobFiles) -> None:
     job.claim = Claim()
     verdict = job.verify()
     assert verdict.holds
-    untold = {finding.name for finding in verdict.findings if finding.holds is None}
-    assert untold == {"finalized", "signature", "result-file", "objective-file", "liability", "agent", "lighthouse"}
+    undecided = {finding.name for finding in verdict.findings if finding.holds is None}
+    assert undecided == {"finalized", "signature", "result-file", "objective-file", "liability", "agent", "lighthouse"}
 
 
 def test_an_arbiter_needs_no_chain_with_the_result_message(job: JobFiles) -> None:
     job.claim = Claim()
     verdict = job.verify(job.message())
     assert verdict.holds
-    untold = {finding.name for finding in verdict.findings if finding.holds is None}
-    assert untold == {"finalized", "objective-file", "lighthouse"}
+    undecided = {finding.name for finding in verdict.findings if finding.holds is None}
+    assert undecided == {"finalized", "objective-file", "lighthouse"}

@@ -49,7 +49,7 @@ def nothing_but_zeros() -> bytes:
 
 
 def private_records() -> bytes:
-    """A gigabyte of empty records of somebody's own kind."""
+    """A gigabyte of empty records with a private opcode."""
     data = struct.pack("<BQ", 0x80, 0) * (CHUNK // 9)
     return raw_file(*[chunk(zstandard.compress(data), compression="zstd", size=len(data))] * (GIB // CHUNK))
 

@@ -114,15 +114,16 @@ def test_malformed_records_are_corrupt(tmp_path: Path, content: bytes, why: str)
 
 
 @pytest.mark.parametrize(
-    ("limits", "what"),
+    ("limits", "limit"),
     [
         (Limits(messages=249), "messages"),
         (Limits(channels=1), "channels"),
         (Limits(definitions=80), "definitions"),
-        (Limits(record=500), "chunk"),
-        (Limits(expanded=10_000), "expand"),
+        (Limits(record=500), "record"),
+        (Limits(expanded=10_000), "expanded"),
     ],
 )
-def test_every_limit_is_enforced(tmp_path: Path, limits: Limits, what: str) -> None:
-    with pytest.raises(RecordingTooLarge, match=what):
+def test_every_limit_is_enforced(tmp_path: Path, limits: Limits, limit: str) -> None:
+    with pytest.raises(RecordingTooLarge) as caught:
         open_objective(kept(tmp_path, Bag(MESSAGES, "bz2").encode()), limits)
+    assert caught.value.limit == limit

@@ -31,7 +31,7 @@ MILLISECOND = 1_000_000
 
 
 class WoundClock:
-    """A clock that goes only when somebody sleeps, or when it is wound."""
+    """A clock that advances only by sleeping, or when the test advances it."""
 
     def __init__(self) -> None:
         self.now = 77 * SECOND
