@@ -100,9 +100,11 @@ _HOMES = {
 _load = on_demand(__name__, _HOMES)
 
 
-def __getattr__(name: str) -> Any:
-    """Load a name on its first use: an edge agent must not load what it does not need."""
-    return _version() if name == "__version__" else _load(name)
+if not TYPE_CHECKING:  # a type checker knows the names from above, and reports others
+
+    def __getattr__(name: str) -> Any:
+        """Load a name on its first use: an edge agent must not load what it does not need."""
+        return _version() if name == "__version__" else _load(name)
 
 
 def _version() -> str:

@@ -1,4 +1,4 @@
-"""Asks the air pollution sensor what is in the air, and prints what it says."""
+"""Asks the air pollution sensor for measurements, and prints them."""
 
 import argparse
 import asyncio
@@ -6,10 +6,19 @@ import secrets
 from functools import partial
 from pathlib import Path
 
-from mesh import Agent
-from mesh.recording import Played, open_objective, pack
-from mesh.running import run_to_end
-from schemas import ZERO_ADDRESS, Demand, Result, String, Verified, cid_of_file
+from mesh import (
+    ZERO_ADDRESS,
+    Agent,
+    Demand,
+    Played,
+    Result,
+    String,
+    Verified,
+    cid_of_file,
+    open_objective,
+    pack,
+    run_to_end,
+)
 
 GASES = ("dust", "CO", "LPG", "methane", "smoke", "hydrogen")
 MODEL = cid_of_file(Path(__file__).with_name("model.md"))
@@ -19,13 +28,13 @@ answers: asyncio.Queue[str] = asyncio.Queue()
 
 
 @agent.on_result
-async def hear(result: Verified[Result]) -> None:
+async def receive(result: Verified[Result]) -> None:
     if result.message.liability == agent.address:
         answers.put_nowait(result.message.result)
 
 
 async def question() -> Demand:
-    """A demand for a measurement, for nothing."""
+    """A demand for a measurement that pays nothing."""
     chain, settings = agent.parts.chain, agent.settings
     return Demand(
         model=MODEL,
@@ -41,16 +50,15 @@ async def question() -> Demand:
 
 
 async def answer() -> Played:
-    """Ask until somebody answers; the measurement, of the file that the Result names."""
+    """Ask until the sensor answers; returns the measurement in the recording that its Result names."""
     cid = None
-    while cid is None:  # a sensor that is not there yet does not hear what was said before
-        agent.channel.publish(agent.parts.signer.sign(await question()))
+    while cid is None:  # a sensor that starts later does not receive earlier demands
+        agent.publish(await question())
         try:
             cid = await asyncio.wait_for(answers.get(), 5)
         except TimeoutError:
-            print("nobody answers yet", flush=True)
-    recording = await agent.parts.exchange.fetch(cid, size_limit=1 << 20, timeout=30)
-    return next(iter(open_objective(recording).messages()))
+            print("no answer yet", flush=True)
+    return next(iter(open_objective(await agent.fetch(cid)).messages()))
 
 
 async def ask(times: int, out: Path | None) -> None:

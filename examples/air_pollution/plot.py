@@ -1,14 +1,11 @@
-"""Draws what the air pollution sensor has said, from recordings, to a PNG: `python plot.py RECORDING… -o air.png`."""
+"""Plots measurements of the air pollution sensor from recordings: `python plot.py RECORDING… -o air.png`."""
 
 import argparse
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
-from mesh.errors import AiraError, ConfigurationError, InputError
-from mesh.recording import open_objective
-from mesh.running import fail
-from schemas import String
+from mesh import AiraError, ConfigurationError, InputError, String, fail, open_objective
 
 GASES = ("dust", "CO", "LPG", "methane", "smoke", "hydrogen")
 
@@ -17,7 +14,7 @@ Reading = tuple[datetime, list[float]]
 
 
 def readings(recording: Path) -> Iterator[Reading]:
-    """The measurements in a recording. Raises `InputError` for one that is none."""
+    """The measurements in a recording. Raises `InputError` for a message that is not a measurement."""
     for message in open_objective(recording).messages():
         if message.topic == "/measurements":
             words = String.decode(message.payload).data.split()
@@ -31,7 +28,7 @@ def readings(recording: Path) -> Iterator[Reading]:
 
 
 def draw(measured: Iterable[Reading], png: Path) -> int:
-    """Draw them to `png`, a line each gas; returns how many there are. Raises `ConfigurationError`, `InputError`."""
+    """Plot them to `png`, one line per gas; returns how many there are. Raises `ConfigurationError`, `InputError`."""
     try:
         from matplotlib.dates import date2num
         from matplotlib.figure import Figure

@@ -1,13 +1,10 @@
-"""Air pollution sensor: answers who asks for nothing with what it measures now. The Result needs no contract."""
+"""Air pollution sensor: answers each Demand that pays nothing with its next measurement, without a contract."""
 
-import asyncio
 import tempfile
 from pathlib import Path
 
 from bridges.serial import Device
-from mesh import Agent
-from mesh.recording import Recorder, RecordingAbout
-from schemas import STRING, Demand, Result, String, Verified, cid_of_file
+from mesh import STRING, Agent, Demand, Recorder, RecordingAbout, Result, String, Verified, cid_of_file
 
 agent = Agent(cid_of_file(Path(__file__).with_name("model.md")))
 board = Device(agent)
@@ -16,35 +13,35 @@ waiting: list[Verified[Demand]] = []
 
 @agent.every(1.0)
 async def listen() -> None:
-    """Tell the next measurement to all who have asked; begun anew should the listening end."""
+    """Answer all waiting demands with each measurement. `every` starts this again should it end."""
     async with board.listen("/measurements") as measurements:
         print("listening to the board", flush=True)
         async for text in measurements:
             if waiting and isinstance(text, String):
-                cid = await asyncio.to_thread(record, text)
+                cid = await record(text)
                 while waiting:
-                    tell(waiting.pop().signer, cid)
+                    answer(waiting.pop().signer, cid)
 
 
 @agent.on_demand
 async def take(demand: Verified[Demand]) -> None:
-    if not demand.message.cost:  # a paid one wants a contract, which is another lesson
+    if not demand.message.cost:  # one that pays needs a contract, as in the other examples
         waiting.append(demand)
 
 
-def tell(asker: str, cid: str) -> None:
-    """A Result without a contract: its liability is the asker's address."""
-    agent.channel.publish(agent.parts.signer.sign(Result(liability=asker, result=cid, success=True)))
-    print(f"told {asker}: {cid}", flush=True)
+def answer(asker: str, cid: str) -> None:
+    """Publish a Result without a contract: it names the asker's address as its liability."""
+    agent.publish(Result(liability=asker, result=cid, success=True))
+    print(f"answered {asker}: {cid}", flush=True)
 
 
-def record(text: String) -> str:
-    """A recording with one measurement, in the store; returns its CID."""
+async def record(text: String) -> str:
+    """Put a recording with one measurement into the store; returns its CID."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "measurement.mcap"
         with Recorder(path, RecordingAbout(agent=agent.address)) as recorder:
             recorder.record("/measurements", text.encode(), STRING, role="device")
-        return agent.parts.store.put_file(path)
+        return await agent.add(path)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,9 @@
-"""Blink: a board whose lamp blinks for money. The board is brought into the mesh by `aira edge`."""
+"""Blink: a board whose lamp blinks for money. `aira edge` connects the board to the mesh."""
 
 from pathlib import Path
 
 from bridges.serial import Device
-from mesh import Agent
-from mesh.work.job import Job
-from schemas import Demand, Verified, cid_of_file
+from mesh import Agent, Demand, Job, Verified, cid_of_file
 
 agent = Agent(cid_of_file(Path(__file__).with_name("model.md")))
 board = Device(agent)

@@ -1,11 +1,9 @@
-"""Blink with arguments: the objective says which lamp. Another colour is a failed job, and the person is refunded."""
+"""Blink with arguments: the objective names the lamp. A colour without a lamp fails the job."""
 
 from pathlib import Path
 
 from bridges.serial import Device
-from mesh import Agent, JobFailed
-from mesh.work.job import Job
-from schemas import Demand, String, Verified, cid_of_file
+from mesh import Agent, Demand, Job, JobFailed, String, Verified, cid_of_file
 
 LAMPS = ("red", "blue")
 

@@ -1,9 +1,8 @@
-"""Hello mesh: greets everybody who publishes a Demand for its model. It needs a router, no account and no chain."""
+"""Hello mesh: greets everyone who publishes a Demand for its model. It needs a router, but no account and no chain."""
 
 from pathlib import Path
 
-from mesh import Agent
-from schemas import Demand, Verified, cid_of_file
+from mesh import Agent, Demand, Verified, cid_of_file
 
 agent = Agent(cid_of_file(Path(__file__).with_name("model.md")))
 

@@ -1,11 +1,9 @@
-"""A robot that does the job: offers its work for each Demand of its model, and blinks as the objective says."""
+"""A robot that does the job: it offers its work for each Demand of its model, and blinks as the objective says."""
 
 import asyncio
 from pathlib import Path
 
-from mesh import Agent
-from mesh.work.job import Job
-from schemas import Demand, Verified, cid_of_file
+from mesh import Agent, Demand, Job, Verified, cid_of_file
 
 agent = Agent(cid_of_file(Path(__file__).with_name("model.md")))
 
