@@ -1,7 +1,7 @@
-"""Accounts: private keys that sign transactions here and messages by `schemas.signing`.
+"""Accounts: private keys that sign transactions here, and messages with `schemas.signing`.
 
-Keyfiles are the Web3 secret storage (version 3) that geth, parity and the legacy stack wrote. A key leaves this module
-only inside a signature; nothing of it is logged or shown.
+Keyfiles are Web3 secret storage (version 3), as geth, parity and the legacy stack write them. Keys never leave this
+module and are never logged or shown.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class KeyfileError(ConfigurationError):
-    """A keyfile or its password file can't be read or written, or is no Web3 secret storage."""
+    """A keyfile or its password file can't be read or written, or is not Web3 secret storage."""
 
     code = "keyfile-error"
 
@@ -47,14 +47,14 @@ class WrongPassword(KeyfileError):
 
 
 class SignedTransaction(NamedTuple):
-    """A transaction as it goes to a node, and the hash it will have (0x…)."""
+    """A signed transaction as bytes, and its hash (0x…)."""
 
     raw: bytes
     hash: str
 
 
 class Account:
-    """One private key: its address, and what it signs. `repr` shows the address only."""
+    """A private key that signs. `repr` shows its address only."""
 
     def __init__(self, private_key: bytes) -> None:
         self.signer = Signer(private_key)
@@ -64,19 +64,19 @@ class Account:
 
     @classmethod
     def from_key(cls, private_key: bytes) -> Account:
-        """The account of a 32-byte private key. Raises `InputError` when it is none."""
+        """The account of a 32-byte private key. Raises `InputError` for anything else."""
         return cls(private_key)
 
     @classmethod
     def from_keyfile(cls, keyfile: Path | str, password_file: Path | str) -> Account:
         """The account of a keyfile, opened with the first line of a password file.
 
-        Takes most of a second, as keyfiles are made to. Raises `KeyfileError`, `WrongPassword`.
+        Takes most of a second, by design of keyfiles. Raises `KeyfileError`, `WrongPassword`.
         """
         return cls(_open_keyfile(Path(keyfile), _read_password(Path(password_file)), password_from=password_file))
 
     def sign_transaction(self, fields: Mapping[str, Any]) -> SignedTransaction:
-        """Sign a transaction's fields, named as in JSON-RPC with ints for quantities, all of them given."""
+        """Sign a transaction whose fields are complete, named as in JSON-RPC, with ints for quantities."""
         signed = self._key.sign_transaction(dict(fields))
         return SignedTransaction(raw=bytes(signed.raw_transaction), hash="0x" + bytes(signed.hash).hex())
 
@@ -88,15 +88,15 @@ class Account:
 
 
 def new_private_key() -> bytes:
-    """A fresh private key, from the system's random source."""
+    """A new private key from the system's random source."""
     return bytes(PrivateKey().secret)
 
 
 def write_keyfile(path: Path | str, private_key: bytes, password: str) -> str:
     """Write a key, encrypted, to a new file that only its owner reads; the account's address.
 
-    Takes most of a second. Raises `KeyfileError` when the file exists or can't be written, `InputError` when
-    `private_key` is none.
+    Takes most of a second. Raises `KeyfileError` when the file exists or can't be written, `InputError` for an
+    invalid `private_key`.
     """
     address = Account(private_key).address
     content = create_keyfile_json(private_key, password.encode())
@@ -124,7 +124,7 @@ def copy_keyfile(source: Path | str, path: Path | str, *, opened_by: str, passwo
 
 
 def keyfile_address(keyfile: Path | str) -> str | None:
-    """The address that a keyfile claims, without its password; None if it does not say. Raises `KeyfileError`."""
+    """The address that a keyfile states, without its password; None if it states none. Raises `KeyfileError`."""
     claimed = _read_keyfile(Path(keyfile)).get("address")
     return parse_address("0x" + claimed.removeprefix("0x").lower()) if isinstance(claimed, str) else None
 

@@ -1,4 +1,4 @@
-"""The built contracts, as package data: `artifacts/NAME.json`, made by the contracts' own build."""
+"""The built contracts (package data `artifacts/NAME.json`), and recognising their code on a chain."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WORD: Final = 32
 
 @dataclass(frozen=True, slots=True)
 class Artifact:
-    """A built contract: its ABI, the code that deploys it, and the code that is deployed, its immutables zero."""
+    """A built contract: ABI, creation code, and deployed code with zeros for its immutables."""
 
     name: str
     abi: tuple[dict[str, Any], ...]

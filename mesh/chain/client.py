@@ -1,4 +1,4 @@
-"""The chain as the mesh uses it: liabilities, lighthouses, tokens, names, events; one account that signs."""
+"""`Chain`: liabilities, lighthouses, tokens, names and events of one chain, for one account."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ class Chain:
     names or addresses, empty for those under that root. `timing`, `fees` and `transactions` are for the node (see
     `Node`), unless a node is given.
 
-    Amounts are ints: wei for ETH, wn for XRT, a token's smallest unit otherwise. Addresses are EIP-55; where a
-    lighthouse, token or account is asked for, an ENS name does as well.
+    Amounts are ints: wei for ETH, wn for XRT, a token's smallest unit otherwise. Addresses are EIP-55; an ENS name
+    works wherever a lighthouse, token or account is expected.
 
     Used with `async with`, which raises `NodeUnreachable`, `NoContracts` and `UnknownName`. Every method raises
-    `NodeUnreachable` when the node is lost, except those that wait for something. What sends a transaction waits until
-    it is mined and raises `NoAccount`, `Reverted` (also without sending, when the simulation fails),
-    `InsufficientFunds`, `TransactionTimeout`. What it can do is in its parts: `liabilities`, `lighthouses`, `tokens`,
-    `names`, and `follow` for events.
+    `NodeUnreachable` when the node is lost, except those that wait for something. Methods that send a transaction wait
+    until it is mined, and raise `NoAccount`, `Reverted` (also without sending, when the simulation fails),
+    `InsufficientFunds`, `TransactionTimeout`. Its methods are grouped in parts: `liabilities`,
+    `lighthouses`, `tokens`, `names`; `follow` yields events.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class Chain:
 
     @property
     def factory(self) -> str:
-        """Address of the factory, which is also what `approve` names as the spender for costs and fees."""
+        """Address of the factory, which is the spender to approve for costs and fees."""
         return self._opened().factory
 
     @property

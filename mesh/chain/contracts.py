@@ -1,4 +1,4 @@
-"""The network's contracts on one chain: where they are, and who signs what is sent to them."""
+"""The contracts on one chain, and the sender of transactions to them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contracts:
-    """What the parts of an open `Chain` share. `factory` and `xrt` are addresses; `sender` is None for reading only."""
+    """The parts that an open `Chain` shares. `factory` and `xrt` are addresses; `sender` is None for reading only."""
 
     node: Node
     names: Names
@@ -34,7 +34,7 @@ class Contracts:
         return self.signing().account.address
 
     def signing(self) -> TransactionSender:
-        """What sends the account's transactions. Raises `NoAccount`."""
+        """The sender of the account's transactions. Raises `NoAccount`."""
         if self.sender is None:
             raise NoAccount
         return self.sender
@@ -44,7 +44,7 @@ class Contracts:
         return await self.signing().call(function)
 
     async def address_or_own(self, name_or_address: str | None) -> str:
-        """The address behind a name; the account's own for None."""
+        """The address of a name; the account's own for None."""
         return self.own_address if name_or_address is None else await self.names.address(name_or_address)
 
     def factory_contract(self) -> AsyncContract:

@@ -1,4 +1,4 @@
-"""Putting the contracts on a chain: names, token, factory, and the first lighthouse."""
+"""Deploying the contracts: names, token, factory, and the first lighthouse."""
 
 from __future__ import annotations
 
@@ -27,27 +27,27 @@ XRT: Final = 10**9 * WN
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeploymentPlan:
-    """What a deployment is made with. Amounts are wn (10^-9 XRT), times are blocks."""
+    """The parameters of a deployment. Amounts are wn (10^-9 XRT), times are blocks."""
 
     lighthouse: str = "airalab"
     """Label of the first lighthouse: `airalab.lighthouse.N.robonomics.eth`."""
 
     initial_supply: int = 1_000_000 * XRT
-    """XRT given to the deployer; all else is minted for work."""
+    """XRT of the deployer; all other XRT is minted for work."""
 
     minimal_stake: int = 1 * XRT
-    """What a provider stakes at least; each such amount is one transaction a turn."""
+    """The least stake of a provider; each such amount is one transaction per turn."""
 
     timeout_blocks: int = 25
-    """Silence of the provider whose turn it is, until another may take the turn."""
+    """How long the current provider may be silent before another takes the turn."""
 
     refund_delay: int = 50_400
-    """From the creation of a liability until its promisee may take the tokens back (a week of 12-second blocks)."""
+    """From the creation of a liability until it can be refunded (a week of 12-second blocks)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Deployment:
-    """Addresses of what was deployed, EIP-55, the number of the last block that it took, and its gas altogether."""
+    """The deployed addresses (EIP-55), the number of the last block, and the gas of all transactions."""
 
     ens: str
     resolver: str
@@ -75,7 +75,7 @@ async def deploy(
 
 
 class _Deployer:
-    """The steps; the order matters, as each uses what the one before made."""
+    """The steps of a deployment, each of which needs the ones before."""
 
     def __init__(self, node: Node, account: Account, plan: DeploymentPlan) -> None:
         self._node = node
@@ -117,7 +117,7 @@ class _Deployer:
         return receipt
 
     async def _name(self, registry: AsyncContract, resolver: str, *, xrt: str, factory: str) -> None:
-        """Both generations' roots lead to the same contracts; lighthouses are named by the factory."""
+        """Name the contracts under the roots of both generations; the factory names the lighthouses."""
         set_record = registry.functions.setSubnodeRecord
         set_address = self._node.contract("Resolver", resolver).functions.setAddr
 

@@ -39,7 +39,7 @@ REVERT_HINTS: Final[Mapping[str, str]] = MappingProxyType(
 
 
 class NodeUnreachable(ChainError):
-    """No node answers at the endpoint, or what answers is no Ethereum node. Trying again later may help."""
+    """No Ethereum node answers at the endpoint. Trying again later may help."""
 
     code = "node-unreachable"
 
@@ -53,7 +53,7 @@ class NodeUnreachable(ChainError):
 
 
 class WrongChain(ConfigurationError):
-    """Of several nodes one is on another chain than the rest; `found` and `expected` are EIP-155 numbers."""
+    """One of several nodes is on another chain; `found` and `expected` are EIP-155 numbers."""
 
     code = "wrong-chain"
 
@@ -68,7 +68,7 @@ class WrongChain(ConfigurationError):
 
 
 class RequestRefused(ChainError):
-    """The node answered with an error that has no better name here. `rpc_code` is JSON-RPC's."""
+    """The node answered with an error that has no class of its own here. `rpc_code` is JSON-RPC's."""
 
     code = "request-refused"
 
@@ -104,7 +104,7 @@ class UnknownName(ChainError):
 
 
 class NotALiability(ChainError):
-    """An address that the factory did not make: its terms can't be trusted."""
+    """The factory did not create the contract at an address: its terms can't be trusted."""
 
     code = "not-a-liability"
 
@@ -114,7 +114,7 @@ class NotALiability(ChainError):
 
 
 class NotOffered(ChainError):
-    """The original contracts lack something that ours have."""
+    """The original contracts lack a function that ours have."""
 
     code = "not-offered"
 
@@ -143,7 +143,7 @@ class InsufficientFunds(ChainError):
 
 
 class InsufficientTokens(ChainError):
-    """The account holds less of a token than it is to give. Amounts are the token's smallest unit (wn for XRT)."""
+    """The account has less of a token than is needed. Amounts are the token's smallest unit (wn for XRT)."""
 
     code = "insufficient-tokens"
 
@@ -159,7 +159,7 @@ class InsufficientTokens(ChainError):
 
 
 class StakeTooSmall(InputError):
-    """A lighthouse takes no provider with less than its minimal stake. Amounts are wn."""
+    """The stake is below the lighthouse's minimum. Amounts are wn."""
 
     code = "stake-too-small"
 
@@ -173,7 +173,7 @@ class StakeTooSmall(InputError):
 
 
 class FeeTooHigh(ChainError):
-    """Gas costs more than the account is ready to pay; nothing was sent. Prices are wei for a unit of gas."""
+    """Gas costs more than the ceiling; nothing was sent. Prices are wei per unit of gas."""
 
     code = "fee-too-high"
 
@@ -187,7 +187,7 @@ class FeeTooHigh(ChainError):
 
 
 class Reverted(ChainError):
-    """A contract refused.
+    """A contract reverted.
 
     `reason` is the name of its custom error (`CostMismatch`), or the text of a plain revert, `Panic`, `OutOfGas`, or
     empty when it gave none; `arguments` are the custom error's; `data` is what it reverted with. `gas_used` and `wei`
@@ -256,7 +256,7 @@ class ReorganisedTooDeep(ChainWentBack):
 
 
 class NoAccount(ConfigurationError):
-    """Something was to be signed and no account was given."""
+    """A transaction needs an account, and none was given."""
 
     code = "no-account"
 
@@ -265,7 +265,7 @@ class NoAccount(ConfigurationError):
 
 
 class InvalidName(InputError):
-    """A text that can't be an ENS name."""
+    """A text that is not an ENS name."""
 
     code = "invalid-name"
 

@@ -1,4 +1,4 @@
-"""What happens on a chain: the events of the factory, the lighthouses, the liabilities and the token."""
+"""The events of the factory, the lighthouses, the liabilities and the token, and their decoding from logs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class NewLiability:
-    """A contract between a promisee and a promisor was made."""
+    """A liability was created."""
 
     liability: str
     tx: str
@@ -40,7 +40,7 @@ class Finalized:
 
 @dataclass(frozen=True, slots=True)
 class NewLighthouse:
-    """A market was made; `name` is its label."""
+    """A lighthouse was created; `name` is its label."""
 
     lighthouse: str
     name: str
@@ -49,7 +49,7 @@ class NewLighthouse:
 
 @dataclass(frozen=True, slots=True)
 class Transfer:
-    """Tokens changed hands, XRT (`value` in wn) unless another was asked for. The zero address mints and burns."""
+    """Tokens were transferred: XRT (`value` in wn) or the followed token. The zero address mints and burns."""
 
     sender: str
     recipient: str
@@ -59,7 +59,7 @@ class Transfer:
 
 @dataclass(frozen=True, slots=True)
 class Approval:
-    """An owner let a spender take up to `value` of its tokens, XRT (wn) unless another was asked for."""
+    """An owner allowed a spender to take up to `value` of its tokens: XRT (wn) or the followed token."""
 
     owner: str
     spender: str
@@ -69,7 +69,7 @@ class Approval:
 
 @dataclass(frozen=True, slots=True)
 class Online:
-    """A provider staked on a lighthouse and takes part in its turns."""
+    """A provider staked on a lighthouse, and takes part in its turns from now on."""
 
     lighthouse: str
     provider: str
@@ -78,7 +78,7 @@ class Online:
 
 @dataclass(frozen=True, slots=True)
 class Offline:
-    """A provider took its stake off a lighthouse."""
+    """A provider withdrew its stake from a lighthouse."""
 
     lighthouse: str
     provider: str
@@ -87,7 +87,7 @@ class Offline:
 
 @dataclass(frozen=True, slots=True)
 class Current:
-    """A provider has its turn on a lighthouse, with `quota` transactions left."""
+    """A provider has the turn on a lighthouse, with `quota` transactions left."""
 
     lighthouse: str
     provider: str
@@ -107,7 +107,7 @@ ChainEvent: TypeAlias = NewLiability | Finalized | NewLighthouse | Transfer | Ap
 
 
 def decode_log(log: Any) -> ChainEvent | None:
-    """The event in a log; None for another contract's that only looks alike."""
+    """The event in a log; None for a log of other contracts that only looks similar."""
     entry = _layouts().get(bytes(log["topics"][0])) if log["topics"] else None
     if entry is None:
         return None
@@ -124,29 +124,29 @@ def decode_log(log: Any) -> ChainEvent | None:
 
 
 def _padded(data: bytes) -> bytes:
-    """The data of an event in whole words: the original factory of generation 3 cuts its string off at the end."""
+    """The data padded to whole words: the original factory of generation 3 does not pad its string."""
     return data + bytes(-len(data) % 32)
 
 
 def topics_of(*contracts: str) -> list[str]:
-    """The topics (0x…) of the events that are read of these contracts (keys of `EVENTS`)."""
+    """The topics (0x…) of the events of these contracts (keys of `EVENTS`)."""
     names = {name for contract in contracts for name in EVENTS[contract]}
     return ["0x" + topic.hex() for topic, layout in _layouts().items() if layout[0] in names]
 
 
 def lighthouse_created(logs: Iterable[Any]) -> NewLighthouse:
-    """The one lighthouse that a transaction made."""
+    """The lighthouse that a transaction created."""
     return next(event for log in logs if isinstance(event := decode_log(log), NewLighthouse))
 
 
 def liability_created(logs: Iterable[Any], *, factory: str) -> NewLiability:
-    """The one liability that a transaction made. Tokens, which it may have called, can log the same."""
+    """The liability that a transaction created. Other contracts, such as tokens, may log the same event."""
     ours = (decode_log(log) for log in logs if _address(log["address"]) == factory)
     return next(event for event in ours if isinstance(event, NewLiability))
 
 
 def xrt_minted(logs: Iterable[Any], *, xrt: str, account: str) -> int:
-    """The XRT (wn) that a transaction made for an account. Other tokens may say what they like."""
+    """The XRT (wn) that a transaction minted for an account. Other tokens may log the same event."""
     transfers = (decode_log(log) for log in logs if _address(log["address"]) == xrt)
     return sum(
         transfer.value
@@ -190,7 +190,7 @@ EVENTS: Final = {
 
 @cache
 def _layouts() -> dict[bytes, tuple[str, list[str], list[str]]]:
-    """Name, types of the indexed and of the other members of each of `EVENTS`, by topic."""
+    """The name and the types of the indexed and the other members of each of `EVENTS`, by topic."""
     layouts = {}
     for contract, names in EVENTS.items():
         for entry in load_artifact(contract).abi:

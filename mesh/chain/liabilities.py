@@ -42,12 +42,12 @@ GETTERS: Final = (
 )
 
 READ_AT_ONCE: Final = 8
-"""Records that a listing asks a node for at the same time."""
+"""How many records a listing asks the node for at the same time."""
 
 
 @dataclass(frozen=True, slots=True)
 class Created:
-    """A liability that a transaction made, and the gas that it took, for so many wei."""
+    """A liability that a transaction created, the gas that it used, and what that cost in wei."""
 
     liability: str
     tx: str
@@ -57,9 +57,9 @@ class Created:
 
 @dataclass(frozen=True, slots=True)
 class Settled:
-    """The transaction that finalized or refunded a liability, and the gas that it took, for so many wei.
+    """The transaction that ended a liability, the gas that it used, and what that cost in wei.
 
-    `minted` is the XRT (wn) that its sender was given for that.
+    `minted` is the XRT (wn) that its sender received for it.
     """
 
     tx: str
@@ -70,18 +70,18 @@ class Settled:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RefundState:
-    """Whether the promisee of a liability can be paid back, as of the block `block_number`."""
+    """Whether a liability can be refunded, as of the block `block_number`."""
 
     liability: str
     block_number: int
     refundable_from: int
-    """The first block in which anybody may have that done, if the liability has not ended by then."""
+    """The first block in which anybody may refund it, if it has not ended by then."""
 
     is_finalized: bool
 
     @property
     def is_refundable(self) -> bool:
-        """Whether a transaction in the next block could do it."""
+        """Whether a transaction in the next block could refund it."""
         return not self.is_finalized and self.block_number + 1 >= self.refundable_from
 
 
@@ -100,17 +100,17 @@ class Liabilities:
         return await self._contracts.version.nonce_of(await self._contracts.address_or_own(address))
 
     async def is_order_used(self, order_hash: bytes, signer: str) -> bool:
-        """Whether a generation-3 order of `signer` (address) was used already (generation 5 is told by its nonce)."""
+        """Whether a generation-3 order of `signer` (address) was used already (generation 5 uses nonces instead)."""
         return await self._contracts.version.is_order_used(order_hash, signer)
 
     async def get(self, address: str) -> Liability:
-        """The record of a liability. Raises `NotALiability` unless the factory made it."""
+        """The record of a liability. Raises `NotALiability` unless the factory created it."""
         return await read_liability(self._contracts.node, await self._recognised(address))
 
     async def list(
         self, *, from_block: int = 0, promisee: str = "", promisor: str = "", lighthouse: str = ""
     ) -> Sequence[Liability]:
-        """The records of the liabilities made since a block, in order; of one promisee, promisor, lighthouse only."""
+        """The liabilities created since a block, in order; only those of a promisee, promisor, lighthouse if given."""
         wanted = {"promisee": promisee, "promisor": promisor}
         filters = {getter: await self._contracts.names.address(whose) for getter, whose in wanted.items() if whose}
         if lighthouse:
@@ -125,10 +125,10 @@ class Liabilities:
         return found
 
     async def watch(self, address: str) -> Liability:
-        """The record of a liability once it has ended, as its contract has it; waits for that.
+        """Wait until a liability has ended; its record then.
 
-        The end counts when it has the node's confirmations (`Timing.confirmations`). Outages of the node are
-        survived, except at the start. Raises `NotALiability`, `NodeUnreachable`.
+        The end needs `Timing.confirmations`. Outages of the node are survived, except at the start.
+        Raises `NotALiability`, `NodeUnreachable`.
         """
         address, node = await self._recognised(address), self._contracts.node
         while True:
@@ -138,13 +138,13 @@ class Liabilities:
             await asyncio.sleep(node.timing.poll_interval)
 
     async def order_hashes(self, liability: str) -> tuple[bytes, bytes]:
-        """The hashes of the demand and of the offer that a liability was made of."""
+        """The hashes of the demand and of the offer that a liability was created from."""
         functions = self._contracts.node.contract("Liability", liability).functions
         demand_hash = await self._contracts.node.read(functions.demandHash())
         return bytes(demand_hash), bytes(await self._contracts.node.read(functions.offerHash()))
 
     async def create(self, lighthouse: str, demand: Demand, offer: Offer) -> Created:
-        """Make a liability of two signed orders, as a provider of the lighthouse.
+        """Create a liability from two signed orders, as a provider of the lighthouse.
 
         Raises `InvalidMessage` for an unsigned order or one with a name that is not resolved.
         """
@@ -174,10 +174,10 @@ class Liabilities:
     async def cancel(
         self, liability: str, *, promisee_signature: str | bytes, promisor_signature: str | bytes
     ) -> Settled:
-        """End a liability without a result, as both parties want; anybody may send it.
+        """End a liability without a result, by the signatures of both parties; anybody may send it.
 
         Each party signs `schemas.cancellation_hash(liability)` with `Signer.sign_hash`: 65 bytes, or their hexadecimal
-        digits. The promisee has everything back. Raises `InvalidMessage` for what is no signature, `NotALiability`,
+        digits. The promisee gets everything back. Raises `InvalidMessage` for an invalid signature, `NotALiability`,
         `NotOffered`, `Reverted` (`WrongSigner`, `AlreadyFinalized`).
         """
         address = await self._contracts.names.address(liability)
@@ -187,7 +187,7 @@ class Liabilities:
         return self._settled(receipt)
 
     async def refund_state(self, liability: str) -> RefundState:
-        """Whether the promisee can be paid back, and from when on. Raises `NotALiability`, `NotOffered`."""
+        """Whether a liability can be refunded, and from which block on. Raises `NotALiability`, `NotOffered`."""
         address = await self._recognised(liability)
         block = await self._contracts.node.block_number()
         return RefundState(
@@ -198,7 +198,7 @@ class Liabilities:
         )
 
     async def refundable_from(self, liability: str) -> int:
-        """The block from which anyone may have the promisee paid back, if the liability is not finalized by then."""
+        """The first block in which anybody may refund a liability, if it is not finalized by then."""
         return await self._contracts.version.refundable_from(liability)
 
     async def refund(self, liability: str) -> Settled:
@@ -217,7 +217,7 @@ class Liabilities:
         return address
 
     async def _matching(self, address: str, filters: Mapping[str, str]) -> Liability | None:
-        """The record of what the factory made, None for another's, or if a reorganisation has taken it back."""
+        """The record of a liability; None if it does not match the filters, or a reorganisation reverted it."""
         self._contracts.version.recognise(address)
         functions = self._contracts.node.contract("Liability", address).functions
         try:
@@ -229,13 +229,13 @@ class Liabilities:
             return None
 
     async def _ended(self, address: str) -> Liability | None:
-        """The record of a liability whose end is confirmed; None as long as it is not."""
+        """The record of a liability if its end is confirmed."""
         block = await self._contracts.node.block_number() - self._contracts.node.timing.confirmations + 1
         try:
             if block < 0 or not await self._is_finalized(address, block):
                 return None
             return await read_liability(self._contracts.node, address, block=block)
-        except NoContracts:  # not made yet in that block
+        except NoContracts:  # not created yet in that block
             return None
 
     async def _is_finalized(self, address: str, block: int) -> bool:
@@ -244,9 +244,9 @@ class Liabilities:
 
 
 async def read_liability(node: Node, address: str, *, block: int | None = None) -> Liability:
-    """The terms and the outcome of what is known to be a liability, as of one block (by default the latest).
+    """The record of an address that is known to be a liability, as of one block (by default the latest).
 
-    Raises `NodeUnreachable`, and `NoContracts` for a block before it was made.
+    Raises `NodeUnreachable`, and `NoContracts` for a block before its creation.
     """
     block = await node.block_number() if block is None else block
     functions = node.contract("Liability", address).functions
@@ -271,6 +271,6 @@ async def read_liability(node: Node, address: str, *, block: int | None = None) 
 
 
 def _signature_bytes(liability: str, given: str | bytes) -> bytes:
-    """The bytes of a signature that somebody made. Raises `InvalidMessage` if nobody can have."""
+    """The bytes of a signature. Raises `InvalidMessage` if it is invalid."""
     recover(cancellation_hash(liability), given)
     return bytes.fromhex(given.removeprefix("0x")) if isinstance(given, str) else bytes(given)

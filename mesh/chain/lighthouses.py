@@ -27,7 +27,7 @@ class Lighthouses:
         self._tokens = Tokens(contracts)
 
     async def exists(self, address: str) -> bool:
-        """Whether the factory made the lighthouse at an address."""
+        """Whether the factory created the lighthouse at an address."""
         functions = self._contracts.factory_contract().functions
         return bool(
             await self._contracts.node.read(functions.isLighthouse(await self._contracts.names.address(address)))
@@ -44,7 +44,7 @@ class Lighthouses:
         )
 
     async def list(self, *, from_block: int = 0) -> Sequence[NewLighthouse]:
-        """All lighthouses made since a block, in order."""
+        """All lighthouses created since a block, in order."""
         created = await list_created(self._contracts.node, self._contracts.factory, from_block)
         return [event for event in created if isinstance(event, NewLighthouse)]
 
@@ -65,19 +65,19 @@ class Lighthouses:
                         yield event
 
     async def create(self, *, minimal_stake: int, timeout_blocks: int, name: str) -> NewLighthouse:
-        """Make a market. `minimal_stake` in wn; `name` is one label of a to z, 0 to 9 and -."""
+        """Create a lighthouse. `minimal_stake` is in wn; `name` is one label of a to z, 0 to 9 and -."""
         function = self._contracts.factory_contract().functions.createLighthouse
         return lighthouse_created((await self._contracts.send(function(minimal_stake, timeout_blocks, name))).logs)
 
     async def become_provider(self, lighthouse: str, stake: int) -> LighthouseState:
-        """Have at least `stake` wn staked on a lighthouse, all told; its state then.
+        """Raise one's stake on a lighthouse to at least `stake` wn; its state then.
 
-        Only what is missing is approved, and only what is missing is staked: called again after it was broken off
-        anywhere, it goes on from there. Raises `StakeTooSmall` and `InsufficientTokens` before anything is sent.
+        Only what is missing is approved and staked, so that it can be called again after an interruption.
+        Raises `StakeTooSmall` and `InsufficientTokens` before anything is sent.
         """
         me = self._contracts.own_address
         address = await self._contracts.names.lighthouse(lighthouse)
-        # In this order: a stake on its way may be mined between the two, and takes its allowance with it.
+        # In this order: a pending stake may be mined in between, and uses up its allowance.
         allowance = await self._tokens.allowance(me, address)
         state = await self._contracts.version.state(address)
         missing = stake - state.stakes.get(me, 0)
@@ -94,13 +94,13 @@ class Lighthouses:
         return await self._contracts.version.state(address)
 
     async def refill(self, lighthouse: str, value: int) -> str:
-        """Stake `value` wn, for which the lighthouse must be approved, and become a provider; the tx hash."""
+        """Stake `value` wn, which the lighthouse must be allowed to take, and become a provider; the tx hash."""
         return (
             await self._contracts.send((await self._contracts.lighthouse_contract(lighthouse)).functions.refill(value))
         ).tx
 
     async def withdraw(self, lighthouse: str, value: int) -> str:
-        """Take `value` wn off the stake, or all of it where less than the minimum would remain; the tx hash."""
+        """Withdraw `value` wn of the stake, or all of it if less than the minimum would remain; the tx hash."""
         return (
             await self._contracts.send(
                 (await self._contracts.lighthouse_contract(lighthouse)).functions.withdraw(value)

@@ -1,4 +1,4 @@
-"""The figures of a chain as one account of it sees it: transactions, what they cost, and what the account has."""
+"""Prometheus metrics of a chain for one account: its transactions, their cost, its balances."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-FRESH: Final = 10.0
-"""Seconds for which what the chain said is told again, without asking."""
-PATIENCE: Final = 1.0
-"""Seconds that a node may take; what it does not say by then is left out."""
+MAX_AGE: Final = 10.0
+"""Seconds for which an answer of the node is reused."""
+ASK_TIMEOUT: Final = 1.0
+"""Seconds that the node may take; metrics that it does not answer by then are left out."""
 
 
-class Asked:
-    """Figures that have to be asked of the node: now and then, and left out where it does not answer soon."""
+class CachedMetrics:
+    """Metrics that the node is asked for at most every `MAX_AGE` seconds, left out if it does not answer in time."""
 
     def __init__(self, ask: Callable[[], Awaitable[Iterable[MetricFamily]]]) -> None:
         self._ask = ask
@@ -32,36 +32,36 @@ class Asked:
         self._asked_at = float("-inf")
 
     async def measure(self) -> tuple[MetricFamily, ...]:
-        """The figures, not older than `FRESH`."""
-        if time.monotonic() - self._asked_at >= FRESH:
+        """The metrics, not older than `MAX_AGE`."""
+        if time.monotonic() - self._asked_at >= MAX_AGE:
             self._asked_at = time.monotonic()
             try:
-                async with asyncio.timeout(PATIENCE):
+                async with asyncio.timeout(ASK_TIMEOUT):
                     self._families = tuple(await self._ask())
             except (AiraError, TimeoutError) as error:
-                log.debug("figures of the chain are left out: %s", error)
+                log.debug("metrics of the chain are left out: %s", error)
                 self._families = ()
         return self._families
 
 
 class ChainMetrics:
-    """The figures of `chain`, which is open, and of its account if it has one."""
+    """The metrics of an open chain, and of its account if it has one."""
 
     def __init__(self, chain: Chain) -> None:
         self._chain = chain
-        self._balances = Asked(self._ask_balances)
+        self._balances = CachedMetrics(self._ask_balances)
 
     async def measure(self) -> tuple[MetricFamily, ...]:
-        """The figures now."""
+        """The metrics now."""
         counted = self._chain.node.metrics.statistics()
-        fates = {fate.value: float(count) for fate, count in counted.transactions.items()}
+        outcomes = {outcome.value: float(count) for outcome, count in counted.transactions.items()}
         return (
             by_label(
                 "aira_transactions_total",
                 "counter",
                 "Transactions of this account, by what became of them",
                 "outcome",
-                fates,
+                outcomes,
             ),
             counter("aira_gas_used_total", "Gas that transactions on the chain have used", counted.gas_used),
             counter("aira_gas_spent_wei_total", "What that gas has cost, wei", counted.wei),
@@ -83,7 +83,7 @@ class ChainMetrics:
 
 
 def reading_families(*, head: int, read_at: float) -> tuple[MetricFamily, ...]:
-    """How far the chain was read: up to the block `head`, at `read_at` of the monotonic clock."""
+    """How far the chain was read: up to the block `head`, at the time `read_at` of the monotonic clock."""
     return (
         gauge("aira_chain_head_block", "The last block that was read", head),
         gauge("aira_chain_read_age_seconds", "Seconds since a block was read", time.monotonic() - read_at),

@@ -1,7 +1,7 @@
-"""Names on a chain: ENS by two calls.
+"""ENS names, looked up with two calls.
 
-A name under a root (`N.robonomics.eth`) is asked of the root's resolver, as every client of the network does: one
-resolver for all its names, looked up once. web3's own helper wants a universal resolver, which a private chain lacks.
+Names under a root (`N.robonomics.eth`) are resolved by the root's resolver, which is looked up once, as every client of
+the network does. web3's own helper needs a universal resolver, which a private chain lacks.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MULTIHASH_ABI: Final = (
         "outputs": [{"name": "", "type": "bytes"}],
     },
 )
-"""What the public resolver of 2018 answers for a name of content; not every resolver does."""
+"""The function of the public resolver of 2018 for names of content; not every resolver has it."""
 
 NAME_RULE: Final = "names end in .eth, .sid or .test, and hold ASCII letters, digits, - and _"
 
@@ -72,7 +72,7 @@ class Names:
         self._resolvers: dict[str, str] = {}
 
     async def address(self, name_or_address: str) -> str:
-        """The address behind a name, or the given address itself; EIP-55.
+        """The address of a name, or the given address itself; EIP-55.
 
         Raises `InvalidName`, `InvalidAddress`, `UnknownName`, `NodeUnreachable`.
         """
@@ -88,7 +88,7 @@ class Names:
     async def model(self, name_or_cid: str) -> str:
         """The CID of a model behind a name (`NAME.model.N.robonomics.eth`), or the given CID itself.
 
-        Raises `InvalidCid` for what is neither, `UnknownName`, `NodeUnreachable`.
+        Raises `InvalidCid` for a text that is neither, `UnknownName`, `NodeUnreachable`.
         """
         if not is_ens_name(name_or_cid):
             parse_cid(name_or_cid)
@@ -118,7 +118,7 @@ class Names:
 
 
 async def find_registry(node: Node, ens: str) -> str:
-    """The ENS registry to use: the given one, else the public or the development one, whichever is there.
+    """The ENS registry to use: the given one, else the public one or that of a development chain.
 
     Raises `NoContracts`, `InvalidAddress`, `NodeUnreachable`.
     """

@@ -1,4 +1,4 @@
-"""What one node has done for its accounts in this process, counted: figures for an operator."""
+"""Counters of one node: the transactions of this process, their cost, and how well the node answers."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ import msgspec
 
 
 class TransactionOutcome(StrEnum):
-    """What became of a transaction, or of the wish to send one. Who is mined was sent before, and counts as both."""
+    """The outcome of a transaction. A transaction that is mined was also sent, and counts as both."""
 
     SENT = "sent"
     """Given to the node for the first time."""
     REPLACED = "replaced"
-    """Made dearer, as it was stuck."""
+    """Replaced by one with higher fees because it was stuck."""
     MINED = "mined"
-    """It is on the chain, and went through."""
+    """Mined, and successful."""
     FAILED = "failed"
-    """It is on the chain and paid for, and was refused there."""
+    """Mined and paid for, but reverted."""
     REFUSED = "refused"
-    """The contracts would refuse it, so it was never sent."""
+    """Never sent, because the contracts would revert it."""
     LOST = "lost"
-    """Another one was mined with its number."""
+    """Another transaction was mined with its nonce."""
 
 
 class NodeStatistics(msgspec.Struct, frozen=True, kw_only=True):
-    """A node's transactions by fate, the gas that they used and what it cost (wei), and how well the node answers.
+    """Transactions by outcome, the gas that they used and what it cost (wei), and how well the node answers.
 
-    `failures` are questions that no node answered, all attempts together; `losses` how often it fell silent.
+    `failures` are requests that no node answered in any attempt; `losses` is how often outages began.
     """
 
     transactions: Mapping[TransactionOutcome, int]
@@ -40,7 +40,7 @@ class NodeStatistics(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class NodeMetrics:
-    """Counts for one node. Used by one event loop."""
+    """The counters of one node. Used by one event loop."""
 
     def __init__(self) -> None:
         self._transactions = Counter(dict.fromkeys(TransactionOutcome, 0))
@@ -50,27 +50,27 @@ class NodeMetrics:
         self._losses = 0
         self._answers = True
 
-    def count(self, fate: TransactionOutcome) -> None:
-        """This became of a transaction."""
-        self._transactions[fate] += 1
+    def count(self, outcome: TransactionOutcome) -> None:
+        """Count the outcome of a transaction."""
+        self._transactions[outcome] += 1
 
     def paid(self, *, gas_used: int, wei: int) -> None:
-        """A transaction that is on the chain has cost this."""
+        """Add the cost of a mined transaction."""
         self._gas_used += gas_used
         self._wei += wei
 
     def answered(self) -> None:
-        """The node has answered."""
+        """Note that the node answered."""
         self._answers = True
 
     def failed(self) -> None:
-        """The node has not answered, however often it was asked."""
+        """Count a request that no attempt got answered."""
         self._failures += 1
         self._losses += self._answers
         self._answers = False
 
     def statistics(self) -> NodeStatistics:
-        """The counts now."""
+        """The counters now."""
         return NodeStatistics(
             transactions=dict(self._transactions),
             gas_used=self._gas_used,

@@ -1,8 +1,8 @@
-"""The interpreter's recursion limit, put right again.
+"""Lowering the interpreter's recursion limit again.
 
-py_ecc, which every Ethereum library here imports in the end, sets it to 100,000 when it is loaded. Deeply nested JSON
-then overflows the stack of C before it is refused, and so a single message could end the process; at 12,288, which
-py-evm wants, it still does in threads with a stack of 2 MB, as Zenoh's are.
+py_ecc, which the Ethereum libraries import, raises it to 100,000. Deeply nested JSON then overflows the C stack before
+it is refused, so a single message could end the process. At 12,288, which py-evm sets, it still does in threads with a
+stack of 2 MB, such as Zenoh's.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Why a contract refused: the errors of nodes turned into `Reverted`.
+"""Decoding why a contract reverted: from a node's JSON-RPC error to `Reverted`.
 
 Revert data is the 4-byte selector of an error and its ABI-encoded arguments: one of our custom errors, `Error(string)`
 or `Panic(uint256)`. Geth, anvil and the embedded chain put it into the `data` of the JSON-RPC error, others deeper.
@@ -27,20 +27,20 @@ PLAIN: Final = bytes.fromhex("08c379a0")
 """Selector of `Error(string)`, a revert with a text."""
 
 PANIC: Final = bytes.fromhex("4e487b71")
-"""Selector of `Panic(uint256)`, a failed assertion of the compiler's."""
+"""Selector of `Panic(uint256)`, a failed assertion of the compiler."""
 
 
 def decode_revert(error: Mapping[str, Any]) -> Reverted | None:
-    """The refusal that a node's JSON-RPC error tells of; None if it is another kind of error."""
+    """The revert in a node's JSON-RPC error; None if it is another kind of error."""
     data = _revert_data(error.get("data"))
     message = str(error.get("message", ""))
     if data is None and error.get("code") != REVERTED and "revert" not in message.lower():
         return None
-    return explain(data or b"", said=message)
+    return explain(data or b"", message=message)
 
 
-def explain(data: bytes, *, said: str = "") -> Reverted:
-    """The refusal in revert data; `said` is what the node said of it, for a revert that left no data."""
+def explain(data: bytes, *, message: str = "") -> Reverted:
+    """The revert in revert data; `message` is the node's, for a revert without data."""
     selector, body = data[:4], data[4:]
     try:
         if selector == PLAIN:
@@ -54,7 +54,7 @@ def explain(data: bytes, *, said: str = "") -> Reverted:
             return Reverted(name, arguments=tuple(arguments), data=data)
     except (DecodingError, UnicodeDecodeError):
         return Reverted("", data=data)
-    _, _, reason = said.partition("execution reverted: ")
+    _, _, reason = message.partition("execution reverted: ")
     return Reverted("" if data else reason, data=data)
 
 
@@ -69,7 +69,7 @@ def custom_errors() -> dict[bytes, tuple[str, list[str]]]:
 
 
 def _revert_data(data: object) -> bytes | None:
-    """The data, wherever the node put it; None if there is none."""
+    """The revert data, which nodes put in different places; None if there is none."""
     if isinstance(data, dict):
         data = data.get("data") or data.get("result")
     if not isinstance(data, str):

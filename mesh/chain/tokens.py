@@ -1,4 +1,4 @@
-"""What accounts hold: ether, XRT and other ERC-20 tokens. `chain.tokens`."""
+"""Ether, XRT and other ERC-20 tokens: balances, allowances, transfers. `chain.tokens`."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ if TYPE_CHECKING:
     from mesh.chain.contracts import Contracts
 
 LONGEST_LABEL: Final = 64
-"""Characters of a token's name or symbol that are shown: anybody may deploy a token and call it anything."""
+"""Characters of a token's name or symbol that are shown; anybody can deploy a token with any name."""
 
 MAX_DECIMALS: Final = 255
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Token:
-    """What an ERC-20 says of itself; nothing that it says can be relied on but the address.
+    """An ERC-20 token as it describes itself; only the address can be trusted.
 
-    `symbol` and `name` are empty and `decimals` is 0 where it does not say. `total_supply` is in its smallest unit, of
+    `symbol` and `name` are empty and `decimals` is 0 if it has none. `total_supply` is in its smallest unit, of
     which 10^`decimals` are one token.
     """
 
@@ -39,7 +39,7 @@ class Token:
 
 
 class Tokens:
-    """Balances, allowances and transfers. Where a token is None, it is XRT; where an account is None, it is the own."""
+    """Balances, allowances and transfers. The default token is XRT, the default account one's own."""
 
     def __init__(self, contracts: Contracts) -> None:
         self._contracts = contracts
@@ -53,15 +53,15 @@ class Tokens:
         return (await self._contracts.signing().send(to=await self._address(to), data=b"", value=value)).tx
 
     async def info(self, token: str | None = None) -> Token:
-        """What a token (XRT by default) says of itself. Raises `NoContracts` for what is no ERC-20."""
+        """A token's description (XRT by default). Raises `NoContracts` for an address without an ERC-20 token."""
         contract = await self._token(token)
         functions = contract.functions
         total_supply = int(await self._contracts.node.read(functions.totalSupply()))
         return Token(
             address=str(contract.address),
-            symbol=_label(await self._said(contract, functions.symbol())),
-            name=_label(await self._said(contract, functions.name())),
-            decimals=_decimals(await self._said(contract, functions.decimals())),
+            symbol=_label(await self._ask(contract, functions.symbol())),
+            name=_label(await self._ask(contract, functions.name())),
+            decimals=_decimals(await self._ask(contract, functions.decimals())),
             total_supply=total_supply,
         )
 
@@ -107,8 +107,8 @@ class Tokens:
         address = self._contracts.xrt if token is None else await self._address(token)
         return self._contracts.node.contract("XRT", address)
 
-    async def _said(self, contract: AsyncContract, function: AsyncContractFunction) -> bytes:
-        """The bytes that an optional function of a token answers; none where it lacks the function."""
+    async def _ask(self, contract: AsyncContract, function: AsyncContractFunction) -> bytes:
+        """The bytes that an optional function of a token returns; empty if the token lacks it."""
         call: Any = {"to": contract.address, "data": function._encode_transaction_data()}
         try:
             return await self._contracts.node.call(call)
@@ -117,7 +117,7 @@ class Tokens:
 
 
 def _label(answer: bytes) -> str:
-    """A text that is fit to be shown. Tokens of the first years answer 32 bytes instead of a string."""
+    """A printable text. Old tokens return 32 bytes instead of a string."""
     try:
         text = answer.rstrip(b"\0").decode() if len(answer) == 32 else decode(["string"], answer)[0]
     except (DecodingError, UnicodeDecodeError):

@@ -1,7 +1,6 @@
-"""JSON-RPC to a node over HTTP or WebSocket: one connection kept open, closed when told to.
+"""JSON-RPC over HTTP or WebSocket: web3 providers that keep one connection open until they are closed.
 
-web3's own HTTP provider opens a connection for each request and its WebSocket provider waits by spinning; these are
-providers for it all the same.
+web3's own HTTP provider opens a connection for each request, and its WebSocket provider waits by spinning.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
     from web3.types import RPCEndpoint, RPCResponse
 
 
-TOO_MANY: Final = 429
+TOO_MANY_REQUESTS: Final = 429
 
 
 class HttpTransport(AsyncJSONBaseProvider):
@@ -34,9 +33,9 @@ class HttpTransport(AsyncJSONBaseProvider):
             self._session = ClientSession(headers={"Content-Type": "application/json"})
         async with self._session.post(self._url, data=self.encode_rpc_request(method, params)) as response:
             body = await response.read()
-            # Some nodes answer errors with HTTP 4xx or 5xx and say what is wrong in the body; of too many requests at
-            # once there is nothing to say but to come again.
-            if response.status == TOO_MANY or (not response.ok and not body.lstrip().startswith(b"{")):
+            # Some nodes answer errors with HTTP 4xx or 5xx and a JSON-RPC error in the body. "Too many requests" is
+            # raised for a retry.
+            if response.status == TOO_MANY_REQUESTS or (not response.ok and not body.lstrip().startswith(b"{")):
                 response.raise_for_status()
             return self.decode_rpc_response(body)
 
@@ -51,7 +50,7 @@ class HttpTransport(AsyncJSONBaseProvider):
 
 
 class WebSocketTransport(AsyncJSONBaseProvider):
-    """A node at `ws(s)://…`. Raises as `HttpTransport`, `ConnectionError` for a connection that breaks meanwhile."""
+    """A node at `ws(s)://…`. Raises as `HttpTransport`, and `ConnectionError` for a lost connection."""
 
     def __init__(self, url: str) -> None:
         super().__init__()
@@ -94,15 +93,15 @@ class WebSocketTransport(AsyncJSONBaseProvider):
             return self._socket
 
     async def _read(self, socket: ClientWebSocketResponse) -> None:
-        """Hand answers to who waits for them, until the connection ends."""
+        """Deliver the answers to the requests that wait for them, until the connection ends."""
         async for message in socket:
             if message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
-                self._hand_over(message.data)
+                self._deliver(message.data)
         for answer in self._waiting.values():
             if not answer.done():
                 answer.set_exception(ConnectionResetError("the connection was closed"))
 
-    def _hand_over(self, text: str | bytes) -> None:
+    def _deliver(self, text: str | bytes) -> None:
         try:
             response = json.loads(text)
         except ValueError:

@@ -1,8 +1,8 @@
-"""Which contracts are on the chain: ours, which serve both generations at once, or the originals of one generation.
+"""The contracts on the chain: ours, which serve both generations at once, or the originals of one generation.
 
-They share most functions. Where they differ (how a result is brought, what lighthouses call their members, how a
-liability is recognised), each version has its own way; the differences are those of the design page "Chain". The
-originals themselves were not at hand: their versions are tested against our contracts, which have both sets of names.
+They share most functions. `ContractVersion` and `OriginalContracts` hold the differences: how a result is finalized,
+the names of a lighthouse's getters, how a liability is recognised. The versions of the originals are tested against
+our contracts, which have both sets of names.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from schemas.messages import Order, Result
 
 ContractKind = Literal["mesh", "original"]
-"""Ours, or what was there before."""
+"""Ours, or the legacy ones."""
 
 AGREE: Final = True
-"""A provider has no opinion of a result: only a validator, who finalizes himself, can disagree."""
+"""A provider always agrees with a result; only a validator, who finalizes on its own, can disagree."""
 
 
 class LighthouseGetters(NamedTuple):
@@ -54,22 +54,22 @@ GAS_OF: Final = {3: "gasUtilizing", 5: "gasConsumedOf"}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LighthouseState:
-    """A lighthouse as it stands: stakes in wn, times in blocks, heights as block numbers."""
+    """The state of a lighthouse. Stakes are wn, `timeout_blocks` and `keep_alive_block` count blocks."""
 
     address: str
     minimal_stake: int
     timeout_blocks: int
     keep_alive_block: int
-    """The last block in which the provider whose turn it is sent something."""
+    """The last block in which the current provider sent a transaction."""
 
     quota: int
-    """Transactions that are left of the turn."""
+    """How many transactions are left in the turn."""
 
     current: str
-    """Whose turn it is; the zero address where nobody staked."""
+    """The provider that has the turn; the zero address if there is none."""
 
     stakes: dict[str, int]
-    """Providers in the order of their turns, with what each staked."""
+    """Providers and their stakes, in the order of their turns."""
 
 
 class ContractVersion:
@@ -85,7 +85,7 @@ class ContractVersion:
         """Raise `InvalidMessage` for an order that the contracts can't read."""
 
     def finalization(self, lighthouse: AsyncContractFunctions, result: Result) -> AsyncContractFunction:
-        """The call by which a provider brings a result."""
+        """The call by which a provider finalizes a liability with its result."""
         return lighthouse.finalizeLiability(result.liability, *result_arguments(result))
 
     def validation(self, result: Result, *, agree: bool) -> AsyncContractFunction:
@@ -94,7 +94,7 @@ class ContractVersion:
         return call
 
     def cancellation(self, liability: str, promisee: bytes, promisor: bytes) -> AsyncContractFunction:
-        """The call that ends a liability as both parties have signed. Raises `NotOffered`."""
+        """The call that ends a liability by the signatures of both parties. Raises `NotOffered`."""
         return self._factory.cancel(liability, promisee, promisor)
 
     def refund(self, liability: str) -> AsyncContractFunction:
@@ -102,7 +102,7 @@ class ContractVersion:
         return self._factory.refund(liability)
 
     async def refundable_from(self, liability: str) -> int:
-        """The block from which that can be had. Raises `NotOffered`."""
+        """The first block in which the refund is possible. Raises `NotOffered`."""
         return int(await self._node.read(self._liability(liability).refundableFrom()))
 
     async def nonce_of(self, address: str) -> int:
@@ -110,15 +110,15 @@ class ContractVersion:
         return int(await self._node.read(self._factory.nonceOf(address)))
 
     async def is_order_used(self, order_hash: bytes, signer: str) -> bool:
-        """Whether the generation-3 order that `signer` has signed made its contract."""
+        """Whether the generation-3 order that `signer` signed has created its liability."""
         return bool(await self._node.read(self._factory.isOrderUsed(order_hash, signer)))
 
     def recognise(self, liability: str) -> None:
-        """Take an address for a liability: the factory said so in an event."""
+        """Remember an address as a liability, because the factory named it in an event."""
         self._liabilities.add(liability)
 
     async def is_liability(self, address: str) -> bool:
-        """Whether the factory made the contract at an address."""
+        """Whether the factory created the contract at an address."""
         if address not in self._liabilities and await self._asked_is_liability(address):
             self._liabilities.add(address)
         return address in self._liabilities
@@ -179,14 +179,14 @@ class OriginalContracts(ContractVersion):
         return await super().nonce_of(address)
 
     async def is_order_used(self, order_hash: bytes, signer: str) -> bool:
-        """Whoever has signed it: the originals take terms once, and a stranger may sign another's."""
+        """By any signer: the originals accept the same terms only once, whoever signed them."""
         return bool(await self._node.read(self._factory.isHashConsumed(order_hash)))
 
     async def state(self, lighthouse: str) -> LighthouseState:
         return await lighthouse_state(self._node, lighthouse, GETTERS[self.generation], current="marker")
 
     async def is_turn(self, lighthouse: str, provider: str) -> bool:
-        """By the rule of the originals: who the marker is at, and anybody after a timeout of silence."""
+        """By the rule of the originals: the provider at the marker, or any provider after a timeout of silence."""
         state = await self.state(lighthouse)
         silence = await self._node.block_number() + 1 - state.keep_alive_block
         return provider in state.stakes and (provider == state.current or silence > state.timeout_blocks)
@@ -197,7 +197,7 @@ class OriginalContracts(ContractVersion):
 
 
 def contract_version(kind: ContractKind, node: Node, factory: str, generation: int) -> ContractVersion:
-    """The version of a kind. Raises `ConfigurationError`."""
+    """The version for a kind and a generation. Raises `ConfigurationError` if there is none."""
     if generation not in GETTERS or kind not in ("mesh", "original"):
         raise ConfigurationError(
             f"there are no {kind} contracts of generation {generation}",
@@ -207,14 +207,14 @@ def contract_version(kind: ContractKind, node: Node, factory: str, generation: i
 
 
 def result_arguments(result: Result) -> tuple[bytes, bool, bytes]:
-    """A signed result as the contracts take it."""
+    """A signed result as arguments of the contracts."""
     return parse_cid(result.result), result.success, bytes.fromhex(result.signature)
 
 
 async def lighthouse_state(node: Node, address: str, names: LighthouseGetters, *, current: str) -> LighthouseState:
     """The state of a lighthouse, as of one block. Raises `NoContracts` if there is none, `NodeUnreachable`.
 
-    `current` is the getter of whose turn it is: of the provider's address, or of its place (`marker`).
+    `current` is the getter for the current provider: of its address, or of its index (`marker`).
     """
     block = await node.block_number()
     functions = node.contract("Lighthouse", address).functions

@@ -1,6 +1,6 @@
 """A chain to develop on: an EVM inside the process or anvil, with the contracts deployed, served over JSON-RPC.
 
-A server, not a client: the client is `mesh.chain`.
+This is a server; the client is `mesh.chain`.
 """
 
 from mesh.devchain.embedded import EmbeddedChain, ServedChain, serve_embedded

@@ -1,5 +1,5 @@
-"""Anvil, the development node of others, as a process of this one's: faster than the embedded chain, and it can keep
-its state in a file."""
+"""Anvil, Foundry's development node, as a child process: faster than the embedded chain, and able to keep its state in
+a file."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ if TYPE_CHECKING:
 
 START_SECONDS: Final = 60.0
 STOP_SECONDS: Final = 10.0
-"""Until a node that was asked to end is killed; it writes its state first."""
+"""Until a node that was asked to stop is killed; it writes its state first."""
 LOOK_SECONDS: Final = 0.02
 KEPT_LINES: Final = 5
-"""Lines of what it said last that are shown when it ends by itself."""
+"""The last lines of its output that are shown when it ends by itself."""
 PR_SET_PDEATHSIG: Final = 1
 """From `linux/prctl.h`."""
 
 
 class NodeEnded(RemoteError):
-    """The node's process ended without being asked to. `code` is its exit code, negative for a signal."""
+    """The node's process ended without being asked to. `exit_code` is negative for a signal."""
 
     code = "node-ended"
 
@@ -59,7 +59,7 @@ def find_anvil(program: Path | None) -> Path | None:
 
 
 class Anvil:
-    """A running anvil: where it answers, and the private keys of the accounts that it gives money."""
+    """A running anvil: its address, and the private keys of the accounts that it funds."""
 
     def __init__(self, program: Path, process: asyncio.subprocess.Process, *, host: str, port: int) -> None:
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
@@ -67,7 +67,7 @@ class Anvil:
         self._program = program
         self._process = process
         self._address = (host, port)
-        self._said: deque[str] = deque(maxlen=KEPT_LINES)
+        self._output: deque[str] = deque(maxlen=KEPT_LINES)
         self._listening = asyncio.create_task(self._listen(), name="output of anvil")
 
     @property
@@ -76,7 +76,7 @@ class Anvil:
         return self._process.pid
 
     async def until_ready(self, facts: Path) -> None:
-        """Return when it answers and has told its `facts`. Raises `NodeEnded`, `RemoteError` if it takes too long."""
+        """Return when it answers and has written `facts`. Raises `NodeEnded`, `RemoteError` if it takes too long."""
         with suppress(TimeoutError):
             async with asyncio.timeout(START_SECONDS):
                 while self._process.returncode is None:
@@ -89,13 +89,13 @@ class Anvil:
         await self.watch()
 
     async def watch(self) -> NoReturn:
-        """Wait for its end, and raise `NodeEnded`."""
+        """Wait until the process ends, and raise `NodeEnded`."""
         code = await self._process.wait()
         await self._listening
-        raise NodeEnded(self._program, code, " | ".join(self._said))
+        raise NodeEnded(self._program, code, " | ".join(self._output))
 
     async def stop(self) -> None:
-        """End the process, by its own id, and wait for that."""
+        """Stop the process and wait for its end."""
         with suppress(ProcessLookupError):
             self._process.terminate()
         try:
@@ -115,23 +115,23 @@ class Anvil:
         return True
 
     async def _listen(self) -> None:
-        """Keep the last lines of what it says; a pipe that nobody reads would stop it."""
+        """Read its output, which would block it otherwise, and keep the last lines."""
         assert self._process.stdout is not None
         while chunk := await self._process.stdout.read(65_536):
             for line in chunk.decode(errors="replace").splitlines():
                 if line.strip():
-                    self._said.append("".join(letter for letter in line.strip() if letter.isprintable()))
+                    self._output.append("".join(letter for letter in line.strip() if letter.isprintable()))
 
 
 @asynccontextmanager
 async def serve_anvil(
     program: Path, *, host: str, port: int, block_time: float | None, state: Path | None
 ) -> AsyncIterator[Anvil]:
-    """Run anvil for the body, which is cancelled with `NodeEnded` when anvil ends before it; port 0 takes a free one.
+    """Run anvil for the body, which is cancelled with `NodeEnded` when anvil ends by itself; port 0 takes a free one.
 
-    Each transaction is mined at once; with `block_time` (seconds) an empty block as often as well. The chain is loaded
-    from the file `state`, where it is there, and kept in it. Raises `ConfigurationError` for a port that is taken, and
-    a state that is none.
+    Each transaction is mined at once; with `block_time` (seconds) empty blocks are mined as well. The chain is loaded
+    from the file `state` if it exists, and kept in it. Raises `ConfigurationError` for a port that is taken, and for
+    an invalid state.
     """
     port = _bindable(host, port)
     async with AsyncExitStack() as stack:
@@ -154,7 +154,7 @@ async def serve_anvil(
 
 
 async def _start(program: Path, arguments: Sequence[str]) -> asyncio.subprocess.Process:
-    """The process; in a group of its own, so that a terminal's Ctrl-C comes to this program alone, which ends both."""
+    """Start the process in its own group, so that a terminal's Ctrl-C reaches only this program, which ends both."""
     try:
         return await asyncio.create_subprocess_exec(
             program,
@@ -170,15 +170,15 @@ async def _start(program: Path, arguments: Sequence[str]) -> asyncio.subprocess.
 
 
 def _end_with_parent() -> Callable[[], None] | None:
-    """What a new process does first, so that it ends with this one even if that is killed; Linux alone has it."""
+    """What the child does first so that it ends with this process even if that is killed; only on Linux."""
     if sys.platform != "linux":
         return None
-    prctl = ctypes.CDLL(None).prctl  # looked up here, as little as possible is safe between fork and exec
+    prctl = ctypes.CDLL(None).prctl  # looked up here because little is safe between fork and exec
     return partial(prctl, PR_SET_PDEATHSIG, int(signal.SIGTERM))
 
 
 def _keys_in(facts: Path) -> tuple[bytes, ...]:
-    """The private keys that anvil tells in a file; none as long as it is not written to its end."""
+    """The private keys in the file that anvil writes; empty while the file is incomplete."""
     try:
         return tuple(bytes.fromhex(key[2:]) for key in json.loads(facts.read_text())["private_keys"])
     except (OSError, ValueError):
@@ -186,7 +186,7 @@ def _keys_in(facts: Path) -> tuple[bytes, ...]:
 
 
 def _bindable(host: str, port: int) -> int:
-    """The port, or a free one instead of 0. Raises `ConfigurationError` when it can't be had."""
+    """The port, or a free one for 0. Raises `ConfigurationError` when it is taken."""
     try:
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -1,4 +1,4 @@
-"""An Ethereum node inside this process, for demonstrations and tests: nothing to install, gone when closed."""
+"""An Ethereum node inside this process, for demos and tests: nothing to install, gone when it is closed."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ T = TypeVar("T")
 
 
 class EmbeddedChain:
-    """A chain of its own: eth-tester's py-evm in one dedicated thread, so that the event loop never waits for it.
+    """A private chain: eth-tester's py-evm in one dedicated thread, so that the event loop never waits for it.
 
     Each transaction is mined at once, in a block of its own. With `block_time` (seconds) an empty block is mined
-    that often as well, for deadlines and turns that are counted in blocks. The state lives in memory.
+    that often as well, so that deadlines and turns, which count blocks, pass. The state lives in memory.
 
     Used with `async with`; `provider` and `mine` raise `ClosedError` after that. Cancelling a request leaves its work
     in the thread to finish.
@@ -76,7 +76,7 @@ class EmbeddedChain:
         return await self._in_thread(lambda: self._opened().answer(method, params))
 
     def _start(self) -> None:
-        # Imported here as py-evm takes most of a second to load, which the event loop need not wait for.
+        # Imported in the thread: py-evm takes most of a second to load.
         try:
             from mesh.devchain.evm import Evm
             from mesh.devchain.methods import Methods
@@ -106,7 +106,7 @@ class EmbeddedChain:
 
 
 class EmbeddedProvider(AsyncBaseProvider):
-    """What web3 talks to: the requests of an `EmbeddedChain`."""
+    """A web3 provider for an `EmbeddedChain`."""
 
     def __init__(self, chain: EmbeddedChain) -> None:
         super().__init__()

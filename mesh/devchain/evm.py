@@ -38,11 +38,11 @@ CALL_STIPEND: Final = 2_300
 """Gas that a value transfer passes on for free; an estimate leaves room for it, as geth's does."""
 
 Call = dict[str, Any]
-"""A call's fields by their JSON-RPC names, values parsed: from, to, data (bytes), value, gas (int)."""
+"""The fields of a call by their JSON-RPC names, parsed: from, to, data (bytes), value, gas (int)."""
 
 
 class Evm:
-    """The chain's state and what may be asked of it. Heights are block numbers; amounts are wei."""
+    """The state of the chain. Heights are block numbers; amounts are wei."""
 
     def __init__(self) -> None:
         self._backend = PyEVMBackend.from_mnemonic(
@@ -77,7 +77,7 @@ class Evm:
         return int(self._backend.chain.header.base_fee_per_gas)
 
     def height(self, tag: object) -> int:
-        """The block number behind a tag (`latest`, …) or a number. Raises `RpcError` for a block that is not there."""
+        """The block number behind a tag (`latest`, …) or a number. Raises `RpcError` for a missing block."""
         match tag:
             case "latest" | "pending" | "safe" | "finalized":
                 return self.head
@@ -139,7 +139,7 @@ class Evm:
             self._backend.mine_blocks(1)
 
     def rewind(self, height: int) -> None:
-        """Take the chain back to a block, as if nothing had come after it. Raises `RpcError` if there is none."""
+        """Remove all blocks after one. Raises `RpcError` if there is no such block."""
         block = self._backend.get_block_by_number(self.height(height), full_transaction=False)
         self._backend.revert_to_snapshot(bytes(block["hash"]))
         gone = [hash_ for hash_, receipt in self._receipts.items() if int(receipt["blockNumber"], 16) > height]
@@ -200,7 +200,7 @@ class Evm:
         return bytes(transaction.hash)
 
     def _check(self, transaction: SignedTransactionAPI, sender: bytes) -> None:
-        """Refuse with geth's words what the chain would refuse with py-evm's."""
+        """Refuse an invalid transaction with geth's error messages instead of py-evm's."""
         expected = self.nonce(sender, self.head)
         if transaction.nonce != expected:
             which = "low" if transaction.nonce < expected else "high"
@@ -230,7 +230,7 @@ class Evm:
         return f"0x{int(header.bloom):0512x}"
 
     def _set_clock(self) -> None:
-        """Give the next block the time of day; py-evm fixed it when the block before was mined."""
+        """Set the time of the next block to now; py-evm fixed it when the previous block was mined."""
         chain = self._backend.chain
         chain.set_header_timestamp(max(int(time.time()), int(chain.header.timestamp)))
 

@@ -1,7 +1,7 @@
-"""The JSON-RPC methods that the embedded node answers, by name: parameters parsed, results as JSON.
+"""The JSON-RPC methods of the embedded node, and the filters that it keeps for its clients.
 
-Enough for this project's clients, for web3.py and ethers, and for the legacy JavaScript (which polls blocks and
-receipts, and lists lighthouses by a filter): no account that the node would sign for.
+Enough for this project's clients, web3.py, ethers and the legacy JavaScript (which polls blocks and receipts, and
+lists lighthouses with a filter). The node has no accounts of its own to sign with.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 TAGS = frozenset({"latest", "pending", "safe", "finalized", "earliest"})
 
 MAX_FILTERS: Final = 1_000
-"""Filters that are kept; a further one takes the place of that which was asked least recently."""
+"""The most filters that are kept; a new one replaces the one that was used least recently."""
 
 
 class Methods:
@@ -73,7 +73,7 @@ class Methods:
         }
 
     def answer(self, method: str, params: Sequence[Any]) -> Any:
-        """The result of a method, as JSON. Raises `RpcError`, and nothing else whatever the parameters."""
+        """The result of a method, as JSON. Raises `RpcError` and nothing else, for any parameters."""
         function = self._table.get(method)
         if function is None:
             raise RpcError(METHOD_NOT_FOUND, f"the method {method} does not exist or is not available")
@@ -128,7 +128,7 @@ class Methods:
         return [log for log in self._evm.logs(first, last) if wanted.accepts(log)]
 
     def _bound(self, block: object) -> int:
-        """A bound of a range of blocks, which unlike the block of a call may lie past the head."""
+        """A bound of a range of blocks, which may be past the head, unlike the block of a call."""
         return self._evm.height(block or "latest") if block is None or block in TAGS else parse_quantity(block)
 
 
@@ -144,15 +144,18 @@ def _call(call: dict[str, Any]) -> Call:
 
 
 class _Filter:
-    """The query of a filter (None: it is of blocks), and the next block that it has not told of."""
+    """The query of a filter (None for new blocks), and the next block that it has not returned."""
 
-    def __init__(self, query: dict[str, Any] | None, following: int) -> None:
+    def __init__(self, query: dict[str, Any] | None, next_block: int) -> None:
         self.query = query
-        self.following = following
+        self.next_block = next_block
 
 
 class NodeFilters:
-    """The filters of one node. `logs` answers a query, as `eth_getLogs` does. All raise `RpcError`."""
+    """The filters of one node (`eth_newFilter`, …): each returns what is new since the last request.
+
+    `logs` answers a query as `eth_getLogs` does. All methods raise `RpcError`.
+    """
 
     def __init__(self, evm: Evm, logs: Callable[[dict[str, Any]], list[dict[str, Any]]]) -> None:
         self._evm = evm
@@ -161,23 +164,23 @@ class NodeFilters:
         self._made = 0
 
     def of_logs(self, query: object) -> str:
-        """A filter of the logs that a query accepts; its name."""
-        LogFilter(query)  # raises for what is no query
+        """Add a filter for the logs that a query accepts; its id."""
+        LogFilter(query)  # raises for an invalid query
         assert isinstance(query, dict)
         return self._add(query)
 
     def of_blocks(self) -> str:
-        """A filter of the hashes of new blocks; its name."""
+        """Add a filter for the hashes of new blocks; its id."""
         return self._add(None)
 
     def changes(self, name: object) -> list[Any]:
-        """What is new since the last time."""
+        """What is new since the last request."""
         found = self._find(name)
-        # The chain may have been taken back meanwhile.
-        first = min(found.following, self._evm.head + 1)
-        found.following = self._evm.head + 1
+        # The chain may have been reverted in the meantime.
+        first = min(found.next_block, self._evm.head + 1)
+        found.next_block = self._evm.head + 1
         if found.query is None:
-            return [self._hash(number) for number in range(first, found.following)]
+            return [self._hash(number) for number in range(first, found.next_block)]
         if isinstance(found.query.get("fromBlock"), str) and found.query["fromBlock"].startswith("0x"):
             first = max(first, parse_quantity(found.query["fromBlock"]))
         logs = self._logs(found.query | {"fromBlock": first})
@@ -191,7 +194,7 @@ class NodeFilters:
         return self._logs(query)
 
     def remove(self, name: object) -> bool:
-        """Forget a filter; False if there was none."""
+        """Remove a filter; False if there was none."""
         return self._filters.pop(str(name), None) is not None
 
     def _add(self, query: dict[str, Any] | None) -> str:

@@ -6,7 +6,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import mesh
-from mesh.chain.metrics import Asked, ChainMetrics, reading_families
+from mesh.chain.metrics import CachedMetrics, ChainMetrics, reading_families
 from mesh.network.metrics import link_state, message_families, network_families
 from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge, labelled
 from schemas.status import ALIVE, MarketStatus, Status
@@ -51,7 +51,7 @@ class ProviderStatusService:
         self._queue = queue
         self._settlement = settlement
         self._earnings = earnings
-        self._stake = Asked(self._ask_stake)
+        self._stake = CachedMetrics(self._ask_stake)
         self._began = time.monotonic()
 
     async def status(self, _request: Nothing) -> Status:

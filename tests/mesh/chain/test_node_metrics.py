@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.chain import XRT, Account, Chain, Node, NodeUnreachable, Reverted, TransactionSender, deploy
+from mesh.chain import XRT, Account, Chain, Node, NodeUnreachable, TransactionSender, deploy
 from mesh.chain.node_metrics import TransactionOutcome
 from mesh.devchain import EmbeddedChain
 from mesh.devchain.embedded import EmbeddedProvider
-from tests.mesh.chain.conftest import QUICK
-from tests.mesh.chain.lives import anvil, ask, life, stranger, until_waiting
+from tests.mesh.chain.conftest import QUICK, reverted
+from tests.mesh.chain.senders import anvil, open_sender, until_pending, unused_address
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -49,7 +49,7 @@ async def test_a_transaction_that_goes_through_is_sent_and_mined_and_costs_its_g
     async with Node(node.provider, timing=QUICK) as way:
         account = Account.from_key(node.funded_keys[0])
         before = await way.eth_balance(account.address)
-        receipt = await TransactionSender(way, account).send(to=stranger(), data=b"", value=5)
+        receipt = await TransactionSender(way, account).send(to=unused_address(), data=b"", value=5)
         counted = way.metrics.statistics()
         assert counted.transactions == NONE | {"sent": 1, "mined": 1}
         assert (counted.gas_used, counted.wei) == (receipt.gas_used, receipt.wei)
@@ -60,7 +60,7 @@ async def test_what_the_contracts_would_refuse_is_never_sent_and_costs_nothing(n
     deployer, friend = (Account.from_key(key) for key in node.funded_keys[:2])
     await deploy(node.provider, deployer)
     async with Chain(node.provider, account=friend, timing=QUICK) as chain:
-        with pytest.raises(Reverted, match="ERC20InsufficientBalance"):
+        with reverted("ERC20InsufficientBalance"):
             await chain.tokens.transfer(deployer.address, XRT)
         counted = chain.node.metrics.statistics()
         assert counted.transactions == NONE | {"refused": 1}
@@ -83,14 +83,14 @@ async def test_a_node_that_falls_silent_is_lost_once_and_each_question_fails(nod
 
 
 async def test_a_stuck_transaction_is_replaced_and_mined_once(anvil: Anvil) -> None:
-    async with life(anvil, replace(QUICK, replace_after=0.1)) as (way, sender):
-        sending = asyncio.create_task(sender.send(to=stranger(), data=b"", value=5))
-        first = (await until_waiting(way, 1))[0]
-        offered = int((await ask(way, "eth_getTransactionByHash", first))["maxFeePerGas"], 16)
-        await ask(way, "anvil_setNextBlockBaseFeePerGas", hex(offered + 1))
+    async with open_sender(anvil, replace(QUICK, replace_after=0.1)) as (way, sender):
+        sending = asyncio.create_task(sender.send(to=unused_address(), data=b"", value=5))
+        first = (await until_pending(way, 1))[0]
+        offered = int((await way.request("eth_getTransactionByHash", first))["maxFeePerGas"], 16)
+        await way.request("anvil_setNextBlockBaseFeePerGas", hex(offered + 1))
         async with asyncio.timeout(30):
             while not sending.done():
-                await ask(way, "evm_mine")
+                await way.request("evm_mine")
                 await asyncio.sleep(0.05)
         await sending
         counted = way.metrics.statistics().transactions

@@ -1,182 +1,179 @@
-"""Transactions that wait: stuck, replaced, lost, confirmed."""
+"""Transactions that an earlier life has left behind, and the journal that tells of them."""
 
 from __future__ import annotations
 
 import asyncio
+import sys
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.chain import GWEI, Account, FeePolicy, Node, NodeUnreachable, TransactionSender, TransactionTimeout
-from mesh.chain.transports import HttpTransport
+from mesh.chain import GWEI, Account, Node, TransactionSender, TransactionTimeout
+from mesh.errors import ConfigurationError
 from tests.mesh.chain.conftest import QUICK
-from tests.mesh.chain.lives import SHORT, anvil, ask, life, stranger, until_waiting
+from tests.mesh.chain.senders import NO_MINING, SHORT, anvil, open_sender, pending_hashes, until_pending, unused_address
+from tests.support.nodes import Anvil
 
 if TYPE_CHECKING:
-    from web3.types import RPCEndpoint, RPCResponse
+    from pathlib import Path
 
-    from tests.support.nodes import Anvil
 
 __all__ = ["anvil"]
 
 
-async def test_a_stuck_transaction_is_replaced_by_a_dearer_one_and_its_effect_happens_once(anvil: Anvil) -> None:
-    async with life(anvil, replace(QUICK, replace_after=0.1)) as (node, sender):
-        friend = stranger()
-        sending = asyncio.create_task(sender.send(to=friend, data=b"", value=5))
-        first = (await until_waiting(node, 1))[0]
-        offered = int((await ask(node, "eth_getTransactionByHash", first))["maxFeePerGas"], 16)
-        # No block takes the first any more.
-        await ask(node, "anvil_setNextBlockBaseFeePerGas", hex(offered + 1))
-        async with asyncio.timeout(10):
-            while not sending.done():
-                await ask(node, "evm_mine")
-                await asyncio.sleep(0.05)
-        receipt = await sending
-        paid = await ask(node, "eth_getTransactionByHash", receipt.tx)
-        assert receipt.tx != first
-        assert int(paid["maxFeePerGas"], 16) > offered
-        assert await node.eth_balance(friend) == 5
+def _files(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob("*") if path.is_file()]
 
 
-class _Swallowing(HttpTransport):
-    """A node that takes transactions, and from some moment on only says so."""
-
-    swallows = False
-
-    def __init__(self, url: str) -> None:
-        super().__init__(url)
-        self.swallowed: list[str] = []
-
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
-        if method == "eth_sendRawTransaction" and self.swallows:
-            self.swallowed.append(params[0])
-            return {"jsonrpc": "2.0", "id": 1, "result": "0x"}
-        return await super().make_request(method, params)
-
-
-async def test_the_version_that_was_replaced_may_be_the_one_that_is_mined(anvil: Anvil) -> None:
-    wire, friend = _Swallowing(anvil.url), stranger()
-    async with Node(wire, timing=replace(QUICK, replace_after=0.05)) as node:
-        sending = asyncio.create_task(
-            TransactionSender(node, Account.from_key(anvil.private_keys[0])).send(to=friend, data=b"", value=5)
-        )
-        first = (await until_waiting(node, 1))[0]
-        wire.swallows = True
-        async with asyncio.timeout(10):
-            while not wire.swallowed:
-                await asyncio.sleep(0.01)
-        await ask(node, "evm_mine")
-        assert (await sending).tx == first
-        assert await node.eth_balance(friend) == 5
-    await wire.close()
-
-
-async def test_at_the_ceiling_the_same_transaction_is_sent_again_to_a_node_that_lost_it(anvil: Anvil) -> None:
-    timing = replace(QUICK, replace_after=0.2)
-    async with life(anvil, timing, fees=FeePolicy(ceiling=3 * GWEI)) as (node, sender):
-        friend = stranger()
-        sending = asyncio.create_task(sender.send(to=friend, data=b"", value=5))
-        first = (await until_waiting(node, 1))[0]
-        await ask(node, "anvil_dropTransaction", first)
-        assert await until_waiting(node, 1) == {0: first}
-        await ask(node, "evm_mine")
-        assert (await sending).tx == first
-
-
-async def test_a_transaction_waits_for_its_confirmations(anvil: Anvil) -> None:
-    async with life(anvil, replace(QUICK, confirmations=3)) as (node, sender):
-        sending = asyncio.create_task(sender.send(to=stranger(), data=b"", value=5))
-        await until_waiting(node, 1)
-        for _ in range(2):
-            await ask(node, "evm_mine")
-        await asyncio.sleep(10 * QUICK.poll_interval)
-        assert not sending.done()
-        await ask(node, "evm_mine")
-        receipt = await sending
-        assert await node.block_number() == receipt.block_number + 2
-
-
-async def test_a_transaction_whose_block_was_replaced_is_sent_again(anvil: Anvil) -> None:
-    async with life(anvil, replace(QUICK, confirmations=3)) as (node, sender):
-        friend = stranger()
-        sending = asyncio.create_task(sender.send(to=friend, data=b"", value=5))
-        first = (await until_waiting(node, 1))[0]
-        for _ in range(2):
-            await ask(node, "evm_mine")
-        await asyncio.sleep(10 * QUICK.poll_interval)
-        await ask(node, "anvil_reorg", 2, [])
-        assert await node.eth_balance(friend) == 0
-        assert await until_waiting(node, 1) == {0: first}
-        for _ in range(3):
-            await ask(node, "evm_mine")
-        assert (await sending).block_number == 3
-        assert await node.eth_balance(friend) == 5
-
-
-class _Indexing(HttpTransport):
-    """A node that is still busy with its index, and says so when it is asked for a receipt."""
-
-    asked = 0
-
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
-        if method == "eth_getTransactionReceipt":
-            self.asked += 1
-            if self.asked < 5:
-                error = {"code": -32000, "message": "transaction indexing is in progress"}
-                return {"jsonrpc": "2.0", "id": 1, "error": error}  # type: ignore[typeddict-item]
-        return await super().make_request(method, params)
-
-
-async def test_a_node_that_is_still_indexing_is_asked_for_the_receipt_again(anvil: Anvil) -> None:
-    wire, friend = _Indexing(anvil.url), stranger()
-    async with Node(wire, timing=QUICK) as node:
-        await ask(node, "evm_setAutomine", True)
-        await TransactionSender(node, Account.from_key(anvil.private_keys[0])).send(to=friend, data=b"", value=5)
-        assert await node.eth_balance(friend) == 5
-        assert wire.asked == 5
-    await wire.close()
-
-
-async def test_after_a_lost_answer_sending_the_same_again_means_the_first(anvil: Anvil) -> None:
-    """The node takes the transaction and is gone before it says so; the caller tries again when it is back."""
-    wire, friend = _Deaf(anvil.url), stranger()
-    async with Node(wire, timing=QUICK) as node:
-        sender = TransactionSender(node, Account.from_key(anvil.private_keys[0]))
-        wire.loses = True
-        with pytest.raises(NodeUnreachable):
+async def test_what_was_mined_long_ago_is_not_what_is_meant_now(anvil: Anvil) -> None:
+    async with open_sender(anvil, replace(SHORT, repeat_within=0)) as (node, sender):
+        friend = unused_address()
+        with pytest.raises(TransactionTimeout):
             await sender.send(to=friend, data=b"", value=5)
-        wire.loses = False
-        sending = asyncio.create_task(sender.send(to=friend, data=b"", value=5))
-        await ask(node, "evm_mine")
+        await node.request("evm_mine")
+        await node.request("evm_setAutomine", True)
+        await sender.send(to=friend, data=b"", value=5)
+        assert await node.eth_balance(friend) == 10
+
+
+async def test_what_an_earlier_life_left_in_the_pool_is_not_collided_with(anvil: Anvil) -> None:
+    friend = unused_address()
+    async with open_sender(anvil, SHORT) as (_, sender):
+        with pytest.raises(TransactionTimeout):
+            await sender.send(to=friend, data=b"", value=1)
+    async with open_sender(anvil) as (node, sender):
+        sending = asyncio.create_task(sender.send(to=friend, data=b"", value=2))
+        assert sorted(await until_pending(node, 2)) == [0, 1]
+        await node.request("evm_mine")
         await sending
-        assert await node.eth_balance(friend) == 5
-        again = asyncio.create_task(sender.send(to=friend, data=b"", value=5))
-        await until_waiting(node, 1)
-        await ask(node, "evm_mine")
-        await again
-        assert await node.eth_balance(friend) == 10, "the outcome of the first was learned: this is another one"
-    await wire.close()
+        assert await node.eth_balance(friend) == 3
 
 
-class _Deaf(HttpTransport):
-    """A way to a node that can lose the answers to what is sent."""
-
-    loses = False
-
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
-        response = await super().make_request(method, params)
-        if method == "eth_sendRawTransaction" and self.loses:
-            raise ConnectionResetError("the answer was lost")
-        return response
-
-
-async def test_after_giving_up_the_same_is_waited_for_even_if_it_is_mined_by_then(anvil: Anvil) -> None:
-    async with life(anvil, SHORT) as (node, sender):
-        friend = stranger()
+async def dropped(anvil: Anvil, friend: str, *, transactions: Path) -> str:
+    """The hash of a transfer of 5 wei in an earlier open_sender, which the node has forgotten."""
+    async with open_sender(anvil, SHORT, transactions=transactions) as (node, sender):
         with pytest.raises(TransactionTimeout) as caught:
             await sender.send(to=friend, data=b"", value=5)
-        await ask(node, "evm_mine")
-        assert (await sender.send(to=friend, data=b"", value=5)).tx == caught.value.tx
+        await node.request("anvil_dropTransaction", caught.value.tx)
+    return caught.value.tx
+
+
+async def test_a_restarted_process_sends_what_the_node_forgot_again(anvil: Anvil, tmp_path: Path) -> None:
+    friend = unused_address()
+    forgotten = await dropped(anvil, friend, transactions=tmp_path)
+    async with open_sender(anvil, transactions=tmp_path) as (node, sender):
+        sending = asyncio.create_task(sender.send(to=friend, data=b"", value=5))
+        assert await until_pending(node, 1) == {0: forgotten}
+        await node.request("evm_mine")
+        assert (await sending).tx == forgotten
         assert await node.eth_balance(friend) == 5
+    assert _files(tmp_path) == [], "what is settled is not kept"
+
+
+async def test_a_forgotten_transaction_gives_its_number_to_another(anvil: Anvil, tmp_path: Path) -> None:
+    friend = unused_address()
+    await dropped(anvil, friend, transactions=tmp_path)
+    async with open_sender(anvil, transactions=tmp_path) as (node, sender):
+        sending = asyncio.create_task(sender.send(to=friend, data=b"", value=7))
+        assert list(await until_pending(node, 1)) == [0]
+        await node.request("evm_mine")
+        await sending
+        assert await node.eth_balance(friend) == 7
+
+
+async def test_what_waits_behind_a_stuck_transaction_of_an_earlier_life_gets_it_moving(
+    anvil: Anvil, tmp_path: Path
+) -> None:
+    friend = unused_address()
+    async with open_sender(anvil, SHORT, transactions=tmp_path) as (node, sender):
+        with pytest.raises(TransactionTimeout) as stuck:
+            await sender.send(to=friend, data=b"", value=1)
+    async with open_sender(anvil, replace(QUICK, replace_after=0.1), transactions=tmp_path) as (node, sender):
+        sending = asyncio.create_task(sender.send(to=friend, data=b"", value=2))
+        async with asyncio.timeout(10):
+            while (await until_pending(node, 2))[0] == stuck.value.tx:
+                await asyncio.sleep(0.01)
+        await node.request("evm_mine")
+        await sending
+        assert await node.eth_balance(friend) == 3
+
+
+async def test_a_transaction_folder_belongs_to_one_chain(tmp_path: Path) -> None:
+    """A development chain that is started afresh has the same chain id, and none of the old transactions."""
+    friend = unused_address()
+    for born in ("1700000000", "1700000001"):
+        async with (
+            Anvil(arguments=(NO_MINING, "--timestamp", born)) as anvil,
+            open_sender(anvil, SHORT, transactions=tmp_path) as (node, sender),
+        ):
+            with pytest.raises(TransactionTimeout):
+                await sender.send(to=friend, data=b"", value=1)
+            assert len(await pending_hashes(node)) == 1
+    assert [path.name for path in _files(tmp_path)] == ["000000000000.jsonl"] * 2
+
+
+async def test_a_number_that_another_transaction_took_at_last_is_replaced(anvil: Anvil) -> None:
+    """Somebody sends with the same key and number through another node, and wins."""
+    account, friend = Account.from_key(anvil.private_keys[0]), unused_address()
+    async with Node(anvil.url, timing=QUICK) as node:
+        sending = asyncio.create_task(TransactionSender(node, account).send(to=friend, data=b"", value=5))
+        await until_pending(node, 1)
+        prices = {"type": 2, "maxFeePerGas": 100 * GWEI, "maxPriorityFeePerGas": 50 * GWEI}
+        fields = {"to": friend, "data": "0x", "value": 70, "gas": 21_000, "chainId": node.chain_id, "nonce": 0}
+        rival = account.sign_transaction(fields | prices)
+        await node.request("eth_sendRawTransaction", "0x" + rival.raw.hex())
+        await node.request("evm_mine")
+        assert list(await until_pending(node, 1)) == [1]
+        await node.request("evm_mine")
+        await sending
+        assert await node.eth_balance(friend) == 75
+
+
+CHILD = """
+import asyncio, sys
+from pathlib import Path
+from mesh.chain import Account, Node, TransactionSender, Timing
+from mesh.chain.transports import HttpTransport
+
+class Forgetful(HttpTransport):
+    async def make_request(self, method, params):
+        if method == "eth_getTransactionCount":
+            params = [params[0], "latest"]
+        return await super().make_request(method, params)
+
+async def main(url, key, friend, folder, count):
+    wire = Forgetful(url)
+    timing = Timing(poll_interval=0.05, receipt_interval=0.01)
+    async with Node(wire, timing=timing, transactions=Path(folder)) as node:
+        sender = TransactionSender(node, Account.from_key(bytes.fromhex(key)))
+        await asyncio.gather(*(sender.send(to=friend, data=b"", value=1) for _ in range(int(count))))
+    await wire.close()
+
+asyncio.run(main(*sys.argv[1:]))
+"""
+
+
+async def test_processes_that_share_a_folder_never_use_the_same_nonce(tmp_path: Path) -> None:
+    """Even where the node does not count what waits."""
+    friend = unused_address()
+
+    async def child(url: str, key: bytes) -> tuple[int | None, str]:
+        arguments = (url, key.hex(), friend, str(tmp_path), "6")
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", CHILD, *arguments, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT
+        )
+        out, _ = await process.communicate()
+        return process.returncode, out.decode()
+
+    async with Anvil(arguments=("--block-time", "1")) as anvil, Node(anvil.url, timing=QUICK) as node:
+        ended = await asyncio.gather(*(child(anvil.url, anvil.private_keys[0]) for _ in range(3)))
+        assert ended == [(0, "")] * 3
+        assert await node.eth_balance(friend) == 18
+
+
+async def test_a_folder_that_can_not_be_written_is_one_clear_error(anvil: Anvil, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    async with open_sender(anvil, transactions=tmp_path / "file") as (_, sender):
+        with pytest.raises(ConfigurationError, match="can't keep sent transactions"):
+            await sender.send(to=unused_address(), data=b"", value=1)

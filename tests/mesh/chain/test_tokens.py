@@ -6,15 +6,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.chain import XRT, NoContracts, Token, TransactionSender
+from mesh.chain import XRT, Token, TransactionSender
+from tests.mesh.chain.conftest import no_contracts
 
 if TYPE_CHECKING:
-    from tests.mesh.chain.conftest import Market
+    from tests.mesh.chain.conftest import DeployedMarket
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 
 
-async def test_the_networks_token_is_described_by_itself(market: Market) -> None:
+async def test_the_networks_token_is_described_by_itself(market: DeployedMarket) -> None:
     async with market.chain() as chain:
         token = await chain.tokens.info()
         assert (
@@ -25,13 +26,13 @@ async def test_the_networks_token_is_described_by_itself(market: Market) -> None
     assert token.total_supply >= 1_000_000 * XRT
 
 
-async def test_what_is_no_token_is_one_clear_error(market: Market) -> None:
+async def test_what_is_no_token_is_one_clear_error(market: DeployedMarket) -> None:
     async with market.chain() as chain:
-        with pytest.raises(NoContracts, match="totalSupply"):
+        with no_contracts("totalSupply"):
             await chain.tokens.info(market.stranger.address)
 
 
-async def _deployed(market: Market, runtime: bytes) -> str:
+async def _deployed(market: DeployedMarket, runtime: bytes) -> str:
     """A contract with that code."""
     init = bytes.fromhex("60") + bytes([len(runtime)]) + bytes.fromhex("80600b6000396000f3")
     async with market.chain(market.stranger) as chain:
@@ -45,7 +46,7 @@ def _answering(word: bytes) -> bytes:
     return b"\x7f" + word.ljust(32, b"\0") + bytes.fromhex("60005260206000f3")
 
 
-async def test_a_token_of_the_first_years_answers_its_symbol_as_32_bytes(market: Market) -> None:
+async def test_a_token_of_the_first_years_answers_its_symbol_as_32_bytes(market: DeployedMarket) -> None:
     address = await _deployed(market, _answering(b"MKR"))
     async with market.chain() as chain:
         token = await chain.tokens.info(address)
@@ -53,7 +54,7 @@ async def test_a_token_of_the_first_years_answers_its_symbol_as_32_bytes(market:
     assert token.decimals == 0, "what is no number of decimals is none"
 
 
-async def test_a_token_that_says_nothing_has_no_symbol_and_whole_units(market: Market) -> None:
+async def test_a_token_that_says_nothing_has_no_symbol_and_whole_units(market: DeployedMarket) -> None:
     """It has `totalSupply` alone: any other call is refused."""
     supply = bytes.fromhex("60003560e01c6318160ddd14601357600080fd5b600760005260206000f3")
     address = await _deployed(market, supply)
@@ -63,7 +64,7 @@ async def test_a_token_that_says_nothing_has_no_symbol_and_whole_units(market: M
         )
 
 
-async def test_what_a_token_calls_itself_can_not_write_to_a_terminal(market: Market) -> None:
+async def test_what_a_token_calls_itself_can_not_write_to_a_terminal(market: DeployedMarket) -> None:
     address = await _deployed(market, _answering(b"\x1b[31mXRT\n\xe2\x80\xae"))
     async with market.chain() as chain:
         assert (await chain.tokens.info(address)).symbol == "[31mXRT"

@@ -13,17 +13,15 @@ from mesh.chain import (
     Account,
     Chain,
     Node,
-    NodeUnreachable,
-    Reverted,
     TransactionSender,
     TransactionTimeout,
     deploy,
-    new_private_key,
 )
 from mesh.chain.transports import HttpTransport
 from mesh.devchain import EmbeddedChain
 from mesh.devchain.embedded import EmbeddedProvider
-from tests.mesh.chain.conftest import QUICK
+from tests.mesh.chain.conftest import QUICK, reverted, unreachable
+from tests.mesh.chain.senders import unused_address
 from tests.support.nodes import Anvil
 
 if TYPE_CHECKING:
@@ -61,12 +59,8 @@ async def node() -> AsyncIterator[EmbeddedChain]:
         yield node
 
 
-def _stranger() -> str:
-    return Account.from_key(new_private_key()).address
-
-
 async def test_a_transaction_whose_answer_was_lost_goes_through_once(node: EmbeddedChain) -> None:
-    wire, friend = _Wire(node), _stranger()
+    wire, friend = _Wire(node), unused_address()
     async with Node(wire, timing=QUICK) as way:
         sender = TransactionSender(way, Account.from_key(node.funded_keys[0]))
         wire.answers_to_lose = 1
@@ -81,13 +75,13 @@ async def test_a_node_that_stays_away_while_sending_is_told(node: EmbeddedChain)
     async with Node(wire, timing=QUICK) as way:
         sender = TransactionSender(way, Account.from_key(node.funded_keys[0]))
         wire.answers_to_lose = 100
-        with pytest.raises(NodeUnreachable, match="lost"):
-            await sender.send(to=_stranger(), data=b"", value=5)
+        with unreachable("lost"):
+            await sender.send(to=unused_address(), data=b"", value=5)
 
 
 async def test_a_number_taken_by_another_client_is_replaced(node: EmbeddedChain) -> None:
     """Even by the very same transaction, byte for byte: it is another one all the same."""
-    wire, friend = _Wire(node), _stranger()
+    wire, friend = _Wire(node), unused_address()
     account = Account.from_key(node.funded_keys[0])
     async with Node(wire, timing=QUICK) as one, Node(node.provider, timing=QUICK) as other:
         wire.before = lambda: TransactionSender(other, account).send(to=friend, data=b"", value=5)
@@ -107,13 +101,13 @@ async def test_what_fails_only_when_mined_is_explained(node: EmbeddedChain) -> N
         await rival.tokens.transfer(friend.address, XRT)
         await chain.tokens.approve(deployer.address, XRT)
         wire.before = lambda: rival.tokens.transfer_from(friend.address, deployer.address, XRT)
-        with pytest.raises(Reverted, match="ERC20InsufficientBalance") as caught:
+        with reverted("ERC20InsufficientBalance") as caught:
             await chain.tokens.transfer(deployment.factory, XRT)
         assert caught.value.arguments == (friend.address, 0, XRT)
 
 
 async def test_transactions_of_one_node_do_not_fight_for_numbers(node: EmbeddedChain) -> None:
-    wire, friend = _Wire(node), _stranger()
+    wire, friend = _Wire(node), unused_address()
     account = Account.from_key(node.funded_keys[0])
     async with Node(wire, timing=QUICK) as way:
         await asyncio.gather(*(TransactionSender(way, account).send(to=friend, data=b"", value=1) for _ in range(10)))
@@ -123,7 +117,7 @@ async def test_transactions_of_one_node_do_not_fight_for_numbers(node: EmbeddedC
 
 async def test_senders_of_one_node_fill_a_block_together() -> None:
     """On a chain that makes blocks by time, many transactions of an account wait at once, each with its number."""
-    friend = _stranger()
+    friend = unused_address()
     async with Anvil(arguments=("--block-time", "1")) as anvil, Node(anvil.url, timing=QUICK) as node:
         account = Account.from_key(anvil.private_keys[0])
         senders = [TransactionSender(node, account) for _ in range(3)]
@@ -142,7 +136,7 @@ class _Forgetful(HttpTransport):
 
 
 async def test_numbers_go_on_where_the_node_forgets_what_is_pending() -> None:
-    friend = _stranger()
+    friend = unused_address()
     async with Anvil(arguments=("--block-time", "1")) as anvil:
         forgetful = _Forgetful(anvil.url)
         async with Node(forgetful, timing=QUICK) as node:
@@ -154,7 +148,7 @@ async def test_numbers_go_on_where_the_node_forgets_what_is_pending() -> None:
 
 async def test_a_transaction_that_is_not_mined_is_given_up_and_the_next_waits_behind_it() -> None:
     timing = replace(QUICK, receipt_timeout=0.1)
-    friend = _stranger()
+    friend = unused_address()
     async with Anvil(arguments=("--no-mining",)) as anvil, Node(anvil.url, timing=timing) as node:
         sender = TransactionSender(node, Account.from_key(anvil.private_keys[0]))
         with pytest.raises(TransactionTimeout) as caught:
@@ -168,7 +162,7 @@ async def test_a_transaction_that_is_not_mined_is_given_up_and_the_next_waits_be
 
 
 async def test_the_number_of_a_transaction_that_the_node_dropped_is_used_again() -> None:
-    friend = _stranger()
+    friend = unused_address()
     async with (
         Anvil(arguments=("--no-mining",)) as anvil,
         Node(anvil.url, timing=replace(QUICK, receipt_timeout=0.1)) as node,
@@ -185,14 +179,14 @@ async def test_the_number_of_a_transaction_that_the_node_dropped_is_used_again()
 
 async def test_a_chain_without_a_base_fee_is_paid_by_gas_price() -> None:
     arguments = ("--hardfork", "berlin", "--gas-price", "1000000000")
-    friend = _stranger()
+    friend = unused_address()
     async with Anvil(arguments=arguments) as anvil, Node(anvil.url, timing=QUICK) as node:
         await TransactionSender(node, Account.from_key(anvil.private_keys[0])).send(to=friend, data=b"", value=1)
         assert await node.eth_balance(friend) == 1
 
 
 async def test_cancelling_does_not_hold_up_the_next(node: EmbeddedChain) -> None:
-    wire, friend = _Wire(node), _stranger()
+    wire, friend = _Wire(node), unused_address()
     reached = asyncio.Event()
 
     async def hang() -> None:

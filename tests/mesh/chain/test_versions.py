@@ -15,7 +15,7 @@ from mesh.errors import ConfigurationError, InvalidMessage
 from tests.mesh.chain.conftest import cid, events_of, read_to
 
 if TYPE_CHECKING:
-    from tests.mesh.chain.conftest import Market
+    from tests.mesh.chain.conftest import DeployedMarket
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 
@@ -23,7 +23,7 @@ FINALIZE_BY = {3: "af0bdb38", 5: "563e52d5"}
 """Selectors of to(address,bytes) and finalizeLiability(address,bytes,bool,bytes)."""
 
 
-async def _orders(market: Market, generation: int, **fields: Any) -> tuple[Any, Any]:
+async def _orders(market: DeployedMarket, generation: int, **fields: Any) -> tuple[Any, Any]:
     if generation == 3:
         return market.demand(**fields), market.offer(**fields)
     async with market.chain() as chain:
@@ -33,7 +33,7 @@ async def _orders(market: Market, generation: int, **fields: Any) -> tuple[Any, 
 
 
 @pytest.mark.parametrize("generation", [3, 5])
-async def test_a_job_is_done_by_the_calls_of_the_generation(market: Market, generation: int) -> None:
+async def test_a_job_is_done_by_the_calls_of_the_generation(market: DeployedMarket, generation: int) -> None:
     options: dict[str, Any] = {"contracts": "original", "generation": generation}
     async with market.chain(market.provider, **options) as chain:
         start = await chain.block_number()
@@ -47,7 +47,7 @@ async def test_a_job_is_done_by_the_calls_of_the_generation(market: Market, gene
     assert Finalized(created.liability, True, cid(3), settled.tx) in events
 
 
-async def test_generation_3s_result_of_a_failed_job_pays_the_promisee_back(market: Market) -> None:
+async def test_generation_3s_result_of_a_failed_job_pays_the_promisee_back(market: DeployedMarket) -> None:
     async with market.chain(market.provider, contracts="original", generation=3) as chain:
         before = await chain.tokens.balance(market.promisee.address)
         created = await chain.liabilities.create("airalab", *await _orders(market, 3, cost=XRT))
@@ -56,7 +56,9 @@ async def test_generation_3s_result_of_a_failed_job_pays_the_promisee_back(marke
 
 
 @pytest.mark.parametrize("generation", [3, 5])
-async def test_a_liability_is_known_by_the_factorys_event_or_by_its_gas(market: Market, generation: int) -> None:
+async def test_a_liability_is_known_by_the_factorys_event_or_by_its_gas(
+    market: DeployedMarket, generation: int
+) -> None:
     options: dict[str, Any] = {"contracts": "original", "generation": generation}
     async with market.chain(market.provider) as chain:
         start = await chain.block_number()
@@ -74,7 +76,7 @@ async def test_a_liability_is_known_by_the_factorys_event_or_by_its_gas(market: 
 
 
 @pytest.mark.parametrize("generation", [3, 5])
-async def test_a_lighthouse_is_read_by_the_names_of_the_generation(market: Market, generation: int) -> None:
+async def test_a_lighthouse_is_read_by_the_names_of_the_generation(market: DeployedMarket, generation: int) -> None:
     options: dict[str, Any] = {"contracts": "original", "generation": generation}
     async with market.chain(market.provider) as ours, market.chain(market.provider, **options) as chain:
         assert await chain.lighthouses.get("airalab") == await ours.lighthouses.get("airalab")
@@ -82,7 +84,7 @@ async def test_a_lighthouse_is_read_by_the_names_of_the_generation(market: Marke
         assert not await chain.lighthouses.is_turn("airalab", market.stranger.address)
 
 
-async def test_names_are_those_of_the_generations_root(market: Market) -> None:
+async def test_names_are_those_of_the_generations_root(market: DeployedMarket) -> None:
     async with market.chain(generation=5) as chain:
         assert (chain.factory, chain.xrt) == (market.deployment.factory, market.deployment.xrt)
         assert await chain.names.lighthouse("airalab") == await chain.names.address(
@@ -90,7 +92,7 @@ async def test_names_are_those_of_the_generations_root(market: Market) -> None:
         )
 
 
-async def test_what_the_originals_lack_is_told(market: Market) -> None:
+async def test_what_the_originals_lack_is_told(market: DeployedMarket) -> None:
     result = market.result(market.stranger.address)
     async with market.chain(market.provider, contracts="original", generation=3) as chain:
         with pytest.raises(NotOffered, match="generation 3 offer no nonceOf") as caught:
@@ -109,7 +111,7 @@ async def test_what_the_originals_lack_is_told(market: Market) -> None:
             await chain.liabilities.create("airalab", *await _orders(market, 3))
 
 
-async def test_contracts_that_never_were_are_refused(market: Market) -> None:
+async def test_contracts_that_never_were_are_refused(market: DeployedMarket) -> None:
     for options in ({"contracts": "original", "generation": 4}, {"contracts": "other"}):
         with pytest.raises(ConfigurationError, match="there are no"):
             async with market.chain(factory=market.deployment.factory, xrt=market.deployment.xrt, **options):

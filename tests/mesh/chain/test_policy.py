@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.chain import GWEI, Account, FeePolicy, FeeTooHigh, Node, TransactionSender, new_private_key
+from mesh.chain import GWEI, Account, FeePolicy, FeeTooHigh, Node, TransactionSender
 from mesh.chain.policy import Fees
 from mesh.chain.transports import HttpTransport
 from mesh.errors import ConfigurationError
 from tests.mesh.chain.conftest import QUICK
+from tests.mesh.chain.senders import unused_address
 from tests.support.nodes import Anvil
 
 if TYPE_CHECKING:
@@ -31,22 +32,14 @@ def _sender(node: Node, anvil: Anvil) -> TransactionSender:
     return TransactionSender(node, Account.from_key(anvil.private_keys[0]))
 
 
-def _stranger() -> str:
-    return Account.from_key(new_private_key()).address
-
-
-async def _ask(node: Node, method: str, *params: Any) -> Any:
-    return await node.request(method, *params)
-
-
 async def _next_base_fee(node: Node, wei: int) -> None:
-    await _ask(node, "anvil_setNextBlockBaseFeePerGas", hex(wei))
-    await _ask(node, "evm_mine")
+    await node.request("anvil_setNextBlockBaseFeePerGas", hex(wei))
+    await node.request("evm_mine")
 
 
 async def test_above_the_ceiling_nothing_is_sent(anvil: Anvil) -> None:
     async with Node(anvil.url, timing=QUICK, fees=FeePolicy(ceiling=20 * GWEI)) as node:
-        sender, friend = _sender(node, anvil), _stranger()
+        sender, friend = _sender(node, anvil), unused_address()
         await _next_base_fee(node, 30 * GWEI)
         with pytest.raises(FeeTooHigh, match=r"31 gwei now, and the ceiling is 20 gwei") as caught:
             await sender.send(to=friend, data=b"", value=1)
@@ -57,7 +50,7 @@ async def test_above_the_ceiling_nothing_is_sent(anvil: Anvil) -> None:
 
 async def test_with_patience_a_transaction_waits_for_the_price_to_come_down(anvil: Anvil) -> None:
     async with Node(anvil.url, timing=QUICK, fees=FeePolicy(ceiling=20 * GWEI, patience=20)) as node:
-        friend = _stranger()
+        friend = unused_address()
         await _next_base_fee(node, 30 * GWEI)
         sending = asyncio.create_task(_sender(node, anvil).send(to=friend, data=b"", value=1))
         await asyncio.sleep(5 * QUICK.poll_interval)
@@ -70,8 +63,8 @@ async def test_with_patience_a_transaction_waits_for_the_price_to_come_down(anvi
 async def test_never_more_than_the_ceiling_is_offered(anvil: Anvil) -> None:
     async with Node(anvil.url, timing=QUICK, fees=FeePolicy(ceiling=25 * GWEI)) as node:
         await _next_base_fee(node, 20 * GWEI)
-        receipt = await _sender(node, anvil).send(to=_stranger(), data=b"", value=1)
-        sent = await _ask(node, "eth_getTransactionByHash", receipt.tx)
+        receipt = await _sender(node, anvil).send(to=unused_address(), data=b"", value=1)
+        sent = await node.request("eth_getTransactionByHash", receipt.tx)
     assert int(sent["maxFeePerGas"], 16) == 25 * GWEI
     assert int(sent["type"], 16) == 2
 
@@ -102,8 +95,8 @@ async def test_a_node_without_a_word_for_priority_fees_is_asked_for_its_price(an
     async with Node(wire, timing=QUICK) as node:
         base = (await node.latest_header()).base_fee or 0
         price = await node.gas_price()
-        receipt = await _sender(node, anvil).send(to=_stranger(), data=b"", value=1)
-        sent = await _ask(node, "eth_getTransactionByHash", receipt.tx)
+        receipt = await _sender(node, anvil).send(to=unused_address(), data=b"", value=1)
+        sent = await node.request("eth_getTransactionByHash", receipt.tx)
     assert int(sent["maxPriorityFeePerGas"], 16) == price - base
     assert int(sent["maxFeePerGas"], 16) == base + price
     await wire.close()

@@ -1,4 +1,4 @@
-"""A JSON-RPC server with a WebSocket, and a client that hears what it pushes."""
+"""An embedded chain behind a JSON-RPC server, and a WebSocket client with subscriptions."""
 
 from __future__ import annotations
 
@@ -28,35 +28,35 @@ async def server(node: EmbeddedChain) -> AsyncIterator[JsonRpcServer]:
         yield server
 
 
-class Client:
-    """A client that hears all that comes on its socket."""
+class SubscriptionClient:
+    """A JSON-RPC client that also receives notifications."""
 
     def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
         self.socket = socket
-        self.heard: list[Any] = []
+        self.received: list[Any] = []
 
-    async def hear(self) -> Any:
-        """The next text."""
+    async def receive(self) -> Any:
+        """The next message."""
         async with asyncio.timeout(30):
-            self.heard.append(json.loads((await self.socket.receive()).data))
-        return self.heard[-1]
+            self.received.append(json.loads((await self.socket.receive()).data))
+        return self.received[-1]
 
     async def ask(self, method: str, *params: Any) -> Any:
-        await self.socket.send_json({"jsonrpc": "2.0", "id": len(self.heard), "method": method, "params": params})
-        return await self.hear()
+        await self.socket.send_json({"jsonrpc": "2.0", "id": len(self.received), "method": method, "params": params})
+        return await self.receive()
 
     async def subscribe(self, *params: Any) -> str:
         answer = await self.ask("eth_subscribe", *params)
         return str(answer["result"])
 
-    async def notified(self, subscription: str) -> Any:
-        """The next notification, which is of that subscription."""
-        heard = await self.hear()
+    async def next_notification(self, subscription: str) -> Any:
+        """The next message, which must be a notification of that subscription."""
+        heard = await self.receive()
         assert (heard["method"], heard["params"]["subscription"]) == ("eth_subscription", subscription)
         return heard["params"]["result"]
 
 
 @asynccontextmanager
-async def connected(server: JsonRpcServer, **headers: str) -> AsyncIterator[Client]:
+async def connected(server: JsonRpcServer, **headers: str) -> AsyncIterator[SubscriptionClient]:
     async with aiohttp.ClientSession() as session, session.ws_connect(server.ws_url, headers=headers) as socket:
-        yield Client(socket)
+        yield SubscriptionClient(socket)

@@ -1,4 +1,4 @@
-"""What the JSON-RPC server pushes on a WebSocket, heard with web3's own subscriptions and by hand."""
+"""`eth_subscribe` over a WebSocket, with web3's own subscriptions and with a plain client."""
 
 from __future__ import annotations
 
@@ -6,17 +6,22 @@ import asyncio
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
+import aiohttp
+import pytest
 from web3 import AsyncWeb3, WebSocketProvider
 
 from mesh.chain import XRT, Account, Chain, Deployment, Node, TransactionSender, deploy
+from mesh.devchain import EmbeddedChain, JsonRpcServer
+from mesh.devchain.embedded import EmbeddedProvider
 from schemas import keccak256
 from tests.mesh.chain.conftest import QUICK
-from tests.mesh.chain.pushing import connected, node, server
+from tests.mesh.devchain.websockets import SubscriptionClient, connected, node, server
+from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from mesh.devchain import EmbeddedChain, JsonRpcServer
+    from web3.types import RPCEndpoint, RPCResponse
 
 
 __all__ = ["node", "server"]
@@ -61,9 +66,9 @@ async def test_a_websocket_answers_as_a_post_does(server: JsonRpcServer) -> None
         assert (await client.ask("eth_blockNumber"))["result"] == "0x0"
         assert (await client.ask("eth_mindControl"))["error"]["code"] == -32601
         await client.socket.send_str("{nonsense")
-        assert (await client.hear())["error"]["code"] == -32700
+        assert (await client.receive())["error"]["code"] == -32700
         await client.socket.send_json([{"id": 1, "method": "eth_chainId"}, {"id": 2, "method": "eth_blockNumber"}])
-        assert [answer["id"] for answer in await client.hear()] == [1, 2]
+        assert [answer["id"] for answer in await client.receive()] == [1, 2]
 
 
 async def test_our_own_client_works_over_it(node: EmbeddedChain, server: JsonRpcServer) -> None:
@@ -76,7 +81,7 @@ async def test_every_block_is_told_once_however_many_come_at_once(node: Embedded
     async with connected(server) as client:
         subscription = await client.subscribe("newHeads")
         await node.mine(300)
-        numbers = [int((await client.notified(subscription))["number"], 16) for _ in range(300)]
+        numbers = [int((await client.next_notification(subscription))["number"], 16) for _ in range(300)]
     assert numbers == list(range(1, 301))
 
 
@@ -86,8 +91,8 @@ async def test_what_was_there_before_is_not_told(node: EmbeddedChain, server: Js
         await node.mine(1)
         second = await late.subscribe("newHeads")
         await node.mine(1)
-        assert int((await late.notified(second))["number"], 16) == 2
-        assert [int((await early.notified(first))["number"], 16) for _ in range(2)] == [1, 2]
+        assert int((await late.next_notification(second))["number"], 16) == 2
+        assert [int((await early.next_notification(first))["number"], 16) for _ in range(2)] == [1, 2]
 
 
 async def test_logs_of_replaced_blocks_are_removed_before_those_of_the_new_ones_come(
@@ -97,11 +102,11 @@ async def test_logs_of_replaced_blocks_are_removed_before_those_of_the_new_ones_
         subscription = await client.subscribe("logs", {"address": deployment.xrt})
         for value in (1, 2):
             await chain.tokens.approve(deployment.factory, value)
-        told = [await client.notified(subscription) for _ in range(2)]
+        told = [await client.next_notification(subscription) for _ in range(2)]
         await node.request("evm_revert", [hex(await chain.block_number() - 2)])
         await node.mine(2)
         await chain.tokens.approve(deployment.factory, 3)
-        told += [await client.notified(subscription) for _ in range(3)]
+        told += [await client.next_notification(subscription) for _ in range(3)]
     assert [(int(log["data"], 16), log["removed"]) for log in told] == [
         (1, False),
         (2, False),
@@ -118,11 +123,11 @@ async def test_a_chain_that_goes_back_behind_the_subscription_is_followed(
     async with connected(server) as client:
         subscription = await client.subscribe("newHeads")
         await node.mine(1)
-        assert int((await client.notified(subscription))["number"], 16) == 6
+        assert int((await client.next_notification(subscription))["number"], 16) == 6
         await node.request("evm_revert", ["0x2"])
-        assert int((await client.notified(subscription))["number"], 16) == 2
+        assert int((await client.next_notification(subscription))["number"], 16) == 2
         await node.mine(1)
-        assert int((await client.notified(subscription))["number"], 16) == 3
+        assert int((await client.next_notification(subscription))["number"], 16) == 3
 
 
 async def test_nothing_comes_after_unsubscribing(node: EmbeddedChain, server: JsonRpcServer) -> None:
@@ -132,7 +137,7 @@ async def test_nothing_comes_after_unsubscribing(node: EmbeddedChain, server: Js
         assert (await client.ask("eth_unsubscribe", one))["error"]["code"] == -32602
         await node.mine(2)
         for _ in range(2):
-            await client.notified(other)
+            await client.next_notification(other)
 
 
 async def test_a_subscription_is_of_one_connection(server: JsonRpcServer) -> None:
@@ -159,3 +164,92 @@ async def test_what_polls_whole_blocks_finds_its_transactions_in_them(
         assert {"from", "gas", "gasPrice", "nonce", "value", "transactionIndex", "blockHash"} <= sent.keys()
         logs = (await way.request("eth_getTransactionReceipt", sent["hash"]))["logs"]
         assert logs[0]["topics"][0] == TRANSFER
+
+
+@pytest.mark.parametrize(
+    ("params", "code"),
+    [
+        (["newPendingTransactions"], -32601),
+        ([], -32602),
+        ([7], -32602),
+        (["logs", "all"], -32602),
+        (["logs", {"address": "0x12"}], -32602),
+        (["logs", {"topics": 7}], -32602),
+        (["logs", {"topics": ["0x12"]}], -32602),
+    ],
+)
+async def test_what_can_not_be_subscribed_to_is_refused(server: JsonRpcServer, params: list[Any], code: int) -> None:
+    async with connected(server) as client:
+        assert (await client.ask("eth_subscribe", *params))["error"]["code"] == code
+
+
+async def test_nobody_subscribes_by_post(server: JsonRpcServer) -> None:
+    request = {"jsonrpc": "2.0", "id": 1, "method": "eth_subscribe", "params": ["newHeads"]}
+    async with aiohttp.ClientSession() as session, session.post(server.url, json=request) as response:
+        assert (await response.json())["error"]["code"] == -32601
+
+
+async def test_the_node_is_not_asked_when_nobody_is_subscribed(node: EmbeddedChain) -> None:
+    counting = Counting(node)
+    async with JsonRpcServer(counting) as server:
+        async with connected(server) as client:
+            await client.subscribe("newHeads")
+            asked = counting.asked
+            await until(lambda: counting.asked > asked + 3, seconds=30)
+        await until(lambda: not server.connections, seconds=30)
+        asked = counting.asked
+        await asyncio.sleep(0.3)
+        assert counting.asked <= asked + 1, "a look may have been under way"
+
+
+class Counting(EmbeddedProvider):
+    """An embedded chain that counts what it is asked, and can be lost."""
+
+    asked = 0
+    is_lost = False
+
+    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+        self.asked += 1
+        if self.is_lost:
+            raise ConnectionError("the wire is cut")
+        return await super().make_request(method, params)
+
+
+async def test_nothing_is_missed_while_the_node_behind_is_lost(node: EmbeddedChain) -> None:
+    flaky = Counting(node)
+    async with JsonRpcServer(flaky) as server, connected(server) as client:
+        subscription = await client.subscribe("newHeads")
+        flaky.is_lost = True
+        await node.mine(3)
+        asked = flaky.asked
+        await until(lambda: flaky.asked > asked + 2, seconds=30)
+        flaky.is_lost = False
+        assert [int((await client.next_notification(subscription))["number"], 16) for _ in range(3)] == [1, 2, 3]
+
+
+async def test_leaving_the_server_closes_its_sockets(node: EmbeddedChain) -> None:
+    async with JsonRpcServer(node.provider) as server, asyncio.timeout(30):
+        session = aiohttp.ClientSession()
+        socket = await session.ws_connect(server.ws_url)
+        client = SubscriptionClient(socket)
+        await client.subscribe("newHeads")
+        leaving = asyncio.create_task(server.__aexit__(None, None, None))
+        assert (await socket.receive()).type is aiohttp.WSMsgType.CLOSE
+        await leaving
+        await session.close()
+
+
+async def test_a_page_may_not_open_a_socket_unless_its_origin_is_allowed(node: EmbeddedChain) -> None:
+    async with JsonRpcServer(node.provider, allowed_origins=["http://page"]) as server:
+        with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
+            async with connected(server, Origin="http://elsewhere"):
+                pass
+        assert caught.value.status == 403
+        async with connected(server, Origin="http://page") as client:
+            assert (await client.ask("eth_blockNumber"))["result"] == "0x0"
+
+
+async def test_a_browser_that_looks_in_is_told_what_this_is(server: JsonRpcServer) -> None:
+    async with aiohttp.ClientSession() as session, session.get(server.url) as response:
+        assert response.status == 426
+        assert "JSON-RPC" in await response.text()

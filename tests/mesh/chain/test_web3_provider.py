@@ -15,7 +15,7 @@ from aiohttp import web
 from mesh.chain import Chain, Node, NodeUnreachable, RequestRefused, WrongChain
 from mesh.devchain import EmbeddedChain, JsonRpcServer
 from mesh.errors import ClosedError, ConfigurationError, RemoteError
-from tests.mesh.chain.conftest import QUICK
+from tests.mesh.chain.conftest import QUICK, unreachable
 from tests.support.nodes import Anvil
 from tests.support.ports import free_port
 
@@ -56,7 +56,7 @@ async def test_attempts_are_bounded_and_spaced() -> None:
 
     timing = replace(QUICK, attempts=4, retry_delay=0.02)
     async with _server(busy) as url:
-        with pytest.raises(NodeUnreachable, match="503"):
+        with unreachable("503"):
             async with Node(url, timing=timing):
                 pass
     pauses = [later - earlier for earlier, later in pairwise(seen)]
@@ -99,7 +99,7 @@ async def test_what_is_no_node_is_found_out_at_once(response: dict[str, Any], wh
         return web.Response(**response)
 
     async with _server(answer) as url:
-        with pytest.raises(NodeUnreachable, match=why):
+        with unreachable(why):
             async with Node(url, timing=QUICK):
                 pass
     assert count == 1
@@ -111,7 +111,7 @@ async def test_a_node_that_never_answers_is_given_up() -> None:
         raise AssertionError
 
     async with _server(sleepy) as url:
-        with pytest.raises(NodeUnreachable, match="no answer in time"):
+        with unreachable("no answer in time"):
             async with Node(url, timing=replace(QUICK, request_timeout=0.05)):
                 pass
 
@@ -160,7 +160,7 @@ async def test_a_websocket_that_closes_without_an_answer_is_not_waited_for() -> 
         return socket
 
     async with _server(hang_up) as url, asyncio.timeout(5):
-        with pytest.raises(NodeUnreachable, match="connection was closed"):
+        with unreachable("connection was closed"):
             async with Node(url.replace("http", "ws"), timing=QUICK):
                 pass
 
@@ -254,7 +254,7 @@ async def test_a_node_that_comes_back_on_another_chain_is_not_taken_for_what_it_
         assert await node.block_number() == 0, "by the second"
         async with Anvil(port=first.port, arguments=("--chain-id", "4")):
             await asyncio.to_thread(second.kill)
-            with pytest.raises(NodeUnreachable, match="on the chain 0x4"):
+            with unreachable("on the chain 0x4"):
                 await node.block_number()
             await asyncio.to_thread(second.start)
 

@@ -1,0 +1,182 @@
+"""Transactions that wait: stuck, replaced, lost, confirmed."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from mesh.chain import GWEI, Account, FeePolicy, Node, NodeUnreachable, TransactionSender, TransactionTimeout
+from mesh.chain.transports import HttpTransport
+from tests.mesh.chain.conftest import QUICK
+from tests.mesh.chain.senders import SHORT, anvil, open_sender, until_pending, unused_address
+
+if TYPE_CHECKING:
+    from web3.types import RPCEndpoint, RPCResponse
+
+    from tests.support.nodes import Anvil
+
+__all__ = ["anvil"]
+
+
+async def test_a_stuck_transaction_is_replaced_by_a_dearer_one_and_its_effect_happens_once(anvil: Anvil) -> None:
+    async with open_sender(anvil, replace(QUICK, replace_after=0.1)) as (node, sender):
+        friend = unused_address()
+        sending = asyncio.create_task(sender.send(to=friend, data=b"", value=5))
+        first = (await until_pending(node, 1))[0]
+        offered = int((await node.request("eth_getTransactionByHash", first))["maxFeePerGas"], 16)
+        # No block takes the first any more.
+        await node.request("anvil_setNextBlockBaseFeePerGas", hex(offered + 1))
+        async with asyncio.timeout(10):
+            while not sending.done():
+                await node.request("evm_mine")
+                await asyncio.sleep(0.05)
+        receipt = await sending
+        paid = await node.request("eth_getTransactionByHash", receipt.tx)
+        assert receipt.tx != first
+        assert int(paid["maxFeePerGas"], 16) > offered
+        assert await node.eth_balance(friend) == 5
+
+
+class _Swallowing(HttpTransport):
+    """A node that takes transactions, and from some moment on only says so."""
+
+    swallows = False
+
+    def __init__(self, url: str) -> None:
+        super().__init__(url)
+        self.swallowed: list[str] = []
+
+    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+        if method == "eth_sendRawTransaction" and self.swallows:
+            self.swallowed.append(params[0])
+            return {"jsonrpc": "2.0", "id": 1, "result": "0x"}
+        return await super().make_request(method, params)
+
+
+async def test_the_version_that_was_replaced_may_be_the_one_that_is_mined(anvil: Anvil) -> None:
+    wire, friend = _Swallowing(anvil.url), unused_address()
+    async with Node(wire, timing=replace(QUICK, replace_after=0.05)) as node:
+        sending = asyncio.create_task(
+            TransactionSender(node, Account.from_key(anvil.private_keys[0])).send(to=friend, data=b"", value=5)
+        )
+        first = (await until_pending(node, 1))[0]
+        wire.swallows = True
+        async with asyncio.timeout(10):
+            while not wire.swallowed:
+                await asyncio.sleep(0.01)
+        await node.request("evm_mine")
+        assert (await sending).tx == first
+        assert await node.eth_balance(friend) == 5
+    await wire.close()
+
+
+async def test_at_the_ceiling_the_same_transaction_is_sent_again_to_a_node_that_lost_it(anvil: Anvil) -> None:
+    timing = replace(QUICK, replace_after=0.2)
+    async with open_sender(anvil, timing, fees=FeePolicy(ceiling=3 * GWEI)) as (node, sender):
+        friend = unused_address()
+        sending = asyncio.create_task(sender.send(to=friend, data=b"", value=5))
+        first = (await until_pending(node, 1))[0]
+        await node.request("anvil_dropTransaction", first)
+        assert await until_pending(node, 1) == {0: first}
+        await node.request("evm_mine")
+        assert (await sending).tx == first
+
+
+async def test_a_transaction_waits_for_its_confirmations(anvil: Anvil) -> None:
+    async with open_sender(anvil, replace(QUICK, confirmations=3)) as (node, sender):
+        sending = asyncio.create_task(sender.send(to=unused_address(), data=b"", value=5))
+        await until_pending(node, 1)
+        for _ in range(2):
+            await node.request("evm_mine")
+        await asyncio.sleep(10 * QUICK.poll_interval)
+        assert not sending.done()
+        await node.request("evm_mine")
+        receipt = await sending
+        assert await node.block_number() == receipt.block_number + 2
+
+
+async def test_a_transaction_whose_block_was_replaced_is_sent_again(anvil: Anvil) -> None:
+    async with open_sender(anvil, replace(QUICK, confirmations=3)) as (node, sender):
+        friend = unused_address()
+        sending = asyncio.create_task(sender.send(to=friend, data=b"", value=5))
+        first = (await until_pending(node, 1))[0]
+        for _ in range(2):
+            await node.request("evm_mine")
+        await asyncio.sleep(10 * QUICK.poll_interval)
+        await node.request("anvil_reorg", 2, [])
+        assert await node.eth_balance(friend) == 0
+        assert await until_pending(node, 1) == {0: first}
+        for _ in range(3):
+            await node.request("evm_mine")
+        assert (await sending).block_number == 3
+        assert await node.eth_balance(friend) == 5
+
+
+class _Indexing(HttpTransport):
+    """A node that is still busy with its index, and says so when it is asked for a receipt."""
+
+    asked = 0
+
+    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+        if method == "eth_getTransactionReceipt":
+            self.asked += 1
+            if self.asked < 5:
+                error = {"code": -32000, "message": "transaction indexing is in progress"}
+                return {"jsonrpc": "2.0", "id": 1, "error": error}  # type: ignore[typeddict-item]
+        return await super().make_request(method, params)
+
+
+async def test_a_node_that_is_still_indexing_is_asked_for_the_receipt_again(anvil: Anvil) -> None:
+    wire, friend = _Indexing(anvil.url), unused_address()
+    async with Node(wire, timing=QUICK) as node:
+        await node.request("evm_setAutomine", True)
+        await TransactionSender(node, Account.from_key(anvil.private_keys[0])).send(to=friend, data=b"", value=5)
+        assert await node.eth_balance(friend) == 5
+        assert wire.asked == 5
+    await wire.close()
+
+
+async def test_after_a_lost_answer_sending_the_same_again_means_the_first(anvil: Anvil) -> None:
+    """The node takes the transaction and is gone before it says so; the caller tries again when it is back."""
+    wire, friend = _Deaf(anvil.url), unused_address()
+    async with Node(wire, timing=QUICK) as node:
+        sender = TransactionSender(node, Account.from_key(anvil.private_keys[0]))
+        wire.loses = True
+        with pytest.raises(NodeUnreachable):
+            await sender.send(to=friend, data=b"", value=5)
+        wire.loses = False
+        sending = asyncio.create_task(sender.send(to=friend, data=b"", value=5))
+        await node.request("evm_mine")
+        await sending
+        assert await node.eth_balance(friend) == 5
+        again = asyncio.create_task(sender.send(to=friend, data=b"", value=5))
+        await until_pending(node, 1)
+        await node.request("evm_mine")
+        await again
+        assert await node.eth_balance(friend) == 10, "the outcome of the first was learned: this is another one"
+    await wire.close()
+
+
+class _Deaf(HttpTransport):
+    """A way to a node that can lose the answers to what is sent."""
+
+    loses = False
+
+    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+        response = await super().make_request(method, params)
+        if method == "eth_sendRawTransaction" and self.loses:
+            raise ConnectionResetError("the answer was lost")
+        return response
+
+
+async def test_after_giving_up_the_same_is_waited_for_even_if_it_is_mined_by_then(anvil: Anvil) -> None:
+    async with open_sender(anvil, SHORT) as (node, sender):
+        friend = unused_address()
+        with pytest.raises(TransactionTimeout) as caught:
+            await sender.send(to=friend, data=b"", value=5)
+        await node.request("evm_mine")
+        assert (await sender.send(to=friend, data=b"", value=5)).tx == caught.value.tx
+        assert await node.eth_balance(friend) == 5
