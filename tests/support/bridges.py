@@ -1,8 +1,8 @@
-"""Container networks for tests: their bridges keep one hardware address for as long as they live.
+"""Container networks for tests: network bridges that keep their hardware address.
 
-The kernel gives a bridge the lowest address of its ports, another one whenever a container comes or goes, and the
-others go on sending to the old one for ten seconds: names are not found for so long. Where udev runs it fixes the
-address; a machine that runs tests may have none.
+The kernel gives a bridge the lowest address of its ports, so the address changes whenever a container starts or stops.
+Other containers send to the old address for ten seconds, and name resolution fails meanwhile. udev fixes the address,
+but a machine that runs tests may not have udev.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 INTERFACES = Path("/sys/class/net")
 FIXED = "3"
-"""`addr_assign_type` of an address that was set."""
+"""The `addr_assign_type` of an address that was set explicitly."""
 SIOCSIFHWADDR = 0x8924
 ARPHRD_ETHER = 1
 LOOK_SECONDS = 0.01
@@ -28,7 +28,7 @@ LOOK_SECONDS = 0.01
 
 @contextmanager
 def steady_bridges() -> Iterator[None]:
-    """Fix the addresses of podman's bridges that there are and that come into being in the body."""
+    """Fix the addresses of podman's bridges, those created in the body included."""
     done = threading.Event()
     watch = threading.Thread(target=_watch, args=(done,), name="addresses of bridges")
     watch.start()
@@ -42,7 +42,7 @@ def steady_bridges() -> Iterator[None]:
 def _watch(done: threading.Event) -> None:
     while True:
         for bridge in INTERFACES.glob("podman*"):
-            # It may go away at any moment.
+            # It may disappear at any moment.
             with suppress(OSError):
                 if (bridge / "addr_assign_type").read_text().strip() != FIXED:
                     _fix(bridge.name, (bridge / "address").read_text().strip())

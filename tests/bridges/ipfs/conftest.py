@@ -1,4 +1,4 @@
-"""Two daemons of a kind in one swarm, for all tests of a run; tests use topics of their own."""
+"""Two daemons of one kind in one swarm, shared by all tests; each test uses its own topic."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ _topics = count(1)
 
 @dataclass(frozen=True)
 class Swarm:
-    """Two daemons; `b` knows `a`, once `join` was awaited."""
+    """Two daemons; `b` knows `a` after `join`."""
 
     a: JsIpfs | Kubo
     b: JsIpfs | Kubo
 
     async def join(self) -> None:
-        """Connect them, which lasts until one of them stops."""
+        """Connect them, until one of them stops."""
         async with LegacyClient(self.b.api) as client:
             await client.call("swarm/connect", ("arg", self.a.swarm_address))
 
 
 @pytest.fixture(scope="session", params=KINDS)
 def kind(request: pytest.FixtureRequest) -> type[JsIpfs | Kubo]:
-    """What the daemons are: js-ipfs, and a current Kubo where `AIRA_KUBO` names one."""
+    """The kind of daemon: js-ipfs, and a current Kubo if `AIRA_KUBO` names one."""
     return KINDS[request.param]
 
 
 @pytest.fixture(scope="session")
 def shared_swarm(kind: type[JsIpfs | Kubo]) -> Iterator[Swarm]:
-    """Two daemons that no test stops."""
+    """Two daemons, which no test stops."""
     with ExitStack() as stack:
         with ThreadPoolExecutor(2) as starting:
             a, b = starting.map(lambda daemon: stack.enter_context(daemon), (kind(), kind()))
@@ -57,14 +57,14 @@ async def swarm(shared_swarm: Swarm) -> Swarm:
 
 @pytest.fixture(scope="session")
 def library() -> Iterator[LibraryNode]:
-    """A Kubo library node, connected to nobody."""
+    """A Kubo library node without connections."""
     with LibraryNode() as node:
         yield node
 
 
 @pytest.fixture
 def topic() -> str:
-    """A lighthouse's name that no other test uses."""
+    """The name of a lighthouse that no other test uses."""
     return f"market{next(_topics)}.lighthouse.3.robonomics.eth"
 
 

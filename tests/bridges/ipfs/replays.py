@@ -1,15 +1,15 @@
-"""The RPC of two generations of daemons, answer for answer, as far as a bridge asks it. Those of a list are one swarm.
+"""Replays of the RPC of two generations of daemons, for the calls that a bridge makes.
 
 `OldDaemon` is go-ipfs 0.4.18, after its `core/commands/pubsub.go`: any method; a topic is an argument as it is, each
 further argument is a message; the lines of a subscription hold base64.
 
 `RecentDaemon` is a Kubo of 2026, after its `core/commands/pubsub.go`, `core/corehttp/commands.go`,
 `core/node/libp2p/pubsub.go` and the `http` of go-ipfs-cmds: POST only; topics and data in base64url behind a `u`;
-published data is a file; browsers and who lacks a listed `Authorization` get 403 as plain text. Since 0.40 a message
-whose number is checked after a higher one of the same node is refused with `validation ignored` by the node itself, and
-dropped by each other one, which says nothing.
+published data is a file; browsers and clients without a listed `Authorization` get 403 as plain text. Since 0.40 a
+message whose number is validated after a higher one of the same node is refused with `validation ignored` by the node
+itself, and silently dropped by others.
 
-Both send the headers of a subscription at once, and no first line `{}` as js-ipfs does.
+Both send the headers of a subscription at once, without the first line `{}` of js-ipfs.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ DENIED = (
 
 
 class Replay(ABC):
-    """One daemon at `api`. `others` are its swarm; `pubsub` is the setting with which it was started."""
+    """One daemon at `api`. `others` are the rest of its swarm; `pubsub` is the setting with which it was started."""
 
     version: ClassVar[str]
     disabled: ClassVar[str]
-    """What it says of PubSub that is not enabled."""
+    """Its error while PubSub is disabled."""
 
     def __init__(self, *, pubsub: bool = True, authorization: str = "") -> None:
         self.port = free_port()
@@ -57,7 +57,7 @@ class Replay(ABC):
 
     @property
     def peer_id(self) -> str:
-        """Its name in the swarm, as the RPC writes it in lists."""
+        """Its peer id, as the RPC writes it in lists."""
         return f"Qm{self.identity.hex()}"
 
     async def __aenter__(self) -> Self:
@@ -87,21 +87,21 @@ class Replay(ABC):
         await self._runner.cleanup()
 
     def listens(self, topic: str) -> bool:
-        """Whether it is subscribed to a topic."""
+        """Whether it is subscribed to `topic`."""
         return bool(self._subscribers.get(topic))
 
     def deliver(self, topic: str, data: bytes, sender: Replay, sequence: int) -> None:
-        """A message of the swarm has come."""
+        """Deliver a message of the swarm to the subscribers."""
         for queue in self._subscribers.get(topic, []):
             queue.put_nowait(json.dumps(self.event(topic, data, sender, sequence)).encode() + b"\n")
 
     @abstractmethod
     def denies(self, request: web.Request) -> web.Response | None:
-        """The answer to who may not ask."""
+        """The response to a client without access, None for others."""
 
     @abstractmethod
     def topic_of(self, request: web.Request) -> str:
-        """The topic that a call names."""
+        """The topic of a call."""
 
     @abstractmethod
     def event(self, topic: str, data: bytes, sender: Replay, sequence: int) -> dict[str, object]:
@@ -120,7 +120,7 @@ class Replay(ABC):
         return web.json_response({"ID": self.peer_id, "Addresses": None, "AgentVersion": f"kubo/{self.version}/"})
 
     async def _swarm_peers(self, request: web.Request) -> web.Response:
-        # Of nobody it makes null, not an empty list.
+        # Without peers the list is null, not empty.
         return web.json_response({"Peers": [{"Addr": "", "Peer": other.peer_id} for other in self.others] or None})
 
     async def _sub(self, request: web.Request) -> web.StreamResponse:
@@ -146,7 +146,7 @@ class Replay(ABC):
 
 
 class OldDaemon(Replay):
-    """A go-ipfs of 2018, behind a proxy that wants `authorization` if there is one."""
+    """A go-ipfs of 2018, behind a proxy that requires `authorization` if it is given."""
 
     version = "0.4.18"
     disabled = "experimental pubsub feature not enabled. Run daemon with --enable-pubsub-experiment to use."
@@ -180,10 +180,10 @@ class OldDaemon(Replay):
 
 
 class RecentDaemon(Replay):
-    """A Kubo of 2026, `authorization` being listed in its `API.Authorizations` with all paths that a bridge needs.
+    """A Kubo of 2026; `authorization` is listed in its `API.Authorizations` with all paths that a bridge needs.
 
-    `slow` seconds lie between the number and the check of every second message of its own, `busy` seconds between the
-    arrival and the check of every second one of others: those that come together are checked in the wrong order.
+    It waits `slow` seconds between numbering and validating every second message of its own, and `busy` seconds between
+    receiving and validating every second message of others, so that concurrent messages are validated out of order.
     """
 
     version = "0.44.0"
@@ -193,10 +193,10 @@ class RecentDaemon(Replay):
         super().__init__(pubsub=pubsub, authorization=authorization)
         self.slow = slow
         self.busy = busy
-        self.overtaken = 0
-        """Messages of its own that it has refused."""
+        self.refused_as_replay = 0
+        """Messages of its own that it refused."""
         self.lost = 0
-        """Messages of others that it has dropped."""
+        """Messages of others that it dropped."""
         self._highest: dict[Replay, int] = {}
 
     def denies(self, request: web.Request) -> web.Response | None:
@@ -237,7 +237,7 @@ class RecentDaemon(Replay):
         sequence = next(self._sequence)
         await asyncio.sleep(self.slow * (sequence % 2))
         if not self._is_next(self, sequence):
-            self.overtaken += 1
+            self.refused_as_replay += 1
             return refusal("validation ignored")
         for daemon in (self, *self.others):
             daemon.deliver(topic, bytes(data), self, sequence)
@@ -257,10 +257,10 @@ class RecentDaemon(Replay):
 
 
 def multibase(data: bytes) -> str:
-    """As today's daemons write bytes."""
+    """Bytes as current daemons write them."""
     return "u" + urlsafe_b64encode(data).decode().rstrip("=")
 
 
 def refusal(why: str) -> web.Response:
-    """An error of a command."""
+    """The error response of a command."""
     return web.json_response({"Message": why, "Code": 0, "Type": "error"}, status=500)

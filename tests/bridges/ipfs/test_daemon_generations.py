@@ -126,7 +126,7 @@ async def test_concurrent_channels_publish_in_order_at_one_daemon() -> None:
     async with RecentDaemon(slow=0.05) as recent, Daemon(recent.api) as daemon:
         await daemon.detect_version()
         await asyncio.gather(*(daemon.publish(f"topic {number}", b"hello") for number in range(6)))
-        assert recent.overtaken == 0
+        assert recent.refused_as_replay == 0
 
 
 async def test_a_flood_reaches_nodes_that_validate_out_of_order(

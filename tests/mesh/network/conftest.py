@@ -1,4 +1,4 @@
-"""Two sessions on one router: `here` and `there`, as two agents have them."""
+"""Two sessions on one router, `here` and `there`, like those of two agents."""
 
 from __future__ import annotations
 

@@ -1,24 +1,104 @@
-"""Recalling open orders from the providers, and the presence of agents on a channel."""
+"""Subscriptions: ENS names in orders, and recalling open orders from the providers."""
 
 from __future__ import annotations
 
 import asyncio
+import json
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.errors import ClosedError
-from mesh.network import Channel, Endpoints, Network, ValidationStatistics, message_key
-from schemas import Demand, PresenceKey, SignedMessage, encode, message_hash
+from mesh.errors import RemoteError
+from mesh.network import MessageValidator, Subscription, ValidationStatistics, message_key
+from schemas import Demand, SignedMessage, encode, market_selector, message_hash
 from tests.mesh.network.channels import KEY, ORDER, contents, listening, opened, take
-from tests.support.orders import MARKET, PERSON, ROBOT, STRANGER, demand
-from tests.support.waiting import at_most, until, until_answered
+from tests.support.orders import LIGHTHOUSE, MARKET, STRANGER, demand
+from tests.support.waiting import at_most, until, until_answered, until_heard
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     import zenoh
+
+
+NAME = "token.robonomics.eth"
+
+
+def with_name(message: Demand, name: str = NAME) -> bytes:
+    return json.dumps(json.loads(encode(message)) | {"token": name}).encode()
+
+
+async def test_names_are_resolved_and_unknown_ones_counted(here: zenoh.Session, there: zenoh.Session) -> None:
+    async def resolver(name: str) -> str:
+        if name != NAME:
+            raise RemoteError(f"nobody knows {name}")
+        return STRANGER.address
+
+    async with listening(here, there, resolver=resolver) as (demands, _):
+        message, nameless = demand(token=STRANGER.address), demand()
+        there.put(message_key(MARKET, nameless), with_name(nameless, "nobody.eth"))
+        there.put(message_key(MARKET, message), with_name(message, NAME.upper()))
+
+        assert contents(await take(demands, 1)) == [message]
+        assert demands.statistics().invalid == {"name": 1}
+
+
+async def test_without_a_resolver_messages_with_names_are_counted(here: zenoh.Session, there: zenoh.Session) -> None:
+    async with listening(here, there) as (demands, theirs):
+        there.put(KEY, with_name(ORDER))
+        theirs.publish(message := demand())
+
+        assert contents(await take(demands, 1)) == [message]
+        assert demands.statistics().invalid == {"name": 1}
+
+
+async def test_a_slow_resolution_does_not_delay_other_messages(here: zenoh.Session, there: zenoh.Session) -> None:
+    known = asyncio.Event()
+
+    async def resolver(name: str) -> str:
+        await known.wait()
+        return STRANGER.address
+
+    async with listening(here, there, resolver=resolver) as (demands, theirs):
+        message = demand(token=STRANGER.address)
+        there.put(message_key(MARKET, message), with_name(message))
+        theirs.publish(other := demand())
+        assert contents(await take(demands, 1)) == [other]
+
+        known.set()
+        assert contents(await take(demands, 1)) == [message]
+
+
+async def test_a_limited_number_of_messages_waits_for_names(here: zenoh.Session, there: zenoh.Session) -> None:
+    async def resolver(name: str) -> str:
+        await asyncio.Event().wait()
+        raise AssertionError
+
+    validator = MessageValidator(Demand, lighthouse=MARKET, address=LIGHTHOUSE, head=lambda: 0)
+    selector = market_selector(MARKET, "demand")
+    async with (
+        Subscription(here, selector, validator, resolver, lookup_limit=2) as demands,
+        opened(there) as theirs,
+    ):
+        await until_heard(there, selector)
+        for _ in range(10):
+            there.put(KEY, with_name(ORDER))
+        theirs.publish(message := demand())
+
+        assert contents(await take(demands, 1)) == [message]
+        assert demands.statistics().invalid["name"] >= 7
+
+
+async def test_an_unexpected_resolver_error_ends_the_iteration(here: zenoh.Session, there: zenoh.Session) -> None:
+    async def resolver(name: str) -> str:
+        raise ZeroDivisionError
+
+    async with listening(here, there, resolver=resolver) as (demands, _):
+        there.put(KEY, with_name(ORDER))
+
+        with pytest.raises(ZeroDivisionError):
+            await take(demands, 1)
 
 
 @asynccontextmanager
@@ -126,80 +206,3 @@ async def test_an_unanswered_recall_ends_with_its_caller(here: zenoh.Session, th
         with at_most(2):  # an event loop of its own ends when all its threads have ended
             await asyncio.to_thread(asyncio.run, recall_in_vain())
         asked.clear()
-
-
-async def test_presence_is_seen_while_the_channel_is_open(here: zenoh.Session, there: zenoh.Session) -> None:
-    async with opened(here) as watching:
-        async with opened(there) as theirs:
-            theirs.announce("provider", ROBOT.address)
-            theirs.announce("agent", PERSON.address)
-            expected = [
-                PresenceKey(MARKET, "agent", PERSON.address),
-                PresenceKey(MARKET, "provider", ROBOT.address),
-            ]
-            await until_present(watching, expected)
-
-        await until_present(watching, [])
-
-
-async def test_presence_ends_with_the_session_of_an_unclosed_channel(router: Any, here: zenoh.Session) -> None:
-    async with opened(here) as watching:
-        async with Network(Endpoints(connect=(router.endpoint,))) as network:
-            theirs = await Channel(network.session, MARKET).__aenter__()
-            theirs.announce("agent", PERSON.address)
-            await until_present(watching, [PresenceKey(MARKET, "agent", PERSON.address)])
-
-        await until_present(watching, [])
-        await theirs.__aexit__(None, None, None)
-
-
-async def test_presence_tokens_outside_the_keyspace_are_ignored(here: zenoh.Session, there: zenoh.Session) -> None:
-    with (
-        there.liveliness().declare_token(f"aira/{MARKET}/@agent/agent/nobody"),
-        there.liveliness().declare_token(f"aira/{MARKET}/@agent/Bad Role/{PERSON.address.lower()}"),
-    ):
-        async with opened(here) as watching, opened(there) as theirs:
-            theirs.announce("agent", PERSON.address)
-            await until_present(watching, [PresenceKey(MARKET, "agent", PERSON.address)])
-
-
-async def test_a_presence_watch_reports_present_and_later_agents_of_its_role(
-    here: zenoh.Session, there: zenoh.Session
-) -> None:
-    events: list[tuple[str, str]] = []
-    async with opened(here) as watching, opened(there) as first:
-        first.announce("provider", ROBOT.address)
-        await until_present(watching, [PresenceKey(MARKET, "provider", ROBOT.address)])
-        watching.watch_presence(
-            lambda key: events.append(("appeared", key.agent)),
-            gone=lambda key: events.append(("gone", key.agent)),
-            role="provider",
-        )
-        await until(lambda: events == [("appeared", ROBOT.address.lower())])
-
-        async with opened(there) as second:
-            second.announce("agent", STRANGER.address)
-            second.announce("provider", PERSON.address)
-            await until(lambda: events[1:] == [("appeared", PERSON.address.lower())])
-        await until(lambda: events[2:] == [("gone", PERSON.address.lower())])
-
-
-async def test_a_presence_watch_ends_with_its_channel(here: zenoh.Session, there: zenoh.Session) -> None:
-    seen: list[PresenceKey] = []
-    other: list[PresenceKey] = []
-    async with opened(there) as theirs, opened(here) as still_open:
-        async with opened(here) as watching:
-            watching.watch_presence(seen.append)
-        still_open.watch_presence(other.append)
-        theirs.announce("agent", PERSON.address)
-        await until(lambda: other)
-
-    assert seen == []
-    with pytest.raises(ClosedError):
-        watching.watch_presence(seen.append)
-
-
-async def until_present(channel: Channel, expected: list[PresenceKey]) -> None:
-    async with asyncio.timeout(10):
-        while await channel.present() != expected:
-            await asyncio.sleep(0.01)

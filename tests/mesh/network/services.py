@@ -1,4 +1,4 @@
-"""Services offered to a test."""
+"""Services for tests."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ REQUEST = StartLiability(LIGHTHOUSE)
 
 @asynccontextmanager
 async def offering(there: zenoh.Session, here: zenoh.Session, **handlers: Any) -> AsyncIterator[Services]:
-    """Services of the agent `there` that one `here` finds."""
+    """Services of the agent `there`, already visible `here`."""
     async with asyncio.timeout(20), Services(there, ADDRESS) as services:
         for name, handler in handlers.items():
             services.offer(name.replace("__", "/"), handler)
