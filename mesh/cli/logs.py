@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from mesh.settings import Settings
-    from mesh.watching.logs import LogReader, Look
+    from mesh.watching.logs import LogReader, LogUpdate
     from schemas.logs import LogEvent
 
 POLL_INTERVAL: Final = 0.5
@@ -94,7 +94,7 @@ async def _show(
     async with Network(endpoints_of(settings)) as network, Background() as tasks:
         tasks.start(wait_for_broken_pipe(), "readers of stdout")
         reader = LogReader(network.session, key, **wanted)
-        look = await reader.look(timeout=timeout)
+        look = await reader.poll(timeout=timeout)
         if not look.answered:
             raise NoAnswer(
                 f"no log at {key}: nothing answers",
@@ -102,7 +102,7 @@ async def _show(
             )
         _tell(look, line)
         while look.more:
-            look = await reader.look(timeout=timeout)
+            look = await reader.poll(timeout=timeout)
             _tell(look, line)
         if follow:
             await _follow(reader, line, timeout=timeout)
@@ -111,23 +111,23 @@ async def _show(
 async def _follow(reader: LogReader, line: Callable[[LogEvent], str], *, timeout: float) -> None:
     """Show new events. Prints to stderr when the answers stop, and when they are back."""
     from mesh.network import ServiceFailed
-    from mesh.watching.logs import Look
+    from mesh.watching.logs import LogUpdate
 
     trouble = ""
     while True:
         await asyncio.sleep(POLL_INTERVAL)
         try:
-            look = await reader.look(timeout=timeout)
+            look = await reader.poll(timeout=timeout)
             met = "" if look.answered else "nobody answers now; waiting"
         except ServiceFailed as error:
-            look, met = Look([]), printable(str(error))
+            look, met = LogUpdate([]), printable(str(error))
         if met != trouble:
             _note(met or "it answers again")
             trouble = met
         _tell(look, line)
 
 
-def _tell(look: Look, line: Callable[[LogEvent], str]) -> None:
+def _tell(look: LogUpdate, line: Callable[[LogEvent], str]) -> None:
     for began in look.began:
         _note(f"it has begun anew at {printable(began)}")
     if look.missed:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from mesh.settings import Settings
-    from mesh.watching import How, Peer
+    from mesh.watching import PresentPeer, RoleStatus
     from schemas.status import ContentMetrics, DirectionStatus, MarketStatus, Work
 
 
@@ -90,7 +90,7 @@ async def show_all(settings: Settings, *, timeout: float, as_json: bool) -> None
         print_line(f"nobody on {channel.lighthouse}")
 
 
-def _status_json(how: How | None) -> dict[str, Any] | None:
+def _status_json(how: RoleStatus | None) -> dict[str, Any] | None:
     """A status as it is on the wire."""
     return None if how is None else json.loads(how.encode())
 
@@ -124,7 +124,7 @@ async def show_peers(settings: Settings, *, as_json: bool) -> None:
     print_line(f"{len(peers) or 'nobody'} on {channel.lighthouse}; on the IPFS side {_ipfs_side(bridges, states)}")
 
 
-def _peers_json(lighthouse: str, peers: list[Peer], states: dict[Peer, BridgeStatus]) -> dict[str, Any]:
+def _peers_json(lighthouse: str, peers: list[PresentPeer], states: dict[PresentPeer, BridgeStatus]) -> dict[str, Any]:
     best = _best(states)
     return {
         "lighthouse": lighthouse,
@@ -133,7 +133,7 @@ def _peers_json(lighthouse: str, peers: list[Peer], states: dict[Peer, BridgeSta
     }
 
 
-def _ipfs_side(bridges: list[Peer], states: dict[Peer, BridgeStatus]) -> str:
+def _ipfs_side(bridges: list[PresentPeer], states: dict[PresentPeer, BridgeStatus]) -> str:
     """How many nodes of the legacy network are on the channel, according to a bridge."""
     best = _best(states)
     if best is None:
@@ -142,7 +142,7 @@ def _ipfs_side(bridges: list[Peer], states: dict[Peer, BridgeStatus]) -> str:
     return nodes if best.state in ("connected", "alone") else f"{nodes}; the bridge says: {printable(best.state)}"
 
 
-def _best(states: dict[Peer, BridgeStatus]) -> BridgeStatus | None:
+def _best(states: dict[PresentPeer, BridgeStatus]) -> BridgeStatus | None:
     """The bridge whose count is used: the one that carries messages, or else the one that sees most nodes."""
     return max(states.values(), key=lambda how: (how.carries, len(how.ipfs_peers)), default=None)
 
@@ -151,13 +151,13 @@ PHASES: Final = ("incoming", "ready", "running", "complete")
 """The phases of open jobs."""
 
 
-def describe_status(how: How) -> dict[str, str]:
+def describe_status(how: RoleStatus) -> dict[str, str]:
     """A status for people, by names. Its texts come from others, so they are made printable."""
     told = _describe_bridge(how) if isinstance(how, BridgeStatus) else _describe_participant(how)
     return {printable(name): printable(fact) for name, fact in told.items()}
 
 
-def summarize_status(how: How | None) -> str:
+def summarize_status(how: RoleStatus | None) -> str:
     """A status in one line; None is a peer that does not answer."""
     if how is None:
         return "does not answer"

@@ -19,7 +19,7 @@ from mesh.cli.output import plural, print_json, print_line, printable, short_add
 from mesh.running import run_until_stopped
 from mesh.settings import NetworkSettings, options_of
 from mesh.telemetry.logs import configure_logging
-from mesh.watching import JobEvent, Reading
+from mesh.watching import JobEvent, SensorReading
 from schemas import Demand, Empty, InvalidAddress, Result, String, Verified, parse_address, parse_cid
 from schemas.signing import Rejection
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from mesh.network import Channel, Network
     from mesh.settings import Settings
-    from mesh.watching import MarketWatch, Seen, Tally
+    from mesh.watching import MarketCounters, MarketEvent, MarketWatch
     from schemas import Liability, Offer
 
 
@@ -60,7 +60,7 @@ async def watch(
     settings: Settings, model: str | None, *, with_open: bool, as_json: bool, readings: bool = False
 ) -> None:
     from mesh.agent.components import watching
-    from mesh.watching import MarketWatch, Readings
+    from mesh.watching import MarketWatch, ReadingFetcher
 
     if model is not None:
         parse_cid(model)
@@ -68,7 +68,7 @@ async def watch(
         network, channel = await stack.enter_async_context(watching(settings))
         words = None if as_json else EventFormatter(await _xrt(settings, network.session, channel))
         tell = partial(_tell, words)
-        looking = await stack.enter_async_context(Readings(network.session, tell)) if readings else None
+        looking = await stack.enter_async_context(ReadingFetcher(network.session, tell)) if readings else None
         seen = await stack.enter_async_context(MarketWatch(network.session, channel, model=model or "*"))
         tasks = await stack.enter_async_context(_report_beside(network, seen))
         if not as_json:
@@ -78,10 +78,10 @@ async def watch(
         async for something in seen:
             tell(something)
             if looking is not None:
-                looking.see(something)
+                looking.handle(something)
 
 
-def _tell(words: EventFormatter | None, something: Seen | Reading) -> None:
+def _tell(words: EventFormatter | None, something: MarketEvent | SensorReading) -> None:
     """Print an event: with `words` for people, else as JSON."""
 
     now = datetime.now(UTC)
@@ -97,7 +97,7 @@ async def _report_beside(network: Network, seen: MarketWatch) -> AsyncIterator[B
     loop = asyncio.get_running_loop()
 
     def tell() -> None:
-        click.echo(format_counters(seen.tally()), err=True)
+        click.echo(format_counters(seen.counters()), err=True)
 
     loop.add_signal_handler(signal.SIGUSR1, tell)
     try:
@@ -112,7 +112,7 @@ async def _report_beside(network: Network, seen: MarketWatch) -> AsyncIterator[B
         loop.remove_signal_handler(signal.SIGUSR1)
 
 
-def format_counters(tally: Tally) -> str:
+def format_counters(tally: MarketCounters) -> str:
     """The counters in a line for people."""
     reasons = ", ".join(f"{count:,} {reason}" for reason, count in sorted(tally.refused.items()))
     refused = f"{sum(tally.refused.values()):,} refused" + (f" ({reasons})" if reasons else "")
@@ -155,7 +155,7 @@ EVENT_WIDTH: Final = 9
 """Columns of the event's name."""
 
 
-def event_json(seen: Seen | Reading, *, time: str) -> dict[str, Any]:
+def event_json(seen: MarketEvent | SensorReading, *, time: str) -> dict[str, Any]:
     """An event at `time` (ISO 8601) for JSON. Amounts are text, in the smallest unit."""
     match seen:
         case Verified():
@@ -169,7 +169,7 @@ def event_json(seen: Seen | Reading, *, time: str) -> dict[str, Any]:
         case Rejection():
             about = {"event": "rejected", "order": seen.order, "provider": seen.provider}
             about |= {"reason": seen.reason, "detail": seen.detail}
-        case Reading():
+        case SensorReading():
             about = {"event": "reading", "signer": seen.signer, "result": seen.result, "topic": seen.topic}
             about["value"] = _value(seen)
         case JobEvent(agent, event, liability):
@@ -201,7 +201,7 @@ class EventFormatter:
     def __init__(self, xrt: str | None) -> None:
         self._xrt = xrt
 
-    def line(self, seen: Seen | Reading) -> str:
+    def line(self, seen: MarketEvent | SensorReading) -> str:
         """The line of an event, without the time."""
         match seen:
             case Verified():
@@ -210,7 +210,7 @@ class EventFormatter:
             case Rejection():
                 why = printable(seen.detail[:LONGEST_TEXT] or seen.reason[:LONGEST_TEXT])
                 kind, words = "rejected", f"{seen.order[:HASH_DIGITS]} by {short_address(seen.provider)}: {why}"
-            case Reading():
+            case SensorReading():
                 kind, words = "reading", f"{printable(seen.topic)}  {_shown(seen)}, from {short_address(seen.signer)}"
             case JobEvent(_, kind, liability):
                 words = self._work(liability)
@@ -239,7 +239,7 @@ class EventFormatter:
         return f"{job.address}  {parties}" + (f", {_ended(job.is_success)}: {job.result}" if job.result else "")
 
 
-def _value(reading: Reading) -> Any:
+def _value(reading: SensorReading) -> Any:
     """The value of a reading for JSON, in which bytes become base64."""
     match reading.value:
         case Empty():
@@ -250,7 +250,7 @@ def _value(reading: Reading) -> Any:
             return value
 
 
-def _shown(reading: Reading) -> str:
+def _shown(reading: SensorReading) -> str:
     value = _value(reading)
     text = value if isinstance(value, str) else msgspec.json.encode(value).decode()
     return printable(text[:LONGEST_TEXT] + ("…" if len(text) > LONGEST_TEXT else ""))

@@ -1,22 +1,20 @@
-"""Seeing what goes on from anywhere in the mesh: a market as it happens, who is there, how each of them is."""
+"""Watching the mesh from outside: the events of a market, who is present, their status, their logs."""
 
 from __future__ import annotations
 
-from mesh.watching.claims import JobEvent
-from mesh.watching.market import MarketWatch, Seen
-from mesh.watching.presence import How, Peer, address_of, present, role_of, status_of, statuses
-from mesh.watching.readings import Reading, Readings
-from mesh.watching.tally import Tally
+from mesh.watching.market import JobEvent, MarketCounters, MarketEvent, MarketWatch
+from mesh.watching.presence import PresentPeer, RoleStatus, address_of, present, role_of, status_of, statuses
+from mesh.watching.readings import ReadingFetcher, SensorReading
 
 __all__ = [
-    "How",
     "JobEvent",
+    "MarketCounters",
+    "MarketEvent",
     "MarketWatch",
-    "Peer",
-    "Reading",
-    "Readings",
-    "Seen",
-    "Tally",
+    "PresentPeer",
+    "ReadingFetcher",
+    "RoleStatus",
+    "SensorReading",
     "address_of",
     "present",
     "role_of",

@@ -1,44 +1,42 @@
-"""Reading the logs of others: what they keep of it, and what comes after that."""
+"""Reading the logs of other processes: the events they keep, and new ones."""
 
 from __future__ import annotations
 
-import asyncio
-from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-import zenoh
-
 from mesh.network.services import Failure, ServiceFailed
-from mesh.watching.asking import ANSWERS, TIMEOUT
+from mesh.watching.queries import TIMEOUT, query_all
 from schemas import InvalidRecord
 from schemas.logs import LogsRead, ReadLogs
 
 if TYPE_CHECKING:
+    import zenoh
+
     from schemas.logs import LogEvent
 
 ALL: Final = 1_000_000
-"""Lines to ask for of somebody who began while we watched: as many as are kept."""
+"""Events to request from a process that started meanwhile: all that it keeps."""
 
 
-class Look(NamedTuple):
-    """What one look at a log has shown."""
+class LogUpdate(NamedTuple):
+    """The new events since the last poll."""
 
     events: list[LogEvent]
-    """In the order of their times."""
+    """In order of time."""
     answered: bool = False
     more: bool = False
-    """Whether there is more already."""
+    """Whether there are more events already."""
     missed: int = 0
-    """Events that were kept no more when they were asked for."""
+    """Events that were dropped before they could be read."""
     began: tuple[str, ...] = ()
-    """When those began who were not there at the last look."""
+    """Start times of processes that were not there at the last poll."""
 
 
 class LogReader:
-    """Reads the log that is told on `key`, from its last `lines` events on: `look`, again and again.
+    """Reads the log served on `key`, from its last `lines` events on: call `poll` repeatedly.
 
-    Several may answer, such as an agent and a provider of one account; each is followed by itself. `level` is the least
-    that is told, `liability` the contract that it has to concern (empty: any).
+    Several processes may reply, such as an agent and a provider of one account; each is followed separately. `level` is
+    the lowest level, `liability` the contract that events are about (empty: any).
     """
 
     def __init__(
@@ -54,15 +52,15 @@ class LogReader:
         """The processes whose logs are followed."""
         return frozenset(self._after)
 
-    async def look(self, *, timeout: float = TIMEOUT) -> Look:
-        """What has come since the last look. Raises `ServiceFailed` when all who answer do so with an error."""
+    async def poll(self, *, timeout: float = TIMEOUT) -> LogUpdate:
+        """The events since the last poll. Raises `ServiceFailed` if all replies are errors."""
         first = not self._after
-        told, failures = await self._ask(timeout)
-        if not told and failures:
+        found, failures = await self._query(timeout)
+        if not found and failures:
             raise ServiceFailed("logs", failures[0].error, hint=failures[0].hint)
         events: list[LogEvent] = []
         missed, began = 0, []
-        for reply in told:
+        for reply in found:
             if reply.instance in self._after:
                 missed += reply.missed
             elif not first:
@@ -71,43 +69,24 @@ class LogReader:
             events += reply.entries
         # Python's sort is stable: the events of one process keep their order.
         events.sort(key=lambda event: event.time)
-        more = any(reply.more for reply in told)
-        return Look(events, answered=bool(told), more=more, missed=missed, began=tuple(began))
+        more = any(reply.more for reply in found)
+        return LogUpdate(events, answered=bool(found), more=more, missed=missed, began=tuple(began))
 
-    async def _ask(self, timeout: float) -> tuple[list[LogsRead], list[Failure]]:
+    async def _query(self, timeout: float) -> tuple[list[LogsRead], list[Failure]]:
         wanted = self._wanted
         lines = ALL if self._after else wanted.lines
         request = ReadLogs(after=self._after, lines=lines, level=wanted.level, liability=wanted.liability)
-        asking = zenoh.CancellationToken()
-        try:
-            return await asyncio.to_thread(self._answers, request.encode(), timeout, asking)
-        finally:
-            asking.cancel()  # type: ignore[no-untyped-call]
-
-    def _answers(
-        self, request: bytes, timeout: float, asking: zenoh.CancellationToken
-    ) -> tuple[list[LogsRead], list[Failure]]:
-        replies = self._session.get(
-            self._key,
-            zenoh.handlers.FifoChannel(ANSWERS),
-            payload=request,
-            encoding="application/json",
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=timeout,
-            cancellation_token=asking,
-        )
-        told: dict[str, LogsRead] = {}
+        found: dict[str, LogsRead] = {}
         failures = []
-        for reply in islice(replies, ANSWERS):
+        for reply in await query_all(self._session, [self._key], payload=request.encode(), timeout=timeout):
             try:
                 if reply.ok is not None:
-                    # A process may answer twice, for two markets with one account.
+                    # A process may reply twice: for two markets with one account.
                     read = LogsRead.decode(reply.ok.payload.to_bytes())
-                    told.setdefault(read.instance, read)
+                    found.setdefault(read.instance, read)
                 elif reply.err is not None:
                     failures.append(Failure.decode(reply.err.payload.to_bytes()))
             except InvalidRecord as error:
                 if reply.ok is not None:  # Zenoh's own error says `Timeout`, which is no record
                     failures.append(Failure(f"the answer can't be read: {error}"))
-        return list(told.values()), failures
+        return list(found.values()), failures

@@ -1,48 +1,112 @@
-"""A market as it happens: verified orders and Results, rejections, and what agents say of their jobs, in one stream."""
+"""A live view of a market: verified orders and results, providers' rejections, and agents' job events, in one stream.
+
+A rejection is signed by its provider. A job event is not signed: it must be on a key of the agent that its liability
+names as promisor. A router with a roster lets nobody else write there.
+"""
 
 from __future__ import annotations
 
 import asyncio
-from collections import OrderedDict
+import threading
+from collections import Counter, OrderedDict
 from contextlib import AsyncExitStack
-from typing import TYPE_CHECKING, Any, Final, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, Self, TypeAlias, TypeVar
+
+import msgspec
 
 from mesh.background import Background
-from mesh.network import Pump, call_in_loop
-from mesh.watching.claims import JobEvent, Reader, read_event, read_rejection
-from mesh.watching.tally import Tally, added_up
+from mesh.errors import AiraError, InputError
+from mesh.network import Pump, ValidationStatistics
 from schemas import (
     Demand,
-    InvalidKey,
+    EventKey,
+    Liability,
     Offer,
-    PresenceKey,
+    RejectKey,
     Result,
     Verified,
     market_selector,
+    parse_address,
+    parse_cid,
     parse_key,
-    presence_selector,
 )
 from schemas.signing import Rejection
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Callable, Iterable
     from types import TracebackType
 
     import zenoh
 
     from mesh.network import Channel, Subscription
 
-Seen: TypeAlias = Verified[Demand] | Verified[Offer] | Verified[Result] | Rejection | JobEvent
-
 WAITING: Final = 256
-"""What waits to be taken at most; meanwhile the oldest of what comes in is lost, and counted."""
-REMEMBERED: Final = 65_536
-"""Orders, contracts and rejections that are remembered."""
+"""Events that wait for the consumer; beyond, the oldest incoming messages are dropped and counted."""
+RECENT: Final = 65_536
+"""Texts that a `RecentSet` keeps."""
 EVENTS: Final = "aira/agent/*/liability/*/*"
 
 
-class Remembered:
-    """The last `REMEMBERED` of some texts."""
+class JobEvent(NamedTuple):
+    """An agent's report on one of its jobs: `event` is `incoming`, `ready`, `complete` or `finalized`."""
+
+    agent: str
+    """Its address, EIP-55."""
+    event: str
+    liability: Liability
+
+
+MarketEvent: TypeAlias = Verified[Demand] | Verified[Offer] | Verified[Result] | Rejection | JobEvent
+Claim: TypeAlias = Rejection | JobEvent
+C = TypeVar("C", bound=Claim)
+
+
+class ClaimReader(Generic[C]):
+    """Decodes samples for a pump and counts refused ones under `reason`."""
+
+    def __init__(self, read: Callable[[str, bytes], C], *, reason: str) -> None:
+        self._read = read
+        self._reason = reason
+        self._lock = threading.Lock()
+        self._refused: Counter[str] = Counter()
+        self._accepted = 0
+
+    def __call__(self, sample: zenoh.Sample) -> C | None:
+        """The claim in a sample; None if it is refused."""
+        try:
+            claim = self._read(str(sample.key_expr), sample.payload.to_bytes())
+        except AiraError:
+            self.refuse()
+            return None
+        with self._lock:
+            self._accepted += 1
+        return claim
+
+    def refuse(self) -> None:
+        """Count a refused sample."""
+        with self._lock:
+            self._refused[self._reason] += 1
+
+    def statistics(self, *, received: int, dropped: int) -> ValidationStatistics:
+        """The counts of this reader, with what its pump received and dropped."""
+        with self._lock:
+            refused = dict(self._refused)
+            return ValidationStatistics(
+                received=received, accepted=self._accepted, invalid=refused, duplicate=0, dropped=dropped
+            )
+
+
+class MarketCounters(msgspec.Struct, frozen=True, kw_only=True):
+    """Messages received, refused (by reason), duplicate, and lost because the consumer was too slow."""
+
+    received: int
+    refused: dict[str, int]
+    duplicate: int
+    lost: int
+
+
+class RecentSet:
+    """A set of the last `RECENT` texts."""
 
     def __init__(self) -> None:
         self._texts: OrderedDict[str, None] = OrderedDict()
@@ -51,32 +115,32 @@ class Remembered:
         return text in self._texts
 
     def add(self, text: str) -> bool:
-        """Remember a text; False where it is known."""
+        """Add a text; False if it was there."""
         if text in self._texts:
             return False
         self._texts[text] = None
-        if len(self._texts) > REMEMBERED:
+        if len(self._texts) > RECENT:
             self._texts.popitem(last=False)
         return True
 
 
 class MarketWatch:
-    """What happens on an open channel from now on: `async with MarketWatch(session, channel) as seen`, then iterate.
+    """Events on an open channel from now on: `async with MarketWatch(session, channel) as watch`, then iterate.
 
-    With `model` (CIDv0) only what concerns orders and contracts of that model; a Result concerns it once the agent has
-    told of its contract. The events are those of agents that are, or were meanwhile, present on the channel. One
-    consumer. Leaving `async with` ends it; session and channel stay the caller's to close.
+    With `model` (CIDv0), only events about orders and liabilities of that model; a result counts once its agent has
+    reported the liability. Job events are taken from agents that are, or have been meanwhile, present on the channel.
+    For one consumer. Leaving `async with` ends it; the caller closes session and channel.
     """
 
     def __init__(self, session: zenoh.Session, channel: Channel, *, model: str = "*") -> None:
         self._session = session
         self._channel = channel
         self._model = model
-        self._queue: asyncio.Queue[Seen] = asyncio.Queue(WAITING)
-        self._here = Remembered()
-        self._orders = Remembered()
-        self._contracts = Remembered()
-        self._rejections = Remembered()
+        self._queue: asyncio.Queue[MarketEvent] = asyncio.Queue(WAITING)
+        self._agents = RecentSet()
+        self._orders = RecentSet()
+        self._contracts = RecentSet()
+        self._rejections = RecentSet()
         self._stack = AsyncExitStack()
 
     async def __aenter__(self) -> Self:
@@ -85,12 +149,14 @@ class MarketWatch:
             self._demands = await stack.enter_async_context(channel.subscribe(Demand, model=self._model))
             self._offers = await stack.enter_async_context(channel.subscribe(Offer, model=self._model))
             self._results = await stack.enter_async_context(channel.subscribe(Result))
-            await self._follow_presence(stack)
-            self._rejecting = Reader(read_rejection, reason="rejection")
-            self._telling = Reader(read_event, reason="event")
+            channel.watch_presence(lambda key: self._agents.add(key.agent))
+            for key in await channel.present():
+                self._agents.add(key.agent)
+            self._rejection_reader = ClaimReader(read_rejection, reason="rejection")
+            self._event_reader = ClaimReader(read_event, reason="event")
             selector = market_selector(channel.lighthouse, "reject")
-            self._rejected = await stack.enter_async_context(Pump(self._session, selector, self._rejecting))
-            self._events = await stack.enter_async_context(Pump(self._session, EVENTS, self._telling))
+            self._rejected = await stack.enter_async_context(Pump(self._session, selector, self._rejection_reader))
+            self._events = await stack.enter_async_context(Pump(self._session, EVENTS, self._event_reader))
             tasks = await stack.enter_async_context(Background())
             for name, items in (
                 ("demands", self._seen_orders(self._demands)),
@@ -111,72 +177,89 @@ class MarketWatch:
     def __aiter__(self) -> Self:
         return self
 
-    async def __anext__(self) -> Seen:
+    def knows(self, agent: str) -> bool:
+        """Whether the agent at this address is, or was meanwhile, present on the channel."""
+        return agent.lower() in self._agents
+
+    async def __anext__(self) -> MarketEvent:
         return await self._queue.get()
 
     async def recall(self) -> None:
-        """Let the orders that are open now come, too, from the providers' memory. Returns when all have answered."""
+        """Request the orders that are open now from the providers' order books. Returns when all have replied."""
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._demands.recall(), name="recall demands")
             tasks.create_task(self._offers.recall(), name="recall offers")
 
-    def tally(self) -> Tally:
-        """What came by so far, and what of it was refused."""
-        claims = ((self._rejected, self._rejecting), (self._events, self._telling))
-        return added_up(
+    def counters(self) -> MarketCounters:
+        """What was received so far, and what of it was refused."""
+        claims = ((self._rejected, self._rejection_reader), (self._events, self._event_reader))
+        return _sum_of(
             [
                 *(subscription.statistics() for subscription in (self._demands, self._offers, self._results)),
                 *(reader.statistics(received=pump.received, dropped=pump.dropped) for pump, reader in claims),
             ]
         )
 
-    async def _move(self, items: AsyncIterator[Seen]) -> None:
+    async def _move(self, items: AsyncIterator[MarketEvent]) -> None:
         async for item in items:
             await self._queue.put(item)
 
-    async def _seen_orders(self, orders: Subscription[Any]) -> AsyncIterator[Seen]:
+    async def _seen_orders(self, orders: Subscription[Any]) -> AsyncIterator[MarketEvent]:
         async for order in orders:
             self._orders.add(order.hash.hex())
             yield order
 
-    async def _seen_results(self) -> AsyncIterator[Seen]:
+    async def _seen_results(self) -> AsyncIterator[MarketEvent]:
         async for result in self._results:
             if self._model == "*" or result.message.liability in self._contracts:
                 yield result
-            else:  # It is sent again, and the agent may have told of its contract by then.
+            else:  # Agents send results repeatedly; by then the liability may be known.
                 self._results.forget(result)
 
-    async def _seen_rejections(self) -> AsyncIterator[Seen]:
+    async def _seen_rejections(self) -> AsyncIterator[MarketEvent]:
         async for rejection in self._rejected:
             wanted = self._model == "*" or rejection.order in self._orders
             if wanted and self._rejections.add(f"{rejection.order} {rejection.provider} {rejection.reason}"):
                 yield rejection
 
-    async def _seen_events(self) -> AsyncIterator[Seen]:
+    async def _seen_events(self) -> AsyncIterator[MarketEvent]:
         async for event in self._events:
-            if event.agent.lower() not in self._here:
-                self._telling.refuse()
+            if not self.knows(event.agent):
+                self._event_reader.refuse()
             elif self._model in ("*", event.liability.model):
                 self._contracts.add(event.liability.address)
                 yield event
 
-    async def _follow_presence(self, stack: AsyncExitStack) -> None:
-        """Know who is here, before the first event comes and from then on."""
-        loop = asyncio.get_running_loop()
-        subscriber: Any = self._session.liveliness().declare_subscriber(
-            presence_selector(self._channel.lighthouse),
-            lambda sample: call_in_loop(loop, self._present, sample),
-            history=True,
-        )
-        stack.callback(lambda: None if self._session.is_closed() else subscriber.undeclare())
-        for key in await self._channel.present():
-            self._here.add(key.agent)
 
-    def _present(self, sample: zenoh.Sample) -> None:
-        """Somebody came; who leaves is remembered, for its last words may still be on their way."""
-        try:
-            key = parse_key(str(sample.key_expr))
-        except InvalidKey:
-            return
-        if isinstance(key, PresenceKey):
-            self._here.add(key.agent)
+def read_rejection(key: str, payload: bytes) -> Rejection:
+    """A provider's signed rejection on its own key. Raises `AiraError`."""
+    rejection, place = Rejection.decode(payload), parse_key(key)
+    if not isinstance(place, RejectKey) or str(RejectKey(place.lighthouse, rejection.order, rejection.provider)) != key:
+        raise InputError("the rejection is on another's key")
+    if not rejection.is_signed:
+        raise InputError("the rejection is not signed by its provider")
+    return rejection
+
+
+def read_event(key: str, payload: bytes) -> JobEvent:
+    """An agent's event about its own job. Raises `AiraError`."""
+    liability, place = Liability.decode(payload), parse_key(key)
+    if not isinstance(place, EventKey):
+        raise InputError("not the key of a job event")
+    for address in (liability.promisee, liability.promisor, liability.lighthouse, liability.token, liability.validator):
+        parse_address(address)
+    for cid in (liability.model, liability.objective, *([liability.result] if liability.result else [])):
+        parse_cid(cid)
+    if place.agent != liability.promisor.lower() or place.liability != liability.address.lower():
+        raise InputError("the event is on another's key")
+    return JobEvent(parse_address(place.agent), place.event, liability)
+
+
+def _sum_of(statistics: Iterable[ValidationStatistics]) -> MarketCounters:
+    """The sum of several statistics."""
+    refused: Counter[str] = Counter()
+    received = duplicate = lost = 0
+    for one in statistics:
+        refused.update(one.invalid)
+        received, duplicate, lost = received + one.received, duplicate + one.duplicate, lost + one.dropped
+    return MarketCounters(received=received, refused=dict(refused), duplicate=duplicate, lost=lost)

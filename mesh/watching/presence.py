@@ -1,11 +1,11 @@
-"""Who is on a lighthouse's channel, and how each of them is."""
+"""The agents that are present on a lighthouse's channel, and the status of each."""
 
 from __future__ import annotations
 
 import re
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
-from mesh.watching.asking import TIMEOUT, answers
+from mesh.watching.queries import TIMEOUT, query_all
 from schemas import InvalidRecord, RpcKey, parse_address
 from schemas.status import BridgeStatus, Status, bridge_status_key
 
@@ -16,76 +16,81 @@ if TYPE_CHECKING:
 
     from mesh.network import Channel
 
-How: TypeAlias = Status | BridgeStatus
-"""What somebody says of itself."""
+RoleStatus: TypeAlias = Status | BridgeStatus
+"""The status that a role reports of itself."""
 
 BRIDGE: Final = "bridge"
-TURN: Final = re.compile(r"bridge-turn-.*")
-"""Roles that are no role, but tell whose turn it is among bridges."""
-AT_ONCE: Final = 64
-"""Peers that are asked at the same time."""
+BRIDGE_TURN: Final = re.compile(r"bridge-turn-.*")
+"""Presence tokens by which bridges take turns; no roles."""
+BATCH: Final = 64
+"""Peers queried at the same time."""
 
 
-class Peer(NamedTuple):
-    """Somebody who shows that it is on the channel: its role, and its address (EIP-55)."""
+class PresentPeer(NamedTuple):
+    """An agent announced on the channel: its role and its address (EIP-55)."""
 
     role: str
     address: str
 
 
-async def present(channel: Channel) -> list[Peer]:
-    """Who is on the channel now, by role and address. Anybody may show anything where no router forbids it."""
+async def present(channel: Channel) -> list[PresentPeer]:
+    """The agents announced on the channel now. Not verified: only a router with a roster restricts announcements."""
     keys = await channel.present()
-    return sorted({Peer(key.role, parse_address(key.agent)) for key in keys if not TURN.fullmatch(key.role)})
+    return sorted(
+        {PresentPeer(key.role, parse_address(key.agent)) for key in keys if not BRIDGE_TURN.fullmatch(key.role)}
+    )
 
 
-async def status_of(session: zenoh.Session, address: str, lighthouse: str, *, timeout: float = TIMEOUT) -> list[How]:
-    """How whoever has this address is, in each of its roles; nothing where nobody answers within `timeout` seconds.
+async def status_of(
+    session: zenoh.Session, address: str, lighthouse: str, *, timeout: float = TIMEOUT
+) -> list[RoleStatus]:
+    """The status of this address in each of its roles; empty if nobody replies within `timeout` seconds.
 
-    Of bridges the one of `lighthouse` (ENS name) is asked. Raises `InvalidKey`.
+    Of a bridge, the status for `lighthouse` (ENS name). Raises `InvalidKey`.
     """
     keys = (str(RpcKey(address, "status")), bridge_status_key(address, lighthouse))
-    # Whoever holds an address may answer on its keys; that it speaks of itself is what is asked for.
-    told = _read(await answers(session, keys, timeout=timeout))
-    return [how for how in told if address_of(how).lower() == address.lower()]
+    # Any process may reply on these keys where no router forbids it; keep statuses of this address only.
+    found = _decoded(await query_all(session, keys, timeout=timeout))
+    return [status for status in found if address_of(status).lower() == address.lower()]
 
 
 async def statuses(
-    session: zenoh.Session, channel: Channel, peers: Iterable[Peer], *, timeout: float = TIMEOUT
-) -> dict[Peer, How | None]:
-    """How each of these peers is on the channel's lighthouse; None for who does not say so within `timeout` seconds."""
+    session: zenoh.Session, channel: Channel, peers: Iterable[PresentPeer], *, timeout: float = TIMEOUT
+) -> dict[PresentPeer, RoleStatus | None]:
+    """The status of each peer on the channel's lighthouse; None if it does not reply within `timeout` seconds."""
     asked, found = list(peers), {}
-    for start in range(0, len(asked), AT_ONCE):
-        some = asked[start : start + AT_ONCE]
-        keys = {_key(peer, channel.lighthouse) for peer in some}
-        for how in _read(await answers(session, keys, timeout=timeout)):
-            if how.lighthouse == channel.lighthouse:
-                found[role_of(how), address_of(how).lower()] = how
+    for start in range(0, len(asked), BATCH):
+        batch = asked[start : start + BATCH]
+        keys = {_key(peer, channel.lighthouse) for peer in batch}
+        for status in _decoded(await query_all(session, keys, timeout=timeout)):
+            if status.lighthouse == channel.lighthouse:
+                found[role_of(status), address_of(status).lower()] = status
     return {peer: found.get((peer.role, peer.address.lower())) for peer in asked}
 
 
-def role_of(how: How) -> str:
-    """The role in which somebody is there."""
-    return how.role if isinstance(how, Status) else BRIDGE
+def role_of(status: RoleStatus) -> str:
+    """The role that a status is of."""
+    return status.role if isinstance(status, Status) else BRIDGE
 
 
-def address_of(how: How) -> str:
-    """Whose answer it is."""
-    return how.address if isinstance(how, Status) else how.bridge
+def address_of(status: RoleStatus) -> str:
+    """The address that a status is of."""
+    return status.address if isinstance(status, Status) else status.bridge
 
 
-def _key(peer: Peer, lighthouse: str) -> str:
+def _key(peer: PresentPeer, lighthouse: str) -> str:
     if peer.role == BRIDGE:
         return bridge_status_key(peer.address, lighthouse)
     return str(RpcKey(peer.address, "status"))
 
 
-def _read(payloads: Iterable[bytes]) -> list[How]:
-    """Those of the answers that can be read; a newer version may answer something else."""
-    return [how for payload in payloads if (how := _read_one(payload)) is not None]
+def _decoded(replies: Iterable[zenoh.Reply]) -> list[RoleStatus]:
+    """The statuses in these replies. Others are ignored: a newer version may reply something else."""
+    payloads = (reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None)
+    return [status for payload in payloads if (status := _decoded_one(payload)) is not None]
 
 
-def _read_one(payload: bytes) -> How | None:
+def _decoded_one(payload: bytes) -> RoleStatus | None:
     for kind in (Status, BridgeStatus):
         try:
             return kind.decode(payload)

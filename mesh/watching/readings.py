@@ -1,4 +1,4 @@
-"""What Results without a contract hold: the readings that sensors give away."""
+"""Sensor readings: the messages in results that belong to no liability."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from mesh.background import Background
 from mesh.content import Exchange, Store
 from mesh.errors import AiraError
 from mesh.recording import Limits, open_objective
-from mesh.watching.claims import JobEvent
-from mesh.watching.market import Remembered
+from mesh.telemetry.context import log_event
+from mesh.watching.market import JobEvent, RecentSet
 from schemas import Result, Verified
 from schemas.payloads import decode_value
 
@@ -26,24 +26,25 @@ if TYPE_CHECKING:
 
     import zenoh
 
-    from mesh.watching.market import Seen
+    from mesh.watching.market import MarketEvent
 
 log = logging.getLogger(__name__)
 
 LARGEST: Final = 64 * 1024
-"""Bytes of a result that is looked into: a reading is small, and nobody has asked us to fetch recordings."""
+"""Bytes of a result that is fetched. ReadingFetcher are small; larger recordings are not fetched unasked."""
 LIMITS: Final = Limits(size=LARGEST, expanded=LARGEST, messages=100)
 KEPT: Final = 16 * 1024 * 1024
-"""Bytes of results that are kept meanwhile; beyond, the oldest go."""
-AT_ONCE: Final = 4
-WAITING: Final = 64
-"""Results that are being fetched or wait for it; more are left out."""
+"""Bytes of results kept in the temporary store; beyond, the oldest are evicted."""
+MAX_FETCHES: Final = 4
+"""Results fetched at the same time."""
+MAX_PENDING: Final = 64
+"""Results being fetched or waiting; more are skipped."""
 TIMEOUT: Final = 10.0
-"""Seconds without a block after which a result is given up."""
+"""Seconds without a block after which fetching a result fails."""
 
 
-class Reading(msgspec.Struct, frozen=True):
-    """A message in a Result that belongs to no contract: who signed it, its CID, and what was said on a topic."""
+class SensorReading(msgspec.Struct, frozen=True):
+    """A message in a result without a liability: its signer, the CID of the result, topic and value."""
 
     signer: str
     result: str
@@ -52,19 +53,22 @@ class Reading(msgspec.Struct, frozen=True):
     """`Empty`, `String`, JSON data or bytes."""
 
 
-class Readings:
-    """Looks into the Results without a contract that `see` is shown, and gives each reading to `tell`.
+class ReadingFetcher:
+    """Fetches the results without a liability among the events given to `handle`, and passes each reading to `deliver`.
 
-    Used with `async with`; the files are in a temporary folder meanwhile. Which Results have a contract is what agents
-    say. What can't be had or read is logged.
+    Use with `async with`; files are in a temporary folder meanwhile. Agents' job events tell which results have a
+    liability. Results that can't be fetched or read are logged.
     """
 
-    def __init__(self, session: zenoh.Session, tell: Callable[[Reading], None]) -> None:
+    def __init__(
+        self, session: zenoh.Session, deliver: Callable[[SensorReading], None], *, timeout: float = TIMEOUT
+    ) -> None:
         self._session = session
-        self._tell = tell
-        self._contracts = Remembered()
-        self._turns = asyncio.Semaphore(AT_ONCE)
-        self._waiting = 0
+        self._deliver = deliver
+        self._timeout = timeout
+        self._contracts = RecentSet()
+        self._turns = asyncio.Semaphore(MAX_FETCHES)
+        self._pending = 0
         self._stack = AsyncExitStack()
 
     async def __aenter__(self) -> Self:
@@ -82,36 +86,43 @@ class Readings:
     ) -> bool | None:
         return await self._stack.__aexit__(kind, error, trace)
 
-    def see(self, seen: Seen) -> None:
-        """Something happened in the market."""
-        if isinstance(seen, JobEvent):
-            self._contracts.add(seen.liability.address)
-        elif isinstance(seen, Verified) and isinstance(seen.message, Result):
-            result = seen.message
+    @property
+    def pending(self) -> int:
+        """Results being fetched or waiting."""
+        return self._pending
+
+    def handle(self, event: MarketEvent) -> None:
+        """Take an event of the market."""
+        if isinstance(event, JobEvent):
+            self._contracts.add(event.liability.address)
+        elif isinstance(event, Verified) and isinstance(event.message, Result):
+            result = event.message
             if result.liability in self._contracts:
                 return
-            if self._waiting == WAITING:
-                log.warning("the result %s of %s is not shown: too many at once", result.result, seen.signer)
+            if self._pending == MAX_PENDING:
+                fields = log_event("result-skipped", result=result.result, signer=event.signer)
+                log.warning("skipped the result %s of %s: too many at once", result.result, event.signer, extra=fields)
                 return
-            self._waiting += 1
-            self._tasks.start(self._look_into(result.result, seen.signer), f"reading {result.result}")
+            self._pending += 1
+            self._tasks.start(self._fetch(result.result, event.signer), f"reading {result.result}")
 
-    async def _look_into(self, cid: str, signer: str) -> None:
+    async def _fetch(self, cid: str, signer: str) -> None:
         try:
             async with self._turns:
-                path = await self._exchange.fetch(cid, size_limit=LARGEST, timeout=TIMEOUT)
+                path = await self._exchange.fetch(cid, size_limit=LARGEST, timeout=self._timeout)
                 readings = await asyncio.to_thread(_read, path, cid, signer)
         except AiraError as error:
-            log.warning("the result %s of %s can't be shown: %s", cid, signer, error)
+            fields = log_event("result-unreadable", result=cid, signer=signer, code=error.code)
+            log.warning("can't read the result %s of %s: %s", cid, signer, error, extra=fields)
         else:
             for reading in readings:
-                self._tell(reading)
+                self._deliver(reading)
         finally:
-            self._waiting -= 1
+            self._pending -= 1
 
 
-def _read(path: Path, cid: str, signer: str) -> list[Reading]:
+def _read(path: Path, cid: str, signer: str) -> list[SensorReading]:
     return [
-        Reading(signer, cid, message.topic, decode_value(message.payload, message.type))
+        SensorReading(signer, cid, message.topic, decode_value(message.payload, message.type))
         for message in open_objective(path, LIMITS).messages()
     ]

@@ -18,7 +18,7 @@ from mesh.cli.watch import format_counters as told
 from mesh.errors import InvalidCid, NetworkUnavailable
 from mesh.network import Channel, Endpoints, Network, message_key
 from mesh.settings import Settings
-from mesh.watching import JobEvent, Reading, Readings, Tally
+from mesh.watching import JobEvent, MarketCounters, ReadingFetcher, SensorReading
 from schemas import Empty, RejectKey, Result, String, encode, message_hash, verify_message
 from schemas.signing import Rejection
 from tests.mesh.watching.test_market import EVENT, JOB
@@ -173,7 +173,7 @@ def test_a_rejection_for_programs() -> None:
 
 
 def test_the_tally_in_words() -> None:
-    tally = Tally(received=1_234, refused={"signature": 2, "event": 1}, duplicate=3, lost=0)
+    tally = MarketCounters(received=1_234, refused={"signature": 2, "event": 1}, duplicate=3, lost=0)
     assert told(tally) == "1,234 messages came by, 3 of them again, 3 refused (1 event, 2 signature)"
     assert told(msgspec.structs.replace(tally, lost=9)).endswith("), 9 lost as this reader was too slow")
 
@@ -269,28 +269,37 @@ async def test_what_a_result_without_a_contract_holds_is_shown(place: Place, sai
     }
 
 
+def events(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [getattr(record, "event", "") for record in caplog.records]
+
+
 async def test_a_result_that_nobody_has_is_told_and_holds_up_nothing(
-    router: EmbeddedRouter, said: Said, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    router: EmbeddedRouter, said: Said, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("mesh.watching.readings.TIMEOUT", 0.5)
-    told: list[Reading] = []
+    told: list[SensorReading] = []
     async with (
         Network(Endpoints(connect=(router.endpoint,))) as network,
-        Readings(network.session, told.append) as looking,
+        ReadingFetcher(network.session, told.append, timeout=0.5) as looking,
     ):
-        looking.see(verify_message(result(liability=CONTRACT)))
-        await until(lambda: "can't be shown: " in caplog.text, what="the warning", seconds=30)
-        looking.see(JobEvent(ROBOT.address, "incoming", JOB))
-        looking.see(verify_message(result(liability=CONTRACT)))
-        assert looking._waiting == 0
+        looking.handle(verify_message(result(liability=CONTRACT)))
+        await until(
+            lambda: "result-unreadable" in [getattr(record, "event", "") for record in caplog.records],
+            what="the warning",
+            seconds=30,
+        )
+        looking.handle(JobEvent(ROBOT.address, "incoming", JOB))
+        looking.handle(verify_message(result(liability=CONTRACT)))
+        assert looking.pending == 0
     assert told == []
 
 
 def test_a_reading_in_words_does_not_steer_the_terminal() -> None:
-    line = words(Reading(ROBOT.address, RECORDING, "/air", String("\x1b[2J" + "y" * 500)))
+    line = words(SensorReading(ROBOT.address, RECORDING, "/air", String("\x1b[2J" + "y" * 500)))
     assert line.startswith("reading    /air  ")
     assert "\x1b" not in line
     assert len(line) < 300
-    assert words(Reading(ROBOT.address, RECORDING, "/air", {"CO": 1})).startswith('reading    /air  {"CO":1}, from 0x')
-    assert words(Reading(ROBOT.address, RECORDING, "/air", Empty())).startswith("reading    /air  null, from 0x")
-    assert words(Reading(ROBOT.address, RECORDING, "/air", b"ab")).startswith('reading    /air  "YWI=", from 0x')
+    assert words(SensorReading(ROBOT.address, RECORDING, "/air", {"CO": 1})).startswith(
+        'reading    /air  {"CO":1}, from 0x'
+    )
+    assert words(SensorReading(ROBOT.address, RECORDING, "/air", Empty())).startswith("reading    /air  null, from 0x")
+    assert words(SensorReading(ROBOT.address, RECORDING, "/air", b"ab")).startswith('reading    /air  "YWI=", from 0x')

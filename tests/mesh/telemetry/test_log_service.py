@@ -135,14 +135,14 @@ async def test_the_reader_says_how_many_events_it_missed(router: EmbeddedRouter,
         key = str(RpcKey(ROBOT.address, "logs"))
         await until_answered(elsewhere.session, key)
         reader = LogReader(elsewhere.session, key, lines=0)
-        assert (await reader.look()).events == []
+        assert (await reader.poll()).events == []
         with source_context(LogSource("agent", ROBOT.address)), liability_context(STRANGER.address):
             for number in range(50):
                 log.info("number %d", number)
-        look = await reader.look()
+        look = await reader.poll()
         assert [event.message for event in look.events] == [f"number {number}" for number in range(30, 50)]
         assert look.missed == 30
-        assert (await reader.look()).events == []
+        assert (await reader.poll()).events == []
 
 
 async def test_several_processes_on_one_key_are_followed_separately(router: EmbeddedRouter, kept: LogHandler) -> None:
@@ -165,13 +165,13 @@ async def test_several_processes_on_one_key_are_followed_separately(router: Embe
         reader = LogReader(elsewhere.session, str(RpcKey(ROBOT.address, "logs")), lines=5)
 
         async def both_answer() -> bool:
-            await reader.look()
+            await reader.poll()
             return len(reader.instances) == 2
 
         await until_found(both_answer, what="the answers of both")
         log.info("of one")
         other.emit(logging.makeLogRecord({"name": "t", "msg": "of the other", "levelno": 20}))
-        look = await reader.look()
+        look = await reader.poll()
     assert sorted(event.message for event in look.events) == ["of one", "of the other"]
 
 

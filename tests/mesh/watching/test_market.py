@@ -66,7 +66,7 @@ class Market:
         self.channel.put(key, msgspec.structs.replace(word, **changes).encode())
 
     async def refused(self, reason: str, count: int = 1) -> None:
-        await until(lambda: self.watch.tally().refused.get(reason) == count, what=f"{count} refused for {reason}")
+        await until(lambda: self.watch.counters().refused.get(reason) == count, what=f"{count} refused for {reason}")
 
 
 @asynccontextmanager
@@ -97,7 +97,7 @@ async def test_orders_and_results_come_as_they_are_published(market: Market) -> 
         seen = await market.next()
         assert isinstance(seen, Verified)
         assert (seen.message, seen.hash) == (message, message_hash(message))
-    assert market.watch.tally().received == 4
+    assert market.watch.counters().received == 4
 
 
 async def test_a_message_with_another_ones_signature_is_counted_and_not_shown(market: Market) -> None:
@@ -158,7 +158,7 @@ async def test_an_event_of_an_agent_of_another_lighthouse_is_not_shown(market: M
 
 async def test_an_agent_that_comes_later_is_shown_too(market: Market) -> None:
     market.channel.announce("agent", STRANGER.address)
-    await until(lambda: STRANGER.address.lower() in market.watch._here, what="the newcomer")
+    await until(lambda: market.watch.knows(STRANGER.address), what="the new agent")
     theirs = msgspec.structs.replace(JOB, promisor=STRANGER.address)
     market.channel.put(str(EventKey(STRANGER.address, CONTRACT, "ready")), theirs.encode())
     assert (await market.next()).agent == STRANGER.address
@@ -182,7 +182,7 @@ async def test_with_a_model_a_result_is_shown_once_its_contract_is_known(router:
     async with watched(router, MODEL) as market:
         early = result(liability=CONTRACT)
         market.channel.publish(early)
-        await until(lambda: market.watch.tally().received == 1, what="the Result")
+        await until(lambda: market.watch.counters().received == 1, what="the Result")
         market.channel.put(EVENT, JOB.encode())
         assert isinstance(await market.next(), JobEvent)
         market.channel.publish(early)  # as the agent does until its effect is seen

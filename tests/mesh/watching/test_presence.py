@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.network import Channel, Endpoints, Network, Services
-from mesh.watching import Peer, present, status_of, statuses
+from mesh.watching import PresentPeer, present, status_of, statuses
 from schemas import RpcKey
 from schemas.status import ALIVE, BridgeStatus, DirectionStatus, Status, bridge_status_key
 from tests.support.orders import MARKET, PERSON, ROBOT, STRANGER
@@ -90,7 +90,7 @@ class Meeting:
         self.shown = shown
         self.writer = writer
 
-    async def see(self, *peers: Peer) -> None:
+    async def see(self, *peers: PresentPeer) -> None:
         async def all_there() -> bool:
             return set(await present(self.seen)) == set(peers)
 
@@ -126,7 +126,7 @@ async def test_everybody_who_shows_itself_is_seen_by_role_and_address(meeting: M
     assert await present(meeting.seen) == []
     meeting.shown.announce("provider", PERSON.address)
     meeting.shown.announce("agent", ROBOT.address)
-    await meeting.see(Peer("agent", ROBOT.address), Peer("provider", PERSON.address))
+    await meeting.see(PresentPeer("agent", ROBOT.address), PresentPeer("provider", PERSON.address))
     found = await present(meeting.seen)
     assert found == sorted(found)
 
@@ -134,7 +134,7 @@ async def test_everybody_who_shows_itself_is_seen_by_role_and_address(meeting: M
 async def test_the_turn_of_a_bridge_is_nobody_of_its_own(meeting: Meeting) -> None:
     meeting.shown.announce("bridge-turn-0-00000000000000ff", STRANGER.address)
     meeting.shown.announce("bridge", STRANGER.address)
-    await meeting.see(Peer("bridge", STRANGER.address))
+    await meeting.see(PresentPeer("bridge", STRANGER.address))
 
 
 async def test_who_is_asked_answers_for_each_of_its_roles(meeting: Meeting) -> None:
@@ -154,7 +154,7 @@ async def test_a_bridge_answers_too(meeting: Meeting) -> None:
     with answering(meeting.writer.session, key, bridge_status().encode()):
         await until_answered(meeting.session, key)
         assert await status_of(meeting.session, STRANGER.address, MARKET) == [bridge_status()]
-        peer = Peer("bridge", STRANGER.address)
+        peer = PresentPeer("bridge", STRANGER.address)
         assert await statuses(meeting.session, meeting.seen, [peer]) == {peer: bridge_status()}
 
 
@@ -173,7 +173,7 @@ async def test_nobody_and_silence_are_no_answer(meeting: Meeting) -> None:
 
 
 async def test_nobody_is_believed_about_another_or_another_lighthouse(meeting: Meeting) -> None:
-    peer = Peer("agent", ROBOT.address)
+    peer = PresentPeer("agent", ROBOT.address)
     key = str(RpcKey(ROBOT.address, "status"))
     lies = (status(address=STRANGER.address).encode(), b"\xff", b"{}", status(lighthouse="another.eth").encode())
     with ExitStack() as stack:
@@ -182,7 +182,7 @@ async def test_nobody_is_believed_about_another_or_another_lighthouse(meeting: M
         await until_answered(meeting.session, key)
         assert await statuses(meeting.session, meeting.seen, [peer]) == {peer: None}
         told = await status_of(meeting.session, ROBOT.address, MARKET)
-        assert {how.lighthouse for how in told} <= {"another.eth"}
+        assert {found.lighthouse for found in told} <= {"another.eth"}
 
 
 def test_what_a_newer_version_says_besides_is_no_reason_not_to_read_the_rest() -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from mesh.identity import Member
 from mesh.network import Channel, Network, Services
-from mesh.watching import MarketWatch, Peer, present, status_of
+from mesh.watching import MarketWatch, PresentPeer, present, status_of
 from tests.mesh.watching.test_market import EVENT, JOB
 from tests.mesh.watching.test_presence import QUICK, status
 from tests.support.orders import MARKET, PERSON, ROBOT, STRANGER
@@ -18,7 +18,7 @@ from tests.support.waiting import until, until_found
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.watching import How
+    from mesh.watching import RoleStatus
     from schemas.rpc import Nothing
     from schemas.status import Status
 
@@ -50,9 +50,9 @@ async def test_what_each_role_sees(tmp_path: Path, role: str, may_ask: int, sees
             shown.announce("agent", ROBOT.address)
 
             async def is_seen() -> bool:
-                return await present(seen) == [Peer("agent", ROBOT.address)]
+                return await present(seen) == [PresentPeer("agent", ROBOT.address)]
 
-            async def told() -> list[How]:
+            async def told() -> list[RoleStatus]:
                 return await status_of(others.session, ROBOT.address, MARKET, timeout=QUICK)
 
             async with MarketWatch(others.session, seen) as watch:
@@ -63,7 +63,7 @@ async def test_what_each_role_sees(tmp_path: Path, role: str, may_ask: int, sees
 
                 def events() -> int:
                     shown.put(EVENT, JOB.encode())
-                    return watch.tally().received
+                    return watch.counters().received
 
                 if sees_events:
                     await until(events, what="an event", seconds=SECONDS)
@@ -71,4 +71,4 @@ async def test_what_each_role_sees(tmp_path: Path, role: str, may_ask: int, sees
                     for _ in range(3):
                         events()
                         await told()
-                    assert watch.tally().received == 0
+                    assert watch.counters().received == 0
