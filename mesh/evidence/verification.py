@@ -43,8 +43,8 @@ def verify(
     Use a thread. Raises `OSError` if a file can't be read.
     """
     cids = objective_cid or cid_of_file(objective), result_cid or cid_of_file(result)
-    opened = _opener(result, objective, progress)
-    return Verdict(tuple(_findings(claim, objective, result, message, *cids, opened)))
+    open_next = _opener(result, objective, progress)
+    return Verdict(tuple(_check_all(claim, objective, result, message, *cids, open_next)))
 
 
 def _opener(first: Path, second: Path, progress: Progress | None) -> Opener:
@@ -52,40 +52,40 @@ def _opener(first: Path, second: Path, progress: Progress | None) -> Opener:
     sizes = first.stat().st_size, second.stat().st_size
     before = iter((0, sizes[0]))
 
-    def opened(path: Path) -> Objective:
+    def open_next(path: Path) -> Objective:
         start = next(before)
         tell = None if progress is None else lambda done, _: progress(start + done, sum(sizes))
         return open_objective(path, GENEROUS, progress=tell)
 
-    return opened
+    return open_next
 
 
-def _findings(
+def _check_all(
     claim: Claim,
     objective: Path,
     result: Path,
     message: bytes | None,
     objective_cid: str,
     result_cid: str,
-    opened: Opener,
+    open_next: Opener,
 ) -> Iterator[Finding]:
     yield check_end(claim)
     yield check_signature(claim, message, recording=result_cid)
     claim = supplemented(claim, message)
-    yield _file("result-file", "result", result_cid, claim.result)
-    yield _file("objective-file", "objective", objective_cid, claim.objective)
+    yield _check_file("result-file", "result", result_cid, claim.result)
+    yield _check_file("objective-file", "objective", objective_cid, claim.objective)
     if not claim.objective:
         # Without a contract, still check that the two files belong together.
         claim = msgspec.structs.replace(claim, objective=objective_cid)
     try:
-        recording = opened(result)
+        recording = open_next(result)
     except RecordingError as error:
         yield Finding("readable", False, f"the recording is not readable: {error.why}")
         return
-    yield from _recording(claim, recording, objective, opened)
+    yield from _check_recording(claim, recording, objective, open_next)
 
 
-def _recording(claim: Claim, recording: Objective, path: Path, opened: Opener) -> Iterator[Finding]:
+def _check_recording(claim: Claim, recording: Objective, path: Path, open_next: Opener) -> Iterator[Finding]:
     sequence, played, seams = SequenceCheck(), list[MessageDigest](), list[int]()
     breaks = _numbers(recording.metadata.get(RECOVERED, {}).get("seams", ""))
     for number, written in enumerate(recording.in_file_order()):
@@ -97,7 +97,7 @@ def _recording(claim: Claim, recording: Objective, path: Path, opened: Opener) -
     yield from check_completeness(recording, sequence)
     yield from check_about(claim, recording.metadata)
     try:
-        objective = opened(path)
+        objective = open_next(path)
     except RecordingError as error:
         why = f"the objective is not a recording ({error.why})"
         if played:
@@ -105,10 +105,10 @@ def _recording(claim: Claim, recording: Objective, path: Path, opened: Opener) -
         else:
             yield Finding("played", None, f"nothing was played: {why}")
         return
-    yield _played(claim, recording, objective, played, seams)
+    yield _check_playback(claim, recording, objective, played, seams)
 
 
-def _played(
+def _check_playback(
     claim: Claim, recording: Objective, objective: Objective, played: list[MessageDigest], seams: list[int]
 ) -> Finding:
     chosen = {name for name in recording.metadata.get(ABOUT, {}).get("topics", "").split(",") if name}
@@ -120,7 +120,7 @@ def _played(
     return finding
 
 
-def _file(name: str, what: str, cid: str, claimed: str) -> Finding:
+def _check_file(name: str, what: str, cid: str, claimed: str) -> Finding:
     if not claimed:
         return Finding(name, None, f"the {what} is {cid}, with nothing to compare it to")
     if cid != claimed:
@@ -170,10 +170,10 @@ def check_completeness(recording: Objective, sequence: SequenceCheck) -> Iterato
         yield Finding("readable", None, f"{recording.unchecked} blocks of it have no checksum")
     else:
         yield Finding("readable", True, f"{recording.count} messages, and every checksum is right")
-    yield _statistics(recording, sequence)
-    yield _closed(recording)
-    yield _faults("sequence", sequence.gaps, "the messages of every channel are numbered without a gap")
-    yield _faults("times", sequence.steps_back, "on every channel, messages are in the order of their times")
+    yield _check_statistics(recording, sequence)
+    yield _check_closed(recording)
+    yield _fault_finding("sequence", sequence.gaps, "the messages of every channel are numbered without a gap")
+    yield _fault_finding("times", sequence.steps_back, "on every channel, messages are in the order of their times")
 
 
 def _gap(written: ChannelMessage, expected: int) -> str:
@@ -185,14 +185,14 @@ def _gap(written: ChannelMessage, expected: int) -> str:
     return f"messages {expected} to {number - 1} on {topic} are missing"
 
 
-def _faults(name: str, faults: list[str], well: str) -> Finding:
+def _fault_finding(name: str, faults: list[str], well: str) -> Finding:
     if not faults:
         return Finding(name, True, well)
     more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
     return Finding(name, False, faults[0] + more)
 
 
-def _statistics(recording: Objective, sequence: SequenceCheck) -> Finding:
+def _check_statistics(recording: Objective, sequence: SequenceCheck) -> Finding:
     said = recording.statistics
     if said is None:
         return Finding("statistics", False, "the file does not state how many messages it has")
@@ -206,7 +206,7 @@ def _statistics(recording: Objective, sequence: SequenceCheck) -> Finding:
     return Finding("statistics", True, "the file has the messages, channels and times that it states")
 
 
-def _closed(recording: Objective) -> Finding:
+def _check_closed(recording: Objective) -> Finding:
     closing = recording.metadata.get(CLOSED)
     if closing is None:
         return Finding("closed", False, "the recorder did not close it: the end may be missing")

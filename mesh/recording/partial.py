@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from mesh.recording.mcap_writer import WriterChannel
     from mesh.recording.source import RecordingSource
 
-Role = Literal["objective", "device", "agent"]
+MessageRole = Literal["objective", "device", "agent"]
 
 ABOUT: Final = "aira"
 """Name of the metadata record with the job that the recording belongs to."""
@@ -45,7 +45,7 @@ PROGRESS_EVERY: Final = 1000
 """Messages between two calls of `progress`."""
 
 _NO_LIMIT: Final = 1 << 62
-_OURS: Final = Limits(
+_UNLIMITED: Final = Limits(
     size=_NO_LIMIT,
     expanded=_NO_LIMIT,
     bz2=_NO_LIMIT,
@@ -55,10 +55,10 @@ _OURS: Final = Limits(
     messages=_NO_LIMIT,
     blocks=_NO_LIMIT,
 )
-_ROLES: Final[Mapping[Role, Mapping[str, str]]] = {role: {"role": role} for role in get_args(Role)}
+_ROLES: Final[Mapping[MessageRole, Mapping[str, str]]] = {role: {"role": role} for role in get_args(MessageRole)}
 
 
-Message: TypeAlias = "tuple[str, bytes, PayloadType, Role, int, int]"
+PendingMessage: TypeAlias = "tuple[str, bytes, PayloadType, MessageRole, int, int]"
 """A message to record, already checked: topic, payload, type, role, log time and publish time in nanoseconds.
 
 A plain tuple, since there may be hundreds of thousands a second.
@@ -91,7 +91,7 @@ class PartialFile:
         _set_aside(final, self._part, self._cut)
         self._stream = _locked(self._part)
         self._writer = McapWriter(self._stream)
-        self._channels: dict[str, tuple[PayloadType, Role, WriterChannel]] = {}
+        self._channels: dict[str, tuple[PayloadType, MessageRole, WriterChannel]] = {}
         """The channel of the last message on each topic: the next one most likely has the same type and role."""
         self._unflushed_since: float | None = None
         self._unsynced_since: float | None = None
@@ -115,7 +115,7 @@ class PartialFile:
         self._cut.unlink(missing_ok=True)
         sync_directory(self._final.parent)
 
-    def add(self, messages: Iterable[Message]) -> list[Unrecordable]:
+    def add(self, messages: Iterable[PendingMessage]) -> list[Unrecordable]:
         """Write messages in their order. Returns an error for each that no file can hold. Raises `OSError`."""
         refused: list[Unrecordable] = []
         for topic, payload, type, role, log_time_ns, publish_time_ns in messages:
@@ -213,7 +213,7 @@ def readable_part(path: Path) -> tuple[RecordingSource, str]:
     why = ""
     size = path.stat().st_size
     with path.open("rb") as file:
-        reader = McapReader(path, file, _OURS)
+        reader = McapReader(path, file, _UNLIMITED)
         try:
             for header in mcap_records(path, file, size):
                 if header.opcode == Opcode.DATA_END:

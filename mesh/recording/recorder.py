@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING, Final, Self
 from mesh.errors import ClosedError
 from mesh.recording.errors import RecordingFailed
 from mesh.recording.mcap_writer import check_message
-from mesh.recording.partial import Message, PartialFile
+from mesh.recording.partial import PartialFile, PendingMessage
 from mesh.telemetry.context import log_event
 
 if TYPE_CHECKING:
     from pathlib import Path
     from types import TracebackType
 
-    from mesh.recording.partial import Role
+    from mesh.recording.partial import MessageRole
     from schemas.payloads import PayloadType
 
 log = logging.getLogger(__name__)
@@ -104,7 +104,7 @@ class Recorder:
         self._about = about
         self._lock = threading.Lock()
         self._wake = threading.Event()
-        self._queue: list[Message] = []
+        self._queue: list[PendingMessage] = []
         self._queued = 0
         self._taken = 0
         self._topics: set[str] = set()
@@ -155,7 +155,7 @@ class Recorder:
         payload: bytes,
         type: PayloadType,
         *,
-        role: Role = "device",
+        role: MessageRole = "device",
         log_time_ns: int | None = None,
         publish_time_ns: int | None = None,
     ) -> None:
@@ -236,7 +236,7 @@ class Recorder:
             if closing:
                 return
 
-    def _add(self, file: PartialFile, messages: list[Message]) -> None:
+    def _add(self, file: PartialFile, messages: list[PendingMessage]) -> None:
         refused = file.add(messages)
         with self._lock:
             self._queued -= sum([len(message[1]) for message in messages]) + _COST * len(messages)
@@ -247,7 +247,7 @@ class Recorder:
             event = log_event("recording-message-refused", path=self.path, error=error)
             log.warning("%s lacks a message: %s", self.path.name, error, extra=event)
 
-    def _take(self) -> list[Message]:
+    def _take(self) -> list[PendingMessage]:
         """All waiting messages; they count as waiting until they are written."""
         with self._lock:
             batch, self._queue = self._queue, []

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def put_all(assembly: Assembly, blocks: dict[str, bytes], *, at_most: int = 10_000) -> int:
-    """Give the blocks from the root down; how many of them had to be given, because they were nowhere on the disk."""
+    """Put the blocks from the root down. Returns how many were not on the disk yet."""
     waiting, given = [assembly.root], 0
     while waiting and given < at_most:
         place = waiting.pop(0)

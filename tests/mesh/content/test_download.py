@@ -49,7 +49,7 @@ asyncio.run(main(*sys.argv[1:]))
 
 
 def is_meant(query: zenoh.Query, session: zenoh.Session) -> bool:
-    """Whether a query is for everybody, or for the holder of this session."""
+    """Whether a query is for all holders, or for this session."""
     return query.parameters.get("holder", str(session.zid())) == str(session.zid())
 
 

@@ -35,7 +35,7 @@ GIGABYTE: Final = 1 << 30
 
 @pytest.fixture(scope="module")
 def pattern() -> bytes:
-    """The content of which all files here are the beginning."""
+    """The bytes that all files here begin with."""
     unit = bytes((i * 31 + 7 + (i >> 8)) & 255 for i in range(PERIOD))
     return unit * (max(NAMES) // PERIOD + 1)
 
@@ -101,7 +101,7 @@ print(peak() - before)
 
 
 def memory_of(imports: str, work: str, *arguments: object) -> int:
-    """Bytes that the work takes at most, over the interpreter with its imports."""
+    """Peak memory of the work, in bytes, above the interpreter with its imports."""
     measured = subprocess.run(
         [sys.executable, "-c", MEASURE.format(imports=imports, work=work), *map(str, arguments)],
         cwd=ROOT,
@@ -115,7 +115,7 @@ def memory_of(imports: str, work: str, *arguments: object) -> int:
 
 
 def sparse(path: Path, size: int) -> Path:
-    """A file of that size which takes no room on the disk."""
+    """A sparse file of that size."""
     with path.open("wb") as file:
         file.truncate(size)
     return path

@@ -1,4 +1,4 @@
-"""What a store deletes to have room, what it never deletes, and what it says when there is none."""
+"""Eviction, pins, and the errors of a full store."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def file_of(kibibytes: int, seed: int = 0) -> bytes:
 
 
 def bytes_on_disk(store: Store) -> int:
-    """All that is not the store's own books."""
+    """The bytes of all files except the store's own."""
     files = (store.directory / name for name in os.listdir(store.directory) if name[0] != "." or name[:2] == ".p")
     return sum(path.stat().st_size for path in files if path.is_file())
 

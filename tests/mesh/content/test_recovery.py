@@ -95,7 +95,7 @@ def killed_at_each_step(directory: Path, work: str, *, check: Callable[[Path], N
 
 
 def check_consistent(directory: Path) -> None:
-    """After a crash: nothing is left over, every file is what its name says, and the index knows all of it."""
+    """Check a store after a crash: no leftovers, every file matches its CID, and the index has all blocks."""
     with Store(directory, quota=QUOTA) as store:
         held = store.list()
         assert store.check().damaged == ()

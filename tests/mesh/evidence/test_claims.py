@@ -1,4 +1,4 @@
-"""What a Result and two files prove by themselves, without a chain."""
+"""What a Result and two files prove without a chain."""
 
 from __future__ import annotations
 

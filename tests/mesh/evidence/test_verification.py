@@ -1,4 +1,4 @@
-"""What is found in sound recordings, and in forged ones."""
+"""Findings on honest and on forged recordings."""
 
 from __future__ import annotations
 
@@ -239,7 +239,7 @@ def test_lost_messages_fail_the_closed_finding(tmp_path: Path) -> None:
 
 
 def interrupted(tmp_path: Path, *parts: tuple[str, ...]) -> JobFiles:
-    """A job whose agent broke down after each of the parts but the last."""
+    """A job whose agent crashed after each of the parts but the last."""
     job = make_job(tmp_path)
     about = {name: text for name, text in open_objective(job.result).metadata["aira"].items() if name != "software"}
     job.result.unlink()

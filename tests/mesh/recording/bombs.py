@@ -1,4 +1,4 @@
-"""Files that cost whoever opens them much more than they weigh, made by code."""
+"""Bombs: small files that take much time or memory to open."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def zeros(size: int) -> bytes:
 
 
 def one_chunk() -> bytes:
-    """What the design calls the bomb: some 33 kB that expand to 1 GiB."""
+    """About 33 kB that expand to 1 GiB."""
     return raw_file(chunk(zeros(GIB), compression="zstd", size=GIB))
 
 
 def many_chunks() -> bytes:
-    """The same in chunks as large as they may be, each one message of zeros."""
+    """The same in chunks of the maximum size, each with one message of zeros."""
     chunks = []
     for number in range(GIB // CHUNK):
         data = message(bytes(CHUNK - 31), time=number)
@@ -44,7 +44,7 @@ def many_chunks() -> bytes:
 
 
 def nothing_but_zeros() -> bytes:
-    """A gigabyte of records of the kind 0 with no content."""
+    """A gigabyte of empty records with opcode 0."""
     return raw_file(*[chunk(zeros(CHUNK), compression="zstd", size=CHUNK)] * (GIB // CHUNK))
 
 
@@ -55,18 +55,18 @@ def private_records() -> bytes:
 
 
 def tiny_messages() -> bytes:
-    """More messages than anybody can count in time."""
+    """More messages than can be counted in time."""
     data = message() * (CHUNK // 31)
     return raw_file(SCHEMA, PLAIN, *[chunk(zstandard.compress(data), compression="zstd", size=len(data))] * 10)
 
 
 def tiny_records() -> bytes:
-    """A file of empty records, nothing compressed."""
+    """A file of empty uncompressed records."""
     return raw_file(record(0x80, b"") * 5_000_000)
 
 
 def interwoven() -> bytes:
-    """Chunks that all span the same time, so that giving their messages in order needs them all at once."""
+    """Chunks that all span the same time, so that sorting their messages needs all at once."""
     data = message(bytes(1 << 20), time=0) * 20 + message(time=1)
     return raw_file(SCHEMA, PLAIN, *[chunk(zstandard.compress(data), compression="zstd", size=len(data))] * 40)
 
@@ -78,12 +78,12 @@ def backwards() -> bytes:
 
 
 def lying_lz4() -> bytes:
-    """A chunk that expands to a quarter of a gigabyte and says that it has a kilobyte."""
+    """A chunk that expands to 256 MiB and states 1 KiB."""
     return raw_file(chunk(bytes(lz4.frame.compress(bytes(GIB // 4))), compression="lz4", size=1000))
 
 
 def bag_of_zeros() -> bytes:
-    """A bag whose chunk expands a thousandfold, to more than it says."""
+    """A bag whose chunk expands a thousandfold, to more than it states."""
     header = {"op": b"\x05", "compression": b"bz2", "size": struct.pack("<I", 1000)}
     return (
         MAGIC
@@ -96,7 +96,7 @@ CONNECTION = bag_record({"op": b"\x07", "conn": bytes(4), "topic": b"/a"}, struc
 
 
 def bag_of(records: bytes) -> bytes:
-    """A bag of chunks as large as they may be, full of these records."""
+    """A bag with chunks of the maximum size, full of these records."""
     data = CONNECTION + records * ((CHUNK - len(CONNECTION)) // len(records))
     header = {"op": b"\x05", "compression": b"lz4", "size": struct.pack("<I", len(data))}
     one = bag_record(header, compress(data, "lz4"))
@@ -104,12 +104,12 @@ def bag_of(records: bytes) -> bytes:
 
 
 def bag_of_connections() -> bytes:
-    """A bag that says the same connection a million times in every chunk."""
+    """A bag that repeats one connection a million times in every chunk."""
     return bag_of(CONNECTION)
 
 
 def bag_of_tiny_messages() -> bytes:
-    """A bag of more messages than anybody can count in time."""
+    """A bag of more messages than can be counted in time."""
     return bag_of(bag_record({"op": b"\x02", "conn": bytes(4), "time": bytes(8)}, b""))
 
 
@@ -132,7 +132,7 @@ def bag_of_scattered_messages() -> bytes:
 
 
 def bag_of_slow_chunks() -> bytes:
-    """A bag of bz2, which takes longer to expand than anything else."""
+    """A bag with bz2 chunks, which take longest to expand."""
     data = CONNECTION + bag_record(
         {"op": b"\x02", "conn": bytes(4), "time": bytes(8)}, random.Random(1).randbytes(1 << 20)
     )
@@ -142,7 +142,7 @@ def bag_of_slow_chunks() -> bytes:
 
 
 def bag_of_too_many_slow_chunks() -> bytes:
-    """The same, but too much of it."""
+    """The same, over the limit."""
     data = bytes(CHUNK)
     header = {"op": b"\x05", "compression": b"bz2", "size": struct.pack("<I", len(data))}
     return (
@@ -151,7 +151,7 @@ def bag_of_too_many_slow_chunks() -> bytes:
 
 
 def bag_of_all_that_is_taken() -> bytes:
-    """A bag of as many messages as are taken, each to be read."""
+    """A bag of as many messages as the limit allows."""
     said = b"".join(fields({name: value}) for name, value in {"type": b"std_msgs/String"}.items())
     connection = bag_record({"op": b"\x07", "conn": bytes(4), "topic": b"/a"}, said)
     data = connection + bag_record({"op": b"\x02", "conn": bytes(4), "time": bytes(8)}, b"\x01\0\0\0x") * (
@@ -164,14 +164,14 @@ def bag_of_all_that_is_taken() -> bytes:
 
 
 def all_that_is_taken() -> bytes:
-    """As many messages of JSON as are taken."""
+    """As many JSON messages as the limit allows."""
     data = message(b'{"a":[1.5]}') * (MANY // 10)
     chunks = [chunk(zstandard.compress(data), compression="zstd", size=len(data))] * 10
     return raw_file(SCHEMA, CHANNEL, *chunks)
 
 
 def json_of_lists() -> bytes:
-    """As much JSON as is taken, of the kind that takes the most time and memory: lists of nothing."""
+    """As much JSON as the limit allows, of the slowest and largest kind: empty lists."""
     data = message(b"[" + b"[]," * (LIMITS.json // 30) + b"[]]")
     return raw_file(SCHEMA, CHANNEL, *[chunk(zstandard.compress(data), compression="zstd", size=len(data))] * 9)
 
@@ -183,7 +183,7 @@ def json_too_long() -> bytes:
 
 
 def large_channel() -> bytes:
-    """A channel with millions of empty metadata, said again in every chunk."""
+    """A channel with millions of empty metadata entries, repeated in every chunk."""
     pairs = bytes(CHUNK - 200)
     channel = struct.pack("<HH", 1, 1) + text("/a") + text("") + struct.pack("<I", len(pairs)) + pairs
     data = record(Opcode.CHANNEL, channel)
@@ -191,7 +191,7 @@ def large_channel() -> bytes:
 
 
 def metadata() -> bytes:
-    """As much metadata as is taken, all different."""
+    """As much metadata as the limit allows, all different."""
     pairs = b"".join(text(f"{number:05x}") + bytes(4) for number in range(LIMITS.definitions // 13 - 10))
     return raw_file(
         SCHEMA, PLAIN, record(Opcode.METADATA, text("a") + struct.pack("<I", len(pairs)) + pairs), message()
@@ -199,7 +199,7 @@ def metadata() -> bytes:
 
 
 def long_statistics() -> bytes:
-    """Statistics of more channels than there can be, again and again."""
+    """Repeated statistics of more channels than a file can have."""
     counts = bytes(10 * (CHUNK // 10 - 100))
     return raw_file(*[record(Opcode.STATISTICS, bytes(42) + struct.pack("<I", len(counts)) + counts)] * 7)
 
@@ -216,7 +216,7 @@ def empty_chunks() -> bytes:
 
 
 def huge_message() -> bytes:
-    """A bag of one message that is larger than what is taken."""
+    """A bag with one message over the limit."""
     return Bag([BagMessage("/a", bytes(CHUNK + 1), 1)]).encode()
 
 

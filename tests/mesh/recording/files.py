@@ -49,7 +49,7 @@ def record(opcode: int, content: bytes) -> bytes:
 
 
 def raw_file(*records: bytes) -> bytes:
-    """A file of these records, with an end but without any index or checksum."""
+    """A file of these records, with an end but no index and no checksums."""
     header = record(Opcode.HEADER, bytes(8))
     end = record(Opcode.DATA_END, bytes(4)) + record(Opcode.FOOTER, bytes(20))
     return MAGIC + header + b"".join(records) + end + MAGIC

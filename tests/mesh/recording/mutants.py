@@ -1,4 +1,4 @@
-"""Sound recordings of seven kinds, and what chance makes of them."""
+"""Valid recordings of seven kinds, and random mutations of them."""
 
 from __future__ import annotations
 

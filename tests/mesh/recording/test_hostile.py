@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parents[3]
 MUTANTS = 40
-"""Of each of the seven sound files."""
+"""Of each of the seven valid files."""
 MEMORY = 256 << 20
 SECONDS = 5.0
 """Of the processor, which others at work on the machine hardly change. The slowest file takes half of it where this was
@@ -46,7 +46,7 @@ for path in sorted(Path(sys.argv[1]).iterdir()):
 
 
 def opened(folder: Path) -> dict[str, tuple[str, str]]:
-    """The reason and the detail of each file of the folder, all of them examined (and read) within the bounds."""
+    """The reason and the detail for each file of the folder. Fails if one takes too much time or memory."""
     done = run(sys.executable, "-c", OPENING, folder, PYTHONPATH=str(ROOT))
     assert done.returncode == 0, done.stderr
     lines = [json.loads(line) for line in done.stdout.splitlines()]

@@ -1,4 +1,4 @@
-"""Our writer's files are those of the package's own writer, to every reader and to the last field."""
+"""Our writer makes the same files as the package's own, down to the last field."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def rows_of(count: int, channels: int, seed: int = 1) -> list[Row]:
 
 
 def content_of(data: bytes) -> dict[str, Any]:
-    """All that the package's readers find in a file."""
+    """Everything that the package's readers find in a file."""
     reader = make_reader(io.BytesIO(data), validate_crcs=True)
     summary = reader.get_summary()
     assert summary is not None

@@ -201,7 +201,7 @@ async def test_at_1_khz_99_percent_are_at_most_two_milliseconds_late(tmp_path: P
 
 
 async def lateness_of_a_bare_sleep() -> int:
-    """How late 99 of 100 are on this machine now, nanoseconds."""
+    """The 99th percentile of lateness of sleeps on this machine now, nanoseconds."""
     begin, late = time.monotonic_ns(), []
     for number in range(500):
         await asyncio.sleep(max(0, begin + number * MILLISECOND - time.monotonic_ns()) / SECOND)

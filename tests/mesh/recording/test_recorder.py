@@ -29,7 +29,7 @@ ABOUT = RecordingAbout(liability="0x1", agent="0x2", lighthouse="a.eth", objecti
 
 
 def read_by_the_package(path: Path) -> list[tuple[Any, Any, Any]]:
-    """What another program sees, checksums and all."""
+    """What another program reads, with checksums verified."""
     with path.open("rb") as file:
         return list(make_reader(file, validate_crcs=True).iter_messages())
 

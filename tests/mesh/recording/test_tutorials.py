@@ -1,4 +1,4 @@
-"""The three bags of the legacy tutorial, made again byte for byte: they have the names under which they are known."""
+"""The three bags of the legacy tutorial, rebuilt byte for byte: they have their published CIDs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ONE, NONE = struct.pack("<I", 1), bytes(4)
 
 
 class Tutorial(NamedTuple):
-    """A bag of one message on /blink. `begin_ns` is what its chunk says; the order of fields is that of its writer."""
+    """A bag of one message on /blink. `begin_ns` is the start of its chunk; fields in the order of its writer."""
 
     cid: str
     payload: bytes
