@@ -1,8 +1,7 @@
-"""Orders a second through the book with a thousand and with a million open orders, and the memory an order takes.
+"""Orders per second that the book processes with a thousand and with a million open orders, and memory per order.
 
-The open orders all differ in their terms, as they would in a market where nothing matches yet. What is measured is a
-demand that is added, and its offer that is added and matches: two orders through the book, at that size throughout.
-The bare figure is the same number of inserts into and removals from one Python dictionary.
+All open orders differ in their terms. Each measured pair is a demand that is added and an offer that matches it, so the
+book keeps its size. For comparison, `bare` does as many inserts into and removals from one Python dictionary.
 """
 
 from __future__ import annotations
@@ -15,17 +14,16 @@ from typing import Final
 
 from msgspec.structs import replace
 
+from common import ADDRESS, arguments, show, unsigned_demands
 from mesh.market import Added, Match, OrderBook
-from orders import ADDRESS, unsigned_demands
-from report import arguments, show
 from schemas import Demand, Offer, Verified, checksum_address, decode, encode
 
 ROUNDS: Final = 100_000
-"""Pairs of a demand and an offer that go through the book."""
+"""Measured pairs of a demand and an offer."""
 
 
 def verified_demands(count: int) -> list[Verified[Demand]]:
-    """Demands as the channel hands them on: decoded from their JSON, with hash and signer (here made up, for speed)."""
+    """Demands as a channel yields them: decoded from JSON, with hash and signer (made up here, for speed)."""
     signature = "11" * 64 + "1b"
     people = [checksum_address(secrets.token_bytes(20)) for _ in range(16)]
     orders = []
@@ -40,7 +38,7 @@ def verified_demands(count: int) -> list[Verified[Demand]]:
 
 
 def offer_for(demand: Verified[Demand]) -> Verified[Offer]:
-    """An offer that agrees with a demand."""
+    """An offer that matches a demand."""
     message = demand.message
     fields = ("model", "objective", "token", "cost", "lighthouse", "validator", "deadline", "nonce", "signature")
     offer = Offer(**{field: getattr(message, field) for field in fields}, lighthouse_fee=0)
@@ -48,12 +46,12 @@ def offer_for(demand: Verified[Demand]) -> Verified[Offer]:
 
 
 def resident() -> int:
-    """Bytes of this process in memory."""
+    """Resident bytes of this process."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
 
 def fill(count: int) -> tuple[OrderBook, float]:
-    """A book with that many open orders, and the bytes that each takes, its text included."""
+    """A book with that many open orders, and the bytes per order, including its text."""
     book = OrderBook(ADDRESS, limit=count + 10)
     gc.collect()
     before = resident()
@@ -65,7 +63,7 @@ def fill(count: int) -> tuple[OrderBook, float]:
 
 
 def orders_per_second(book: OrderBook, pairs: list[tuple[Verified[Demand], Verified[Offer]]]) -> float:
-    """Orders a second while the book keeps its size."""
+    """Orders per second while the book keeps its size."""
     started = time.perf_counter()
     for demand, offer in pairs:
         book.add(demand)
@@ -76,7 +74,7 @@ def orders_per_second(book: OrderBook, pairs: list[tuple[Verified[Demand], Verif
 
 
 def bare_per_second(pairs: list[tuple[Verified[Demand], Verified[Offer]]]) -> float:
-    """The same orders into and out of one dictionary by their hash."""
+    """Orders per second into and out of one dictionary, by their hash."""
     entries: dict[bytes, object] = {}
     started = time.perf_counter()
     for demand, offer in pairs:
@@ -87,21 +85,21 @@ def bare_per_second(pairs: list[tuple[Verified[Demand], Verified[Offer]]]) -> fl
 
 
 def main() -> None:
-    """Run it."""
-    options = arguments("orders a second through the book", small=1000, large=1_000_000)
+    """Run the benchmark."""
+    options = arguments("orders per second through the book", small=1000, large=1_000_000)
     pairs = [(demand, offer_for(demand)) for demand in verified_demands(ROUNDS)]
     small, _ = fill(options.small)
     at_small = max(orders_per_second(small, pairs) for _ in range(3))
     large, bytes_per_order = fill(options.large)
     at_large = max(orders_per_second(large, pairs) for _ in range(3))
-    figures = {
+    results = {
         "orders_per_second": round(at_large),
         "orders_per_second_small": round(at_small),
         "bare_per_second": round(bare_per_second(pairs)),
         "ratio": round(at_large / at_small, 3),
         "bytes_per_order": round(bytes_per_order),
     }
-    show(figures, as_json=options.json)
+    show(results, as_json=options.json)
 
 
 if __name__ == "__main__":

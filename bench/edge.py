@@ -1,6 +1,6 @@
-"""What an edge agent costs, and how fast a device answers: memory, time to start, round trips on a simulated Uno.
+"""The cost of an edge agent, and how fast a device answers: memory, start time, round trips on a simulated Uno.
 
-`wire_ms` is what the bytes of a round trip take on the line alone, `ratio` how many times that the round trip takes.
+`wire_ms` is the time that the bytes of a round trip take on the line; `ratio` is the round trip divided by that.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from bridges.serial.boards import SimulatedBoard
 from bridges.serial.dialect import BoardReady, Command, CommandFinished, LineEvent, MessageReceived, load_dialect
 from bridges.serial.firmware import compile_sketch
 from bridges.serial.line import PortName, SerialLine
+from common import arguments, show
 from mesh.errors import AiraError
 from mesh.network import Endpoints, free_endpoint
 from mesh.running import fail
-from report import arguments, show
 from schemas.payloads import String
 
 if TYPE_CHECKING:
@@ -45,25 +45,25 @@ AGENT: Final = "0x" + "11" * 20
 MOST_MEMORY: Final = 40.0
 MOST_START: Final = 0.4
 STARTS: Final = 5
-SECONDS: Final = 30.0
-AT_REST: Final = 0.05
-"""Seconds until a rosserial board has announced its topics, by which it shows that it has read a command."""
+TIMEOUT: Final = 30.0
+IDLE_TIME: Final = 0.05
+"""Seconds in which a rosserial board announces its topics, which confirms a command."""
 
 
 def main() -> None:
-    """Measure, print, and fail where a bar is missed."""
+    """Measure and print; exit with 1 above a limit."""
     given = arguments(__doc__ or "", calls=200)
-    figures: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
-        figures |= start_and_memory(compiled("frames", BAUDS[0], Path(folder)))
+        results |= start_and_memory(compiled("frames", BAUDS[0], Path(folder)))
         for protocol in SKETCHES:
-            figures[protocol] = {
+            results[protocol] = {
                 str(baud): round_trips(protocol, baud, compiled(protocol, baud, Path(folder)), given.calls)
                 for baud in BAUDS
             }
-    show(figures, as_json=given.json)
-    if figures["memory_mb"] > MOST_MEMORY or figures["start_s"] > MOST_START:
-        sys.exit(f"an edge agent is to have {MOST_MEMORY:g} MB and {MOST_START:g} s at most")
+    show(results, as_json=given.json)
+    if results["memory_mb"] > MOST_MEMORY or results["start_s"] > MOST_START:
+        sys.exit(f"the limits of an edge agent are {MOST_MEMORY:g} MB and {MOST_START:g} s")
 
 
 def compiled(protocol: str, baud: int, folder: Path) -> Path:
@@ -73,7 +73,7 @@ def compiled(protocol: str, baud: int, folder: Path) -> Path:
 
 
 def start_and_memory(elf: Path) -> dict[str, float]:
-    """Seconds from the start of `aira edge` to what it first publishes, its board's presence; megabytes resident."""
+    """Seconds from the start of `aira edge` until its board is present, and its resident megabytes."""
     endpoint = free_endpoint()
     starts, memories = [], []
     with zenoh.open(Endpoints(listen=(endpoint,), mode="router").config()) as router, SimulatedBoard(elf) as board:
@@ -83,10 +83,10 @@ def start_and_memory(elf: Path) -> dict[str, float]:
             watch: Any = router.liveliness().declare_subscriber(key, partial(_seen, present))
             began = time.perf_counter()
             with edge(board.port, endpoint) as process:
-                if not present.wait(SECONDS):
-                    sys.exit("the edge agent did not come up")
+                if not present.wait(TIMEOUT):
+                    sys.exit("the edge agent did not start")
                 starts.append(time.perf_counter() - began)
-                time.sleep(0.5)  # what it takes after its start counts, too
+                time.sleep(0.5)  # memory that it allocates after its start counts, too
                 memories.append(resident(process.pid))
             watch.undeclare()
     return {"memory_mb": round(max(memories), 1), "start_s": round(statistics.median(starts), 3)}
@@ -111,7 +111,7 @@ def resident(pid: int) -> float:
 
 
 def round_trips(protocol: str, baud: int, elf: Path, calls: int) -> dict[str, float]:
-    """16 bytes to the board and back, one after the other, each on a line at rest: milliseconds, median."""
+    """Median milliseconds of 16 bytes to the board and back, one round trip at a time on an idle line."""
     arrived: SimpleQueue[tuple[LineEvent, float]] = SimpleQueue()
     dialect = load_dialect(protocol)(baud=baud)
     took = []
@@ -125,7 +125,7 @@ def round_trips(protocol: str, baud: int, elf: Path, calls: int) -> dict[str, fl
             PortName(str(board.port)),
             dialect,
             baud=baud,
-            on_event=lambda happening: arrived.put((happening, time.perf_counter())),
+            on_event=lambda event: arrived.put((event, time.perf_counter())),
         )
         thread = threading.Thread(target=line.run, name="line")
         thread.start()
@@ -137,7 +137,7 @@ def round_trips(protocol: str, baud: int, elf: Path, calls: int) -> dict[str, fl
                 took.append(_next(arrived, answer) - began)
                 if answer is not CommandFinished:
                     _next(arrived, CommandFinished)
-                    time.sleep(AT_REST)
+                    time.sleep(IDLE_TIME)
         finally:
             line.stop()
             thread.join()
@@ -158,10 +158,10 @@ def _seen(present: threading.Event, sample: zenoh.Sample) -> None:
 
 
 def _next(arrived: SimpleQueue[tuple[LineEvent, float]], kind: type[LineEvent]) -> float:
-    """When the next happening of that kind came."""
+    """When the next event of that kind arrived."""
     while True:
-        happening, when = arrived.get(timeout=SECONDS)
-        if isinstance(happening, kind):
+        event, when = arrived.get(timeout=TIMEOUT)
+        if isinstance(event, kind):
             return when
 
 

@@ -1,6 +1,6 @@
-"""Gas of the contracts beside that of the original ones, and the bars; fails above the bars.
+"""Gas of our contracts, compared with the original ones and with limits; exits with 1 above a limit.
 
-The measuring is that of the contracts' tests, `tests/contracts/gas.py`, which says under which conditions.
+The measurements are those of the contracts' tests; `tests/contracts/gas.py` documents their conditions.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from tests.contracts.gas import GENERATIONS, ROWS, Gas, exceeded, measure
 
 
 def table(gas: Gas) -> str:
-    """The measurements for people."""
-    lines = [f"{'':28}{'ours 5':>9}{'bar':>9}{'original 5':>12}   {'ours 3':>9}{'bar':>9}{'original 3':>12}"]
+    """The measurements as a table."""
+    lines = [f"{'':28}{'ours 5':>9}{'limit':>9}{'original 5':>12}   {'ours 3':>9}{'limit':>9}{'original 3':>12}"]
     for key, row in ROWS.items():
         line = f"{row.label:28}"
         for index, column in enumerate(GENERATIONS.values()):
@@ -28,16 +28,16 @@ def table(gas: Gas) -> str:
 
 
 def main() -> int:
-    """Run from the command line; 1 if a bar is missed."""
+    """Run from the command line; returns 1 above a limit."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", action="store_true", help="one JSON object: gas by row and generation")
     arguments = parser.parse_args()
     gas = measure()
     print(json.dumps(gas) if arguments.json else table(gas))
-    too_much = exceeded(gas)
-    for line in too_much:
+    too_high = exceeded(gas)
+    for line in too_high:
         print(line, file=sys.stderr)
-    return 1 if too_much else 0
+    return 1 if too_high else 0
 
 
 if __name__ == "__main__":

@@ -1,15 +1,14 @@
-"""Verified messages a second through the channel, against bare coincurve recoveries in the same run.
+"""Verified messages per second through a channel, compared with bare coincurve recoveries in the same run.
 
-A process of its own publishes signed demands through a router and keeps no more under way than the channel's ring
-holds, so nothing is lost. The receiving process is held to one core, and what counts is its own processor time (all of
-its threads, Zenoh's too), for the channel and for the bare recoveries alike: the ratio is what is left of a core's
-recoveries when all the rest of the work is done as well, whatever else the machine does.
+Another process publishes signed demands through a router, never more at a time than the channel's ring holds, so that
+none is lost. The receiving process runs on one core. Both rates are per second of its processor time (of all its
+threads, including Zenoh's), so that other load on the machine does not count. The ratio is the share of that time that
+recoveries take.
 """
 
 from __future__ import annotations
 
 import asyncio
-import multiprocessing
 import os
 import threading
 import time
@@ -18,16 +17,15 @@ from typing import Any, Final
 from coincurve import PublicKey
 from zenoh import CongestionControl
 
-from mesh.network import Channel, Endpoints, Network, free_endpoint, message_key
-from orders import ADDRESS, LIGHTHOUSE, signed_demands
-from report import arguments, show
+from common import ADDRESS, LIGHTHOUSE, SPAWN, arguments, router, show, signed_demands
+from mesh.network import Channel, Endpoints, Network, message_key
 from schemas import Demand, encode, keccak256, message_hash
 
 WINDOW: Final = 4096
-"""Messages under way at most; the ring holds twice as many."""
+"""Most messages in flight; the ring holds twice as many."""
 PROGRESS_KEY: Final = "aira/bench/progress"
 EVERY: Final = 256
-"""Messages after which the receiver says how far it is."""
+"""Messages between two progress reports of the receiver."""
 PREFIX: Final = b"\x19Ethereum Signed Message:\n32"
 
 
@@ -45,7 +43,7 @@ async def _publish(endpoint: str, count: int, ready: Any) -> None:
         done = int(sample.payload.to_string())
         room.set()
 
-    block = CongestionControl.BLOCK  # a full queue must slow the flood down, not thin it out
+    block = CongestionControl.BLOCK  # a full queue must slow the publisher down, not drop messages
     wire = [(message_key(LIGHTHOUSE, demand), encode(demand)) for demand in demands]
     async with Network(Endpoints(connect=(endpoint,))) as network:
         network.session.declare_subscriber(PROGRESS_KEY, progressed)
@@ -61,7 +59,7 @@ async def _publish(endpoint: str, count: int, ready: Any) -> None:
 
 
 async def receive(endpoint: str, count: int, ready: Any) -> tuple[float, list[Demand]]:
-    """Verified messages a second of this process's time, and the messages."""
+    """Verified messages per second of this process's time, and the messages."""
     received: list[Demand] = []
     async with (
         Network(Endpoints(connect=(endpoint,))) as network,
@@ -86,7 +84,7 @@ async def receive(endpoint: str, count: int, ready: Any) -> tuple[float, list[De
 
 
 def recover_bare(demands: list[Demand]) -> float:
-    """Recoveries a second of this process's time, of the same signatures; the rest is done beforehand."""
+    """Recoveries of the same signatures per second of this process's time; preparations are not counted."""
     signatures = [compact(demand) for demand in demands]
     started = time.process_time()
     for signature, digest in signatures:
@@ -101,32 +99,18 @@ def compact(demand: Demand) -> tuple[bytes, bytes]:
 
 
 def main() -> None:
-    """Run it."""
-    options = arguments("verified messages a second against bare recoveries", count=20_000)
-    spawn = multiprocessing.get_context("spawn")
-    endpoint, ready = free_endpoint(), spawn.Event()
-    cores = sorted(os.sched_getaffinity(0))
-    router = spawn.Process(target=route, args=(endpoint,), daemon=True)
-    router.start()
-    publisher = spawn.Process(target=publish, args=(endpoint, options.count, ready))
-    publisher.start()
-    os.sched_setaffinity(0, {cores[0]})
-    rate, demands = asyncio.run(receive(endpoint, options.count, ready))
-    publisher.join()
-    router.terminate()
+    """Run the benchmark."""
+    options = arguments("verified messages per second, compared with bare recoveries", count=20_000)
+    ready, core = SPAWN.Event(), min(os.sched_getaffinity(0))
+    with router() as (endpoint, _):
+        publisher = SPAWN.Process(target=publish, args=(endpoint, options.count, ready))
+        publisher.start()
+        os.sched_setaffinity(0, {core})
+        rate, demands = asyncio.run(receive(endpoint, options.count, ready))
+        publisher.join()
     bare = recover_bare(demands)
-    figures = {"verified_per_second": round(rate), "bare_per_second": round(bare), "ratio": round(rate / bare, 3)}
-    show(figures, as_json=options.json)
-
-
-def route(endpoint: str) -> None:
-    """The router's process."""
-    asyncio.run(_route(endpoint))
-
-
-async def _route(endpoint: str) -> None:
-    async with Network(Endpoints(listen=(endpoint,), mode="router")):
-        await asyncio.Event().wait()
+    results = {"verified_per_second": round(rate), "bare_per_second": round(bare), "ratio": round(rate / bare, 3)}
+    show(results, as_json=options.json)
 
 
 if __name__ == "__main__":

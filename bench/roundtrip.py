@@ -1,24 +1,22 @@
-"""A round trip through a router: a signed demand out, a signed offer back, both verified; against bare Zenoh.
+"""The round trip of a signed demand and a signed offer through a router, both verified, compared with bare Zenoh.
 
-Two processes with an event loop each, and a router in a third. The bare round trip sends the same bytes, which Zenoh's
-callback hands to the event loop that answers: what an agent would do without a channel. What two recoveries of a signer
-cost by themselves is shown apart, and so is a round trip that is answered in Zenoh's own thread.
+There are two processes with an event loop each, and a router process. The bare round trip sends the same bytes; Zenoh's
+callback passes them to the event loop, which answers: what an agent would do without a channel. The time of two
+signature recoveries is shown separately, and so is a round trip that is answered in Zenoh's own thread.
 """
 
 from __future__ import annotations
 
 import asyncio
-import multiprocessing
 import statistics
 import time
 from typing import Any, Final
 
 from coincurve import PublicKey
 
-from mesh.network import Channel, Endpoints, Network, free_endpoint
-from messages import compact, route
-from orders import ADDRESS, LIGHTHOUSE, signed_demands
-from report import arguments, show
+from common import ADDRESS, LIGHTHOUSE, SPAWN, arguments, router, show, signed_demands
+from mesh.network import Channel, Endpoints, Network
+from messages import compact
 from schemas import Demand, Offer, Signer, encode
 
 PING: Final = "aira/bench/ping"
@@ -27,7 +25,7 @@ PONG: Final = "aira/bench/pong"
 
 
 def signed_offers(count: int) -> list[Offer]:
-    """Offers that answer nothing in particular, each signed."""
+    """Signed offers that match no demand."""
     signer = Signer(b"\1" * 32)
     fields = ("model", "objective", "token", "cost", "lighthouse", "validator", "deadline", "nonce")
     return [
@@ -37,7 +35,7 @@ def signed_offers(count: int) -> list[Offer]:
 
 
 def echo(endpoint: str, count: int, ready: Any, done: Any) -> None:
-    """The answering process."""
+    """The process that answers."""
     asyncio.run(_echo(endpoint, count, ready, done))
 
 
@@ -64,7 +62,7 @@ async def _echo(endpoint: str, count: int, ready: Any, done: Any) -> None:
 
 
 async def measure(endpoint: str, count: int) -> dict[str, list[float]]:
-    """Seconds of each round trip, the kinds taken in turns."""
+    """Seconds of each round trip; the kinds alternate."""
     taken: dict[str, list[float]] = {"bare": [], "callback": [], "verified": [], "signature": []}
     loop = asyncio.get_running_loop()
     async with (
@@ -92,7 +90,7 @@ async def measure(endpoint: str, count: int) -> dict[str, list[float]]:
 
 
 def recover_once(order: Demand) -> float:
-    """Seconds that one recovery takes here, between round trips, where nothing is warm."""
+    """Seconds of one recovery between round trips, with cold caches."""
     signature, digest = compact(order)
     started = time.perf_counter()
     PublicKey.from_signature_and_message(signature, digest, hasher=None)
@@ -100,20 +98,17 @@ def recover_once(order: Demand) -> float:
 
 
 def main() -> None:
-    """Run it."""
+    """Run the benchmark."""
     options = arguments("verified round trip against bare Zenoh", count=3000)
-    spawn = multiprocessing.get_context("spawn")
-    endpoint, ready, done = free_endpoint(), spawn.Event(), spawn.Event()
-    router = spawn.Process(target=route, args=(endpoint,), daemon=True)
-    router.start()
-    answering = spawn.Process(target=echo, args=(endpoint, options.count, ready, done), daemon=True)
-    answering.start()
-    ready.wait(60)
-    taken = asyncio.run(measure(endpoint, options.count))
-    answering.terminate()
-    router.terminate()
+    ready, done = SPAWN.Event(), SPAWN.Event()
+    with router() as (endpoint, _):
+        answering = SPAWN.Process(target=echo, args=(endpoint, options.count, ready, done), daemon=True)
+        answering.start()
+        ready.wait(60)
+        taken = asyncio.run(measure(endpoint, options.count))
+        answering.terminate()
     median = {kind: statistics.median(seconds) for kind, seconds in taken.items()}
-    figures = {
+    results = {
         "verified_ms": round(median["verified"] * 1e3, 3),
         "bare_ms": round(median["bare"] * 1e3, 3),
         "ratio": round(median["verified"] / median["bare"], 3),
@@ -123,7 +118,7 @@ def main() -> None:
         "verified_p99_ms": round(statistics.quantiles(taken["verified"], n=100)[98] * 1e3, 3),
         "bare_p99_ms": round(statistics.quantiles(taken["bare"], n=100)[98] * 1e3, 3),
     }
-    show(figures, as_json=options.json)
+    show(results, as_json=options.json)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
-"""The content store, the recorder and the player against what they stand on, and the bars; fails below the bars.
+"""The content store, the recorder and the player, compared with what they are built on; exits with 1 below a limit.
 
-- cid: naming a file, against bare sha-256 of the same bytes, in turns.
-- transfer: a file from one store to another through a router, three processes, hashing and fsync included.
-- recorder: JSON messages of 100 bytes from another process over Zenoh through `mesh.recording.Recorder` into a whole
-  file, against a bare `mcap.Writer` that has the messages in memory and writes them, in turns.
+- cid: computing the CID of a file, compared with bare sha-256 of the same bytes, alternating.
+- transfer: a file from one store to another through a router, in three processes, with hashing and fsync.
+- recorder: JSON messages of 100 bytes from another process over Zenoh through `mesh.recording.Recorder` into a file,
+  compared with a bare `mcap.Writer` that writes messages from memory, alternating.
 - playback: how late messages recorded at 1 kHz are played.
 
-Each is measured three times and the best counts, since what else the machine does at that moment is not ours; but a
-message that is lost counts whenever it happens.
+Each is measured three times and the best result counts, as other load on the machine is not ours. Lost messages are
+added up.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import asyncio
 import hashlib
 import io
 import json
-import multiprocessing
 import os
 import statistics
 import sys
@@ -30,23 +29,22 @@ from typing import TYPE_CHECKING, Any, Final
 from mcap.writer import Writer
 from zenoh import CongestionControl
 
+from common import SPAWN, arguments
+from common import router as router_process
 from mesh.content import Exchange, Store
-from mesh.network import Endpoints, Network, free_endpoint
+from mesh.network import Endpoints, Network
 from mesh.recording import Recorder, RecordingAbout, open_objective, play
-from messages import route
-from report import arguments
 from schemas.payloads import JSON
 from schemas.unixfs import cid_of_stream
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-SPAWN: Final = multiprocessing.get_context("spawn")
 MEGABYTE: Final = 1e6
 ROUNDS: Final = 3
 KEY: Final = "aira/bench/topic"
 HERTZ: Final = 1000
-BARS: Final = {
+LIMITS: Final = {
     "cid ratio": (">=", 0.6),
     "transfer mb_per_s": (">=", 100),
     "recorder ratio": (">=", 0.6),
@@ -54,11 +52,11 @@ BARS: Final = {
     "playback p99_ms": ("<=", 2),
 }
 
-Figures = dict[str, dict[str, float]]
+Results = dict[str, dict[str, float]]
 
 
 def measure_cid(mebibytes: int) -> dict[str, float]:
-    """Megabytes a second of naming a file in memory, and of bare sha-256."""
+    """Megabytes per second of computing the CID of a file in memory, and of bare sha-256."""
     data = os.urandom((mebibytes << 20) // 4)
     ours = bare = float("inf")
     for _ in range(4 * ROUNDS):
@@ -69,7 +67,7 @@ def measure_cid(mebibytes: int) -> dict[str, float]:
 
 
 def measure_transfer(folder: Path, mebibytes: int) -> dict[str, float]:
-    """Megabytes a second from the store of one process to that of another, through a router in a third."""
+    """Megabytes per second from the store of one process to that of another, through a router in a third."""
     with Store(folder / "holder", limit=mebibytes << 20) as store:
         cid = store.put_stream(_Noise(mebibytes << 20))
     ready, done = SPAWN.Event(), SPAWN.Event()
@@ -81,17 +79,17 @@ def measure_transfer(folder: Path, mebibytes: int) -> dict[str, float]:
 
 
 def measure_recorder(folder: Path, count: int) -> dict[str, float]:
-    """Messages a second over Zenoh through the recorder, those of a bare writer, and how many were lost."""
+    """Messages per second over Zenoh through the recorder, those of a bare writer, and the number of lost messages."""
     ours = bare = 0.0
     lost = 0
-    orders, their_orders = SPAWN.Pipe()
-    with _router() as endpoint, _process(_publish, endpoint, count, their_orders):
-        orders.recv()
+    commands, their_commands = SPAWN.Pipe()
+    with _router() as endpoint, _process(_publish, endpoint, count, their_commands):
+        commands.recv()
         for number in range(ROUNDS):
             bare = max(bare, count / _write_bare(folder / f"bare-{number}.mcap", count))
-            seconds, missing = asyncio.run(_record(endpoint, folder / f"ours-{number}.mcap", count, orders))
+            seconds, missing = asyncio.run(_record(endpoint, folder / f"ours-{number}.mcap", count, commands))
             ours, lost = max(ours, count / seconds), lost + missing
-        orders.send("enough")
+        commands.send("enough")
     return {
         "messages_per_s": round(ours),
         "bare_messages_per_s": round(bare),
@@ -101,7 +99,7 @@ def measure_recorder(folder: Path, count: int) -> dict[str, float]:
 
 
 def measure_playback(folder: Path, seconds: int) -> dict[str, float]:
-    """How many milliseconds late a message is played, in 99 of 100 cases at most, at a thousand a second."""
+    """How many milliseconds late messages are played at a thousand per second: the 99th percentile."""
     path = folder / "played.mcap"
     with Recorder(path, RecordingAbout()) as recorder:
         for number in range(seconds * HERTZ):
@@ -110,47 +108,47 @@ def measure_playback(folder: Path, seconds: int) -> dict[str, float]:
     return {"p99_ms": round(p99 * 1e3, 3)}
 
 
-def missed(figures: Figures) -> list[str]:
-    """The bars that are not reached."""
+def missed(results: Results) -> list[str]:
+    """The limits that are not met."""
     lines = []
-    for name, (sense, bar) in BARS.items():
+    for name, (sense, limit) in LIMITS.items():
         group, _, key = name.partition(" ")
-        value = figures[group][key]
-        if (value < bar) if sense == ">=" else (value > bar):
-            lines.append(f"{name} is {value:g}, and the bar is {sense} {bar:g}")
+        value = results[group][key]
+        if (value < limit) if sense == ">=" else (value > limit):
+            lines.append(f"{name} is {value:g}, and the limit is {sense} {limit:g}")
     return lines
 
 
-def table(figures: Figures) -> str:
-    """The figures for people."""
+def table(results: Results) -> str:
+    """The results as a table."""
     lines = []
-    for group, values in figures.items():
+    for group, values in results.items():
         for name, value in values.items():
-            sense, bar = BARS.get(f"{group} {name}", ("", ""))
-            lines.append(f"{group:10}{name.replace('_', ' '):22}{value:>12,}   {sense} {bar}".rstrip())
+            sense, limit = LIMITS.get(f"{group} {name}", ("", ""))
+            lines.append(f"{group:10}{name.replace('_', ' '):22}{value:>12,}   {sense} {limit}".rstrip())
     return "\n".join(lines)
 
 
 def main() -> int:
-    """Run from the command line; 1 if a bar is missed."""
+    """Run from the command line; returns 1 if a limit is not met."""
     options = arguments(__doc__.splitlines()[0], mebibytes=256, messages=200_000, seconds=5)
     with tempfile.TemporaryDirectory(prefix="aira-bench-") as name:
         folder = Path(name)
-        figures: Figures = {
+        results: Results = {
             "cid": measure_cid(options.mebibytes),
             "transfer": measure_transfer(folder, options.mebibytes),
             "recorder": measure_recorder(folder, options.messages),
             "playback": measure_playback(folder, options.seconds),
         }
-    print(json.dumps(figures) if options.json else table(figures))
-    too_low = missed(figures)
+    print(json.dumps(results) if options.json else table(results))
+    too_low = missed(results)
     for line in too_low:
         print(line, file=sys.stderr)
     return 1 if too_low else 0
 
 
 def _hold(endpoint: str, folder: Path, ready: Any, done: Any) -> None:
-    """The process that has the file."""
+    """The process that holds the file."""
     asyncio.run(_holding(endpoint, folder, ready, done))
 
 
@@ -169,61 +167,61 @@ async def _fetch(endpoint: str, folder: Path, cid: str) -> float:
             return time.perf_counter() - started
 
 
-def _publish(endpoint: str, count: int, orders: Any) -> None:
-    """The process that says what is recorded, as often as it is told to."""
-    asyncio.run(_publishing(endpoint, count, orders))
+def _publish(endpoint: str, count: int, commands: Any) -> None:
+    """The process that publishes what is recorded, once per command."""
+    asyncio.run(_publishing(endpoint, count, commands))
 
 
-async def _publishing(endpoint: str, count: int, orders: Any) -> None:
+async def _publishing(endpoint: str, count: int, commands: Any) -> None:
     payloads = [_message(number) for number in range(count)]
     async with Network(Endpoints(connect=(endpoint,))) as network:
-        # A full queue must slow the flood down, not thin it out.
+        # A full queue must slow the publisher down, not drop messages.
         block = CongestionControl.BLOCK
         publisher = network.session.declare_publisher(KEY, encoding=JSON.zenoh_encoding, congestion_control=block)
-        orders.send("ready")
-        while orders.recv() == "go":
-            await asyncio.to_thread(_until_heard, publisher)
+        commands.send("ready")
+        while commands.recv() == "go":
+            await asyncio.to_thread(_until_matching, publisher)
             for payload in payloads:
                 publisher.put(payload)
 
 
-def _until_heard(publisher: Any) -> None:
+def _until_matching(publisher: Any) -> None:
     while not publisher.matching_status.matching:
         time.sleep(0.01)
 
 
-async def _record(endpoint: str, path: Path, count: int, orders: Any) -> tuple[float, int]:
+async def _record(endpoint: str, path: Path, count: int, commands: Any) -> tuple[float, int]:
     """Seconds from the first message to the finished file, and how many messages are not in it."""
     async with Network(Endpoints(connect=(endpoint,))) as network:
-        hearing = _Hearing(Recorder(path, RecordingAbout()), count)
-        subscriber: Any = network.session.declare_subscriber(KEY, hearing.hear)
-        orders.send("go")
-        await asyncio.to_thread(hearing.all_heard.wait, 60)  # what is not there then is lost
-        summary = await asyncio.to_thread(hearing.recorder.close)
-        seconds = time.perf_counter() - hearing.started
+        receiver = _Receiver(Recorder(path, RecordingAbout()), count)
+        subscriber: Any = network.session.declare_subscriber(KEY, receiver.receive)
+        commands.send("go")
+        await asyncio.to_thread(receiver.all_received.wait, 60)  # what has not arrived then is lost
+        summary = await asyncio.to_thread(receiver.recorder.close)
+        seconds = time.perf_counter() - receiver.started
         subscriber.undeclare()
     return seconds, count - summary.messages
 
 
-class _Hearing:
-    """Gives what a subscriber hears to a recorder, in Zenoh's thread, as an agent does."""
+class _Receiver:
+    """Records what a subscriber receives, in Zenoh's thread, as an agent does."""
 
     def __init__(self, recorder: Recorder, count: int) -> None:
         self.recorder = recorder
         self.started = 0.0
-        self.all_heard = threading.Event()
+        self.all_received = threading.Event()
         self._missing = count
 
-    def hear(self, sample: Any) -> None:
+    def receive(self, sample: Any) -> None:
         self.started = self.started or time.perf_counter()
         self.recorder.record("/topic", sample.payload.to_bytes(), JSON)
         self._missing -= 1
         if not self._missing:
-            self.all_heard.set()
+            self.all_received.set()
 
 
 def _write_bare(path: Path, count: int) -> float:
-    """Seconds that a bare writer takes for the messages, from the first to the end of the file."""
+    """Seconds that a bare writer takes from the first message to the end of the file."""
     payloads = [_message(number) for number in range(count)]
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -271,8 +269,7 @@ class _Noise:
 
 @contextmanager
 def _router() -> Iterator[str]:
-    endpoint = free_endpoint()
-    with _process(route, endpoint):
+    with router_process() as (endpoint, _):
         yield endpoint
 
 

@@ -1,41 +1,37 @@
-"""Many on one router: what the router needs for each session, what reaches subscribers, what a device's process takes.
+"""Many sessions on one router: memory per session, messages to subscribers, and the cost of edge processes.
 
-Memory is the proportional set size (PSS): what processes share is counted once for all of them.
+Memory is the proportional set size (PSS), which counts shared memory once.
 """
 
 from __future__ import annotations
 
 import asyncio
-import multiprocessing
 import os
 import pty
 import subprocess
 import sys
 import time
-from contextlib import AsyncExitStack, contextmanager
+from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from msgspec.structs import replace
 from zenoh import CongestionControl
 
-from mesh.network import Channel, Endpoints, Network, free_endpoint, message_key
-from messages import route
-from orders import ADDRESS, LIGHTHOUSE, signed_demands
+from common import ADDRESS, LIGHTHOUSE, SPAWN, router, signed_demands
+from mesh.network import Channel, Endpoints, Network, message_key
 from schemas import Demand, cid_of_bytes, encode
 from schemas.keys import market_selector
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
-SPAWN: Final = multiprocessing.get_context("spawn")
-A_PROCESS: Final = 50
-"""Sessions that one process holds."""
-SETTLING: Final = 1.0
-"""Seconds until what was declared has got around, and memory is at rest."""
-PATIENCE: Final = 120.0
+SESSIONS_PER_PROCESS: Final = 50
+SETTLE_TIME: Final = 1.0
+"""Seconds until declarations have spread, and memory is stable."""
+TIMEOUT: Final = 120.0
 WINDOW: Final = 2000
-"""Messages under way at most, so that none is lost."""
+"""Most messages in flight, so that none is lost."""
 
 
 def memory(pid: int) -> float:
@@ -46,90 +42,79 @@ def memory(pid: int) -> float:
     raise ValueError(f"no memory of {pid}")
 
 
-@contextmanager
-def router() -> Iterator[tuple[str, int]]:
-    """A router in a process of its own: its endpoint and its process id."""
-    endpoint = free_endpoint()
-    process = SPAWN.Process(target=route, args=(endpoint,), daemon=True)
-    process.start()
-    assert process.pid is not None
-    try:
-        yield endpoint, process.pid
-    finally:
-        process.terminate()
-        process.join()
-
-
 def sessions(counts: Sequence[int]) -> list[dict[str, float]]:
-    """For each number of agents that are there, each a session with a token and a subscription to its model's demands:
-    memory of the router, and the seconds in which somebody who asks is told of all of them."""
+    """For each number of agents: memory of the router, and the time of a query for all agents that are present.
+
+    Each agent is a session with a presence token and a subscription to the demands for its model.
+    """
     found = []
-    crowds: list[Any] = []
+    processes: list[Any] = []
     with router() as (endpoint, pid):
         empty = None
         try:
             for count in sorted(counts):
-                while (missing := count - sum(size for _, size, _ in crowds)) > 0:
-                    crowds.append(_gathered(endpoint, min(A_PROCESS, missing), first=sum(one[1] for one in crowds)))
-                time.sleep(SETTLING)
-                seconds = asyncio.run(_roll_call(endpoint, count))
+                while (missing := count - sum(size for _, size, _ in processes)) > 0:
+                    processes.append(
+                        _agents(endpoint, min(SESSIONS_PER_PROCESS, missing), first=sum(one[1] for one in processes))
+                    )
+                time.sleep(SETTLE_TIME)
+                seconds = asyncio.run(_query_presence(endpoint, count))
                 now = memory(pid)
                 empty = now if empty is None else empty
                 found.append({"sessions": count, "router_mib": round(now, 1), "roll_call_ms": round(seconds * 1e3, 1)})
         finally:
-            for process, _, leave in crowds:
+            for process, _, leave in processes:
                 leave.set()
                 process.join()
     return found
 
 
-def _gathered(endpoint: str, size: int, *, first: int) -> tuple[Any, int, Any]:
-    there, leave = SPAWN.Event(), SPAWN.Event()
-    process = SPAWN.Process(target=crowd, args=(endpoint, first, size, there, leave), daemon=True)
+def _agents(endpoint: str, size: int, *, first: int) -> tuple[Any, int, Any]:
+    ready, leave = SPAWN.Event(), SPAWN.Event()
+    process = SPAWN.Process(target=run_agents, args=(endpoint, first, size, ready, leave), daemon=True)
     process.start()
-    assert there.wait(PATIENCE), "the sessions did not open"
+    assert ready.wait(TIMEOUT), "the sessions did not open"
     return process, size, leave
 
 
-def crowd(endpoint: str, first: int, size: int, there: Any, leave: Any) -> None:
+def run_agents(endpoint: str, first: int, size: int, ready: Any, leave: Any) -> None:
     """A process with many sessions."""
-    asyncio.run(_crowd(endpoint, first, size, there, leave))
+    asyncio.run(_run_agents(endpoint, first, size, ready, leave))
 
 
-async def _crowd(endpoint: str, first: int, size: int, there: Any, leave: Any) -> None:
+async def _run_agents(endpoint: str, first: int, size: int, ready: Any, leave: Any) -> None:
     async with AsyncExitStack() as stack:
         for number in range(first, first + size):
             network = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,))))
             channel = await stack.enter_async_context(Channel(network.session, LIGHTHOUSE, address=ADDRESS))
             await stack.enter_async_context(channel.subscribe(Demand, model=model(number)))
             channel.announce("agent", f"0x{number:040x}")
-        there.set()
+        ready.set()
         await asyncio.to_thread(leave.wait)
 
 
-async def _roll_call(endpoint: str, count: int) -> float:
-    """Seconds until somebody who asks has heard of everybody; a connection to begin with is not counted."""
+async def _query_presence(endpoint: str, count: int) -> float:
+    """Seconds of a query that is answered with all agents; connecting is not counted."""
     async with (
         Network(Endpoints(connect=(endpoint,))) as network,
         Channel(network.session, LIGHTHOUSE, address=ADDRESS) as channel,
     ):
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + TIMEOUT
         while True:
             started = time.perf_counter()
             present = len(await channel.present())
             if present == count:
                 return time.perf_counter() - started
-            assert time.monotonic() < deadline, f"{present} of {count} are there"
+            assert time.monotonic() < deadline, f"{present} of {count} are present"
 
 
 def model(number: int) -> str:
-    """What an agent can do, another thing each."""
+    """The model of an agent; each has another one."""
     return cid_of_bytes(f"model {number}".encode())
 
 
 def filtered(counts: Sequence[int], messages: int) -> list[dict[str, float]]:
-    """For each number of subscribers, each to its own model: messages a second of all models together that get from
-    one publisher through the router to whom they concern."""
+    """For each number of subscribers, each to its own model: messages per second from one publisher to all of them."""
     found = []
     for count in counts:
         with router() as (endpoint, pid):
@@ -145,45 +130,45 @@ def filtered(counts: Sequence[int], messages: int) -> list[dict[str, float]]:
 
 
 async def _through(endpoint: str, pid: int, count: int, messages: int) -> tuple[float, float]:
-    """Seconds that the messages took, and those of processor time that the router took for them."""
-    heard, ready, leave = SPAWN.Value("l", 0), SPAWN.Event(), SPAWN.Event()
-    listening = SPAWN.Process(target=listen, args=(endpoint, count, heard, ready, leave), daemon=True)
-    listening.start()
-    assert await asyncio.to_thread(ready.wait, PATIENCE)
-    (demand,) = signed_demands(1)  # what counts is its size
+    """Seconds that the messages took, and the router's processor time in seconds."""
+    received, ready, leave = SPAWN.Value("l", 0), SPAWN.Event(), SPAWN.Event()
+    subscribers = SPAWN.Process(target=subscribe, args=(endpoint, count, received, ready, leave), daemon=True)
+    subscribers.start()
+    assert await asyncio.to_thread(ready.wait, TIMEOUT)
+    (demand,) = signed_demands(1)  # only its size matters
     wire = [(message_key(LIGHTHOUSE, replace(demand, model=model(number))), encode(demand)) for number in range(count)]
     async with Network(Endpoints(connect=(endpoint,))) as network:
-        await asyncio.sleep(SETTLING)
+        await asyncio.sleep(SETTLE_TIME)
         before, started = _seconds_of(pid), time.perf_counter()
         for number in range(messages):
-            while number - heard.value >= WINDOW:
+            while number - received.value >= WINDOW:
                 await asyncio.sleep(0.0005)
             key, payload = wire[number % count]
             network.session.put(key, payload, congestion_control=CongestionControl.BLOCK)
-        deadline = time.monotonic() + PATIENCE
-        while heard.value < messages:
-            assert time.monotonic() < deadline, f"{heard.value} of {messages} came"
+        deadline = time.monotonic() + TIMEOUT
+        while received.value < messages:
+            assert time.monotonic() < deadline, f"{received.value} of {messages} arrived"
             await asyncio.sleep(0.001)
         seconds, used = time.perf_counter() - started, _seconds_of(pid) - before
     leave.set()
-    listening.join()
+    subscribers.join()
     return seconds, used
 
 
-def listen(endpoint: str, count: int, heard: Any, ready: Any, leave: Any) -> None:
-    """A process with many subscribers, a session each, which count and do nothing else."""
-    asyncio.run(_listen(endpoint, count, heard, ready, leave))
+def subscribe(endpoint: str, count: int, received: Any, ready: Any, leave: Any) -> None:
+    """A process with many subscribers, each with its own session, that only count."""
+    asyncio.run(_subscribe(endpoint, count, received, ready, leave))
 
 
-async def _listen(endpoint: str, count: int, heard: Any, ready: Any, leave: Any) -> None:
-    def hear(_: Any) -> None:
-        with heard.get_lock():
-            heard.value += 1
+async def _subscribe(endpoint: str, count: int, received: Any, ready: Any, leave: Any) -> None:
+    def count_one(_: Any) -> None:
+        with received.get_lock():
+            received.value += 1
 
     async with AsyncExitStack() as stack:
         for number in range(count):
             network = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,))))
-            network.session.declare_subscriber(market_selector(LIGHTHOUSE, "demand", model(number)), hear)
+            network.session.declare_subscriber(market_selector(LIGHTHOUSE, "demand", model(number)), count_one)
         ready.set()
         await asyncio.to_thread(leave.wait)
 
@@ -195,12 +180,12 @@ def _seconds_of(pid: int) -> float:
 
 
 def devices(count: int) -> dict[str, float]:
-    """Edge processes on lines on which nobody answers, at rest: memory of each, and how much of a core all take."""
+    """Idle edge processes on lines without a board: memory of each, and the processor time of all."""
     lines = [pty.openpty() for _ in range(count)]
     with router() as (endpoint, _):
         processes = [_edge(endpoint, number, line) for number, (_, line) in enumerate(lines)]
         try:
-            time.sleep(3 + SETTLING * count / 4)
+            time.sleep(3 + SETTLE_TIME * count / 4)
             before, started = sum(_seconds_of(process.pid) for process in processes), time.perf_counter()
             time.sleep(5)
             core = (sum(_seconds_of(process.pid) for process in processes) - before) / (time.perf_counter() - started)

@@ -1,4 +1,4 @@
-"""A provider under load: orders that it takes into its book a second, and whole jobs a minute on two kinds of chain."""
+"""A provider under load: orders per second that it adds to its book, and jobs per minute on two kinds of chain."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from crowd import PATIENCE, SPAWN, router
+from common import SPAWN, router, signed_demands
 from mesh import Agent
 from mesh.background import Background
 from mesh.demo.lamp import write_objective
@@ -20,8 +20,8 @@ from mesh.devchain.development import deploy_market
 from mesh.market.provider import Provider
 from mesh.network import Channel, Endpoints, Network
 from mesh.settings import Settings
-from orders import signed_demands
 from peers.catalog import PeerMissing, locate
+from scale import TIMEOUT
 from schemas import cid_of_bytes
 
 if TYPE_CHECKING:
@@ -32,26 +32,26 @@ if TYPE_CHECKING:
 
 MODEL: Final = cid_of_bytes(b"what the robot of the benchmark can do")
 WINDOW: Final = 2000
-"""Orders under way at most, so that none is lost."""
+"""Most orders in flight, so that none is lost."""
 
 
-def taken_a_second(count: int) -> dict[str, float]:
-    """Signed demands without an offer that a provider takes into its book: checked, and kept open."""
+def orders_per_second(count: int) -> dict[str, float]:
+    """Orders per second for signed demands without an offer, which a provider verifies and adds to its book."""
     with router() as (endpoint, _):
-        return asyncio.run(_taken(endpoint, count))
+        return asyncio.run(_orders(endpoint, count))
 
 
-async def _taken(endpoint: str, count: int) -> dict[str, float]:
+async def _orders(endpoint: str, count: int) -> dict[str, float]:
     async with embedded() as (node, market):
         chain = market.chain(node, "provider")
-        ready, taken = SPAWN.Event(), SPAWN.Value("l", 0)
+        ready, added = SPAWN.Event(), SPAWN.Value("l", 0)
         publishing = SPAWN.Process(
             target=publish,
-            args=(endpoint, market.deployment.lighthouse_name, market.deployment.lighthouse, count, ready, taken),
+            args=(endpoint, market.deployment.lighthouse_name, market.deployment.lighthouse, count, ready, added),
             daemon=True,
         )
         publishing.start()
-        assert await asyncio.to_thread(ready.wait, PATIENCE)
+        assert await asyncio.to_thread(ready.wait, TIMEOUT)
         async with (
             chain,
             Network(Endpoints(connect=(endpoint,))) as network,
@@ -60,14 +60,14 @@ async def _taken(endpoint: str, count: int) -> dict[str, float]:
         ):
             tasks.start(provider.run(), "provider")
             await asyncio.sleep(0.5)  # the router learns of its subscriptions
-            taken.value = 1
+            added.value = 1
             while not len(provider.book):
                 await asyncio.sleep(0.001)
             started, used = time.perf_counter(), time.process_time()
-            deadline = time.monotonic() + PATIENCE
+            deadline = time.monotonic() + TIMEOUT
             while len(provider.book) < count:
-                taken.value = len(provider.book)
-                assert time.monotonic() < deadline, f"{len(provider.book)} of {count} orders were taken"
+                added.value = len(provider.book)
+                assert time.monotonic() < deadline, f"{len(provider.book)} of {count} orders were added"
                 await asyncio.sleep(0.005)
             seconds, used = time.perf_counter() - started, time.process_time() - used
         publishing.terminate()
@@ -79,40 +79,40 @@ async def _taken(endpoint: str, count: int) -> dict[str, float]:
     }
 
 
-def publish(endpoint: str, lighthouse: str, address: str, count: int, ready: Any, taken: Any) -> None:
-    """The publishing process: it says what it has when `taken` says that the provider is there."""
-    asyncio.run(_publish(endpoint, lighthouse, address, count, ready, taken))
+def publish(endpoint: str, lighthouse: str, address: str, count: int, ready: Any, added: Any) -> None:
+    """The process that publishes, beginning when `added` is set to 1."""
+    asyncio.run(_publish(endpoint, lighthouse, address, count, ready, added))
 
 
-async def _publish(endpoint: str, lighthouse: str, address: str, count: int, ready: Any, taken: Any) -> None:
+async def _publish(endpoint: str, lighthouse: str, address: str, count: int, ready: Any, added: Any) -> None:
     demands = signed_demands(count, lighthouse=address)
     async with (
         Network(Endpoints(connect=(endpoint,))) as network,
         Channel(network.session, lighthouse, address=address) as channel,
     ):
         ready.set()
-        while not taken.value:
+        while not added.value:
             await asyncio.sleep(0.001)
         for number, demand in enumerate(demands):
-            while number - taken.value >= WINDOW:
+            while number - added.value >= WINDOW:
                 await asyncio.sleep(0.001)
             channel.publish(demand)
-        await asyncio.sleep(PATIENCE)
+        await asyncio.sleep(TIMEOUT)
 
 
-def jobs_a_minute(count: int, at_once: int) -> dict[str, dict[str, float] | str]:
-    """Whole jobs, from the demand to the payment, of one provider and one robot; so many demands are open at once."""
-    found: dict[str, dict[str, float] | str] = {}
+def jobs_per_minute(count: int, at_once: int) -> dict[str, dict[str, float] | str]:
+    """Jobs from demand to payment, with one provider and one robot; `at_once` demands are open at a time."""
+    results: dict[str, dict[str, float] | str] = {}
     with router() as (endpoint, _):
-        found["embedded"] = asyncio.run(_jobs(endpoint, embedded(), count, at_once))
+        results["embedded"] = asyncio.run(_jobs(endpoint, embedded(), count, at_once))
         try:
             program = find_anvil(locate("anvil"))
         except PeerMissing as missing:
-            found["anvil"] = str(missing)
+            results["anvil"] = str(missing)
         else:
             assert program is not None
-            found["anvil"] = asyncio.run(_jobs(endpoint, on_anvil(program), count, at_once))
-    return found
+            results["anvil"] = asyncio.run(_jobs(endpoint, on_anvil(program), count, at_once))
+    return results
 
 
 @asynccontextmanager
@@ -129,9 +129,9 @@ async def on_anvil(program: Path) -> AsyncIterator[tuple[Any, DevelopmentMarket]
         yield node.url, await deploy_market(node.url, node.funded_keys)
 
 
-async def _jobs(endpoint: str, place: Any, count: int, at_once: int) -> dict[str, float]:
+async def _jobs(endpoint: str, opened_market: Any, count: int, at_once: int) -> dict[str, float]:
     async with AsyncExitStack() as stack:
-        node, market = await stack.enter_async_context(place)
+        node, market = await stack.enter_async_context(opened_market)
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         network = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,))))
         chain = await stack.enter_async_context(market.chain(node, "provider"))
@@ -141,14 +141,14 @@ async def _jobs(endpoint: str, place: Any, count: int, at_once: int) -> dict[str
         await stack.enter_async_context(_robot(await _agent(stack, endpoint, node, market, "robot", folder)))
         person = await stack.enter_async_context(await _agent(stack, endpoint, node, market, "person", folder))
         write_objective(folder / "objective.mcap")
-        await _done(person, folder / "objective.mcap")  # what is done once only
-        turns, taken = asyncio.Semaphore(at_once), []
+        await _do_job(person, folder / "objective.mcap")  # the first job also approves allowances
+        limit, seconds_each = asyncio.Semaphore(at_once), []
 
         async def job() -> None:
-            async with turns:
+            async with limit:
                 started = time.perf_counter()
-                await _done(person, folder / "objective.mcap")
-                taken.append(time.perf_counter() - started)
+                await _do_job(person, folder / "objective.mcap")
+                seconds_each.append(time.perf_counter() - started)
 
         started = time.perf_counter()
         async with asyncio.TaskGroup() as jobs:
@@ -159,7 +159,7 @@ async def _jobs(endpoint: str, place: Any, count: int, at_once: int) -> dict[str
         "jobs": count,
         "at_once": at_once,
         "jobs_per_minute": round(count / seconds * 60),
-        "a_job_takes_s": round(sum(taken) / count, 2),
+        "a_job_takes_s": round(sum(seconds_each) / count, 2),
     }
 
 
@@ -189,8 +189,8 @@ def _robot(robot: Agent) -> Agent:
     return robot
 
 
-async def _done(person: Agent, objective: Path) -> None:
-    async with asyncio.timeout(PATIENCE):
+async def _do_job(person: Agent, objective: Path) -> None:
+    async with asyncio.timeout(TIMEOUT):
         contract = await person.demand(objective, cost=1)
         outcome = await contract.outcome()
     assert outcome.success, "a job failed"

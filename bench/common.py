@@ -1,0 +1,93 @@
+"""What the benchmarks share: signed messages, a router process, command line options and output."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import multiprocessing
+import secrets
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Final
+
+from mesh.network import Endpoints, Network, free_endpoint
+from schemas import ZERO_ADDRESS, Demand, Signer, cid_of_digest
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+SPAWN: Final = multiprocessing.get_context("spawn")
+LIGHTHOUSE: Final = "airalab.lighthouse.3.robonomics.eth"
+ADDRESS: Final = "0x" + "11" * 20
+TOKEN: Final = "0x" + "22" * 20
+MODEL: Final = cid_of_digest(bytes(32))
+
+
+def unsigned_demands(count: int, *, deadline: int = 2**40, lighthouse: str = ADDRESS) -> Iterator[Demand]:
+    """Demands for one model that differ in objective and nonce."""
+    for _ in range(count):
+        yield Demand(
+            model=MODEL,
+            objective=cid_of_digest(secrets.token_bytes(32)),
+            token=TOKEN,
+            cost=1000,
+            lighthouse=lighthouse,
+            validator=ZERO_ADDRESS,
+            validator_fee=0,
+            deadline=deadline,
+            nonce=secrets.token_hex(32),
+        )
+
+
+def signed_demands(count: int, *, lighthouse: str = ADDRESS) -> list[Demand]:
+    """The same demands, each signed by one of sixteen people."""
+    people = [Signer(secrets.token_bytes(32)) for _ in range(16)]
+    return [
+        people[number % 16].sign(demand) for number, demand in enumerate(unsigned_demands(count, lighthouse=lighthouse))
+    ]
+
+
+@contextmanager
+def router() -> Iterator[tuple[str, int]]:
+    """A router in a process of its own: its endpoint and its process id."""
+    endpoint = free_endpoint()
+    process = SPAWN.Process(target=_route, args=(endpoint,), daemon=True)
+    process.start()
+    assert process.pid is not None
+    try:
+        yield endpoint, process.pid
+    finally:
+        process.terminate()
+        process.join()
+
+
+def _route(endpoint: str) -> None:
+    asyncio.run(_run_router(endpoint))
+
+
+async def _run_router(endpoint: str) -> None:
+    async with Network(Endpoints(listen=(endpoint,), mode="router")):
+        await asyncio.Event().wait()
+
+
+def arguments(description: str, **defaults: int | tuple[str, ...]) -> argparse.Namespace:
+    """The command line options: `--json`, and for each of `defaults` a number, or one of several words."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    for name, default in defaults.items():
+        option = f"--{name.replace('_', '-')}"
+        if isinstance(default, tuple):
+            parser.add_argument(option, choices=default, default=default[0])
+        else:
+            parser.add_argument(option, type=int, default=default)
+    return parser.parse_args()
+
+
+def show(results: dict[str, Any], *, as_json: bool) -> None:
+    """Print the results."""
+    if as_json:
+        print(json.dumps(results))
+        return
+    width = max(len(name) for name in results)
+    for name, value in results.items():
+        print(f"{name.replace('_', ' '):<{width}}  {value}")
