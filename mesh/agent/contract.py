@@ -1,4 +1,4 @@
-"""A liability, from the side of one who waits for its end."""
+"""A contract (liability) whose end is waited for."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Contract:
-    """A contract of the chain: `await contract.outcome()`, then `await contract.recording()`."""
+    """A contract on the chain: `await contract.outcome()`, then `await contract.recording()`."""
 
     def __init__(self, liability: Liability, ended: asyncio.Future[Outcome], parts: AgentComponents) -> None:
         self.liability = liability
-        """Its terms, as they were when the contract was first seen."""
+        """Its record, as it was when the contract was first read."""
         self._ended = ended
         self._parts = parts
 
@@ -38,17 +38,17 @@ class Contract:
         return self.liability.address
 
     async def outcome(self) -> Outcome:
-        """Wait until the chain has finalized the contract. Cancelling the wait changes nothing.
+        """Wait until the contract is finalized. Cancelling the wait changes nothing.
 
-        Raises `ClosedError` when the agent ends before the contract does, and `LiabilityReverted` when the chain has
-        taken it back and it was not made again in time.
+        Raises `ClosedError` if the agent ends first, and `LiabilityReverted` if a reorganisation reverted the contract
+        and it was not created again by its orders' deadline.
         """
         return await asyncio.shield(self._ended)
 
     async def recording(self) -> Path:
-        """The result's file: waits for the outcome, fetches the recording by its CID and checks every block.
+        """Wait for the outcome, and fetch the result's recording, every block of it checked.
 
-        Raises a `ContentError` when nobody holds it, or the contract was refunded without a result.
+        Raises a `ContentError` if the recording is unavailable or the contract was refunded without a result.
         """
         outcome = await self.outcome()
         if not outcome.result:

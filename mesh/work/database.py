@@ -1,4 +1,4 @@
-"""The file of a ledger: SQLite, opened with its tables, written by one call after the other and synced by each."""
+"""The SQLite file of a ledger. Calls write one after the other, and each is synced to the disk."""
 
 from __future__ import annotations
 
@@ -47,20 +47,20 @@ CREATE TABLE IF NOT EXISTS cursors (name TEXT PRIMARY KEY, block INTEGER NOT NUL
 
 
 class LedgerUnusable(ConfigurationError):
-    """The ledger can't be read or written: a full disk, a folder of somebody else's, a file that is no ledger."""
+    """The ledger can't be read or written: the disk is full, the folder belongs to another user, or it is no ledger."""
 
     code = "ledger-unusable"
 
     def __init__(self, path: Path, why: object) -> None:
-        hint = "make room on that disk, let this user write there, or give another folder with --data-dir"
+        hint = "free space on the disk, let this user write there, or give another folder with --data-dir"
         super().__init__(f"can't use the ledger {path}: {why}", hint=hint)
         self.path = path
 
 
 class Database:
-    """The database in the file at `path`. Calls run in a thread of its own, in their order.
+    """The database in the file at `path`. Calls run in order, in a thread of their own.
 
-    All raise `LedgerUnusable`, and `ClosedError` before `open` and after `close`.
+    Every call raises `LedgerUnusable`, and `ClosedError` before `open` and after `close`.
     """
 
     def __init__(self, path: Path) -> None:
@@ -69,7 +69,7 @@ class Database:
         self._writing = asyncio.Lock()
 
     async def open(self) -> None:
-        """Open the file, made when missing. Raises `ConfigurationError` for one of a newer version."""
+        """Open the file, or create it. Raises `ConfigurationError` if a newer version wrote it."""
         if self._connection is not None:
             raise ClosedError("this ledger is open already")
         try:
@@ -84,13 +84,13 @@ class Database:
             raise
 
     async def close(self) -> None:
-        """Close it, if it is open: a connection that is left open keeps its thread, and the interpreter, alive."""
+        """Close the file if it is open. An open connection keeps its thread, and so the interpreter, alive."""
         connection, self._connection = self._connection, None
         if connection is not None:
             await connection.close()
 
     async def run(self, statement: str, values: tuple[Any, ...] = ()) -> bool:
-        """Run one statement, which is on the disk when this returns. Whether it changed any rows."""
+        """Run one statement, and sync it to the disk. Returns whether it changed any rows."""
         async with self._writing:
             with self._usable():
                 cursor = await self._opened().execute(statement, values)
@@ -99,7 +99,7 @@ class Database:
         return changed
 
     async def run_together(self, *statements: tuple[str, tuple[Any, ...]]) -> None:
-        """Run all statements or, when cancelled too, none."""
+        """Run all statements in one transaction. If it fails or is cancelled, none of them has an effect."""
         connection = self._opened()
         async with self._writing:
             try:
@@ -109,12 +109,12 @@ class Database:
                         await connection.execute(statement, values)
                     await connection.commit()
             except BaseException:
-                # What was cancelled is executed all the same: nothing may stay open behind it.
+                # A cancelled statement still runs: its transaction must not stay open.
                 await connection.rollback()
                 raise
 
     async def rows(self, statement: str, values: tuple[Any, ...] = ()) -> list[Any]:
-        """The rows that a statement finds."""
+        """The rows that a statement returns."""
         with self._usable():
             return list(await self._opened().execute_fetchall(statement, values))
 
@@ -137,7 +137,7 @@ class Database:
 
     @contextmanager
     def _usable(self) -> Iterator[None]:
-        """Raise `LedgerUnusable` for what the disk does not let the database do."""
+        """Raise `LedgerUnusable` for errors of the disk."""
         try:
             yield
         except aiosqlite.OperationalError as error:

@@ -1,7 +1,7 @@
-"""The agent's memory: what it owes and is owed, what it has said, how far it has read the chain. SQLite, one file.
+"""The ledger: an agent's jobs, its unsent messages, and how far it has read the chain, in one SQLite file.
 
-Every write is committed and synced before the call returns, so that what an agent has done it remembers after
-`kill -9`. Writes are idempotent: handling the same block or message twice changes nothing.
+Every write is synced before the call returns, so it survives `kill -9`. Writes are idempotent: handling the same block
+or message twice changes nothing.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 
 POST: Final = "INSERT OR IGNORE INTO outbox (identity, kind, payload, deadline, posted) VALUES (?, ?, ?, ?, ?)"
 SPENT_KEPT: Final = 4096
-"""Orders that are kept after they became contracts; the chain replaces its last blocks only."""
+"""Most orders that are kept after they became contracts. A reorganisation replaces only the last blocks."""
 
 
 class JobRecord(msgspec.Struct, frozen=True, kw_only=True):
     """A job as the ledger holds it.
 
-    `success` and `result` (CIDv0 of the recording) are there from COMPLETE on; `position` counts the objective's
-    messages already played; `note` says why a job failed.
+    `success` and `result` (CIDv0 of the recording) are set from COMPLETE on. `position` counts the objective's messages
+    that were played. `note` says why a job failed.
     """
 
     liability: Liability
@@ -41,7 +41,7 @@ class JobRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Outgoing(msgspec.Struct, frozen=True, kw_only=True):
-    """A signed message that is sent until its effect is seen, or block `deadline` has passed (None: never)."""
+    """A signed message that is sent until its effect is seen, or until block `deadline` (None: without end)."""
 
     identity: str
     kind: str
@@ -50,9 +50,9 @@ class Outgoing(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Ledger:
-    """The ledger in the file at `path`, made when missing: `async with Ledger(path) as ledger`.
+    """The ledger in the file at `path`, created if missing: `async with Ledger(path) as ledger`.
 
-    One agent owns a file. Calls run in a thread of the ledger's own, in their order. All raise `LedgerUnusable`.
+    A file belongs to one agent. Calls run in order, in a thread of their own. Every call raises `LedgerUnusable`.
     """
 
     def __init__(self, path: Path) -> None:
@@ -68,7 +68,7 @@ class Ledger:
         await self._database.close()
 
     async def add_job(self, liability: Liability) -> bool:
-        """Write down a new job as INCOMING, or take up one that was set aside; False when it was known."""
+        """Add a job as INCOMING, or bring back one that was set aside. False if it was known already."""
         return await self._database.run(
             "INSERT INTO jobs (liability, phase, record, changed) VALUES (?, ?, ?, ?)"
             " ON CONFLICT (liability) DO UPDATE SET aside = 0 WHERE aside",
@@ -76,29 +76,29 @@ class Ledger:
         )
 
     async def set_aside(self, liability: str) -> None:
-        """There is no such job, until `add_job` takes it up again with all that is known of it."""
+        """Hide a job, with everything that is known of it, until `add_job` brings it back."""
         await self._database.run("UPDATE jobs SET aside = 1 WHERE liability = ?", (liability,))
 
     async def set_phase(self, liability: str, phase: Phase, *, position: int | None = None) -> None:
-        """Write down where the job at `liability` (address) stands, and how many messages it has played."""
+        """Set the phase of the job at `liability` (address) and, if given, how many messages it has played."""
         await self._database.run(
             "UPDATE jobs SET phase = ?, position = COALESCE(?, position), changed = ? WHERE liability = ?",
             (phase, position, time.time(), liability),
         )
 
     async def set_position(self, liability: str, position: int) -> None:
-        """Write down how many messages the job at `liability` (address) has played; its phase stays."""
+        """Set how many messages the job at `liability` (address) has played."""
         await self._database.run("UPDATE jobs SET position = ? WHERE liability = ?", (position, liability))
 
     async def complete(self, liability: str, *, success: bool, result: str, note: str, outgoing: Outgoing) -> None:
-        """Write down the job's end and the signed Result that tells of it, both or neither (when cancelled, too)."""
+        """Set the job's outcome and keep its signed Result for sending: both or, if this is cancelled, neither."""
         ended = "UPDATE jobs SET phase = ?, success = ?, result = ?, note = ?, changed = ? WHERE liability = ?"
         await self._database.run_together(
             (ended, (Phase.COMPLETE, success, result, note, time.time(), liability)), (POST, _posted(outgoing))
         )
 
     async def job(self, liability: str) -> JobRecord | None:
-        """The job at `liability` (EIP-55 address), if it is ours."""
+        """The job at `liability` (EIP-55 address), if there is one."""
         rows = await self._database.rows("SELECT * FROM jobs WHERE liability = ? AND NOT aside", (liability,))
         return _job(rows[0]) if rows else None
 
@@ -112,25 +112,25 @@ class Ledger:
         return [_job(row) for row in rows]
 
     async def jobs_by_phase(self) -> dict[str, int]:
-        """How many jobs there are in each phase that has any."""
+        """The number of jobs in each phase that has any."""
         return {phase: count for phase, count, _ in await self.phases()}
 
     async def phases(self) -> list[tuple[str, int, float]]:
-        """Each phase that has any jobs: how many, and since when (Unix time) the one that came first stands there."""
+        """Each phase that has jobs: how many, and when (Unix time) the first of them entered it."""
         return await self._database.rows(
             "SELECT phase, COUNT(*), MIN(changed) FROM jobs WHERE NOT aside GROUP BY phase"
         )
 
     async def post(self, outgoing: Outgoing) -> None:
-        """Keep a signed message for sending until `settle`."""
+        """Keep a signed message for sending, until `settle`."""
         await self._database.run(POST, _posted(outgoing))
 
     async def settle(self, identity: str) -> bool:
-        """The effect of the message was seen: send it no more. False when it was not in the outbox."""
+        """Remove a message whose effect was seen. False if it was not in the outbox."""
         return await self._database.run("DELETE FROM outbox WHERE identity = ?", (identity,))
 
     async def spend(self, identity: str, liability: str) -> None:
-        """The order became the contract at the address `liability`: send it no more, but keep it for `unspend`."""
+        """Take an order out of the outbox that became the contract at `liability`, and keep it for `unspend`."""
         await self._database.run_together(
             ("INSERT OR REPLACE INTO spent SELECT *, ? FROM outbox WHERE identity = ?", (liability, identity)),
             ("DELETE FROM outbox WHERE identity = ?", (identity,)),
@@ -138,12 +138,12 @@ class Ledger:
         )
 
     async def spent_until(self, liability: str) -> int | None:
-        """The deadline (block) of the orders that became the contract at this address; None when none is known."""
+        """The deadline (block) of the orders that became the contract at this address; None if there are none."""
         ((deadline,),) = await self._database.rows("SELECT MIN(deadline) FROM spent WHERE liability = ?", (liability,))
         return None if deadline is None else int(deadline)
 
     async def unspend(self, liability: str) -> bool:
-        """There is no contract at this address after all: its orders are to be sent again. False when it had none."""
+        """Move the orders of a reverted contract back into the outbox. False if it had none."""
         columns = "identity, kind, payload, deadline, posted"
         await self._database.run(
             f"INSERT OR IGNORE INTO outbox ({columns}) SELECT {columns} FROM spent WHERE liability = ?", (liability,)
@@ -151,31 +151,31 @@ class Ledger:
         return await self._database.run("DELETE FROM spent WHERE liability = ?", (liability,))
 
     async def outbox(self, *, head: int) -> list[Outgoing]:
-        """What is to be sent, oldest first; forgets what has passed its deadline at block `head`."""
+        """The messages to send, oldest first. Deletes those whose deadline block `head` has reached."""
         await self._database.run("DELETE FROM outbox WHERE deadline <= ?", (head,))
         rows = await self._database.rows("SELECT identity, kind, payload, deadline FROM outbox ORDER BY rowid")
         return [Outgoing(identity=row[0], kind=row[1], payload=row[2], deadline=row[3]) for row in rows]
 
     async def waiting(self) -> int:
-        """How many messages are in the outbox."""
+        """The number of messages in the outbox."""
         return sum((await self.waiting_by_kind()).values())
 
     async def waiting_by_kind(self) -> dict[str, int]:
-        """The same for each kind that is there: `demand`, `offer`, `result`."""
+        """The same for each kind (`demand`, `offer`, `result`) that has any."""
         return dict(await self._database.rows("SELECT kind, COUNT(*) FROM outbox GROUP BY kind"))
 
     async def cursor(self, name: str) -> int | None:
-        """The last block handled by `name`; None when there was none."""
+        """The last block that the reader `name` has handled; None if it never handled one."""
         rows = await self._database.rows("SELECT block FROM cursors WHERE name = ?", (name,))
         return int(rows[0][0]) if rows else None
 
     async def history(self, name: str) -> bytes:
-        """What `name` remembered of the chain at its cursor; empty when it remembered nothing."""
+        """The encoded chain history of the reader `name` at its cursor; empty if there is none."""
         rows = await self._database.rows("SELECT history FROM cursors WHERE name = ?", (name,))
         return bytes(rows[0][0]) if rows else b""
 
     async def set_cursor(self, name: str, block: int, *, history: bytes = b"") -> None:
-        """All of `block` has been handled by `name`, which remembers `history` of the chain."""
+        """Save that the reader `name` has handled all of `block`, with its encoded chain history."""
         await self._database.run(
             "INSERT OR REPLACE INTO cursors (name, block, history) VALUES (?, ?, ?)", (name, block, history)
         )

@@ -144,8 +144,8 @@ class Place:
         return path
 
 
-def obliging(robot: Agent) -> Agent:
-    """The same robot, which offers to do whatever is asked of it."""
+def offering(robot: Agent) -> Agent:
+    """The same robot, with a handler that offers for every demand."""
 
     @robot.on_demand
     async def offer(demand: Verified[Demand]) -> None:
@@ -154,8 +154,8 @@ def obliging(robot: Agent) -> Agent:
     return robot
 
 
-def careless(robot: Agent) -> Agent:
-    """The same robot, which offers without a look at the objective: such a job comes to nothing only later."""
+def offering_unseen(robot: Agent) -> Agent:
+    """The same robot, with a handler that offers without examining the objective: bad jobs fail only later."""
 
     @robot.on_demand
     async def offer(demand: Verified[Demand]) -> None:

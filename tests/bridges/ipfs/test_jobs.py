@@ -16,7 +16,7 @@ from mesh.devchain.development import ROLES
 from mesh.network import Endpoints, Network
 from schemas import Demand, Offer, Result, decode
 from tests.bridges.ipfs.legacy import LegacyTrader
-from tests.support.market import MODEL, Place, founded, obliging, place
+from tests.support.market import MODEL, Place, founded, offering, place
 from tests.support.objectives import objective
 from tests.support.waiting import until, until_found
 
@@ -179,7 +179,7 @@ def working(robot: Agent) -> Agent:
     async def nothing(job: Job, message: Any) -> None:
         pass
 
-    return obliging(robot)
+    return offering(robot)
 
 
 def read(message: dict[str, Any], kind: type[Any]) -> Any:

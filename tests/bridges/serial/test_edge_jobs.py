@@ -14,7 +14,7 @@ from schemas import Empty, String, cid_of_bytes
 from schemas.payloads import decode_value
 from tests.support.bags import Bag, BagMessage, string
 from tests.support.boards import COUNTER, ROSSERIAL_ECHO, board, edge
-from tests.support.market import QUICK, founded, obliging, place
+from tests.support.market import QUICK, founded, offering, place
 from tests.support.objectives import objective
 from tests.support.waiting import until
 
@@ -45,7 +45,7 @@ def counting(robot: Agent) -> Agent:
     async def work(job: Job, message: object) -> None:
         await device.call("/slow", 1, job=job)
 
-    return obliging(robot)
+    return offering(robot)
 
 
 def recorded(recording: Path, topic: str) -> list[Any]:
@@ -87,7 +87,7 @@ async def test_a_job_whose_board_was_reset_fails_and_never_hangs(place: Place) -
 
 
 async def test_a_ros_bag_is_an_objective_for_a_board(place: Place) -> None:
-    robot = obliging(place.agent("robot"))
+    robot = offering(place.agent("robot"))
     device = Device(robot, patience=LONG)
 
     @robot.on("/work", String)
@@ -107,7 +107,7 @@ async def test_a_ros_bag_is_an_objective_for_a_board(place: Place) -> None:
 
 
 async def test_among_devices_with_the_same_topics_a_call_reaches_the_one_it_names(place: Place) -> None:
-    robot = obliging(place.agent("robot"))
+    robot = offering(place.agent("robot"))
     left, right = Device(robot, "left", patience=LONG), Device(robot, "right", patience=LONG)
     address = place.address("robot")
 
@@ -134,7 +134,7 @@ async def test_among_devices_with_the_same_topics_a_call_reaches_the_one_it_name
 
 
 async def test_a_command_in_a_job_reaches_only_the_device_with_that_topic_name(place: Place) -> None:
-    robot = obliging(place.agent("robot"))
+    robot = offering(place.agent("robot"))
     left, right = Device(robot, "left", patience=LONG), Device(robot, "right", patience=LONG)
     address = place.address("robot")
 
@@ -168,7 +168,7 @@ async def second_robot(place: Place, account: Account, model: str) -> AsyncItera
 
 async def test_two_boards_do_jobs_of_one_market_at_the_same_time(place: Place) -> None:
     counting_began, talking_began = asyncio.Event(), asyncio.Event()
-    first = obliging(place.agent("robot"))
+    first = offering(place.agent("robot"))
     counter = Device(first, patience=LONG)
 
     @first.on("/work")
@@ -187,7 +187,7 @@ async def test_two_boards_do_jobs_of_one_market_at_the_same_time(place: Place) -
             await counting_began.wait()
             await talker.call("/hear", text, job=job)
 
-        obliging(second)
+        offering(second)
         numbers = place.save(objective(("/work", Empty()), ("/work", Empty())), "numbers.mcap")
         words = place.save(objective(("/say", String("hello")), ("/say", String("world"))), "words.mcap")
         with (

@@ -13,7 +13,7 @@ from mesh.network import Endpoints, Network, call
 from schemas import String
 from schemas.keys import LiabilityTopicKey
 from schemas.rpc import Done, FinishLiability, LiabilityRead, Nothing, ReadLiability, StartLiability
-from tests.support.market import in_phase, obliging
+from tests.support.market import in_phase, offering
 from tests.support.objectives import objective
 from tests.support.waiting import until, until_heard
 
@@ -73,7 +73,7 @@ class Control:
 @pytest.fixture
 async def control(place: Place) -> AsyncIterator[Control]:
     """A robot without handlers, a provider, and whoever drives the robot."""
-    async with controlled(place, obliging(place.agent("robot"))) as control:
+    async with controlled(place, offering(place.agent("robot"))) as control:
         yield control
 
 

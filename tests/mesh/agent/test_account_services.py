@@ -26,7 +26,7 @@ from schemas.rpc import (
     TransferRequest,
 )
 from tests.mesh.agent.conftest import Asker, asking, other_token
-from tests.support.market import QUICK, obliging
+from tests.support.market import QUICK, offering
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -154,7 +154,7 @@ async def test_an_allowance_is_given(place: Place, opened: Asker) -> None:
         (TransferRequest("0x" + "12" * 20, 10**30), "the contract refused: ERC20InsufficientBalance"),
     ],
 )
-async def test_why_nothing_was_sent_is_told_in_a_line(opened: Asker, request_: TransferRequest, said: str) -> None:
+async def test_a_refused_transaction_is_one_line(opened: Asker, request_: TransferRequest, said: str) -> None:
     assert (await opened.refused("eth/transfer", request_)).startswith(said)
 
 
@@ -181,7 +181,7 @@ async def test_a_chain_that_was_opened_for_reading_sends_nothing(place: Place) -
 
 async def test_who_works_by_itself_is_not_driven_by_others(place: Place) -> None:
     """Its own code starts and ends its jobs; without any, there is nobody else to do it."""
-    robot = obliging(place.agent("robot"))
+    robot = offering(place.agent("robot"))
 
     @robot.on("/say")
     async def say(job: Any, word: Any) -> None:

@@ -117,7 +117,7 @@ async def test_all_handlers_of_a_kind_are_called_and_a_failing_one_stops_nothing
     assert logged_facts(caplog, "handler-cancelled") == [{"handler": "be_cancelled"}] * 2
 
 
-async def test_open_orders_are_heard_by_who_comes_late(place: Place) -> None:
+async def test_a_late_agent_receives_open_orders(place: Place) -> None:
     late = place.agent("robot")
     heard: list[Demand] = []
 
@@ -135,7 +135,7 @@ async def test_open_orders_are_heard_by_who_comes_late(place: Place) -> None:
     assert heard[0].cost == 5
 
 
-async def test_a_market_of_many_open_orders_is_heard_whole(place: Place) -> None:
+async def test_a_late_agent_receives_all_of_many_open_orders(place: Place) -> None:
     """More of them than what waits between Zenoh and the agent."""
     late = place.agent("robot", model="")
     heard: set[bytes] = set()
@@ -153,7 +153,7 @@ async def test_a_market_of_many_open_orders_is_heard_whole(place: Place) -> None
             await until(lambda: len(heard) == len(orders), seconds=30)
 
 
-async def test_every_calls_at_the_start_and_again_and_bears_failures(settings: Settings) -> None:
+async def test_every_calls_at_the_start_and_again_in_spite_of_failures(settings: Settings) -> None:
     agent = Agent(settings=settings)
     calls = 0
 

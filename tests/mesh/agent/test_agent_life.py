@@ -13,7 +13,7 @@ from mesh.agent import Phase
 from mesh.errors import ClosedError, NetworkUnavailable
 from mesh.network import Channel, Endpoints, Network
 from tests.mesh.agent.agents import SOON, channel, heard_on, settings
-from tests.support.market import obliging
+from tests.support.market import offering
 from tests.support.objectives import objective
 from tests.support.orders import LIGHTHOUSE, MARKET, demand
 from tests.support.ports import free_endpoint
@@ -66,7 +66,7 @@ async def test_leaving_ends_every_task_and_thread(place: Place) -> None:
         pass  # whatever Zenoh and asyncio keep for later is there now
     tasks = asyncio.all_tasks()
     threads = {thread for thread in threading.enumerate() if not thread.name.startswith("asyncio_")}
-    robot = obliging(place.agent("robot"))
+    robot = offering(place.agent("robot"))
 
     @robot.every(SOON)
     async def tick() -> None:
@@ -129,7 +129,7 @@ def listening(agent: Agent, heard: list[Demand]) -> Agent:
 
 async def test_a_job_handler_that_uses_the_agent_while_it_ends_does_not_fail_its_job(place: Place) -> None:
     """A refund because of a Ctrl-C would be a job lost: it is to be resumed."""
-    robot = obliging(place.agent("robot"))
+    robot = offering(place.agent("robot"))
     begun = asyncio.Event()
 
     @robot.on("/go")
@@ -164,7 +164,7 @@ async def test_a_lost_router_does_not_end_an_agent(settings: Settings, router: E
             await until(lambda: heard)
 
 
-async def test_no_router_is_told_with_its_endpoint() -> None:
+async def test_a_missing_router_raises_with_its_endpoint() -> None:
     endpoint = free_endpoint()
     with pytest.raises(NetworkUnavailable, match=endpoint):
         async with Agent(settings=Settings(connect=(endpoint,), connect_timeout=0.1)):

@@ -72,26 +72,26 @@ async def spend(place: Place, cost: int) -> None:
     await place.chains["provider"].liabilities.create(deployment.lighthouse_name, demand, offer)
 
 
-async def test_promises_add_up_and_are_allowed_together(chain: Chain, allowances: Allowances) -> None:
+async def test_the_costs_of_open_orders_add_up(chain: Chain, allowances: Allowances) -> None:
     await allowances.ensure("one", {chain.xrt: 10})
     await allowances.ensure("other", {chain.xrt: 5})
     assert await allowance(chain) == 15
 
 
-async def test_what_is_allowed_already_costs_no_transaction(chain: Chain, allowances: Allowances) -> None:
+async def test_a_sufficient_allowance_costs_no_transaction(chain: Chain, allowances: Allowances) -> None:
     await chain.tokens.approve(chain.factory, 100)
     before = await chain.block_number()
     await allowances.ensure("one", {chain.xrt: 100})
     assert await chain.block_number() == before
 
 
-async def test_a_promise_of_nothing_asks_nothing(chain: Chain, allowances: Allowances) -> None:
+async def test_an_order_without_cost_needs_no_allowance(chain: Chain, allowances: Allowances) -> None:
     before = await chain.block_number()
     await allowances.ensure("one", {chain.xrt: 0})
     assert await chain.block_number() == before
 
 
-async def test_a_forgotten_promise_makes_room(chain: Chain, allowances: Allowances) -> None:
+async def test_a_released_order_no_longer_counts(chain: Chain, allowances: Allowances) -> None:
     balance = await chain.tokens.balance()
     await allowances.ensure("one", {chain.xrt: balance})
     with pytest.raises(FundsShort) as caught:
@@ -102,7 +102,7 @@ async def test_a_forgotten_promise_makes_room(chain: Chain, allowances: Allowanc
     await allowances.ensure("other", {chain.xrt: balance})
 
 
-async def test_an_allowance_that_is_used_up_on_the_way_is_given_once_more(
+async def test_an_allowance_used_up_meanwhile_is_approved_again(
     place: Place, road: Overtaken, chain: Chain, allowances: Allowances
 ) -> None:
     """Gas is estimated for changing an allowance; to set one anew costs more."""

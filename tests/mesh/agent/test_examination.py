@@ -13,7 +13,7 @@ from mesh.content import ContentUnavailable
 from mesh.work.objectives import ObjectiveUnfit
 from schemas import Empty, cid_of_bytes, cid_of_file
 from tests.support.log_events import logged_facts
-from tests.support.market import Place, obliging
+from tests.support.market import Place, offering
 from tests.support.objectives import objective
 from tests.support.waiting import until
 
@@ -50,7 +50,7 @@ async def test_no_offer_is_made_for_an_objective_that_can_not_be_played(
     place: Place, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.WARNING)
-    robot = going(obliging(place.agent("robot")))
+    robot = going(offering(place.agent("robot")))
     async with place.at_work(robot) as person:
         unfit = asyncio.create_task(person.demand(place.save(objective(("/fly", Empty())), "unfit.mcap")))
         await until(lambda: refused_offers(caplog), seconds=30)
@@ -66,7 +66,7 @@ async def test_no_offer_is_made_for_a_message_that_its_handler_can_not_take(
     place: Place, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.WARNING)
-    robot = obliging(place.agent("robot"))
+    robot = offering(place.agent("robot"))
     speeds: list[Speed] = []
 
     @robot.on("/go", Speed)
@@ -87,7 +87,7 @@ async def test_no_offer_is_made_for_a_message_that_its_handler_can_not_take(
 
 
 async def test_demands_with_objectives_that_nobody_has_hold_up_no_other(place: Place) -> None:
-    robot = going(obliging(place.agent("robot", fetch_timeout=60.0)))
+    robot = going(offering(place.agent("robot", fetch_timeout=60.0)))
     async with place.at_work(robot) as person, asyncio.timeout(50):
         missing = [
             asyncio.create_task(person.demand(cid_of_bytes(b"nobody has objective %d" % number))) for number in range(5)

@@ -27,7 +27,7 @@ __all__ = ["ledger"]
 QUICK_TO_GIVE_UP = Timing(poll_interval=0.03, attempts=1)
 
 
-async def test_a_contract_that_names_the_account_is_told_with_its_orders(place: Place, ledger: Ledger) -> None:
+async def test_a_contract_that_names_the_account_is_reported_with_its_orders(place: Place, ledger: Ledger) -> None:
     async with listening(place, ledger) as listener:
         await started(ledger)
         address, demand, offer = await contract(place)
@@ -46,7 +46,7 @@ async def test_contracts_of_others_are_left_out(place: Place, ledger: Ledger) ->
     assert [liability.address for liability, *_ in listener.liabilities] == [mine]
 
 
-async def test_the_end_of_a_contract_is_told_with_its_result(place: Place, ledger: Ledger) -> None:
+async def test_a_finalization_is_reported_with_its_result(place: Place, ledger: Ledger) -> None:
     async with listening(place, ledger) as listener:
         await started(ledger)
         address, *_ = await contract(place)
@@ -55,7 +55,7 @@ async def test_the_end_of_a_contract_is_told_with_its_result(place: Place, ledge
     assert listener.ends == [(address, True, RECORDING)]
 
 
-async def test_one_that_never_ran_begins_at_the_head(place: Place, ledger: Ledger) -> None:
+async def test_a_new_agent_begins_at_the_head(place: Place, ledger: Ledger) -> None:
     await contract(place)
     head = await place.chains["robot"].block_number()
     async with listening(place, ledger) as listener:
@@ -66,7 +66,7 @@ async def test_one_that_never_ran_begins_at_the_head(place: Place, ledger: Ledge
     assert [liability.address for liability, *_ in listener.liabilities] == [later]
 
 
-async def test_what_happens_while_the_agent_is_down_is_read_when_it_is_back(place: Place, ledger: Ledger) -> None:
+async def test_events_during_a_downtime_are_read_afterwards(place: Place, ledger: Ledger) -> None:
     async with listening(place, ledger):
         await started(ledger)
     address, *_ = await contract(place)
@@ -93,7 +93,7 @@ async def test_a_block_that_was_not_handled_to_its_end_is_handled_again(place: P
     assert [liability.address for liability, *_ in listener.liabilities] == [address]
 
 
-async def test_the_head_is_told_as_the_chain_grows_and_kept(place: Place, ledger: Ledger) -> None:
+async def test_the_head_is_reported_and_saved_as_the_chain_grows(place: Place, ledger: Ledger) -> None:
     async with listening(place, ledger) as listener:
         await started(ledger)
         await place.node.mine(3)
@@ -102,7 +102,7 @@ async def test_the_head_is_told_as_the_chain_grows_and_kept(place: Place, ledger
     assert await ledger.cursor(ChainListener.CURSOR) == listener.head
 
 
-async def test_a_lost_node_is_waited_for_and_said_once(
+async def test_an_outage_of_the_node_is_survived_and_logged_once(
     place: Place, ledger: Ledger, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "mesh.agent")

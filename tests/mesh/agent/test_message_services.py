@@ -13,7 +13,7 @@ from schemas import ZERO_ADDRESS, Demand, Offer, Result, Verified, cid_of_bytes,
 from schemas.message_requests import Published, SendDemand, SendOffer, SendResult, SignDemand, SignOffer, SignResult
 from schemas.rpc import Approve
 from tests.mesh.agent.conftest import Asker, asking
-from tests.support.market import MODEL, obliging
+from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
 from tests.support.waiting import until_found, until_heard
 
@@ -112,7 +112,7 @@ async def test_orders_that_two_agents_signed_become_a_contract(place: Place, gen
 
 async def test_a_result_that_the_agent_signed_ends_the_contract_and_is_sent_until_then(place: Place) -> None:
     """The robot's own executor is off: who drives it makes the results."""
-    robot = obliging(place.agent("robot", open_services=True, enable_executor=False))
+    robot = offering(place.agent("robot", open_services=True, enable_executor=False))
     async with asking(place, robot) as asker, place.agent("person") as person:
         async with place.provider():
             contract = await person.demand(place.save(objective(("/say", "x"))))

@@ -29,7 +29,7 @@ async def test_a_chain_that_is_shorter_than_what_was_read_is_refused(place: Plac
             await listener.run()
 
 
-async def test_an_end_that_the_chain_took_back_is_told(place: Place, ledger: Ledger) -> None:
+async def test_a_reverted_finalization_is_reported(place: Place, ledger: Ledger) -> None:
     async with listening(place, ledger) as listener:
         await started(ledger)
         address, *_ = await contract(place)
@@ -44,7 +44,7 @@ async def test_an_end_that_the_chain_took_back_is_told(place: Place, ledger: Led
     assert len(listener.liabilities) == 1, "what came before is as it was"
 
 
-async def test_an_end_that_was_taken_back_while_the_agent_was_down_is_told(place: Place, ledger: Ledger) -> None:
+async def test_a_finalization_reverted_while_the_agent_was_down_is_reported(place: Place, ledger: Ledger) -> None:
     async with listening(place, ledger) as listener:
         await started(ledger)
         address, *_ = await contract(place)
@@ -57,9 +57,7 @@ async def test_an_end_that_was_taken_back_while_the_agent_was_down_is_told(place
     assert listener.reverted_ends == [address]
 
 
-async def test_a_contract_that_the_chain_took_back_is_told_and_told_again_when_it_is_made(
-    place: Place, ledger: Ledger
-) -> None:
+async def test_a_reverted_contract_is_reported_and_again_when_it_is_created(place: Place, ledger: Ledger) -> None:
     async with listening(place, ledger) as listener:
         await started(ledger)
         first, demand, offer = await contract(place)
@@ -74,7 +72,7 @@ async def test_a_contract_that_the_chain_took_back_is_told_and_told_again_when_i
     assert listener.reverted_ends == []
 
 
-async def test_token_events_are_told_and_taken_back(place: Place, ledger: Ledger) -> None:
+async def test_token_events_and_their_reversions_are_reported(place: Place, ledger: Ledger) -> None:
     person = place.chains["person"]
     async with listening(place, ledger) as listener:
         await started(ledger)
@@ -95,9 +93,7 @@ async def test_token_events_are_told_and_taken_back(place: Place, ledger: Ledger
     assert listener.reverted_token_events == [transfer]
 
 
-async def test_as_much_of_the_chain_is_remembered_as_may_be_replaced_whatever_was_so_before(
-    place: Place, ledger: Ledger
-) -> None:
+async def test_the_history_has_the_depth_of_the_settings_after_they_change(place: Place, ledger: Ledger) -> None:
     for depth in (3, 7, 2):
         timing = Timing(poll_interval=0.03, reorg_depth=depth)
         async with (
@@ -113,9 +109,7 @@ async def test_as_much_of_the_chain_is_remembered_as_may_be_replaced_whatever_wa
         assert (history.depth, len(history.blocks)) == (depth, depth + 1)
 
 
-async def test_a_contract_that_a_reorganisation_took_before_it_was_read_is_left_out(
-    place: Place, ledger: Ledger
-) -> None:
+async def test_a_contract_reverted_before_it_was_read_is_ignored(place: Place, ledger: Ledger) -> None:
     """The chain says of a contract, and when the listener reads it, there is none."""
     async with opened(place, ledger) as listener:
         await listener.handle(NewLiability(place.address("robot"), "0x"))

@@ -11,7 +11,7 @@ from schemas import Liability, String
 from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey
 from schemas.rpc import Done, LiabilityRead, RestartLiability, ResumeLiability
 from tests.mesh.agent.controls import WORDS, Control, control, controlled, person, ready
-from tests.support.market import in_phase, obliging
+from tests.support.market import in_phase, offering
 from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ async def test_a_job_may_be_finished_before_it_was_started(place: Place, control
 
 
 async def test_a_playback_in_progress_is_ended_by_finish(place: Place) -> None:
-    robot = obliging(place.agent("robot", playback="recorded"))
+    robot = offering(place.agent("robot", playback="recorded"))
     async with controlled(place, robot) as control, place.agent("person") as person, asyncio.timeout(20):
         contract = await ready(control, person, place, step_ns=HOUR_NS)
         await control.start(contract.address)
@@ -102,7 +102,7 @@ async def test_a_ready_job_may_be_restarted_too(place: Place, control: Control, 
 
 async def test_resume_goes_on_after_the_agent_was_down(place: Place) -> None:
     async with place.agent("person") as person:
-        async with controlled(place, obliging(place.agent("robot"))) as control:
+        async with controlled(place, offering(place.agent("robot"))) as control:
             contract = await ready(control, person, place)
             await control.start(contract.address)
             await control.played(contract.address)
@@ -122,7 +122,7 @@ async def test_resume_goes_on_after_the_agent_was_down(place: Place) -> None:
 async def test_a_ready_job_can_be_started_right_after_the_agent_has_come_back(place: Place) -> None:
     """Its objective may not have been examined again yet."""
     async with place.agent("person") as person:
-        async with controlled(place, obliging(place.agent("robot"))) as control:
+        async with controlled(place, offering(place.agent("robot"))) as control:
             contract = await ready(control, person, place)
         robot = place.agent("robot")
         async with place.provider(), robot:

@@ -19,7 +19,7 @@ from schemas.rpc import (
     StartLiability,
 )
 from tests.mesh.agent.controls import Control, control, controlled, person, ready
-from tests.support.market import careless, in_phase
+from tests.support.market import in_phase, offering_unseen
 
 if TYPE_CHECKING:
     from mesh.agent import Agent
@@ -47,7 +47,7 @@ async def test_what_the_phase_does_not_allow_is_answered_with_the_reason(
 
 
 async def test_a_job_whose_objective_has_not_come_can_not_be_started(place: Place) -> None:
-    robot = careless(place.agent("robot", fetch_timeout=30.0))
+    robot = offering_unseen(place.agent("robot", fetch_timeout=30.0))
     async with controlled(place, robot) as control, place.agent("person") as person:
         contract = await person.demand(cid_of_bytes(b"nobody's"))
         await in_phase(robot, contract, Phase.INCOMING)
@@ -72,7 +72,7 @@ async def test_what_is_no_address_is_an_error_reply(control: Control, service: s
         await control.ask(service, requests.get(service, StartLiability("the kitchen")))
 
 
-async def test_an_agent_told_not_to_work_offers_only_to_read(place: Place) -> None:
+async def test_an_agent_without_executor_offers_only_to_read(place: Place) -> None:
     async with controlled(place, place.agent("robot", enable_executor=False)) as control:
         assert await control.read(ZERO_ADDRESS) == LiabilityRead(False)
         with pytest.raises(ServiceFailed, match="no agent answers"):

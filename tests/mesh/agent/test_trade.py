@@ -13,7 +13,7 @@ from mesh.content import ContentUnavailable
 from mesh.errors import ClosedError
 from schemas import ZERO_ADDRESS, Demand, cid_of_bytes, cid_of_file, message_hash
 from tests.mesh.agent.trades import OBJECTIVE, all_posted, job, known, posted, waiting, working
-from tests.support.market import MODEL, Place, obliging
+from tests.support.market import MODEL, Place, offering
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ async def test_concurrent_demands_become_a_contract_each(place: Place, generatio
     assert await place.balance("robot") == before + 3210
 
 
-async def test_offers_that_were_overtaken_in_generation_5_are_signed_anew(place: Place) -> None:
+async def test_overtaken_offers_of_generation_5_are_signed_again(place: Place) -> None:
     """Both of the robot's offers bear the same nonce, since neither was taken when they were made."""
     robot = working(place.agent("robot"))
     people = [place.agent(role, generation=5) for role in ("person", "provider")]
@@ -67,7 +67,7 @@ async def test_offers_that_were_overtaken_in_generation_5_are_signed_anew(place:
             assert [(await contract.outcome()).success for contract in contracts] == [True, True]
 
 
-async def test_a_demand_that_was_overtaken_in_generation_5_is_signed_anew_without_being_told(place: Place) -> None:
+async def test_an_overtaken_demand_of_generation_5_is_signed_again_without_a_rejection(place: Place) -> None:
     """Nobody offers to do it, so no provider says that its nonce is used: the person knows it of the other demand."""
     robot = place.agent("robot", generation=5)
     async with place.provider(), robot, place.agent("person", generation=5) as person:
@@ -93,7 +93,7 @@ async def test_the_factory_is_allowed_what_all_open_demands_may_cost(place: Plac
         await asyncio.wait(demands)
 
 
-async def test_who_is_short_of_funds_is_told_before_anything_is_sent(place: Place) -> None:
+async def test_short_funds_raise_before_anything_is_sent(place: Place) -> None:
     balance = await place.balance("person")
     async with place.agent("person") as person:
         with pytest.raises(FundsShort) as caught:
@@ -117,7 +117,7 @@ async def test_open_demands_count_towards_what_can_be_paid_until_they_are_given_
         await asyncio.wait([second])
 
 
-async def test_a_refused_demand_promises_nothing(place: Place) -> None:
+async def test_a_refused_demand_does_not_count(place: Place) -> None:
     balance = await place.balance("person")
     async with place.agent("person") as person:
         with pytest.raises(FundsShort):
@@ -138,7 +138,7 @@ async def test_a_cancelled_demand_is_sent_no_more(place: Place) -> None:
         assert await waiting(person) == []
 
 
-async def test_the_end_of_the_agent_is_told_to_who_waits_for_a_contract(place: Place) -> None:
+async def test_closing_the_agent_fails_the_wait_for_a_contract(place: Place) -> None:
     async with place.agent("person") as person:
         demand = asyncio.create_task(person.demand(OBJECTIVE))
         await posted(person)
@@ -148,8 +148,8 @@ async def test_the_end_of_the_agent_is_told_to_who_waits_for_a_contract(place: P
         assert await waiting(person) == [], "nobody waits for it any more"
 
 
-async def test_the_end_of_the_agent_is_told_to_who_waits_for_an_outcome(place: Place) -> None:
-    robot = obliging(place.agent("robot"))
+async def test_closing_the_agent_fails_the_wait_for_an_outcome(place: Place) -> None:
+    robot = offering(place.agent("robot"))
     async with place.provider(), robot:
         async with place.agent("person") as person:
             contract = await person.demand(job(place))
@@ -237,7 +237,7 @@ async def test_an_order_of_an_earlier_run_is_settled_when_it_is_taken(place: Pla
 
 
 async def test_a_contract_of_others_can_be_waited_for(place: Place) -> None:
-    robot = obliging(place.agent("robot"))
+    robot = offering(place.agent("robot"))
     async with place.provider(), robot, place.agent("person") as person, place.agent("provider") as stranger:
         address = (await person.demand(job(place))).address
         await known(robot, address)
@@ -265,7 +265,7 @@ async def test_what_is_no_contract_can_not_be_waited_for(place: Place) -> None:
 
 
 async def test_giving_up_to_wait_for_an_outcome_leaves_it_to_others(place: Place) -> None:
-    robot = obliging(place.agent("robot"))
+    robot = offering(place.agent("robot"))
     async with place.provider(), robot, place.agent("person") as person:
         contract = await person.demand(job(place))
         impatient, patient = (asyncio.create_task(contract.outcome()) for _ in range(2))
@@ -277,7 +277,7 @@ async def test_giving_up_to_wait_for_an_outcome_leaves_it_to_others(place: Place
 
 
 async def test_a_contract_refunded_without_a_result_has_no_recording(place: Place) -> None:
-    robot = obliging(place.agent("robot"))
+    robot = offering(place.agent("robot"))
     async with place.provider(), robot, place.agent("person") as person:
         contract = await person.demand(job(place))
         await known(robot, contract.address)

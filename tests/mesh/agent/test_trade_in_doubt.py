@@ -129,7 +129,7 @@ async def test_a_provider_without_room_is_asked_again(place: Place, caplog: pyte
             assert (await demand).liability.promisee == place.address("person")
 
 
-async def test_orders_of_a_contract_that_the_chain_took_back_are_sent_again(place: Place) -> None:
+async def test_orders_of_a_reverted_contract_are_sent_again(place: Place) -> None:
     """The provider who made it is gone, and another one has never heard of them."""
     async with working(place.agent("robot")) as robot, place.agent("person") as person:
         async with place.provider():
@@ -144,7 +144,7 @@ async def test_orders_of_a_contract_that_the_chain_took_back_are_sent_again(plac
             await until_found(lambda: all_posted(person, 0))
 
 
-async def test_a_contract_that_the_chain_took_back_and_nobody_makes_again_ends_at_its_deadline(place: Place) -> None:
+async def test_a_reverted_contract_that_is_not_created_again_fails_at_its_deadline(place: Place) -> None:
     async with working(place.agent("robot")) as robot, place.agent("person") as person:
         async with place.provider():
             contract = await person.demand(cid_of_bytes(b"a job that is made once"), lifetime=50)
@@ -166,7 +166,7 @@ async def test_a_contract_that_the_chain_took_back_and_nobody_makes_again_ends_a
         assert person.runtime.trader.watched == frozenset()
 
 
-async def test_a_contract_that_is_made_again_does_not_end_at_the_deadline(place: Place) -> None:
+async def test_a_contract_that_is_created_again_does_not_fail_at_the_deadline(place: Place) -> None:
     async with working(place.agent("robot")) as robot, place.agent("person") as person:
         async with place.provider():
             contract = await person.demand(cid_of_bytes(b"a job that is made twice"), lifetime=50)
@@ -209,7 +209,7 @@ async def test_a_contract_on_our_terms_that_a_stranger_has_signed_leaves_our_dem
         await asyncio.wait([demanding])
 
 
-async def test_an_offer_that_can_not_be_signed_anew_stops_nothing(
+async def test_an_offer_that_can_not_be_signed_again_stops_nothing(
     place: Place, caplog: pytest.LogCaptureFixture
 ) -> None:
     """One of two offers of generation 5 was taken; for the fee of the other one the robot has too little by then."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from schemas import cid_of_bytes
-from tests.support.market import Place, careless
+from tests.support.market import Place, offering_unseen
 from tests.support.objectives import objective
 from tests.support.waiting import until_found
 
@@ -25,7 +25,7 @@ def working(robot: Agent) -> Agent:
     async def nothing(job: Job, message: Any) -> None:
         pass
 
-    return careless(robot)
+    return offering_unseen(robot)
 
 
 def job(place: Place) -> Path:

@@ -20,7 +20,7 @@ from mesh.errors import ConfigurationError, NetworkUnavailable
 from mesh.settings import Settings
 from schemas import cid_of_bytes, cid_of_file
 from tests.support.development import settings_of
-from tests.support.market import obliging
+from tests.support.market import offering
 from tests.support.objectives import objective
 from tests.support.ports import free_endpoint
 from tests.support.waiting import until
@@ -82,7 +82,7 @@ async def test_a_job_from_up_to_the_recording(tmp_path: Path, printed: Printed) 
     path, out = tmp_path / "job.mcap", tmp_path / "new" / "result.mcap"
     path.write_bytes(objective(("/go", "there")))
     order: dict[str, Any] = ORDER | {"cost": "7wn"}
-    async with obliging(moving(Agent(MODEL, settings=robot, account=load_account(robot)))), asyncio.timeout(60):
+    async with offering(moving(Agent(MODEL, settings=robot, account=load_account(robot)))), asyncio.timeout(60):
         await demand(person, objective=str(path), out=out, as_json=False, **order)
         assert f"paid, result {cid_of_file(out)}\nrecording {out}\n" in printed
         assert f"demand by {load_account(person).address} for {MODEL}\ncontract 0x" in printed

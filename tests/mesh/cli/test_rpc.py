@@ -16,7 +16,7 @@ from mesh.network import ServiceFailed
 from schemas.message_requests import SendDemand
 from schemas.rpc import GUARDED, SERVICES, FinishLiability, Nothing, ReadLiability, StartLiability, TransferRequest
 from tests.mesh.cli.chains import columns
-from tests.support.market import obliging
+from tests.support.market import offering
 from tests.support.objectives import objective
 from tests.support.orders import LIGHTHOUSE, STRANGER, demand
 from tests.support.waiting import until_found
@@ -125,7 +125,7 @@ async def test_a_reply_is_facts_or_json(place: Place, capsys: pytest.CaptureFixt
 
 
 async def test_a_job_is_driven_from_the_command_line(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
-    async with place.at_work(obliging(place.agent("robot"))) as person:
+    async with place.at_work(offering(place.agent("robot"))) as person:
         contract = await person.demand(place.save(objective(("/go", "x"))), cost=1)
 
         async def started() -> bool:

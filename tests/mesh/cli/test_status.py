@@ -20,7 +20,7 @@ from schemas.status import ContentMetrics, MarketStatus, Status, StoreUse, Work
 from tests.mesh.cli.chains import columns
 from tests.mesh.market.floor import QUICK
 from tests.mesh.watching.test_presence import WAY, bridge_status, status
-from tests.support.market import MODEL, careless, obliging
+from tests.support.market import MODEL, offering, offering_unseen
 from tests.support.objectives import objective
 from tests.support.orders import MARKET, OBJECTIVE, ROBOT, STRANGER
 from tests.support.waiting import until_found
@@ -57,7 +57,7 @@ async def told(place: Place, role: str, capsys: pytest.CaptureFixture[str]) -> d
 async def test_an_agent_tells_its_parts_its_block_and_its_work(
     place: Place, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    async with place.at_work(obliging(place.agent("robot"))) as person:
+    async with place.at_work(offering(place.agent("robot"))) as person:
         contract = await person.demand(place.save(objective(("/go", "x"))), cost=1)
 
         async def is_ready() -> bool:
@@ -109,7 +109,7 @@ async def test_a_node_that_is_lost_is_said_by_those_who_wait_for_it(
 
 
 async def test_a_provider_tells_its_orders_and_what_it_earned(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
-    async with place.at_work(careless(place.agent("robot"))) as person:
+    async with place.at_work(offering_unseen(place.agent("robot"))) as person:
         await person.demand(place.save(objective(("/go", "x"))), cost=1)
         how = await told(place, "provider", capsys)
         await show_one(place.settings("watcher"), place.address("provider"), timeout=5.0, as_json=False)

@@ -27,7 +27,7 @@ from tests.mesh.evidence.jobs import LIABILITY, OTHER, make_job
 from tests.support.commands import aira, refused
 from tests.support.development import settings_of
 from tests.support.listening import Listener
-from tests.support.market import obliging
+from tests.support.market import offering
 from tests.support.objectives import objective
 from tests.support.ports import free_endpoint
 from tests.support.routers import client_config
@@ -153,7 +153,7 @@ async def served_market(folder: Path, capsys: pytest.CaptureFixture[str]) -> Asy
 
 def moving(robot: Settings) -> Agent:
     """A robot that goes where it is told to."""
-    agent = obliging(Agent(MODEL, settings=robot, account=load_account(robot)))
+    agent = offering(Agent(MODEL, settings=robot, account=load_account(robot)))
 
     @agent.on("/go")
     async def go(job: Job, message: object) -> None:

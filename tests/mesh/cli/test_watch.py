@@ -23,7 +23,7 @@ from schemas import Empty, RejectKey, Result, String, encode, message_hash, veri
 from schemas.signing import Rejection
 from tests.mesh.watching.test_market import EVENT, JOB
 from tests.support.commands import AIRA, environment, invoke, refused
-from tests.support.market import MODEL, obliging
+from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
 from tests.support.orders import CONTRACT, MARKET, RECORDING, ROBOT, TOKEN, demand, offer, result
 from tests.support.waiting import until, until_heard
@@ -73,7 +73,7 @@ async def watching(settings: Settings, model: str | None = None, *, json: bool =
 
 async def test_a_job_is_told_from_the_demand_to_the_payment(place: Place, said: Said) -> None:
     kinds = ["demand", "offer", "incoming", "ready", "complete", "result", "finalized"]
-    async with place.at_work(obliging(robot(place))) as person, watching(place.settings("watcher"), json=True):
+    async with place.at_work(offering(robot(place))) as person, watching(place.settings("watcher"), json=True):
         # Nobody else listens on such a key, and the market's were declared before it.
         await until_heard(person.parts.network.session, EVENT)
         contract = await person.demand(place.save(objective(("/go", "there"))), cost=5 * 10**9)
@@ -253,7 +253,7 @@ def test_without_a_router_it_is_one_clear_line(command: list[str]) -> None:
 async def test_what_a_result_without_a_contract_holds_is_shown(place: Place, said: Said) -> None:
     readings = objective(("/measurements", "0.5 1.0"), ("/measurements", "0.6 1.1"))
     work = asyncio.create_task(watch(place.settings("watcher"), None, with_open=False, readings=True, as_json=True))
-    async with place.at_work(obliging(robot(place))) as sensor:
+    async with place.at_work(offering(robot(place))) as sensor:
         await until_heard(sensor.parts.network.session, EVENT)
         cid = sensor.parts.store.put_file(place.save(readings))
         signed = sensor.parts.signer.sign(Result(liability=place.address("robot"), result=cid, success=True))

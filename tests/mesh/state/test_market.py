@@ -11,7 +11,7 @@ from mesh.recording import open_objective
 from mesh.state import ContentScope, back_up, restore
 from mesh.work import Phase
 from schemas import String
-from tests.support.market import in_phase, obliging
+from tests.support.market import in_phase, offering
 from tests.support.objectives import objective
 from tests.support.waiting import until
 
@@ -38,7 +38,7 @@ class Robot:
         self.released = asyncio.Event()
 
     def life(self) -> Agent:
-        robot = obliging(self._place.agent("robot"))
+        robot = offering(self._place.agent("robot"))
 
         @robot.on("/say")
         async def say(job: Job, message: String) -> None:

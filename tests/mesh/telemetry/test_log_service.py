@@ -16,7 +16,7 @@ from mesh.telemetry.logs import LogHandler, LogService, keep_log
 from mesh.watching.logs import LogReader
 from schemas import RpcKey
 from schemas.logs import LogsRead, ReadLogs
-from tests.support.market import obliging
+from tests.support.market import offering
 from tests.support.objectives import objective
 from tests.support.orders import OBJECTIVE, PERSON, ROBOT, STRANGER
 from tests.support.sites import Site
@@ -65,7 +65,7 @@ def talkative(robot: Agent) -> Agent:
     async def phase(phase: Any, liability: Any) -> None:
         log.info("it is %s", phase)
 
-    return obliging(robot)
+    return offering(robot)
 
 
 async def test_agent_and_provider_serve_the_events_of_a_liability(place: Place, kept: LogHandler) -> None:

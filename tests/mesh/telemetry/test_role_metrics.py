@@ -16,7 +16,7 @@ from mesh.network import Endpoints, Network
 from mesh.telemetry.serving import Telemetry
 from schemas import Demand, Empty, cid_of_bytes
 from schemas.status import ALIVE
-from tests.support.market import MODEL, obliging
+from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
 from tests.support.orders import demand
 from tests.support.scraping import Scrape, health, scraped
@@ -61,7 +61,7 @@ def url_of(agent: Agent) -> str:
 
 def blinking(place: Place) -> Agent:
     """A robot that does what it is asked for, and says something of it; its metrics are told."""
-    robot = obliging(place.agent("robot", metrics_listen=HERE))
+    robot = offering(place.agent("robot", metrics_listen=HERE))
 
     @robot.on("/go")
     async def go(job: Any, message: Any) -> None:
@@ -151,7 +151,7 @@ async def _finalized(url: str, count: float) -> bool:
 
 
 async def test_a_job_that_is_under_way_stands_in_its_phase_for_longer_and_longer(place: Place) -> None:
-    robot, done = obliging(place.agent("robot", metrics_listen=HERE)), asyncio.Event()
+    robot, done = offering(place.agent("robot", metrics_listen=HERE)), asyncio.Event()
 
     @robot.on("/go")
     async def go(job: Any, message: Any) -> None:

@@ -10,7 +10,7 @@ import pytest
 from mesh.agent import Phase
 from schemas import Empty, String, cid_of_file
 from tests.mesh.work.executions import COST, doing_nothing, heard, recorded
-from tests.support.market import Place, obliging
+from tests.support.market import Place, offering
 from tests.support.objectives import MILLISECOND, objective, timed
 from tests.support.waiting import until, until_found
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 async def test_an_objective_is_played_in_order_to_the_handlers_and_the_robot_is_paid(place: Place) -> None:
-    robot = obliging(place.agent("robot"))
+    robot = offering(place.agent("robot"))
     done: list[object] = []
 
     @robot.on("/go")
@@ -46,7 +46,7 @@ async def test_an_objective_is_played_in_order_to_the_handlers_and_the_robot_is_
 
 
 async def test_the_recording_holds_what_was_played_and_what_the_handler_published(place: Place) -> None:
-    robot = obliging(place.agent("robot"))
+    robot = offering(place.agent("robot"))
 
     @robot.on("/go")
     async def go(job: Job, message: String) -> None:
@@ -64,7 +64,7 @@ async def test_the_recording_holds_what_was_played_and_what_the_handler_publishe
 
 
 async def test_messages_come_at_their_recorded_times(place: Place) -> None:
-    robot = obliging(place.agent("robot", playback="recorded"))
+    robot = offering(place.agent("robot", playback="recorded"))
     times: list[float] = []
 
     @robot.on("/tick")
@@ -79,14 +79,14 @@ async def test_messages_come_at_their_recorded_times(place: Place) -> None:
 
 
 async def test_at_once_means_without_waiting_for_recorded_times(place: Place) -> None:
-    robot = doing_nothing(obliging(place.agent("robot", playback="at-once")))
+    robot = doing_nothing(offering(place.agent("robot", playback="at-once")))
     path = place.save(timed([("/tick", Empty(), hour * 3600 * 1000 * MILLISECOND) for hour in range(3)]))
     async with place.at_work(robot) as person, asyncio.timeout(20):
         assert (await (await person.demand(path)).outcome()).success
 
 
 async def test_jobs_are_done_one_after_the_other(place: Place) -> None:
-    robot = obliging(place.agent("robot"))
+    robot = offering(place.agent("robot"))
     begun: list[str] = []
     release = asyncio.Event()
 
@@ -109,8 +109,8 @@ async def test_jobs_are_done_one_after_the_other(place: Place) -> None:
     assert begun[0::2] == begun[1::2], "both messages of a job before any of the next"
 
 
-async def test_witnesses_hear_every_phase_in_order_with_its_record(place: Place) -> None:
-    robot = doing_nothing(obliging(place.agent("robot")))
+async def test_phase_handlers_get_every_phase_in_order_with_its_record(place: Place) -> None:
+    robot = doing_nothing(offering(place.agent("robot")))
     seen: list[tuple[Phase, Liability]] = []
 
     @robot.on_liability
@@ -129,7 +129,7 @@ async def test_witnesses_hear_every_phase_in_order_with_its_record(place: Place)
 
 
 async def test_a_handler_may_end_its_own_job(place: Place) -> None:
-    robot = obliging(place.agent("robot"))
+    robot = offering(place.agent("robot"))
     done: list[str] = []
 
     @robot.on("/go")
@@ -148,8 +148,8 @@ async def test_a_handler_may_end_its_own_job(place: Place) -> None:
     assert len(done) == 2, "nothing is played after the end"
 
 
-async def test_a_witness_may_end_the_job_that_has_just_begun(place: Place) -> None:
-    robot = doing_nothing(obliging(place.agent("robot")))
+async def test_a_phase_handler_may_end_the_job_that_has_just_started(place: Place) -> None:
+    robot = doing_nothing(offering(place.agent("robot")))
 
     @robot.on_liability
     async def phase(phase: Phase, liability: Liability) -> None:
@@ -162,7 +162,7 @@ async def test_a_witness_may_end_the_job_that_has_just_begun(place: Place) -> No
 
 
 async def test_only_the_chosen_topics_are_recorded(place: Place) -> None:
-    robot = obliging(place.agent("robot", recording_topics="/go, /led"))
+    robot = offering(place.agent("robot", recording_topics="/go, /led"))
 
     @robot.on("*")
     async def anything(job: Job, message: Any) -> None:
@@ -175,8 +175,8 @@ async def test_only_the_chosen_topics_are_recorded(place: Place) -> None:
     assert {topic.name for topic in recording.topics} == {"/go", "/led"}
 
 
-async def test_an_agent_told_not_to_work_leaves_liabilities_alone(place: Place) -> None:
-    robot = doing_nothing(obliging(place.agent("robot", enable_executor=False)))
+async def test_an_agent_without_executor_ignores_liabilities(place: Place) -> None:
+    robot = doing_nothing(offering(place.agent("robot", enable_executor=False)))
     async with place.at_work(robot) as person:
         contract = await person.demand(place.save(objective(("/go", Empty()))))
         head = await place.chains["robot"].block_number()
@@ -186,7 +186,7 @@ async def test_an_agent_told_not_to_work_leaves_liabilities_alone(place: Place) 
 
 
 async def test_played_messages_are_on_the_mesh(place: Place) -> None:
-    robot = doing_nothing(obliging(place.agent("robot")))
+    robot = doing_nothing(offering(place.agent("robot")))
     played: list[tuple[str, bytes, str]] = []
     async with place.at_work(robot) as person:
         listener: Any = person.parts.network.session.declare_subscriber(
@@ -204,7 +204,7 @@ async def test_played_messages_are_on_the_mesh(place: Place) -> None:
 
 
 async def test_a_burst_of_played_messages_arrives_whole(place: Place) -> None:
-    robot = doing_nothing(obliging(place.agent("robot")))
+    robot = doing_nothing(offering(place.agent("robot")))
     heard: list[bytes] = []
     words = [str(number) for number in range(500)]
     async with place.at_work(robot) as person:
@@ -221,7 +221,7 @@ async def test_a_burst_of_played_messages_arrives_whole(place: Place) -> None:
 
 async def test_a_late_device_message_of_a_played_topic_keeps_its_role(place: Place) -> None:
     """What was played and what was said on the same topic can be told apart in the recording."""
-    robot = obliging(place.agent("robot"))
+    robot = offering(place.agent("robot"))
 
     @robot.on("/go")
     async def go(job: Job, message: Any) -> None:

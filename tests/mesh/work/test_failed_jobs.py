@@ -16,7 +16,7 @@ from mesh.work.database import LedgerUnusable
 from mesh.work.run import NOTE_TOPIC
 from schemas import Empty, String, cid_of_bytes
 from tests.mesh.work.executions import COST, doing_nothing, heard, recorded
-from tests.support.market import Place, careless, obliging
+from tests.support.market import Place, offering, offering_unseen
 from tests.support.objectives import objective
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ async def refusal(place: Place, robot: Agent, content: bytes | str, **terms: Any
 
 @pytest.mark.parametrize("error", [JobFailed("the lamp is broken"), ValueError("the lamp is broken")], ids=repr)
 async def test_a_handler_that_raises_fails_its_job_and_the_promisee_is_refunded(place: Place, error: Exception) -> None:
-    robot = obliging(place.agent("robot"))
+    robot = offering(place.agent("robot"))
     calls = 0
 
     @robot.on("/go")
@@ -68,7 +68,7 @@ async def test_a_handler_that_raises_fails_its_job_and_the_promisee_is_refunded(
 
 
 async def test_a_handler_whose_inner_task_was_cancelled_has_not_done_its_job(place: Place) -> None:
-    robot = obliging(place.agent("robot"))
+    robot = offering(place.agent("robot"))
 
     @robot.on("/go")
     async def go(job: Job, message: Any) -> None:
@@ -81,7 +81,7 @@ async def test_a_handler_whose_inner_task_was_cancelled_has_not_done_its_job(pla
 
 
 async def test_a_message_of_another_type_than_the_handlers_is_refused_before_anything_is_played(place: Place) -> None:
-    robot = careless(place.agent("robot"))
+    robot = offering_unseen(place.agent("robot"))
     speeds: list[Speed] = []
 
     @robot.on("/go", Speed)
@@ -94,7 +94,7 @@ async def test_a_message_of_another_type_than_the_handlers_is_refused_before_any
 
 
 async def test_a_topic_without_handler_is_refused_before_anything_is_played(place: Place) -> None:
-    robot = careless(place.agent("robot"))
+    robot = offering_unseen(place.agent("robot"))
     done: list[object] = []
 
     @robot.on("/go")
@@ -107,25 +107,25 @@ async def test_a_topic_without_handler_is_refused_before_anything_is_played(plac
     assert done == []
 
 
-async def test_what_is_no_recording_is_refused(place: Place) -> None:
-    note, _ = await refusal(place, doing_nothing(careless(place.agent("robot"))), b"please go to the kitchen\n")
+async def test_a_file_that_is_no_recording_is_refused(place: Place) -> None:
+    note, _ = await refusal(place, doing_nothing(offering_unseen(place.agent("robot"))), b"please go to the kitchen\n")
     assert "not-a-recording" in note
 
 
 async def test_an_objective_that_nobody_holds_is_given_up_and_refunded(place: Place) -> None:
-    robot = doing_nothing(careless(place.agent("robot", fetch_timeout=0.2)))
+    robot = doing_nothing(offering_unseen(place.agent("robot", fetch_timeout=0.2)))
     note, _ = await refusal(place, robot, cid_of_bytes(b"held by nobody"))
     assert "is not available" in note
 
 
 async def test_an_objective_over_the_size_limit_is_refused(place: Place) -> None:
-    robot = doing_nothing(careless(place.agent("robot", objective_size_limit=2000)))
+    robot = doing_nothing(offering_unseen(place.agent("robot", objective_size_limit=2000)))
     note, _ = await refusal(place, robot, objective(("/blob", os.urandom(4000))))
     assert "2000 allowed" in note
 
 
 async def test_a_job_whose_objective_is_missing_does_not_hold_up_the_next(place: Place) -> None:
-    robot = doing_nothing(careless(place.agent("robot", fetch_timeout=30.0)))
+    robot = doing_nothing(offering_unseen(place.agent("robot", fetch_timeout=30.0)))
     async with place.at_work(robot) as person, asyncio.timeout(25):
         missing = await person.demand(cid_of_bytes(b"nobody has this"))
         good = await person.demand(place.save(objective(("/go", Empty()))))
@@ -138,7 +138,7 @@ async def test_a_job_whose_objective_is_missing_does_not_hold_up_the_next(place:
 async def test_a_failure_that_was_meant_is_logged_without_a_traceback(
     place: Place, caplog: pytest.LogCaptureFixture
 ) -> None:
-    robot = obliging(place.agent("robot"))
+    robot = offering(place.agent("robot"))
 
     @robot.on("/go")
     async def go(job: Job, message: Any) -> None:
@@ -158,7 +158,7 @@ async def test_a_ledger_that_can_not_be_written_ends_the_agent_and_fails_no_job(
     before = await place.chains["person"].block_number()
 
     def robot() -> Agent:
-        made = obliging(place.agent("robot"))
+        made = offering(place.agent("robot"))
 
         @made.on("/go")
         async def go(job: Job, message: Any) -> None:

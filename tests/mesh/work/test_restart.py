@@ -10,7 +10,7 @@ from mesh.recording import open_objective
 from mesh.work import Ledger
 from schemas import String, cid_of_file
 from tests.mesh.work.restarts import COST, WORDS, Paying, made_by_a_provider_that_goes, paid, speaking, words
-from tests.support.market import careless, in_phase, obliging
+from tests.support.market import in_phase, offering, offering_unseen
 from tests.support.orders import result
 from tests.support.waiting import until, until_found
 
@@ -28,7 +28,7 @@ __all__ = ["paid"]
 async def test_a_ready_job_is_done_after_a_restart(place: Place, paid: Paying) -> None:
     said: list[str] = []
     async with place.provider(), place.agent("person") as person:
-        async with obliging(place.agent("robot")) as robot:
+        async with offering(place.agent("robot")) as robot:
             contract = await person.demand(words(place), cost=COST)
             await in_phase(robot, contract, Phase.READY)
         async with speaking(place.agent("robot"), said) as robot:
@@ -38,11 +38,11 @@ async def test_a_ready_job_is_done_after_a_restart(place: Place, paid: Paying) -
     assert await paid.once()
 
 
-async def test_a_running_job_goes_on_where_it_was(place: Place, paid: Paying) -> None:
+async def test_a_running_job_continues_where_it_was(place: Place, paid: Paying) -> None:
     first: list[str] = []
     second: list[str] = []
     async with place.provider(), place.agent("person") as person:
-        async with speaking(obliging(place.agent("robot")), first, stuck_at="3"):
+        async with speaking(offering(place.agent("robot")), first, stuck_at="3"):
             contract = await person.demand(words(place), cost=COST)
             await until(lambda: len(first) == 3)
         async with speaking(place.agent("robot"), second):
@@ -57,7 +57,7 @@ async def test_a_running_job_goes_on_where_it_was(place: Place, paid: Paying) ->
 async def test_a_running_job_can_be_stopped_again_and_again(place: Place, paid: Paying) -> None:
     said: list[str] = []
     async with place.provider(), place.agent("person") as person:
-        async with speaking(obliging(place.agent("robot")), said, stuck_at="0") as robot:
+        async with speaking(offering(place.agent("robot")), said, stuck_at="0") as robot:
             contract = await person.demand(words(place), cost=COST)
             await in_phase(robot, contract, Phase.RUNNING)
         for stop in ("2", "2", "4"):
@@ -73,7 +73,7 @@ async def test_a_job_that_the_chain_ended_meanwhile_is_not_done(place: Place) ->
     said: list[str] = []
     seen: list[Phase] = []
     async with place.provider(), place.agent("person") as person:
-        async with obliging(place.agent("robot")) as robot:
+        async with offering(place.agent("robot")) as robot:
             contract = await person.demand(words(place))
             await in_phase(robot, contract, Phase.READY)
             failed = result(signer=robot.parts.signer, liability=contract.address, success=False)
@@ -107,7 +107,7 @@ async def reading(robot: Agent) -> None:
 async def test_a_liability_that_has_ended_before_the_agent_heard_of_it_is_no_job(place: Place) -> None:
     said: list[str] = []
     async with place.provider(), place.agent("person") as person:
-        async with obliging(place.agent("robot", enable_executor=False)) as robot:
+        async with offering(place.agent("robot", enable_executor=False)) as robot:
             await reading(robot)
             head, robot_memory = robot.parts.clock.head, robot.parts.directory
             contract = await person.demand(words(place))
@@ -122,7 +122,7 @@ async def test_a_liability_that_has_ended_before_the_agent_heard_of_it_is_no_job
     assert said == []
 
 
-async def told_again(robot: Agent, contract: Contract) -> None:
+async def created_again(robot: Agent, contract: Contract) -> None:
     """Have the chain take a contract back and tell it again, as when another block holds the same transaction."""
     hashes = await robot.parts.chain.liabilities.order_hashes(contract.address)
     await robot.runtime.listener.liability_reverted(contract.address)
@@ -131,10 +131,10 @@ async def told_again(robot: Agent, contract: Contract) -> None:
     await robot.runtime.listener.new_liability(contract.liability, demand_hash=hashes[0], offer_hash=hashes[1])
 
 
-async def test_a_job_that_rested_goes_on_where_it_was(place: Place, paid: Paying) -> None:
+async def test_a_job_that_was_set_aside_continues_where_it_was(place: Place, paid: Paying) -> None:
     said: list[str] = []
     released = asyncio.Event()
-    robot = obliging(place.agent("robot"))
+    robot = offering(place.agent("robot"))
 
     @robot.on("/say")
     async def say(job: Job, message: String) -> None:
@@ -146,7 +146,7 @@ async def test_a_job_that_rested_goes_on_where_it_was(place: Place, paid: Paying
     async with place.provider(), robot, place.agent("person") as person:
         contract = await person.demand(words(place), cost=COST)
         await until(lambda: len(said) == 3)
-        await told_again(robot, contract)
+        await created_again(robot, contract)
         released.set()
         assert (await contract.outcome()).success
         recording = open_objective(await contract.recording())
@@ -156,8 +156,8 @@ async def test_a_job_that_rested_goes_on_where_it_was(place: Place, paid: Paying
     assert await paid.once()
 
 
-async def test_a_job_may_rest_while_its_objective_is_looked_for(place: Place) -> None:
-    robot = careless(place.agent("robot", fetch_timeout=30.0))
+async def test_a_job_may_be_set_aside_while_its_objective_is_fetched(place: Place) -> None:
+    robot = offering_unseen(place.agent("robot", fetch_timeout=30.0))
     said: list[str] = []
     async with place.provider(), speaking(robot, said), place.agent("person") as person:
         path = words(place)
@@ -166,7 +166,7 @@ async def test_a_job_may_rest_while_its_objective_is_looked_for(place: Place) ->
         await robot.runtime.listener.liability_reverted(contract.address)
         await asyncio.to_thread(person.parts.store.put_file, path)
         await until_found(lambda: held(robot, contract), what="the objective")
-        await told_again(robot, contract)
+        await created_again(robot, contract)
         assert (await contract.outcome()).success
     assert said == WORDS
 
@@ -175,19 +175,19 @@ async def held(robot: Agent, contract: Contract) -> bool:
     return robot.parts.store.has(contract.liability.objective)
 
 
-async def test_a_finished_job_that_rested_sends_its_result_again(place: Place, paid: Paying) -> None:
+async def test_a_finished_job_that_was_set_aside_sends_its_result_again(place: Place, paid: Paying) -> None:
     said: list[str] = []
-    async with place.agent("person") as person, speaking(obliging(place.agent("robot")), said) as robot:
+    async with place.agent("person") as person, speaking(offering(place.agent("robot")), said) as robot:
         contract = await made_by_a_provider_that_goes(place, person)
         await in_phase(robot, contract, Phase.COMPLETE)
-        await told_again(robot, contract)
+        await created_again(robot, contract)
         async with place.provider():
             assert (await contract.outcome()).success
     assert said == WORDS
     assert await paid.once()
 
 
-async def test_a_chain_started_anew_is_another_memory(place: Place) -> None:
+async def test_a_restarted_development_chain_has_a_ledger_of_its_own(place: Place) -> None:
     """A development chain gives the same addresses to other contracts: an old job there must not hide a new one."""
     from mesh.chain import Chain
     from mesh.devchain import EmbeddedChain

@@ -13,7 +13,7 @@ from mesh.work.outbox import outgoing
 from schemas import String, cid_of_file
 from tests.mesh.work.restarts import COST, WORDS, Paying, made_by_a_provider_that_goes, paid, speaking, words
 from tests.mesh.work.samples import liability
-from tests.support.market import in_phase, obliging
+from tests.support.market import in_phase, offering
 from tests.support.orders import result
 from tests.support.waiting import until
 
@@ -28,7 +28,7 @@ __all__ = ["paid"]
 async def test_a_job_that_awaits_its_finish_keeps_its_recording_over_a_restart(place: Place) -> None:
     """Without handlers: what the device has said until the restart is in the Result."""
     async with place.provider(), place.agent("person") as person:
-        async with obliging(place.agent("robot")) as robot:
+        async with offering(place.agent("robot")) as robot:
             contract = await person.demand(words(place))
             await in_phase(robot, contract, Phase.READY)
             executor = robot.runtime.executor
@@ -53,7 +53,7 @@ async def test_a_job_that_awaits_its_finish_keeps_its_recording_over_a_restart(p
 
 async def test_a_finished_job_is_paid_when_the_provider_comes_late(place: Place, paid: Paying) -> None:
     said: list[str] = []
-    async with place.agent("person") as person, speaking(obliging(place.agent("robot")), said) as robot:
+    async with place.agent("person") as person, speaking(offering(place.agent("robot")), said) as robot:
         contract = await made_by_a_provider_that_goes(place, person)
         await in_phase(robot, contract, Phase.COMPLETE)
         assert not await paid.once()
@@ -67,7 +67,7 @@ async def test_a_finished_job_is_paid_when_the_provider_comes_late(place: Place,
 async def test_a_finished_job_is_paid_after_a_restart(place: Place, paid: Paying) -> None:
     said: list[str] = []
     async with place.agent("person") as person:
-        async with speaking(obliging(place.agent("robot")), said) as robot:
+        async with speaking(offering(place.agent("robot")), said) as robot:
             contract = await made_by_a_provider_that_goes(place, person)
             await in_phase(robot, contract, Phase.COMPLETE)
         async with speaking(place.agent("robot"), said) as robot, place.provider():
@@ -97,9 +97,9 @@ async def test_a_result_is_out_of_the_outbox_before_its_job_is_marked_as_finaliz
         assert job.phase is Phase.COMPLETE
 
 
-async def test_a_payment_that_the_chain_took_back_is_asked_for_again(place: Place, paid: Paying) -> None:
+async def test_the_result_of_a_reverted_payment_is_sent_again(place: Place, paid: Paying) -> None:
     said: list[str] = []
-    async with place.agent("person") as person, speaking(obliging(place.agent("robot")), said) as robot:
+    async with place.agent("person") as person, speaking(offering(place.agent("robot")), said) as robot:
         async with place.provider():
             contract = await person.demand(words(place), cost=COST)
             await in_phase(robot, contract, Phase.FINALIZED)
@@ -114,7 +114,7 @@ async def test_a_payment_that_the_chain_took_back_is_asked_for_again(place: Plac
     assert said == WORDS
 
 
-async def test_an_end_without_a_result_of_ours_is_not_taken_back(place: Place) -> None:
+async def test_a_finalization_without_a_result_is_not_reverted(place: Place) -> None:
     ours = liability(promisor=place.address("robot"))
     async with place.agent("robot") as robot:
         await robot.parts.ledger.add_job(ours)
@@ -125,11 +125,11 @@ async def test_an_end_without_a_result_of_ours_is_not_taken_back(place: Place) -
         assert await robot.parts.ledger.outbox(head=0) == []
 
 
-async def test_a_contract_that_is_made_again_elsewhere_is_one_job_and_paid_once(place: Place, paid: Paying) -> None:
+async def test_a_contract_created_again_at_another_address_is_paid_once(place: Place, paid: Paying) -> None:
     """A reorganisation took the contract; the provider makes it again of the same orders, at another address."""
     said: list[str] = []
     async with place.agent("person") as person, place.provider():
-        async with obliging(place.agent("robot")) as robot:
+        async with offering(place.agent("robot")) as robot:
             contract = await person.demand(words(place), cost=COST)
             first = contract.address
             await in_phase(robot, contract, Phase.READY)
