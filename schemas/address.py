@@ -36,9 +36,9 @@ def checksum_address(raw: bytes) -> str:
     if len(raw) != 20:
         raise InvalidAddress(raw.hex(), f"an address has 20 bytes, not {len(raw)}")
     lower = raw.hex().encode()
-    # EIP-55: a letter is a capital where the same digit of the hash of the text is 8 or more. All 40 characters are
-    # done at once in one integer, a byte each: of the hash's digits 8 and 9 have bit 3 set and a-f bit 6, of the
-    # address's only the letters have bit 6; clearing bit 5 of a letter makes it a capital.
+    # EIP-55: a letter is upper case if the same digit of the text's hash is 8 or more. This computes all 40 characters
+    # at once in one integer with a byte for each: among the hash's digits, 8 and 9 have bit 3 set and a-f bit 6; among
+    # the address's digits, only letters have bit 6; clearing bit 5 of a letter makes it upper case.
     text = int.from_bytes(lower, "big")
     digest = int.from_bytes(keccak256(lower)[:20].hex().encode(), "big")
     capitals = (digest >> 3 | digest >> 6) & text >> 6 & _LOW_BIT_OF_40
@@ -73,9 +73,9 @@ def address_bytes(text: str) -> bytes:
 
 
 def is_ens_name(text: str) -> bool:
-    """Whether `text` is an ENS name that may stand where an address is expected: `*.eth`, `*.sid` or `*.test`.
+    """Whether `text` is an ENS name that may replace an address: `*.eth`, `*.sid` or `*.test`.
 
-    Labels are ASCII letters of either case, digits, `-` and `_`, so that a name is always fit for a key.
+    Labels are ASCII letters of either case, digits, `-` and `_`, so every name can be part of a key.
     """
     if len(text) > _MAX_NAME or not text.isascii():
         return False

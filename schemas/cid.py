@@ -1,8 +1,8 @@
-"""CIDv0: the name of a content, base58 of `0x12 0x20` and the sha2-256 digest of the root block.
+"""CIDv0, the name of a file by its content: base58 of `0x12 0x20` and the sha2-256 digest of the root block.
 
-Only this one form is taken, 46 characters for exactly 34 bytes: the hash of a message packs the raw bytes of two
-names without their lengths, so names of other lengths would let a byte move from one to the other. A CIDv0 has no
-checksum: a typing error is most often a valid name that nobody has.
+Only this form is accepted, 46 characters for exactly 34 bytes: the hash of a message packs the raw bytes of two CIDs
+without their lengths, so CIDs of other lengths would let a byte move from one to the other. A CIDv0 has no checksum: a
+mistyped one is usually valid, but names nothing.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ _ALPHABET: Final = "123456789ABCDEFGHJKLMNPQRSTUVWXYZabcdefghijkmnopqrstuvwxyz"
 _NO_DIGIT: Final = 0xFF
 _DIGIT: Final = bytes(_ALPHABET.find(chr(code)) & 0xFF for code in range(256))
 
-# Decoding takes 48 digits at a time (a CIDv0 has 46), a byte each in one integer, and adds up neighbours in all of its
-# lanes at once: first pairs of digits, then pairs of pairs, then of those; six words of eight digits are left. A CID
-# that nobody has seen yet is decoded for every message with a new objective, and this halves its time.
+# Decoding processes 48 digits at a time (a CIDv0 has 46), a byte for each in one integer, and adds up neighbours in all
+# lanes at once: first pairs of digits, then pairs of pairs, then fours; six words of eight digits remain. Every message
+# with a new objective has a CID that is not in the cache, and this halves the time for it.
 _BLOCK: Final = 48
 _PAIRS: Final = int.from_bytes(b"\x00\xff" * 24, "big")
 _FOURS: Final = int.from_bytes(b"\x00\x00\xff\xff" * 12, "big")
@@ -38,7 +38,7 @@ def parse_cid(text: str) -> bytes:
     if len(text) != CID_LENGTH:
         raise InvalidCid(text, f"it has {CID_LENGTH} characters, this text {len(text)}")
     try:
-        # 46 digits are never more than 34 bytes, and what has fewer fails by its first two.
+        # 46 digits are never more than 34 bytes; with fewer the check of the first two bytes fails.
         multihash = base58_number(text).to_bytes(_MULTIHASH_SIZE, "big")
     except InputError:
         raise InvalidCid(text, "a character is not in the base58 alphabet") from None
@@ -71,7 +71,7 @@ def encode_base58(data: bytes) -> str:
 
 
 def decode_base58(text: str) -> bytes:
-    """The bytes behind a base58 text. Raises `InputError` if a character is not in the alphabet."""
+    """The bytes that a base58 text encodes. Raises `InputError` if a character is not in the alphabet."""
     number = base58_number(text)
     zeros = len(text) - len(text.lstrip("1"))
     return bytes(zeros) + number.to_bytes((number.bit_length() + 7) // 8, "big")

@@ -1,7 +1,7 @@
-"""The errors of AIRA mesh, by whose fault they are.
+"""The root of all errors of AIRA mesh, and the errors of invalid input.
 
-`AiraError` is the root of every error that the project raises on purpose. The branches here are those of what
-travels; the branches of what runs (configuration, network, chain, content) are in `mesh.errors`.
+`AiraError` is the base of every error that the project raises on purpose. Errors of configuration, network, chain and
+content are in `mesh.errors`.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from typing import ClassVar
 
 
 class AiraError(Exception):
-    """Anything that went wrong and that a person can act on.
+    """An error that a person can act on.
 
-    `str(error)` is one clear line; `hint` says what to do about it (one sentence, or empty). `code` is a stable word
-    for programs: it stays when the sentences change.
+    `str(error)` is one clear line; `hint` says what to do about it (one sentence, or empty). `code` is a stable name
+    for programs, which stays the same when the sentences change.
     """
 
     code: ClassVar[str] = "error"
@@ -24,13 +24,13 @@ class AiraError(Exception):
 
 
 class InputError(AiraError, ValueError):
-    """What was given is wrong: a message, a key, a name, a file. Giving it again changes nothing."""
+    """The input is wrong: a message, a key, a name, a file. Trying again does not help."""
 
     code = "input-error"
 
 
 class InvalidAddress(InputError):
-    """A text is no Ethereum address, or a mixed-case one whose EIP-55 checksum does not hold."""
+    """A text is not an Ethereum address, or it is in mixed case with a wrong EIP-55 checksum."""
 
     code = "invalid-address"
 
@@ -40,7 +40,7 @@ class InvalidAddress(InputError):
 
 
 class InvalidCid(InputError):
-    """A text or some bytes are no CIDv0 (base58 of a 34-byte sha2-256 multihash), or no block that such a CID names."""
+    """A text or bytes are not a CIDv0 (base58 of a 34-byte sha2-256 multihash), or not the block that a CID names."""
 
     code = "invalid-cid"
 
@@ -50,7 +50,7 @@ class InvalidCid(InputError):
 
 
 class InvalidKey(InputError):
-    """A key is outside the keyspace, or would have to be built from text that no key may hold."""
+    """A key is outside the keyspace, or a text can't be part of a key."""
 
     code = "invalid-key"
 
@@ -60,10 +60,10 @@ class InvalidKey(InputError):
 
 
 class InvalidMessage(InputError):
-    """A message can't be what it claims to be.
+    """A message is not valid.
 
-    `reason` is a short machine-readable word, the label under which a channel counts it (`not-json`, `field`,
-    `signature`, …); `detail` is for people.
+    `reason` is a short word for programs, by which channels count such messages (`not-json`, `field`, `signature`, …);
+    `detail` is for people.
     """
 
     code = "invalid-message"
@@ -75,7 +75,7 @@ class InvalidMessage(InputError):
 
 
 class InvalidRecord(InputError):
-    """A request, a reply or a liability record is not what it should be."""
+    """A request, a reply or a liability record is not valid."""
 
     code = "invalid-record"
 
@@ -85,7 +85,7 @@ class InvalidRecord(InputError):
 
 
 class InvalidPayload(InputError):
-    """The payload of a topic can't be read as the type it should have."""
+    """The payload of a topic is not of its type."""
 
     code = "invalid-payload"
 

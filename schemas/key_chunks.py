@@ -1,7 +1,7 @@
-"""The parts of keys: what each may hold, and its one canonical text.
+"""Chunks of keys: what each may contain, and its canonical text.
 
-Every function raises `InvalidKey`, and those that give a text give its canonical form. What they let pass is free of
-wildcards, blanks, control characters and empty chunks, and does not begin with `@`.
+Every function returns the canonical form of a text, or raises `InvalidKey`. Accepted texts contain no wildcards,
+blanks, control characters or empty chunks, and do not begin with `@`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _CHUNKS: Final = re.compile(rf"{_CHUNK}(?:/{_CHUNK})*")
 
 @lru_cache(maxsize=_CACHED)
 def lighthouse_chunk(text: str) -> str:
-    """A lighthouse: its ENS name or, if it has none, its address; in lower case."""
+    """A lighthouse: its ENS name, or its address if it has none; in lower case."""
     try:
         return parse_address_or_name(text).lower()
     except InvalidAddress:
@@ -53,9 +53,9 @@ def cid_chunk(text: str) -> str:
 
 
 def hash_chunk(text: str) -> str:
-    """A 32-byte hash: 64 hexadecimal digits, in lower case and without `0x` already."""
+    """A 32-byte hash: 64 hexadecimal digits in lower case, without `0x`."""
     try:
-        # Also refuses capitals and the blanks that bytes.fromhex() skips.
+        # This also rejects upper case and the blanks that bytes.fromhex() skips.
         if len(text) == 64 and bytes.fromhex(text).hex() == text:
             return text
     except ValueError:
@@ -64,27 +64,27 @@ def hash_chunk(text: str) -> str:
 
 
 def name_chunk(text: str) -> str:
-    """A name that somebody chose: a role, a device."""
+    """A freely chosen name: a role, a device."""
     if len(text) > MAX_PATH_LENGTH or not _ONE_CHUNK.fullmatch(text):
-        raise InvalidKey(text, "a name has letters, digits, - _ ~ and, after the first of them, dots")
+        raise InvalidKey(text, "a name consists of letters, digits, - _ ~ and, after the first character, dots")
     return text
 
 
 def check_event(text: str, *known: str) -> None:
-    """Refuse the name of an event that is none of those known."""
+    """Raise `InvalidKey` for an event that is not one of `known`."""
     if text not in known:
-        raise InvalidKey(text, f"it is none of the events {', '.join(known)}")
+        raise InvalidKey(text, f"it is not one of the events {', '.join(known)}")
 
 
 def path_chunks(text: str) -> str:
-    """Several names with `/` between them: a service."""
+    """Several names separated by `/`: a service."""
     if len(text) > MAX_PATH_LENGTH or not _CHUNKS.fullmatch(text):
-        raise InvalidKey(text, f"a path is names with / between them, of {MAX_PATH_LENGTH} characters at most")
+        raise InvalidKey(text, f"a path is names separated by /, at most {MAX_PATH_LENGTH} characters long")
     return text
 
 
 def topic_chunks(text: str) -> str:
-    """A topic as ROS writes it: `/`, and names with `/` between them."""
+    """A topic as in ROS: `/`, and names separated by `/`."""
     if not text.startswith("/"):
         raise InvalidKey(text, "a topic begins with /")
     path_chunks(text[1:])
@@ -107,4 +107,4 @@ CANONICAL: Final[dict[str, Callable[[str], str]]] = {
     "service": path_chunks,
     "topic": topic_chunks,
 }
-"""What the field of that name in any key may hold."""
+"""The check of each field of a key, by the field's name."""

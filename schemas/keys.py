@@ -1,11 +1,12 @@
-"""The keyspace: which keys there are, and what each says.
+"""The keyspace: all keys and their meaning.
 
-`str(key)` gives the text of a key, `parse_key` reads one; both go through the same checks, because Zenoh itself takes
-blanks, line ends and NUL in a key. There is one text for a key and one key for a text.
+`str(key)` is the text of a key, `parse_key` parses one; both make the same checks, because Zenoh itself accepts blanks,
+line ends and NUL in a key. Each key has exactly one text.
 
-A lighthouse is named by its ENS name in lower case, or by its address if it has none. Addresses are in lower case (the
-classes take any case), hashes are 64 hexadecimal digits in lower case without `0x`. A topic is written as in ROS,
+A lighthouse is given by its ENS name in lower case, or by its address if it has none. Addresses are in lower case (the
+classes accept any case), hashes are 64 hexadecimal digits in lower case without `0x`. A topic is written as in ROS,
 `/a/b`, and becomes the chunks `a/b`. Selectors are key expressions with wildcards, for subscribers and queries.
+To add a family of keys, add its class, its pattern in `_parse`, and a selector.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _MARKET_PATTERNS: Final = {
 
 
 class _Key(Struct, frozen=True, gc=False):
-    """A key of some family. Constructing one raises `InvalidKey` if a field holds what no key may hold."""
+    """The base of all keys. Constructing one raises `InvalidKey` if a field is not valid in a key."""
 
     def __post_init__(self) -> None:
         for field in self.__struct_fields__:
@@ -46,7 +47,7 @@ class _Key(Struct, frozen=True, gc=False):
 
 
 class DemandKey(_Key, frozen=True):
-    """A Demand for `model` with this message hash; written by the promisee."""
+    """A Demand for `model` with this message hash; put by the promisee."""
 
     lighthouse: str
     model: str
@@ -57,7 +58,7 @@ class DemandKey(_Key, frozen=True):
 
 
 class OfferKey(_Key, frozen=True):
-    """An Offer of `model` with this message hash; written by the promisor."""
+    """An Offer of `model` with this message hash; put by the promisor."""
 
     lighthouse: str
     model: str
@@ -68,7 +69,7 @@ class OfferKey(_Key, frozen=True):
 
 
 class ResultKey(_Key, frozen=True):
-    """A Result of `liability` with this message hash; written by the promisor."""
+    """A Result of `liability` with this message hash; put by the promisor."""
 
     lighthouse: str
     liability: str
@@ -79,7 +80,7 @@ class ResultKey(_Key, frozen=True):
 
 
 class FeedbackKey(_Key, frozen=True):
-    """A generation-5 provider's feedback on the order with the hash `order`; `hash` tells several apart."""
+    """A generation-5 provider's feedback on the order with the hash `order`; `hash` distinguishes several."""
 
     lighthouse: str
     order: str
@@ -100,7 +101,7 @@ class PendingKey(_Key, frozen=True):
 
 
 class RejectKey(_Key, frozen=True):
-    """Why `provider` can't match the order with the hash `order`."""
+    """The reason why `provider` rejects the order or result with the hash `order`."""
 
     lighthouse: str
     order: str
@@ -122,7 +123,7 @@ class PresenceKey(_Key, frozen=True):
 
 
 class EventKey(_Key, frozen=True):
-    """What happened to `liability`: `incoming`, `ready`, `complete` or `finalized`; written by the agent."""
+    """What happened to `liability`: `incoming`, `ready`, `complete` or `finalized`; put by the agent."""
 
     agent: str
     liability: str
@@ -137,7 +138,7 @@ class EventKey(_Key, frozen=True):
 
 
 class ObjectiveTopicKey(_Key, frozen=True):
-    """A topic of the objective of `liability`, as the agent's executor plays it."""
+    """A topic of the objective of `liability`, as the agent plays it."""
 
     agent: str
     liability: str
@@ -148,7 +149,7 @@ class ObjectiveTopicKey(_Key, frozen=True):
 
 
 class LiabilityTopicKey(_Key, frozen=True):
-    """A topic that the device publishes for `liability`: what is recorded."""
+    """A topic of the job for `liability`, on which the device publishes; it is recorded."""
 
     agent: str
     liability: str
@@ -194,7 +195,7 @@ class EthEventKey(_Key, frozen=True):
 
 
 class CidKey(_Key, frozen=True):
-    """A block or a file by its content; answered by whoever holds it."""
+    """A block or a file by its CID; answered by every store that has it."""
 
     cid: str
 
@@ -208,11 +209,11 @@ Key: TypeAlias = MarketKey | AgentKey | PresenceKey | CidKey
 
 
 def parse_key(text: str) -> Key:
-    """The key that `text` spells. Raises `InvalidKey` if it is none, or not in the one form that `str(key)` has."""
+    """The key with this text. Raises `InvalidKey` if there is none, or if it is not in the canonical form."""
     if len(text) > MAX_KEY_LENGTH:
         raise InvalidKey(text, f"it is longer than {MAX_KEY_LENGTH} characters")
     if str(key := _parse(text)) != text:
-        raise InvalidKey(text, f"it has to be written {key}")
+        raise InvalidKey(text, f"its canonical form is {key}")
     return key
 
 
@@ -257,23 +258,23 @@ def _parse_of_agent(text: str, agent: str, path: list[str]) -> AgentKey:
 
 
 def market_selector(lighthouse: str, kind: MarketKind, model: str = "*") -> str:
-    """All messages of a kind on a lighthouse; demands and offers of one model only, if `model` is its CID."""
+    """All messages of a kind on a lighthouse; with `model` (CID), only the demands or offers of that model."""
     pattern = _MARKET_PATTERNS.get(kind)
     if pattern is None:
-        raise InvalidKey(kind, f"it is none of the kinds {', '.join(_MARKET_PATTERNS)}")
+        raise InvalidKey(kind, f"it is not one of the kinds {', '.join(_MARKET_PATTERNS)}")
     if model != "*" and "{model}" not in pattern:
-        raise InvalidKey(model, f"the keys of a {kind} do not name a model")
+        raise InvalidKey(model, f"the keys of a {kind} have no model")
     chunk = model if model == "*" else cid_chunk(model)
     return f"aira/{lighthouse_chunk(lighthouse)}/{pattern.format(model=chunk)}"
 
 
 def lighthouse_selector(lighthouse: str) -> str:
-    """All that is on a lighthouse's market, for who comes late; no wildcard matches presence."""
+    """All messages on a lighthouse's market; presence tokens are not matched by wildcards."""
     return f"aira/{lighthouse_chunk(lighthouse)}/**"
 
 
 def presence_selector(lighthouse: str, role: str = "*") -> str:
-    """The liveliness tokens of all agents on a lighthouse, or of those in one role."""
+    """The presence tokens of all agents on a lighthouse, or of those in one role."""
     chunk = role if role == "*" else name_chunk(role)
     return f"aira/{lighthouse_chunk(lighthouse)}/@agent/{chunk}/*"
 
@@ -294,6 +295,6 @@ def topic_selector(agent: str, liability: str) -> str:
 
 
 def device_selector(agent: str, device: str = "*") -> str:
-    """All topics outside any job of one device of an agent, or of all."""
+    """All topics outside any job of one device of an agent, or of all its devices."""
     chunk = device if device == "*" else name_chunk(device)
     return f"aira/agent/{address_chunk(agent)}/device/{chunk}/**"

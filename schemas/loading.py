@@ -1,4 +1,4 @@
-"""Packages whose names are loaded when they are asked for: who uses a part pays for that part only (PEP 562)."""
+"""Packages that import a public name when it is first used, so that programs load only what they need (PEP 562)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def on_demand(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
-    """A `__getattr__` for `package` (its `__name__`): each name is loaded from its home, a module, and then kept."""
+    """A `__getattr__` for `package` (its `__name__`): it imports each name from its module in `homes`, once."""
 
     def load(name: str) -> Any:
         if name not in homes:

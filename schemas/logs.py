@@ -1,6 +1,6 @@
-"""Events of a role's log, and how they are asked for: the service `logs` of agents, providers and bridges.
+"""Log events, and the requests for them: the service `logs` of agents, providers, bridges and edge agents.
 
-An event as a JSON line on stderr has the same names. These records may have fields that a reader does not know yet.
+An event as a JSON line on stderr has the same fields. Readers ignore unknown fields.
 """
 
 from __future__ import annotations
@@ -11,66 +11,66 @@ from typing import Final
 from schemas.records import Record
 
 LEVELS: Final = ("debug", "info", "warning", "error", "critical")
-"""How much an event matters, from the least."""
+"""The levels, in ascending order."""
 
 
 class LogEvent(Record, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=False):
-    """Something that happened. Empty fields don't travel."""
+    """One event of a log. Empty fields are not sent."""
 
     sequence: int = 0
-    """Its number in the log of its process, from 1 on."""
+    """Its number in the log of its process, from 1."""
     time: str
     """ISO 8601, UTC, with milliseconds and `Z`."""
     level: str
     """One of `LEVELS`."""
     logger: str
-    """The module that says it."""
+    """The module that logged it."""
     event: str = ""
     """The stable name of what happened (`contract-created`), for programs; empty for other programs' lines."""
     message: str
     role: str = ""
-    """What speaks: agent, provider, router, bridge, edge."""
+    """The role of the process: agent, provider, router, bridge, edge."""
     address: str = ""
-    """Its account (EIP-55)."""
+    """The account of the process (EIP-55)."""
     lighthouse: str = ""
     liability: str = ""
     """The contract that it concerns (EIP-55)."""
     facts: Mapping[str, str] = {}
-    """What else is known, by name; members of the event itself in a JSON line."""
+    """Further fields by name; in a JSON line they are members of the event itself."""
     error: str = ""
-    """The exception, in a line."""
+    """The exception, in one line."""
     trace: str = ""
-    """Where it was raised, as Python tells it, with line breaks."""
+    """Its traceback, with line breaks."""
 
 
 class ReadLogs(Record, frozen=True, kw_only=True):
-    """Ask for events, the oldest first."""
+    """A request for events, the oldest first."""
 
     after: Mapping[str, int] = {}
-    """What the asker has by now: the sequence number of the last event, by instance."""
+    """The sequence number of the last event that the caller has, by instance."""
     lines: int = 100
-    """How many of the newest events an instance tells that is not in `after`."""
+    """How many of the newest events to return from an instance that is not in `after`."""
     level: str = "debug"
-    """The least that is told, one of `LEVELS`."""
+    """The lowest level to return, one of `LEVELS`."""
     liability: str = ""
-    """Only what concerns this contract (empty: all)."""
+    """Return only events that concern this contract (empty: all)."""
 
 
 class LogsRead(Record, frozen=True, kw_only=True, forbid_unknown_fields=False):
-    """As many events as fit into a reply."""
+    """The reply: as many events as fit."""
 
     instance: str
-    """One run of the process: after a restart it is another one."""
+    """An id of this run of the process; it changes at a restart."""
     began: str
-    """When that was; as `LogEvent.time`."""
+    """When this run started; as `LogEvent.time`."""
     role: str = ""
     entries: tuple[LogEvent, ...] = ()
     last: int
-    """The sequence number to ask from next."""
+    """The sequence number to continue from."""
     more: bool = False
-    """Whether there are further events already."""
+    """Whether there are more events now."""
     missed: int = 0
-    """Events after the one that was asked from that are kept no more."""
+    """How many of the requested events are no longer in memory."""
 
 
 __all__ = ["LEVELS", "LogEvent", "LogsRead", "ReadLogs"]

@@ -18,7 +18,7 @@ _MAX_DIGITS: Final = len(str(MAX_UINT256))
 
 
 class _OrderFields(Record, frozen=True, kw_only=True, rename="camel"):
-    """The fields that the requests for a Demand and for an Offer have in common."""
+    """The fields that requests for a Demand and for an Offer share."""
 
     model: str
     objective: str
@@ -62,7 +62,7 @@ class SignResult(Record, frozen=True, kw_only=True):
 
 
 class SendDemand(_OrderFields, frozen=True, kw_only=True, rename="camel", omit_defaults=True):
-    """Publish a signed Demand. `nonce` is 64 hexadecimal digits, or decimal ones where `sender` is there."""
+    """Publish a signed Demand. `nonce` is 64 hexadecimal digits, or decimal digits if there is a `sender`."""
 
     validator_fee: UInt256
     nonce: str
@@ -80,7 +80,7 @@ class SendDemand(_OrderFields, frozen=True, kw_only=True, rename="camel", omit_d
 
 
 class SendOffer(_OrderFields, frozen=True, kw_only=True, rename="camel", omit_defaults=True):
-    """Publish a signed Offer. `nonce` is 64 hexadecimal digits, or decimal ones where `sender` is there."""
+    """Publish a signed Offer. `nonce` is 64 hexadecimal digits, or decimal digits if there is a `sender`."""
 
     lighthouse_fee: UInt256
     nonce: str
@@ -116,13 +116,13 @@ class SendResult(Record, frozen=True, kw_only=True):
 
 
 class Published(Record, frozen=True):
-    """The message went out; `hash` is its hash, 64 hexadecimal digits."""
+    """The message was published; `hash` is its hash, 64 hexadecimal digits."""
 
     hash: str
 
 
 def _fields(request: Record) -> dict[str, Any]:
-    """The fields of a request as those of its message, whose amounts are plain ints."""
+    """The fields of a request as those of its message, with plain ints as amounts."""
     fields = msgspec.structs.asdict(request)
     return {name: int(value) if isinstance(value, UInt256) else value for name, value in fields.items()}
 

@@ -74,7 +74,7 @@ class _Order(_Message, frozen=True, kw_only=True, rename="camel"):
 
     @property
     def generation(self) -> Literal[3, 5]:
-        """The generation of the network whose rules the order follows: 5 if it names its sender, else 3."""
+        """The generation of the message format: 5 if the order has a sender, else 3."""
         return 3 if self.sender is None else 5
 
     def __post_init__(self) -> None:
@@ -82,19 +82,19 @@ class _Order(_Message, frozen=True, kw_only=True, rename="camel"):
             parse_cid(self.model)
             force_setattr(self, "model", intern(self.model))
             parse_cid(self.objective)
-            _settle_address(self, "token", self.token)
-            _settle_address(self, "lighthouse", self.lighthouse)
-            _settle_address(self, "validator", self.validator)
+            _set_address(self, "token", self.token)
+            _set_address(self, "lighthouse", self.lighthouse)
+            _set_address(self, "validator", self.validator)
             if self.sender is not None:
-                _settle_address(self, "sender", self.sender)
+                _set_address(self, "sender", self.sender)
         except (InvalidCid, InvalidAddress) as error:
-            _refuse(self, error)
+            _raise_invalid(self, error)
         _check_uint256("cost", self.cost)
         _check_uint256("deadline", self.deadline)
-        self._settle_nonce()
-        _settle_signature(self, self.signature)
+        self._set_nonce()
+        _set_signature(self, self.signature)
 
-    def _settle_nonce(self) -> None:
+    def _set_nonce(self) -> None:
         nonce = self.nonce
         if self.sender is not None:
             if type(nonce) is not int:
@@ -109,10 +109,10 @@ class _Order(_Message, frozen=True, kw_only=True, rename="camel"):
 
 
 class Demand(_Order, frozen=True, kw_only=True):
-    """A promisee's order: who does `objective` by `model` until `deadline` gets `cost` of `token`.
+    """A promisee's order: it pays `cost` of `token` for doing `objective` by `model` before `deadline`.
 
-    `nonce` is 64 hexadecimal digits in generation 3 and the factory's `nonceOf(sender)` in generation 5; `sender` is
-    there in generation 5 only. `validator` is the zero address if there is none; `validator_fee` is in wn.
+    `nonce` is 64 hexadecimal digits in generation 3 and the factory's `nonceOf(sender)` in generation 5; only
+    generation 5 has a `sender`. `validator` is the zero address if there is none; `validator_fee` is in wn.
     """
 
     kind: ClassVar[MarketKind] = "demand"
@@ -126,7 +126,7 @@ class Demand(_Order, frozen=True, kw_only=True):
 
 
 class Offer(_Order, frozen=True, kw_only=True):
-    """A promisor's order: does `objective` by `model` for `cost` of `token`.
+    """A promisor's order: it does `objective` by `model` for `cost` of `token`.
 
     It pays `lighthouse_fee` wn to the provider; `nonce` and `sender` are as in a `Demand`.
     """
@@ -144,8 +144,8 @@ class Offer(_Order, frozen=True, kw_only=True):
 class Result(_Message, frozen=True, kw_only=True):
     """A promisor's report: `result` is the CID of the recording, `success` whether the job was done.
 
-    `liability` is the contract's address or, for an answer to a Demand that cost nothing and made no contract, the
-    address of the one who asked.
+    `liability` is the contract's address or, in answer to a Demand of cost 0 without a contract, the address of the
+    promisee.
     """
 
     kind: ClassVar[MarketKind] = "result"
@@ -164,17 +164,17 @@ class Result(_Message, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         try:
-            _settle_address(self, "liability", self.liability)
+            _set_address(self, "liability", self.liability)
             parse_cid(self.result)
         except (InvalidCid, InvalidAddress) as error:
-            _refuse(self, error)
+            _raise_invalid(self, error)
         if type(self.success) is not bool:
             raise InvalidMessage("field", "success: expected a boolean")
-        _settle_signature(self, self.signature)
+        _set_signature(self, self.signature)
 
 
 class OrderFeedback(_Message, frozen=True, kw_only=True):
-    """A generation-5 provider's word that it has taken an order: `order` is the order's hash, 64 hexadecimal digits.
+    """A generation-5 provider's feedback on an order: `order` is the order's hash, 64 hexadecimal digits.
 
     What its signature covers is not documented, so it can't be verified.
     """
@@ -192,13 +192,13 @@ class OrderFeedback(_Message, frozen=True, kw_only=True):
         return self.order
 
     def __post_init__(self) -> None:
-        _settle_hash(self, "order", self.order)
+        _set_hash(self, "order", self.order)
         _check_uint256("accepted", self.accepted)
-        _settle_signature(self, self.signature)
+        _set_signature(self, self.signature)
 
 
 class TransactionFeedback(_Message, frozen=True, kw_only=True):
-    """A generation-5 provider's word that it has sent a transaction: `tx` is its hash, 64 hexadecimal digits."""
+    """A generation-5 provider's notice of a transaction it has sent: `tx` is its hash, 64 hexadecimal digits."""
 
     kind: ClassVar[MarketKind] = "pending"
     mark: ClassVar[str] = "tx"
@@ -211,7 +211,7 @@ class TransactionFeedback(_Message, frozen=True, kw_only=True):
         return self.tx
 
     def __post_init__(self) -> None:
-        _settle_hash(self, "tx", self.tx)
+        _set_hash(self, "tx", self.tx)
 
 
 Order: TypeAlias = Demand | Offer
@@ -247,8 +247,8 @@ def resolve_names(message: _AnyMessage, addresses: Mapping[str, str]) -> _AnyMes
     return replace(message, **{field: parse_address(addresses[text]) for field, text in texts.items() if text in names})
 
 
-def _settle_address(message: Struct, field: str, text: str) -> None:
-    # The cached text replaces its equal: the same few addresses stand in a million open orders, and in memory once.
+def _set_address(message: Struct, field: str, text: str) -> None:
+    # The cached text replaces the equal one, so that an address in a million open orders is in memory once.
     canonical = parse_address_or_name(text)
     if canonical is not text:
         force_setattr(message, field, canonical)
@@ -261,7 +261,7 @@ def _check_uint256(field: str, value: int) -> None:
         raise InvalidMessage("range", f"{field}: expected an integer from 0 to 2^256-1")
 
 
-def _settle_signature(message: Struct, text: str) -> None:
+def _set_signature(message: Struct, text: str) -> None:
     if not text:
         return
     digits = _hex_digits(text, SIGNATURE_SIZE)
@@ -271,7 +271,7 @@ def _settle_signature(message: Struct, text: str) -> None:
         force_setattr(message, "signature", digits)
 
 
-def _settle_hash(message: Struct, field: str, text: str) -> None:
+def _set_hash(message: Struct, field: str, text: str) -> None:
     digits = _hex_digits(text, 32)
     if digits is None:
         raise InvalidMessage("hash", f"{field}: expected 64 hexadecimal digits")
@@ -280,7 +280,7 @@ def _settle_hash(message: Struct, field: str, text: str) -> None:
 
 
 def _hex_digits(text: str, size: int) -> str | None:
-    """The canonical digits of a text of `size` bytes, or None if it isn't one."""
+    """The canonical hexadecimal digits of `size` bytes, or None if `text` is something else."""
     if text[:2] == "0x":
         text = text[2:]
     if len(text) != 2 * size:
@@ -289,11 +289,11 @@ def _hex_digits(text: str, size: int) -> str | None:
         raw = bytes.fromhex(text)
     except ValueError:
         return None
-    # bytes.fromhex() skips blanks: what has the right number of characters, but blanks among them, is too short here.
+    # bytes.fromhex() skips blanks, so a text with blanks among its characters is too short here.
     return raw.hex() if len(raw) == size else None
 
 
-def _refuse(message: Struct, error: InvalidCid | InvalidAddress) -> NoReturn:
+def _raise_invalid(message: Struct, error: InvalidCid | InvalidAddress) -> NoReturn:
     field = next(name for name in message.__struct_fields__ if getattr(message, name) == error.text)
     reason = "cid" if isinstance(error, InvalidCid) else "address"
     raise InvalidMessage(reason, f"{field}: {error}") from error

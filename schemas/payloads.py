@@ -1,7 +1,7 @@
-"""What the bytes on a topic are: the type of a payload, in Zenoh's encoding field and in a recording's schema.
+"""Payloads of topics: their types, in Zenoh's encoding field and in the schemas of recordings, and Python values.
 
-A topic's payload is carried as it is; its type says how to read it. The two ROS types that the legacy network's lessons
-use, std_msgs/Empty and std_msgs/String, are here in full; of other types only the name travels with a message.
+Payloads are carried unchanged; the type says how to decode them. The two ROS types of the legacy network's lessons,
+std_msgs/Empty and std_msgs/String, are defined here; of other types only the name travels with a message.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ _DECODER: Final = msgspec.json.Decoder()
 
 
 class PayloadType(Struct, frozen=True):
-    """How the bytes of a payload are to be read, in the words of MCAP.
+    """How to decode a payload, in the terms of MCAP.
 
     `encoding` is the message encoding (`ros1`, `json`, `cdr`, `protobuf`, …), `schema_name` the type's name,
-    `schema_encoding` says how `schema_data` describes it; both are empty if the description is not at hand.
+    `schema_encoding` says how `schema_data` describes it; both are empty if the description is not known.
     """
 
     encoding: str
@@ -48,7 +48,7 @@ class PayloadType(Struct, frozen=True):
 
 
 class Empty(Struct, frozen=True):
-    """std_msgs/Empty: no bytes at all."""
+    """std_msgs/Empty: no bytes."""
 
     type: ClassVar[PayloadType] = PayloadType("ros1", "std_msgs/Empty", "ros1msg", b"")
     md5: ClassVar[str] = "d41d8cd98f00b204e9800998ecf8427e"
@@ -87,7 +87,7 @@ class String(Struct, frozen=True):
     def decode(cls, payload: bytes) -> String:
         """The message in a payload. Raises `InvalidPayload` if the length does not fit or the text is not UTF-8."""
         if len(payload) < _LENGTH.size or _LENGTH.unpack_from(payload)[0] != len(payload) - _LENGTH.size:
-            raise InvalidPayload("std_msgs/String", f"its length does not fit its {len(payload)} bytes")
+            raise InvalidPayload("std_msgs/String", f"its length field does not match its {len(payload)} bytes")
         try:
             return cls(payload[_LENGTH.size :].decode())
         except UnicodeDecodeError as error:
@@ -103,9 +103,9 @@ _KNOWN: Final = {known.zenoh_encoding: known for known in (EMPTY, STRING, JSON, 
 
 
 def payload_type(zenoh_encoding: str) -> PayloadType:
-    """The type that the text of Zenoh's encoding field names; `RAW` for none.
+    """The type in the text of Zenoh's encoding field; `RAW` if it is empty.
 
-    Of a type that is not known here `schema_data` is empty.
+    `schema_data` is empty for a type that is not defined here.
     """
     known = _KNOWN.get(zenoh_encoding)
     if known is not None:
@@ -120,8 +120,8 @@ def payload_type(zenoh_encoding: str) -> PayloadType:
 def encode_value(value: object) -> tuple[bytes, PayloadType]:
     """The payload of a value, and its type.
 
-    `Empty`, `String` and str become the ROS types, bytes travel as they are; a msgspec Struct, a dict or anything else
-    that JSON can hold becomes JSON. Raises `InvalidPayload` for what can't travel.
+    `Empty`, `String` and str become the ROS types, bytes stay unchanged; a msgspec Struct, a dict or any other value
+    that JSON can represent becomes JSON. Raises `InvalidPayload` for other values.
     """
     match value:
         case Empty() | String():
@@ -137,9 +137,9 @@ def encode_value(value: object) -> tuple[bytes, PayloadType]:
 
 
 def decode_value(payload: bytes, kind: PayloadType) -> Any:
-    """What a payload of `kind` says: `Empty`, `String`, JSON data, or the bytes themselves for any other type.
+    """The value of a payload of type `kind`: `Empty`, `String`, JSON data, or the bytes for any other type.
 
-    Raises `InvalidPayload` if the payload is not what its type says.
+    Raises `InvalidPayload` if the payload is not of that type.
     """
     match kind.encoding, kind.schema_name:
         case "ros1", EMPTY.schema_name:

@@ -1,7 +1,7 @@
-"""Records: objects that agents hand each other as JSON outside the market, and the amounts in them.
+"""Records: the JSON objects of services, and the amounts in them.
 
-In a record an amount is a decimal string, as UInt256 was in the legacy stack: JSON numbers beyond 2^53 don't survive in
-every reader. In Python it is an `int` all the same.
+In a record an amount is a decimal string, as UInt256 was in the legacy stack, because not every JSON reader keeps
+numbers beyond 2^53. In Python it is an `int`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from schemas.errors import InvalidRecord
 from schemas.messages import MAX_UINT256
 
 MAX_RECORD_SIZE: Final = 65_536
-"""The longest record, in bytes, that is read."""
+"""The longest record, in bytes, that is decoded."""
 
 _MAX_DIGITS: Final = len(str(MAX_UINT256))
 
@@ -48,7 +48,7 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def decode(cls, payload: bytes) -> Self:
         """The record in `payload`. Raises `InvalidRecord` and nothing else, whatever the bytes are."""
         if len(payload) > MAX_RECORD_SIZE:
-            raise InvalidRecord(cls.__name__, f"{len(payload)} bytes, and {MAX_RECORD_SIZE} are the most")
+            raise InvalidRecord(cls.__name__, f"it has {len(payload)} bytes; the limit is {MAX_RECORD_SIZE}")
         try:
             record: Self = _decoder(cls).decode(payload)
         except msgspec.ValidationError as error:
@@ -61,9 +61,9 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Liability(Record, frozen=True, kw_only=True, rename="camel"):
-    """A liability: who does what for whom, for how much, and how it ended.
+    """A liability contract as agents and clients read it: its parties, its terms, and how it ended.
 
-    Addresses are in EIP-55, `validator` is the zero address if there is none. `model`, `objective` and `result` are
+    Addresses are in EIP-55; `validator` is the zero address if there is none. `model`, `objective` and `result` are
     CIDs; `result` is empty until the liability is finalized. `cost` is in the token's smallest unit, the fees in wn.
     """
 
@@ -100,7 +100,7 @@ def _read_amount(_kind: type[Any], value: Any) -> UInt256:
 
 
 def _one_line(error: Exception) -> str:
-    """The text of an error, which may quote what it was given."""
+    """The text of an error, which may quote its input, in one line."""
     return str(error)[:200].encode("unicode_escape").decode()
 
 

@@ -20,38 +20,38 @@ if TYPE_CHECKING:
 
 
 class StartLiability(Record, frozen=True):
-    """Begin to play the objective of the liability at `address`."""
+    """Start to play the objective of the liability at `address`."""
 
     address: str
 
 
 class FinishLiability(Record, frozen=True):
-    """End the liability at `address`: close the recording, sign the Result and send it."""
+    """Finish the job of the liability at `address`: close the recording, sign the Result and send it."""
 
     address: str
     success: bool
 
 
 class RestartLiability(Record, frozen=True):
-    """Play the objective of the liability at `address` again from its beginning."""
+    """Play the objective of the liability at `address` again from the start."""
 
     address: str
 
 
 class ResumeLiability(Record, frozen=True):
-    """Play on the objective of the liability at `address` from where it stopped."""
+    """Continue to play the objective of the liability at `address` where it stopped."""
 
     address: str
 
 
 class ReadLiability(Record, frozen=True):
-    """Ask for the record of the liability at `address`."""
+    """Request the record of the liability at `address`."""
 
     address: str
 
 
 class Done(Record, frozen=True):
-    """Whether it was done, and if not, why."""
+    """Whether it was done, and why not."""
 
     success: bool
     msg: str = ""
@@ -62,20 +62,20 @@ class Nothing(Record, frozen=True):
 
 
 class LiabilityRead(Record, frozen=True):
-    """The record, if there is such a liability (`read`)."""
+    """The record; `read` says whether the liability exists."""
 
     read: bool
     liability: Liability | None = None
 
 
 class AccountBalance(Record, frozen=True):
-    """Ask for the balance of an account."""
+    """Request the balance of an account."""
 
     account: str
 
 
 class AccountToAddressAllowance(Record, frozen=True):
-    """Ask how much `to` may spend of what `account` has."""
+    """Request the allowance of `to` on the tokens of `account`."""
 
     account: str
     to: str
@@ -89,7 +89,7 @@ class TransferRequest(Record, frozen=True):
 
 
 class TransferFromRequest(Record, frozen=True):
-    """Send `value` wn of `owner`, who has approved it, to `to`."""
+    """Send `value` wn of `owner` to `to`, by an allowance of `owner`."""
 
     owner: str
     to: str
@@ -97,7 +97,7 @@ class TransferFromRequest(Record, frozen=True):
 
 
 class Approve(Record, frozen=True):
-    """Let `spender` spend `value` wn."""
+    """Allow `spender` to spend `value` wn."""
 
     spender: str
     value: UInt256
@@ -150,7 +150,7 @@ class ApprovalEvent(Record, frozen=True):
 
 
 class Service(NamedTuple):
-    """What a service is asked, and what it answers."""
+    """The request and the reply of a service."""
 
     request: type[Record]
     reply: type[Record]
@@ -184,10 +184,10 @@ SERVICES: Final[Mapping[str, Service]] = MappingProxyType(
         "eth/xrt_allowance": Service(Nothing, Allowance),
     }
 )
-"""Every service by the part of its key after `rpc/`."""
+"""All services, by the part of their key after `rpc/`."""
 
 SPENDING: Final = frozenset({"eth/transfer", "eth/transfer_from", "eth/approve"})
-"""The services that send transactions, and so take as long as one takes to be mined."""
+"""The services that send a transaction, and wait until it is mined."""
 
 GUARDED: Final = SPENDING | {
     "sign/demand",
@@ -197,4 +197,4 @@ GUARDED: Final = SPENDING | {
     "send/offer",
     "send/result",
 }
-"""The services that sign, spend or speak in an agent's name: offered to others only where its settings say so."""
+"""The services that sign, spend or publish in the agent's name: offered only if its settings allow it."""

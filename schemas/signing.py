@@ -1,10 +1,10 @@
-"""Signatures of messages: ECDSA on secp256k1 over Ethereum's personal-message form of a message's hash.
+"""Signatures of messages and of rejections: ECDSA on secp256k1 over the hash as a personal message of Ethereum.
 
-`verify` is what every received message passes, once, at the edge of the process. It costs one public-key recovery and
-little else; everything that repeats between messages (addresses, CIDs, the signers' addresses) is cached.
+`verify` checks every received message once, where it enters the process. It costs one public-key recovery and little
+else; addresses and CIDs, which repeat between messages, are cached.
 
-The format has twins of each signature (v as 0/1, high s) that other readers accept; here there is only one signature
-for a hash and a key, so that a message can't travel twice under two texts.
+Every signature has twins (v as 0/1, high s) that other readers accept. Here only one form is valid, so a message can't
+travel under two texts.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _REJECTION_DOMAIN: Final = b"aira rejection\0"
 
 
 class Verified(Struct, Generic[_M_co], frozen=True, gc=False):
-    """A message with its 32-byte hash and the EIP-55 address of the one who signed it."""
+    """A message with its 32-byte hash and the EIP-55 address of its signer."""
 
     message: _M_co
     hash: bytes
@@ -49,7 +49,7 @@ class Verified(Struct, Generic[_M_co], frozen=True, gc=False):
 
 
 class Signer:
-    """A private key that signs messages; it never shows the key.
+    """A private key that signs messages; it never reveals the key.
 
     Raises `InputError` if `private_key` is not 32 bytes of a number from 1 to the order of the curve less one.
     """
@@ -68,7 +68,8 @@ class Signer:
     def sign(self, message: _M) -> _M:
         """The same message with this key's signature on it; deterministic (RFC 6979).
 
-        Raises `InvalidMessage`: `unresolved-name` if the message holds an ENS name, `sender` if it names another.
+        Raises `InvalidMessage`: `unresolved-name` if the message contains an ENS name, `sender` if its sender is not
+        this account.
         """
         signature = self.sign_hash(message_hash(message))
         _check_sender(message, self.address)
@@ -106,20 +107,20 @@ def recover(digest: bytes, signature: str | bytes) -> str:
     compact = signature[:64] + (b"\1" if recovery_id else b"\0")
     try:
         key = PublicKey.from_signature_and_message(compact, keccak256(_PREFIX + digest), hasher=None)
-    except ValueError:  # coincurve's only word for r or s out of range and for points off the curve
+    except ValueError:  # coincurve's error for r or s out of range and for points off the curve
         raise InvalidMessage("signature", "no key could have made it") from None
     return _address_of(key.format(compressed=False))
 
 
 def verify(payload: bytes) -> Verified[SignedMessage]:
-    """Decode a message, hash it and recover its signer: all that a receiver must know before anything else sees it.
+    """Decode a message, hash it and recover its signer: all checks that need no chain.
 
     Raises `InvalidMessage` and nothing else, whatever the bytes are: the reasons of `wire.decode`, and `unsigned`,
-    `unresolved-name`, `signature`, and `sender` if a generation-5 order is signed by another than its sender.
+    `unresolved-name`, `signature`, and `sender` if the signer of a generation-5 order is not its sender.
     """
     message = decode(payload)
     if isinstance(message, (OrderFeedback, TransactionFeedback)):
-        raise InvalidMessage("unsigned", f"it is not defined what is signed in a {type(message).__name__}")
+        raise InvalidMessage("unsigned", f"what is signed in a {type(message).__name__} is not defined")
     return verify_hashed(message, message_hash(message))
 
 
@@ -136,12 +137,12 @@ def verify_hashed(message: _M, digest: bytes) -> Verified[_M]:
 
 
 class Rejection(Record, frozen=True, kw_only=True):
-    """Why a provider will not use a message.
+    """A provider's statement that it can't use an order or a result; put on `aira/{lighthouse}/reject/…`.
 
-    `order` is the message's hash (64 hexadecimal digits), `reason` a machine-readable word (a refusal of the order
-    book, or the name of the contracts' error), `detail` is for people, `provider` the EIP-55 address of who says so,
-    `signature` (130 hexadecimal digits) that account's. Anybody may write one: believe what `is_signed`, of a provider
-    of the lighthouse.
+    `order` is the message's hash (64 hexadecimal digits), `reason` a word for programs (a rejection by the order book,
+    or the name of the contracts' error), `detail` is for people, `provider` the EIP-55 address of the provider, and
+    `signature` (130 hexadecimal digits) its signature. Anybody may put one: trust it only if it `is_signed` by a
+    provider of the lighthouse.
     """
 
     order: str
@@ -151,7 +152,7 @@ class Rejection(Record, frozen=True, kw_only=True):
     signature: str = ""
 
     def signed_by(self, signer: Signer) -> Self:
-        """The same with the signature of `signer`, whose address `provider` has to be."""
+        """The same with the signature of `signer`, whose address must be `provider`."""
         return replace(self, signature=signer.sign_hash(self._hash()).hex())
 
     @property
@@ -163,7 +164,7 @@ class Rejection(Record, frozen=True, kw_only=True):
             return False
 
     def _hash(self) -> bytes:
-        """Of the JSON without the signature, which is written in one way only."""
+        """The hash of the JSON without the signature, whose encoding is canonical."""
         return keccak256(_REJECTION_DOMAIN + replace(self, signature="").encode())
 
 

@@ -1,7 +1,7 @@
-"""How an agent, a provider or a bridge is: what each answers who asks it over Zenoh.
+"""The status of agents, providers and bridges, as they report it over Zenoh.
 
-Agents and providers answer the service `status` (see `schemas.rpc`), bridges a query on `bridge_status_key`. These
-records may have fields that a reader does not know yet: versions meet here.
+Agents and providers answer the service `status` (see `schemas.rpc`), bridges a query on `bridge_status_key`. Readers
+ignore unknown fields, because different versions talk to each other here.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from schemas.keys import RpcKey
 from schemas.records import Record, UInt256
 
 ALIVE: Final = "alive"
-"""The state of a part that does what it is for."""
+"""The state of a part that works."""
 OFF: Final = "off"
-"""The state of a part that the settings switch off."""
+"""The state of a part that is switched off by the settings."""
 BRIDGE_SERVICE: Final = "bridge/status"
-"""The beginning of the key's part after `aira/agent/{bridge}/rpc/`; the lighthouse follows."""
+"""The service of a bridge's status, in `aira/agent/{bridge}/rpc/…`, before the lighthouse."""
 
 
 class StoreUse(Record, frozen=True, kw_only=True, forbid_unknown_fields=False):
-    """How much of its content store an agent uses; `quota` (bytes) is the most."""
+    """The use of an agent's content store, in bytes; `quota` is the limit."""
 
     files: int
     bytes: int
@@ -31,7 +31,7 @@ class StoreUse(Record, frozen=True, kw_only=True, forbid_unknown_fields=False):
 
 
 class Work(Record, frozen=True, kw_only=True, rename="camel", forbid_unknown_fields=False):
-    """An agent's work: its jobs by phase, the messages that it sends until their effect is seen, its store."""
+    """An agent's work: its jobs by phase, the messages in its outbox, its store."""
 
     jobs: Mapping[str, int]
     outbox: int
@@ -39,7 +39,7 @@ class Work(Record, frozen=True, kw_only=True, rename="camel", forbid_unknown_fie
 
 
 class MarketStatus(Record, frozen=True, kw_only=True, rename="camel", forbid_unknown_fields=False):
-    """A provider's market since it began: open orders, contracts, messages rejected by reason, money.
+    """A provider's market since it started: open orders, contracts, rejected messages by reason, amounts.
 
     `fees` and `minted` (XRT for gas) are in wn, `spent` is in wei.
     """
@@ -55,47 +55,47 @@ class MarketStatus(Record, frozen=True, kw_only=True, rename="camel", forbid_unk
 
 
 class Status(Record, frozen=True, kw_only=True, rename="camel", forbid_unknown_fields=False):
-    """How an agent or a provider is (`status`).
+    """The status of an agent or a provider (service `status`).
 
-    `work` is an agent's, `market` a provider's. One account may be both, and on several lighthouses: then each answers.
+    Agents report `work`, providers `market`. One account may run several of them: then each one answers.
     """
 
     role: str
     """`agent` or `provider`."""
     address: str
-    """Of its account, EIP-55."""
+    """The address of its account, EIP-55."""
     version: str
     zenoh_id: str
     lighthouse: str
     """The ENS name of its market."""
     parts: Mapping[str, str]
-    """The state of each part: `ALIVE`, `OFF`, or in a few words what it waits for."""
+    """The state of each part: `ALIVE`, `OFF`, or in a few words what it is waiting for."""
     head: int
-    """The last block that it has handled."""
+    """The last block that it has processed."""
     chain_id: int
     xrt: str = ""
     """The address of the token of fees and stakes, EIP-55."""
     uptime: float = 0.0
-    """Seconds since it began."""
+    """Seconds since it started."""
     work: Work | None = None
     market: MarketStatus | None = None
 
 
 class DirectionStatus(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
-    """One direction of a bridge in figures. Counts are since it started; `per_second` is over the last ten seconds."""
+    """The counters of one direction of a bridge since it started; `per_second` is over the last ten seconds."""
 
     received: int
     invalid: Mapping[str, int]
-    """Not let through, by reason."""
+    """Messages rejected, by reason."""
     known: int
-    """Let through and on the far side already: echoes, repetitions, what another bridge brought."""
+    """Valid messages that were already on the other side: echoes, repetitions, those of another bridge."""
     accepted: int
     carried: int
     """Carried by this bridge."""
     left: int
-    """Carried by another one."""
+    """Carried by another bridge."""
     dropped: Mapping[str, int]
-    """Lost, by reason: `no-room`, `refused` by the far side, `unseen` for a reader that was too slow, `unheard`."""
+    """Lost, by reason: `no-room`, `refused` by the other side, `unseen` by a reader that was too slow, `unheard`."""
     waiting: int
     left_waiting: int
     unheard: int
@@ -103,63 +103,63 @@ class DirectionStatus(msgspec.Struct, frozen=True, kw_only=True, rename="camel")
     kinds: Mapping[str, int] = {}
     """Accepted, by kind: demand, offer, result, feedback, pending."""
     bytes: int = 0
-    """Of the messages that this bridge has carried."""
+    """Bytes of the messages that this bridge has carried."""
 
 
 class ContentMetrics(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
-    """What a bridge has done with content since it started, on all its lighthouses together."""
+    """The content that a bridge has transferred since it started, for all its lighthouses."""
 
     fetched: int
     """Files fetched from IPFS and kept."""
     fetched_bytes: int
-    """Of all blocks that came from IPFS and were what they should be."""
+    """Bytes of all blocks from IPFS that matched their CID."""
     lies: int
-    """Blocks that came from IPFS and were not."""
+    """Blocks from IPFS that did not match their CID."""
     answered: int
-    """Blocks of IPFS given to who asked for them in the mesh."""
+    """Blocks of IPFS sent to the mesh in answer to queries."""
     added: int
     """Files of the mesh added to IPFS."""
     added_bytes: int
     by_blocks: int
-    """Those of them that the daemon would name otherwise, and was given block by block."""
+    """Those of them added block by block, because the daemon would give them another CID."""
     pinned: int
-    """Files that further nodes have pinned, once for each node."""
+    """Files pinned by further nodes, counted once for each node."""
     failed: int
-    """Files that could be had from neither side, or not added."""
+    """Files that neither side could provide, or that could not be added."""
 
 
 class BridgeStatus(Record, frozen=True, kw_only=True, rename="camel", forbid_unknown_fields=False):
-    """How one bridge of one lighthouse is.
+    """The status of one bridge of one lighthouse.
 
-    The answer to a query on `aira/agent/{bridge}/rpc/bridge/status/{lighthouse}`, where `bridge` is the address in its
-    presence token; each of them may be `*`.
+    It answers a query on `aira/agent/{bridge}/rpc/bridge/status/{lighthouse}`, where `bridge` is the address in its
+    presence token; either may be `*`.
     """
 
     bridge: str
-    """Its address: a name of its own, or its account's."""
+    """Its address: a generated one, or that of its account."""
     lighthouse: str
     state: str
-    """`connected`, `alone` (nobody listens on IPFS), `no daemon` or `no router`."""
+    """`connected`, `alone` (no other node on the topic), `no daemon` or `no router`."""
     carries: bool
-    """Whether it is its turn to carry; another bridge does otherwise."""
+    """Whether this bridge carries messages, or leaves them to another one."""
     api: str
     daemon: str
-    """What the daemon says it is; empty before it was first reached."""
+    """The daemon's name and version; empty before it was first reached."""
     dialect: str
     ipfs_peers: tuple[str, ...]
     """The other nodes on the topic."""
     mesh_peers: tuple[str, ...]
-    """Who is on the lighthouse's channel: role and address of each."""
+    """The peers on the lighthouse's channel: role and address of each."""
     losses: int
-    """How often the daemon was lost."""
+    """How often the connection to the daemon was lost."""
     last_error: str
     to_ipfs: DirectionStatus
     to_mesh: DirectionStatus
     content: ContentMetrics | None = None
     uptime: float = 0.0
-    """Seconds since it began."""
+    """Seconds since it started."""
 
 
 def bridge_status_key(bridge: str, lighthouse: str) -> str:
-    """The key on which the bridge of that address answers how it is."""
+    """The key on which the bridge with that address reports its status."""
     return str(RpcKey(bridge, f"{BRIDGE_SERVICE}/{lighthouse}"))

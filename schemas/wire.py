@@ -43,7 +43,7 @@ def decode(payload: bytes) -> Message:
     `nonce`, `range`, `hash` and `signature`.
     """
     if len(payload) > MAX_MESSAGE_SIZE:
-        raise InvalidMessage("too-large", f"{len(payload)} bytes, and {MAX_MESSAGE_SIZE} are the most")
+        raise InvalidMessage("too-large", f"it has {len(payload)} bytes; the limit is {MAX_MESSAGE_SIZE}")
     kind = _type_of(payload)
     try:
         message = _DECODERS[kind].decode(payload)

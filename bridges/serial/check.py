@@ -11,7 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from bridges.serial.dialect import BoardReady, dialect_names, load_dialect
-from bridges.serial.errors import LineError
+from bridges.serial.errors import LineError, PortBusy, PortForbidden
 from bridges.serial.line import PortName, SerialLine, SerialPort
 from mesh.doctor.checks import Check, CheckResult, failed, in_thread, passed
 
@@ -76,12 +76,11 @@ def check_board(settings: SerialSettings, *, timeout: float = ANSWER_TIMEOUT) ->
 
 def _unusable(path: Path, error: LineError) -> CheckResult:
     """Why an existing port can't be opened, and what to do."""
-    why = str(error)
-    if "permission" in why:
+    if isinstance(error, PortForbidden):
         return _forbidden(path)
-    if "another process" in why:
-        return failed(why, hint=f"`fuser {path}` shows which; if it is `aira edge`, stop it to have the line tried")
-    return failed(why, hint="is this the board's port? `ls -l /dev/serial/by-id` shows what is plugged in")
+    if isinstance(error, PortBusy):
+        return failed(str(error), hint=f"`fuser {path}` shows which; if it is `aira edge`, stop it to check the line")
+    return failed(str(error), hint="is this the board's port? `ls -l /dev/serial/by-id` shows what is plugged in")
 
 
 def _forbidden(path: Path) -> CheckResult:

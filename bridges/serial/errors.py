@@ -26,6 +26,24 @@ class PortMissing(LineError):
         self.port = port
 
 
+class PortForbidden(LineError):
+    """This user has no permission to open the port."""
+
+    code = "port-forbidden"
+
+
+class PortBusy(LineError):
+    """Another process uses the port."""
+
+    code = "port-busy"
+
+
+class InvalidPort(LineError):
+    """The path is not a serial port."""
+
+    code = "invalid-port"
+
+
 class UnknownDialect(InputError):
     """No installed package provides a dialect of that name."""
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import serial
 
-from bridges.serial.errors import LineError, PortMissing
+from bridges.serial.errors import InvalidPort, LineError, PortBusy, PortForbidden, PortMissing
 from mesh.errors import InputError
 from mesh.telemetry.context import log_event
 
@@ -78,7 +78,7 @@ class SerialPort:
         except (OSError, ValueError) as error:  # pyserial's errors are OSErrors
             if not path.exists():
                 raise PortMissing(str(path), "it was unplugged") from None
-            raise LineError(f"can't open {path} at {baud} baud: {_reason(error)}") from None
+            raise _open_error(path, baud, error) from None
 
     def fileno(self) -> int:
         """The file descriptor, for select."""
@@ -264,18 +264,19 @@ class SerialLine:
         self.dialect.closed(time.monotonic())
 
 
-def _reason(error: OSError | ValueError) -> str:
+def _open_error(path: Path, baud: int, error: OSError | ValueError) -> LineError:
     """Why a port can't be opened, in short."""
     below = error.__context__
     number = below.args[0] if isinstance(below, termios.error) else getattr(error, "errno", None)
+    failed = f"can't open {path} at {baud} baud:"
     match number:
         case errno.EACCES | errno.EPERM:
-            return "no permission; on Debian, be in the group dialout"
+            return PortForbidden(f"{failed} no permission", hint="on Debian, join the group dialout")
         case errno.EAGAIN | errno.EBUSY:
-            return "another process uses it"
+            return PortBusy(f"{failed} another process uses it")
         case errno.ENOTTY | errno.EISDIR | errno.ENODEV:
-            return "it is no serial port"
-    return os.strerror(number) if number else str(error)
+            return InvalidPort(f"{failed} it is not a serial port")
+    return LineError(f"{failed} {os.strerror(number) if number else error}")
 
 
 def _usb_ports() -> Iterable[serial.tools.list_ports_common.ListPortInfo]:

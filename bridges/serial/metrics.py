@@ -109,15 +109,15 @@ def families_of(now: EdgeStatistics) -> tuple[MetricFamily, ...]:
         by_label(
             "aira_edge_frame_faults_total",
             "counter",
-            "Frames with a wrong check, that can't be what they claim, that are missing, sent again, or not asked for",
+            "Frames that are damaged, undecodable, missing, repeated, or unrequested",
             "reason",
             faults,
         ),
-        counter("aira_edge_noise_bytes_total", "Bytes of the line that belong to no frame", line.noise),
-        by_label("aira_edge_calls_total", "counter", "Commands and calls, by how they ended", "outcome", now.calls),
+        counter("aira_edge_noise_bytes_total", "Bytes on the line that belong to no frame", line.noise),
+        by_label("aira_edge_calls_total", "counter", "Commands and calls, by outcome", "outcome", now.calls),
         counter(
             "aira_edge_line_openings_total", "How often the port was opened: once, and after each loss", now.openings
         ),
-        counter("aira_edge_board_losses_total", "How often a board that was there was lost", now.board_losses),
-        gauge("aira_edge_board_present", "1 while the board is there, 0 otherwise", float(now.board_is_present)),
+        counter("aira_edge_board_losses_total", "How often a present board was lost", now.board_losses),
+        gauge("aira_edge_board_present", "1 while the board is present, 0 otherwise", float(now.board_is_present)),
     )

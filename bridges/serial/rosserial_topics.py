@@ -65,7 +65,7 @@ class RosType:
         """Raise `InvalidPayload` if these bytes are not of this type."""
         if self.payload == STRING:
             if len(payload) < 4 or int.from_bytes(payload[:4], "little") != len(payload) - 4:
-                raise InvalidPayload("std_msgs/String", f"its length does not fit its {len(payload)} bytes")
+                raise InvalidPayload("std_msgs/String", f"its length field does not match its {len(payload)} bytes")
         elif self.size is not None and len(payload) != self.size:
             raise InvalidPayload(self.payload.schema_name, f"it has {self.size} bytes, not {len(payload)}")
 

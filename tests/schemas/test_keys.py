@@ -186,7 +186,7 @@ def test_what_is_no_key_is_refused(text: str) -> None:
     ],
 )
 def test_there_is_one_text_for_a_key(text: str) -> None:
-    with pytest.raises(InvalidKey, match="has to be written"):
+    with pytest.raises(InvalidKey, match="canonical"):
         parse_key(text)
 
 

@@ -91,7 +91,7 @@ def test_a_file_that_is_no_port_is_said_to_be_none() -> None:
     result = check.check_port(SerialSettings(port="/dev/null"))
 
     assert not result.ok
-    assert "it is no serial port" in result.message
+    assert "it is not a serial port" in result.message
 
 
 def test_a_port_on_which_nobody_answers_is_told_what_may_be_wrong(silent: str) -> None:
