@@ -9,11 +9,12 @@ from schemas.loading import on_demand
 if TYPE_CHECKING:
     from mesh.network.channel import Channel
     from mesh.network.connecting import NotAdmitted
-    from mesh.network.endpoints import Endpoints, Tls, free_endpoint
+    from mesh.network.endpoints import Endpoints, free_endpoint
     from mesh.network.pump import Pump, call_in_loop
     from mesh.network.services import ServiceFailed, Services, call
     from mesh.network.session import Network, NetworkChange
     from mesh.network.subscription import Subscription
+    from mesh.network.tls import Tls
     from mesh.network.validation import MessageValidator, ValidationStatistics, message_key, verified_key
 
 _HOMES: Final = {
@@ -27,7 +28,7 @@ _HOMES: Final = {
     "ServiceFailed": "mesh.network.services",
     "Services": "mesh.network.services",
     "Subscription": "mesh.network.subscription",
-    "Tls": "mesh.network.endpoints",
+    "Tls": "mesh.network.tls",
     "ValidationStatistics": "mesh.network.validation",
     "call": "mesh.network.services",
     "call_in_loop": "mesh.network.pump",

@@ -16,7 +16,7 @@ from mesh.errors import ConfigurationError
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.network.endpoints import Tls
+    from mesh.network.tls import Tls
 
 NEW_IDENTITY_HINT: Final = "`aira identity new` creates it"
 LOCATOR: Final = re.compile(r"tls/(?:\[(?P<six>[^\]]+)\]|(?P<host>[^:]+)):(?P<port>[0-9]+)")

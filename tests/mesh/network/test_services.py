@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     import zenoh
 
     from schemas import Record
-    from schemas.rpc import StartLiability
 
 
 async def test_a_request_is_handled_in_the_event_loop_of_the_agent(here: zenoh.Session, there: zenoh.Session) -> None:
