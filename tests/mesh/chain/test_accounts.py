@@ -60,13 +60,13 @@ def test_an_account_has_the_address_of_its_key() -> None:
 
 
 @pytest.mark.parametrize("key", [b"", bytes(32), b"\xff" * 32, KEY + b"\0"])
-def test_bytes_that_are_no_key_are_refused_without_being_shown(key: bytes) -> None:
+def test_invalid_keys_are_refused_and_not_shown(key: bytes) -> None:
     with pytest.raises(InputError) as caught:
         Account.from_key(key)
     assert not key or key.hex() not in str(caught.value)
 
 
-def test_new_keys_differ_and_are_keys() -> None:
+def test_new_keys_are_valid_and_unique() -> None:
     keys = {new_private_key() for _ in range(5)}
     assert len(keys) == 5
     assert all(Account.from_key(key).address for key in keys)
@@ -85,7 +85,7 @@ def test_a_keyfile_of_geth_opens(tmp_path: Path) -> None:
     assert account.address == "0x008AeEda4D805471dF9b2A5B0f38A0C3bCBA786b"
 
 
-def test_a_keyfile_is_for_its_owner_only(keyfile: Path) -> None:
+def test_only_the_owner_can_read_a_keyfile(keyfile: Path) -> None:
     assert stat.S_IMODE(keyfile.stat().st_mode) == 0o600
 
 
@@ -96,7 +96,7 @@ def test_a_keyfile_is_never_overwritten(keyfile: Path) -> None:
     assert keyfile.read_bytes() == before
 
 
-def test_a_keyfile_says_its_address_without_the_password(keyfile: Path) -> None:
+def test_a_keyfiles_address_is_read_without_the_password(keyfile: Path) -> None:
     assert keyfile_address(keyfile) == ADDRESS
 
 
@@ -120,7 +120,7 @@ def test_a_missing_password_file_is_named(keyfile: Path, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '"text"', '{"version": 3, "crypto": {}}', '{"version": 9}'])
-def test_a_file_that_is_no_keyfile_is_refused(tmp_path: Path, content: str) -> None:
+def test_a_file_that_is_not_a_keyfile_is_refused(tmp_path: Path, content: str) -> None:
     path = tmp_path / "key.json"
     path.write_text(content)
     with pytest.raises(KeyfileError, match="is not a keyfile"):
@@ -137,6 +137,6 @@ def test_neither_key_nor_password_is_shown_or_logged(
     assert "sesame" not in shown
 
 
-def test_an_account_is_not_pickled() -> None:
+def test_an_account_can_not_be_pickled() -> None:
     with pytest.raises(TypeError):
         pickle.dumps(Account.from_key(KEY))

@@ -1,4 +1,4 @@
-"""What the mesh does on a chain, on the embedded one and on anvil."""
+"""`Chain` on the embedded chain and on anvil."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ async def test_names_of_both_generations_lead_to_the_same_contracts(market: Depl
         assert await chain.names.address(chain.xrt.lower()) == chain.xrt
 
 
-async def test_what_is_no_name_and_what_nobody_knows_are_different_errors(market: DeployedMarket) -> None:
+async def test_invalid_and_unknown_names_raise_different_errors(market: DeployedMarket) -> None:
     async with market.chain() as chain:
         with pytest.raises(UnknownName, match=r"none\.lighthouse"):
             await chain.names.address("none.lighthouse.3.robonomics.eth")
@@ -55,7 +55,7 @@ async def test_what_is_no_name_and_what_nobody_knows_are_different_errors(market
             await chain.names.address("0x12")
 
 
-async def test_a_chain_without_the_contracts_says_so(market: DeployedMarket) -> None:
+async def test_a_chain_without_the_contracts_is_an_error(market: DeployedMarket) -> None:
     with no_contracts("ENS registry at") as caught:
         async with market.chain(ens="0x" + "12" * 20):
             pass
@@ -68,7 +68,7 @@ async def test_a_chain_without_the_contracts_says_so(market: DeployedMarket) -> 
             pass
 
 
-async def test_tokens_are_moved_and_approved(market: DeployedMarket) -> None:
+async def test_tokens_are_transferred_and_approved(market: DeployedMarket) -> None:
     owner, friend = market.promisee.address, Account.from_key(new_private_key()).address
     async with market.chain(market.promisee) as chain:
         before = await chain.tokens.balance()
@@ -83,7 +83,7 @@ async def test_tokens_are_moved_and_approved(market: DeployedMarket) -> None:
         assert await chain.tokens.balance(friend, token="xrt.5.robonomics.eth") == 12
 
 
-async def test_ether_is_counted_and_sent(market: DeployedMarket) -> None:
+async def test_ether_balances_and_transfers(market: DeployedMarket) -> None:
     friend = Account.from_key(new_private_key()).address
     async with market.chain(market.promisee) as chain:
         await chain.tokens.send_eth(friend, 10**15)
@@ -104,7 +104,7 @@ async def test_without_funds_there_is_one_clear_error(market: DeployedMarket) ->
         assert caught.value.needed >= 10**18
 
 
-async def test_a_reader_needs_no_account_and_a_writer_does(market: DeployedMarket) -> None:
+async def test_only_transactions_need_an_account(market: DeployedMarket) -> None:
     async with market.chain() as chain:
         assert await chain.tokens.balance(market.promisee.address) > 0
         with pytest.raises(NoAccount):
@@ -113,7 +113,7 @@ async def test_a_reader_needs_no_account_and_a_writer_does(market: DeployedMarke
             await chain.tokens.balance()
 
 
-async def test_a_refusal_of_the_token_is_decoded(market: DeployedMarket) -> None:
+async def test_a_revert_of_the_token_is_decoded(market: DeployedMarket) -> None:
     async with market.chain(market.stranger) as chain:
         before = await chain.tokens.eth_balance()
         with reverted("ERC20InsufficientBalance") as caught:
@@ -181,7 +181,7 @@ async def test_a_failed_job_pays_the_promisee_back(market: DeployedMarket) -> No
     ("field", "value", "reason"),
     [("cost", 1, "CostMismatch"), ("deadline", 1, "DeadlineReached"), ("token", ZERO_ADDRESS, "TokenMismatch")],
 )
-async def test_orders_that_do_not_match_are_refused_by_name(
+async def test_orders_that_do_not_match_are_refused_with_a_reason(
     market: DeployedMarket, field: str, value: Any, reason: str
 ) -> None:
     async with market.chain(market.provider) as chain:
@@ -190,7 +190,7 @@ async def test_orders_that_do_not_match_are_refused_by_name(
     assert caught.value.reason == reason
 
 
-async def test_an_order_makes_one_liability_only(market: DeployedMarket) -> None:
+async def test_an_order_creates_only_one_liability(market: DeployedMarket) -> None:
     demand, offer = market.demand(), market.offer()
     async with market.chain(market.provider) as chain:
         await chain.liabilities.create("airalab", demand, offer)
@@ -206,7 +206,7 @@ async def test_only_a_provider_sends_to_the_lighthouse(market: DeployedMarket) -
     assert (caught.value.reason, caught.value.arguments) == ("NotAProvider", (market.stranger.address,))
 
 
-async def test_a_result_of_another_is_refused(market: DeployedMarket) -> None:
+async def test_a_result_signed_by_another_account_is_refused(market: DeployedMarket) -> None:
     async with market.chain(market.provider) as chain:
         created = await chain.liabilities.create("airalab", market.demand(), market.offer())
         forged = market.result(created.liability, account=market.stranger)
@@ -215,7 +215,7 @@ async def test_a_result_of_another_is_refused(market: DeployedMarket) -> None:
         assert caught.value.arguments == (market.promisor.address, market.stranger.address)
 
 
-async def test_a_liability_is_only_what_the_factory_made(market: DeployedMarket) -> None:
+async def test_only_contracts_of_the_factory_are_liabilities(market: DeployedMarket) -> None:
     async with market.chain() as chain:
         for address in (market.stranger.address, market.deployment.xrt):
             assert not await chain.liabilities.exists(address)
@@ -235,7 +235,7 @@ async def test_the_named_validator_finalizes_a_generation_3_liability(market: De
     assert (record.is_finalized, record.is_success, record.validator) == (True, False, validator)
 
 
-async def test_a_promisee_is_paid_back_when_the_promisor_vanished(market: DeployedMarket) -> None:
+async def test_a_promisee_is_refunded_when_no_result_comes(market: DeployedMarket) -> None:
     async with market.chain(market.provider) as chain:
         before = await chain.tokens.balance(market.promisee.address)
         created = await chain.liabilities.create("airalab", market.demand(cost=9), market.offer(cost=9))
@@ -249,7 +249,7 @@ async def test_a_promisee_is_paid_back_when_the_promisor_vanished(market: Deploy
     assert (record.is_finalized, record.is_success, record.result) == (True, False, "")
 
 
-async def test_a_lighthouse_is_made_staked_and_left(market: DeployedMarket) -> None:
+async def test_a_lighthouse_is_created_staked_on_and_left(market: DeployedMarket) -> None:
     owner = market.promisor
     async with market.chain(owner) as chain:
         made = await chain.lighthouses.create(minimal_stake=10, timeout_blocks=3, name="beacon")
@@ -271,7 +271,7 @@ async def test_a_lighthouse_is_made_staked_and_left(market: DeployedMarket) -> N
             await chain.lighthouses.create(minimal_stake=10, timeout_blocks=3, name="beacon")
 
 
-async def test_many_transactions_of_one_account_at_once_all_go_through(market: DeployedMarket) -> None:
+async def test_concurrent_transactions_of_one_account_all_succeed(market: DeployedMarket) -> None:
     friend = Account.from_key(new_private_key()).address
     async with market.chain(market.promisee) as chain:
         txs = await asyncio.gather(*(chain.tokens.transfer(friend, 1) for _ in range(20)))
@@ -286,7 +286,7 @@ async def test_two_clients_of_one_account_do_not_lose_a_transaction(market: Depl
         assert await one.tokens.balance(friend) == 10
 
 
-async def test_what_is_no_lighthouse_is_one_clear_error(market: DeployedMarket) -> None:
+async def test_an_address_that_is_not_a_lighthouse_is_an_error(market: DeployedMarket) -> None:
     async with market.chain() as chain:
         with no_contracts("providersLength"):
             await chain.lighthouses.get(market.promisee.address)
@@ -295,7 +295,7 @@ async def test_what_is_no_lighthouse_is_one_clear_error(market: DeployedMarket) 
             await chain.node.read_all((functions.model(), functions.cost()), block="latest")
 
 
-async def test_a_closed_client_says_so(market: DeployedMarket) -> None:
+async def test_a_closed_chain_raises(market: DeployedMarket) -> None:
     chain = market.chain(market.promisee)
     with pytest.raises(ClosedError):
         await chain.names.address("xrt.3.robonomics.eth")

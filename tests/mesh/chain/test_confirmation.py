@@ -1,4 +1,4 @@
-"""Transactions that wait: stuck, replaced, lost, confirmed."""
+"""Waiting for transactions: stuck, replaced, lost and confirmed ones."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["anvil"]
 
 
-async def test_a_stuck_transaction_is_replaced_by_a_dearer_one_and_its_effect_happens_once(anvil: Anvil) -> None:
+async def test_a_stuck_transaction_is_replaced_with_higher_fees_and_takes_effect_once(anvil: Anvil) -> None:
     async with open_sender(anvil, replace(QUICK, replace_after=0.1)) as (node, sender):
         friend = unused_address()
         sending = asyncio.create_task(sender.send(to=friend, data=b"", value=5))
@@ -56,7 +56,7 @@ class _Swallowing(HttpTransport):
         return await super().make_request(method, params)
 
 
-async def test_the_version_that_was_replaced_may_be_the_one_that_is_mined(anvil: Anvil) -> None:
+async def test_the_replaced_version_may_be_the_one_that_is_mined(anvil: Anvil) -> None:
     wire, friend = _Swallowing(anvil.url), unused_address()
     async with Node(wire, timing=replace(QUICK, replace_after=0.05)) as node:
         sending = asyncio.create_task(
@@ -139,7 +139,7 @@ async def test_a_node_that_is_still_indexing_is_asked_for_the_receipt_again(anvi
     await wire.close()
 
 
-async def test_after_a_lost_answer_sending_the_same_again_means_the_first(anvil: Anvil) -> None:
+async def test_sending_again_after_a_lost_answer_continues_the_first_transaction(anvil: Anvil) -> None:
     """The node takes the transaction and is gone before it says so; the caller tries again when it is back."""
     wire, friend = _Deaf(anvil.url), unused_address()
     async with Node(wire, timing=QUICK) as node:
@@ -172,7 +172,7 @@ class _Deaf(HttpTransport):
         return response
 
 
-async def test_after_giving_up_the_same_is_waited_for_even_if_it_is_mined_by_then(anvil: Anvil) -> None:
+async def test_sending_again_after_a_timeout_continues_the_first_transaction(anvil: Anvil) -> None:
     async with open_sender(anvil, SHORT) as (node, sender):
         friend = unused_address()
         with pytest.raises(TransactionTimeout) as caught:

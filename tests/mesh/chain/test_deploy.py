@@ -1,4 +1,4 @@
-"""Deploying everything on a chain of one's own."""
+"""Deploying the contracts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ async def test_a_fresh_chain_takes_less_than_three_seconds_of_cpu() -> None:
     assert time.process_time() - started < 3
 
 
-async def test_the_plan_is_what_is_deployed() -> None:
+async def test_the_deployment_follows_its_plan() -> None:
     plan = DeploymentPlan(lighthouse="home", initial_supply=7 * XRT, minimal_stake=5, timeout_blocks=9, refund_delay=33)
     async with EmbeddedChain() as node:
         account = Account.from_key(node.funded_keys[3])

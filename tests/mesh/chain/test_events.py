@@ -1,4 +1,4 @@
-"""Logs as contracts write them."""
+"""Decoding logs."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ def _log(name: bytes, *, announced: int) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("padding", [0, 32 - len(NAME), 5])
-def test_the_name_of_a_new_lighthouse_is_read_whether_it_is_padded_or_not(padding: int) -> None:
+def test_padded_and_unpadded_lighthouse_names_are_decoded(padding: int) -> None:
     """The original factory of generation 3 cuts the event's data off where the name ends."""
     log = _log(NAME + bytes(padding), announced=len(NAME))
     assert decode_log(log) == NewLighthouse(LIGHTHOUSE, "airalab", "0x" + "00" * 32)
 
 
-def test_a_name_of_whole_words_is_read() -> None:
+def test_a_name_that_fills_its_words_is_decoded() -> None:
     event = decode_log(_log(b"a" * 64, announced=64))
     assert isinstance(event, NewLighthouse)
     assert event.name == "a" * 64
 
 
 @pytest.mark.parametrize("name", [b"", NAME, b"\xff" * 70])
-def test_a_name_that_is_not_there_or_is_no_text_is_no_event(name: bytes) -> None:
+def test_a_missing_or_invalid_name_is_no_event(name: bytes) -> None:
     assert decode_log(_log(name, announced=70)) is None

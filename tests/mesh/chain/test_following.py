@@ -1,4 +1,4 @@
-"""Reading events from a cursor."""
+"""Following the chain from a cursor."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 
 
-async def test_a_job_is_told_from_the_liability_to_the_payment(market: DeployedMarket) -> None:
+async def test_the_events_of_a_whole_job_are_yielded(market: DeployedMarket) -> None:
     cost = 5 * XRT
     async with market.chain(market.provider) as chain:
         start = await chain.block_number()
@@ -61,7 +61,7 @@ async def test_a_job_is_told_from_the_liability_to_the_payment(market: DeployedM
     assert [event.recipient for event in minted] == [market.provider.address]
 
 
-async def test_lighthouses_are_told_and_those_asked_for_tell_their_turns(market: DeployedMarket) -> None:
+async def test_new_lighthouses_are_yielded_and_turns_of_requested_ones(market: DeployedMarket) -> None:
     async with market.chain() as chain:
         head = await chain.block_number()
         everything = events_of(await read_to(chain, 0, head, lighthouses=[market.deployment.lighthouse]))
@@ -74,7 +74,7 @@ async def test_lighthouses_are_told_and_those_asked_for_tell_their_turns(market:
     assert not [event for event in without if isinstance(event, Online | Current)]
 
 
-async def test_an_approval_is_told(market: DeployedMarket) -> None:
+async def test_an_approval_is_yielded(market: DeployedMarket) -> None:
     async with market.chain(market.promisee) as chain:
         tx = await chain.tokens.approve(market.stranger.address, 17)
         head = await chain.block_number()
@@ -83,7 +83,7 @@ async def test_an_approval_is_told(market: DeployedMarket) -> None:
         ]
 
 
-async def test_a_refund_is_told_without_a_result(market: DeployedMarket) -> None:
+async def test_a_refund_is_yielded_without_a_result(market: DeployedMarket) -> None:
     async with market.chain(market.provider) as chain:
         created = await chain.liabilities.create("airalab", market.demand(cost=1), market.offer(cost=1))
         while await chain.block_number() + 1 < await chain.liabilities.refundable_from(created.liability):
@@ -94,7 +94,7 @@ async def test_a_refund_is_told_without_a_result(market: DeployedMarket) -> None
     assert Finalized(created.liability, False, "", settled.tx) in events
 
 
-async def test_block_numbers_grow_and_the_head_is_told_withoutevents_of(market: DeployedMarket) -> None:
+async def test_block_numbers_grow_and_the_head_is_yielded_without_events(market: DeployedMarket) -> None:
     async with market.chain(market.promisee) as chain:
         await chain.tokens.send_eth(market.stranger.address, 1)
         head = await chain.block_number()
@@ -104,7 +104,7 @@ async def test_block_numbers_grow_and_the_head_is_told_withoutevents_of(market: 
     assert blocks[-1] == BlockEvents(head, ())
 
 
-async def test_reading_goes_on_with_new_blocks_and_a_cursor_takes_it_up(market: DeployedMarket) -> None:
+async def test_new_blocks_are_yielded_and_a_cursor_resumes(market: DeployedMarket) -> None:
     async with market.chain(market.promisee) as chain:
         cursor = await chain.block_number() + 1
         reading = asyncio.create_task(read_to(chain, cursor, cursor + 1))
@@ -117,7 +117,7 @@ async def test_reading_goes_on_with_new_blocks_and_a_cursor_takes_it_up(market: 
     assert events_of(rest) == events_of(again)[1:]
 
 
-async def test_a_cursor_past_the_head_means_that_the_chain_went_back(market: DeployedMarket) -> None:
+async def test_a_cursor_past_the_head_is_an_error(market: DeployedMarket) -> None:
     async with market.chain() as chain:
         head = await chain.block_number()
         with pytest.raises(ChainWentBack) as caught:
@@ -125,7 +125,7 @@ async def test_a_cursor_past_the_head_means_that_the_chain_went_back(market: Dep
     assert (caught.value.cursor, caught.value.head) == (head + 2, head)
 
 
-async def test_a_finalized_event_of_somebody_elses_contract_is_not_told(market: DeployedMarket) -> None:
+async def test_events_of_another_factorys_liabilities_are_left_out(market: DeployedMarket) -> None:
     """A second factory on the same chain makes liabilities of its own; they are no business of the first."""
     async with market.chain(market.deployer) as chain:
         other = await deploy(chain.node, market.deployer)
@@ -195,7 +195,7 @@ async def _prepare_lonely(node: EmbeddedChain) -> Account:
     return deployer
 
 
-async def test_following_goes_on_after_an_outage_of_the_node(caplog: pytest.LogCaptureFixture) -> None:
+async def test_following_continues_after_an_outage(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     async with EmbeddedChain() as node:
         await _prepare_lonely(node)

@@ -1,4 +1,4 @@
-"""Blocks that the chain replaces after they were read."""
+"""Following the chain through reorganisations."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def _values(events: tuple[ChainEvent, ...]) -> list[int]:
     return [event.value for event in events if isinstance(event, Approval)]
 
 
-async def test_events_of_replaced_blocks_are_taken_back_newest_first_before_the_new_ones(fork: Fork) -> None:
+async def test_events_of_replaced_blocks_are_reverted_newest_first_before_the_new_ones(fork: Fork) -> None:
     chain = fork.chain
     start = await fork.approve(1)
     async with aclosing(chain.follow(start)) as events:
@@ -127,7 +127,7 @@ async def test_events_of_replaced_blocks_are_taken_back_newest_first_before_the_
     assert min(block.block_number for block in new) > back.block_number
 
 
-async def test_a_reorganisation_while_nobody_read_is_told_first_with_the_history_that_was_kept(fork: Fork) -> None:
+async def test_a_reorganisation_while_stopped_is_yielded_first_with_a_saved_history(fork: Fork) -> None:
     chain, history = fork.chain, History()
     start = await fork.approve(1)
     async with aclosing(chain.follow(start, history=history)) as events:
@@ -143,14 +143,14 @@ async def test_a_reorganisation_while_nobody_read_is_told_first_with_the_history
         assert await anext(events) == BlockEvents(head + 1, ())
 
 
-async def test_without_a_history_a_new_iterator_only_looks_forward(fork: Fork) -> None:
+async def test_without_a_history_earlier_reorganisations_go_unnoticed(fork: Fork) -> None:
     head = await fork.approve(1)
     await fork.replace_last(1)
     async with aclosing(fork.chain.follow(head + 1)) as events:
         assert await anext(events) == BlockEvents(head + 1, ())
 
 
-async def test_a_reorganisation_of_eventless_blocks_takes_nothing_back(fork: Fork) -> None:
+async def test_a_reorganisation_of_blocks_without_events_reverts_nothing(fork: Fork) -> None:
     start = await fork.approve(1)
     async with aclosing(fork.chain.follow(start)) as events:
         await _until(events, _reaches(start))
@@ -161,7 +161,7 @@ async def test_a_reorganisation_of_eventless_blocks_takes_nothing_back(fork: For
     assert back == Reorganisation(start, (), ())
 
 
-async def test_a_reorganisation_of_the_whole_depth_is_unwound_and_a_deeper_one_is_an_error(fork: Fork) -> None:
+async def test_a_reorganisation_of_the_whole_depth_is_reverted_and_a_deeper_one_is_an_error(fork: Fork) -> None:
     chain, history = fork.chain, History(depth=3)
     start = await fork.approve(1)
     async with aclosing(chain.follow(start, history=history)) as events:
@@ -183,7 +183,7 @@ async def test_a_reorganisation_of_the_whole_depth_is_unwound_and_a_deeper_one_i
     assert (caught.value.cursor, caught.value.head) == (head - 3, head + 1)
 
 
-async def test_a_block_that_was_handled_in_part_is_told_again_or_taken_back(fork: Fork) -> None:
+async def test_a_block_that_was_not_handled_completely_is_yielded_again_or_reverted(fork: Fork) -> None:
     """The cursor of a reader that fell over in the middle of a block is behind the history."""
     chain, history = fork.chain, History()
     start = await fork.approve(1)
@@ -197,7 +197,7 @@ async def test_a_block_that_was_handled_in_part_is_told_again_or_taken_back(fork
     assert (back.block_number, _values(back.reverted_events)) == (start - 1, [1])
 
 
-async def test_a_node_that_is_behind_is_waited_for_by_who_read_further(fork: Fork) -> None:
+async def test_a_node_that_is_behind_is_waited_for(fork: Fork) -> None:
     """After one of several nodes fell out, the next may not know the last blocks yet."""
     chain, history = fork.chain, History()
     for value in (1, 2, 3):
@@ -226,9 +226,7 @@ async def _anvil_with_state(folder: Path) -> AsyncIterator[Anvil]:
         yield anvil
 
 
-async def test_a_node_that_is_killed_and_started_from_its_state_takes_back_what_it_lost(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_events_that_a_killed_node_lost_are_reverted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     state = tmp_path / "state.json"
     async with _anvil_with_state(tmp_path) as anvil:
         account, friend = (Account.from_key(key) for key in anvil.private_keys[:2])
@@ -258,7 +256,7 @@ async def test_a_node_that_is_killed_and_started_from_its_state_takes_back_what_
     assert (new.block_number, _values(new.events)) == (lost, [3])
 
 
-async def test_a_chain_started_afresh_is_not_taken_for_the_one_that_was_read() -> None:
+async def test_a_chain_that_was_restarted_from_nothing_is_an_error() -> None:
     history = History()
     async with Anvil() as anvil, Node(anvil.url, timing=QUICK) as node:
         account = Account.from_key(anvil.private_keys[0])
@@ -277,7 +275,7 @@ async def test_a_chain_started_afresh_is_not_taken_for_the_one_that_was_read() -
     assert "fresh data_dir" in caught.value.hint
 
 
-def test_a_history_survives_as_bytes_and_what_is_none_is_refused() -> None:
+def test_a_history_is_encoded_and_decoded_and_invalid_ones_are_refused() -> None:
     history = History(depth=2)
     for number in (5, 6, 9):
         history.remember(SeenBlock(number, number.to_bytes(32, "big"), (Approval("a", "b", 2**256 - 1, "0x"),)))

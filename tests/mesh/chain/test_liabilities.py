@@ -1,4 +1,4 @@
-"""Liabilities listed, watched, called off and refunded."""
+"""Listing, watching, cancelling and refunding liabilities."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _signed(account: Account, liability: str) -> bytes:
     return account.signer.sign_hash(cancellation_hash(liability))
 
 
-async def test_what_both_parties_call_off_is_paid_back(market: DeployedMarket) -> None:
+async def test_a_liability_cancelled_by_both_parties_is_refunded(market: DeployedMarket) -> None:
     async with market.chain(market.stranger) as chain:
         before = await chain.tokens.balance(market.promisee.address)
         liability = await _made(market, cost=XRT)
@@ -42,7 +42,7 @@ async def test_what_both_parties_call_off_is_paid_back(market: DeployedMarket) -
             await chain.liabilities.cancel(liability, promisee_signature=promisee, promisor_signature=promisor)
 
 
-async def test_one_party_alone_calls_nothing_off(market: DeployedMarket) -> None:
+async def test_one_party_alone_can_not_cancel(market: DeployedMarket) -> None:
     liability = await _made(market)
     promisee, stranger = (_signed(account, liability) for account in (market.promisee, market.stranger))
     async with market.chain(market.stranger) as chain:
@@ -52,7 +52,7 @@ async def test_one_party_alone_calls_nothing_off(market: DeployedMarket) -> None
         assert not (await chain.liabilities.get(liability)).is_finalized
 
 
-async def test_what_is_no_signature_is_told_without_asking_the_contract(market: DeployedMarket) -> None:
+async def test_an_invalid_signature_is_refused_before_the_contract_is_asked(market: DeployedMarket) -> None:
     liability = await _made(market)
     async with market.chain() as chain:
         for nonsense in ("", "0x12", "nonsense", bytes(65)):
@@ -60,7 +60,7 @@ async def test_what_is_no_signature_is_told_without_asking_the_contract(market: 
                 await chain.liabilities.cancel(liability, promisee_signature=nonsense, promisor_signature=bytes(65))
 
 
-async def test_a_signature_of_another_liability_does_not_count(market: DeployedMarket) -> None:
+async def test_a_signature_for_another_liability_is_refused(market: DeployedMarket) -> None:
     one, other = await _made(market), await _made(market)
     signatures = [_signed(account, other) for account in (market.promisee, market.promisor)]
     async with market.chain(market.stranger) as chain:
@@ -68,7 +68,7 @@ async def test_a_signature_of_another_liability_does_not_count(market: DeployedM
             await chain.liabilities.cancel(one, promisee_signature=signatures[0], promisor_signature=signatures[1])
 
 
-async def test_what_is_no_liability_can_be_neither_called_off_nor_watched(market: DeployedMarket) -> None:
+async def test_only_liabilities_can_be_cancelled_and_watched(market: DeployedMarket) -> None:
     nobody = Account.from_key(new_private_key()).address
     signature = _signed(market.promisee, nobody)
     async with market.chain(market.stranger) as chain:
@@ -81,7 +81,7 @@ async def test_what_is_no_liability_can_be_neither_called_off_nor_watched(market
 
 
 @pytest.mark.parametrize("generation", [3, 5])
-async def test_the_originals_can_not_be_called_off(market: DeployedMarket, generation: int) -> None:
+async def test_liabilities_of_the_originals_can_not_be_cancelled(market: DeployedMarket, generation: int) -> None:
     liability = await _made(market)
     signature = _signed(market.promisee, liability)
     options: dict[str, Any] = {"contracts": "original", "generation": generation}
@@ -94,7 +94,7 @@ async def test_the_originals_can_not_be_called_off(market: DeployedMarket, gener
             await chain.liabilities.refund_state(liability)
 
 
-async def test_a_refund_is_due_after_the_delay_and_not_after_the_end(market: DeployedMarket) -> None:
+async def test_a_refund_is_possible_after_the_delay_and_before_the_end(market: DeployedMarket) -> None:
     liability = await _made(market, cost=1)
     async with market.chain(market.provider) as chain:
         state = await chain.liabilities.refund_state(liability)
@@ -109,7 +109,7 @@ async def test_a_refund_is_due_after_the_delay_and_not_after_the_end(market: Dep
     assert (state.is_finalized, state.is_refundable) == (True, False)
 
 
-async def test_liabilities_are_listed_in_order_and_by_who_has_part_in_them(market: DeployedMarket) -> None:
+async def test_liabilities_are_listed_in_order_and_filtered_by_party(market: DeployedMarket) -> None:
     async with market.chain(market.provider) as chain:
         start = await chain.block_number() + 1
         # Each is the other's promisee: the accounts of the market change places.
@@ -134,13 +134,13 @@ async def test_liabilities_are_listed_in_order_and_by_who_has_part_in_them(marke
         assert len(await chain.liabilities.list()) >= len(made)
 
 
-async def test_liabilities_of_the_originals_are_listed_by_the_factorys_word(market: DeployedMarket) -> None:
+async def test_liabilities_of_the_originals_are_listed_from_the_factorys_events(market: DeployedMarket) -> None:
     liability = await _made(market)
     async with market.chain(contracts="original", generation=3) as chain:
         assert liability in [record.address for record in await chain.liabilities.list()]
 
 
-async def test_the_end_of_a_liability_is_waited_for_and_read_from_its_contract(market: DeployedMarket) -> None:
+async def test_watching_waits_for_the_end_and_returns_the_record(market: DeployedMarket) -> None:
     liability = await _made(market, cost=1)
     async with market.chain() as reader, market.chain(market.provider) as chain, asyncio.timeout(30):
         watching = asyncio.create_task(reader.liabilities.watch(liability.lower()))
@@ -153,7 +153,7 @@ async def test_the_end_of_a_liability_is_waited_for_and_read_from_its_contract(m
         assert await reader.liabilities.watch(liability) == ended, "what has ended already is told at once"
 
 
-async def test_an_end_counts_when_it_has_its_confirmations(market: DeployedMarket) -> None:
+async def test_watching_waits_for_confirmations(market: DeployedMarket) -> None:
     liability = await _made(market)
     timing = replace(QUICK, confirmations=3)
     async with market.chain(timing=timing) as reader, market.chain(market.provider) as chain, asyncio.timeout(30):
@@ -166,7 +166,7 @@ async def test_an_end_counts_when_it_has_its_confirmations(market: DeployedMarke
         assert (await watching).is_finalized
 
 
-async def test_watching_outlives_a_lost_node() -> None:
+async def test_watching_survives_an_outage() -> None:
     async with EmbeddedChain() as node, asyncio.timeout(30):
         market = await prepare(node.provider, node.funded_keys)
         liability = await _made(market)

@@ -1,4 +1,4 @@
-"""Staking on lighthouses, and hearing of new ones."""
+"""Staking on lighthouses, listing and watching them."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ async def _beacon(market: DeployedMarket, name: str) -> str:
         return (await chain.lighthouses.create(minimal_stake=10, timeout_blocks=3, name=name)).lighthouse
 
 
-async def test_who_becomes_a_provider_approves_and_stakes_just_that(market: DeployedMarket) -> None:
+async def test_becoming_a_provider_approves_and_stakes_exactly_the_stake(market: DeployedMarket) -> None:
     beacon, account = await _beacon(market, "first"), await _newcomer(market, holding=XRT)
     async with market.chain(account) as chain:
         start = await chain.block_number()
@@ -80,7 +80,7 @@ async def test_a_provider_that_stakes_enough_already_sends_nothing(market: Deplo
         assert (await chain.lighthouses.become_provider("second", STAKE + 1)).stakes == {account.address: STAKE + 1}
 
 
-async def test_what_was_broken_off_after_the_approval_goes_on_from_there(market: DeployedMarket) -> None:
+async def test_becoming_a_provider_resumes_after_an_interruption(market: DeployedMarket) -> None:
     beacon, account = await _beacon(market, "third"), await _newcomer(market, holding=XRT)
     async with market.chain(account) as chain:
         await chain.tokens.approve(beacon, STAKE)  # and then the process was killed
@@ -91,7 +91,7 @@ async def test_what_was_broken_off_after_the_approval_goes_on_from_there(market:
     assert not [event for event in told if isinstance(event, Approval)]
 
 
-async def test_a_stake_that_was_sent_before_a_crash_is_waited_for_and_not_sent_again(tmp_path: Path) -> None:
+async def test_a_stake_sent_before_a_crash_is_not_sent_again(tmp_path: Path) -> None:
     async with Anvil() as anvil:
         market = await prepare(anvil.url, anvil.private_keys)
         beacon, account = await _beacon(market, "beacon"), await _newcomer(market, holding=XRT)
@@ -112,7 +112,7 @@ async def test_a_stake_that_was_sent_before_a_crash_is_waited_for_and_not_sent_a
 
 
 @pytest.mark.parametrize("generation", [3, 5])
-async def test_the_originals_take_providers_in_the_same_way(market: DeployedMarket, generation: int) -> None:
+async def test_providers_join_the_originals_in_the_same_way(market: DeployedMarket, generation: int) -> None:
     await _beacon(market, f"original-{generation}")
     account = await _newcomer(market, holding=XRT)
     async with market.chain(account, contracts="original", generation=generation) as chain:
@@ -120,7 +120,7 @@ async def test_the_originals_take_providers_in_the_same_way(market: DeployedMark
     assert state.stakes == {account.address: STAKE}
 
 
-async def test_too_small_a_stake_and_too_few_tokens_are_told_before_anything_is_sent(market: DeployedMarket) -> None:
+async def test_a_small_stake_and_missing_tokens_are_refused_before_anything_is_sent(market: DeployedMarket) -> None:
     await _beacon(market, "fourth")
     account = await _newcomer(market, holding=STAKE)
     async with market.chain(account) as chain:
@@ -134,7 +134,7 @@ async def test_too_small_a_stake_and_too_few_tokens_are_told_before_anything_is_
     assert (poor.value.account, poor.value.balance, poor.value.needed) == (account.address, STAKE, STAKE + 1)
 
 
-async def test_a_lighthouse_is_only_what_the_factory_made(market: DeployedMarket) -> None:
+async def test_only_contracts_of_the_factory_are_lighthouses(market: DeployedMarket) -> None:
     async with market.chain() as chain:
         assert await chain.lighthouses.exists("airalab.lighthouse.3.robonomics.eth")
         assert not await chain.lighthouses.exists(market.deployment.xrt)
@@ -151,7 +151,7 @@ async def _first(watching: AsyncGenerator[NewLighthouse, None], count: int) -> l
     return names
 
 
-async def test_new_lighthouses_are_heard_of_as_they_are_made(market: DeployedMarket) -> None:
+async def test_new_lighthouses_are_yielded_when_they_are_created(market: DeployedMarket) -> None:
     async with market.chain() as chain:
         watching = asyncio.create_task(_first(chain.lighthouses.watch(await chain.block_number() + 1), 2))
         await _beacon(market, "fifth")
@@ -159,14 +159,14 @@ async def test_new_lighthouses_are_heard_of_as_they_are_made(market: DeployedMar
         assert await watching == ["fifth", "sixth"]
 
 
-async def test_those_made_before_are_told_when_asked_for_and_the_list_has_them_too(market: DeployedMarket) -> None:
+async def test_earlier_lighthouses_are_yielded_on_request_and_listed(market: DeployedMarket) -> None:
     async with market.chain() as chain:
         listed = [made.name for made in await chain.lighthouses.list()]
         assert listed[0] == "airalab"
         assert await _first(chain.lighthouses.watch(0), len(listed)) == listed
 
 
-async def test_watching_outlives_a_lost_node_and_a_reorganisation() -> None:
+async def test_watching_survives_an_outage_and_a_reorganisation() -> None:
     async with EmbeddedChain() as node:
         deployer = Account.from_key(node.funded_keys[0])
         await deploy(node.provider, deployer)
@@ -192,7 +192,7 @@ async def test_watching_outlives_a_lost_node_and_a_reorganisation() -> None:
             assert (await heard).name == "two"
 
 
-async def test_the_new_lighthouse_is_told_with_its_transaction(market: DeployedMarket) -> None:
+async def test_creating_a_lighthouse_returns_its_event(market: DeployedMarket) -> None:
     async with market.chain(market.provider) as chain:
         made = await chain.lighthouses.create(minimal_stake=1, timeout_blocks=1, name="far")
     assert isinstance(made, NewLighthouse)

@@ -1,4 +1,4 @@
-"""The hashes of names, and which resolver knows a name."""
+"""ENS names."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ def test_namehash_is_that_of_eip_137(name: str, node: str) -> None:
         ("a.b.c.eth", "a.b.c.eth"),
     ],
 )
-def test_names_of_the_network_are_asked_of_their_root(name: str, root: str) -> None:
+def test_names_of_the_network_are_resolved_at_their_root(name: str, root: str) -> None:
     assert root_of(name) == root
 
 
 @pytest.mark.parametrize("text", ["", "eth", "a..eth", "ünï.eth", "a b.eth", "x.com", "0x12", "a" * 300 + ".eth"])
-def test_what_is_no_name_is_refused(text: str) -> None:
+def test_invalid_names_are_refused(text: str) -> None:
     with pytest.raises(InvalidName):
         parse_name(text)
 
 
-def test_a_name_is_of_either_case() -> None:
+def test_names_ignore_case() -> None:
     assert parse_name("AiraLab.Lighthouse.3.Robonomics.ETH") == "airalab.lighthouse.3.robonomics.eth"
 
 

@@ -1,4 +1,4 @@
-"""What is counted of transactions and of the node: each by what became of it, and what it cost."""
+"""The counters of a node: transactions by outcome, their cost, failures and outages."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ async def node() -> AsyncIterator[EmbeddedChain]:
         yield node
 
 
-async def test_a_transaction_that_goes_through_is_sent_and_mined_and_costs_its_gas(node: EmbeddedChain) -> None:
+async def test_a_successful_transaction_counts_as_sent_and_mined_with_its_gas(node: EmbeddedChain) -> None:
     async with Node(node.provider, timing=QUICK) as way:
         account = Account.from_key(node.funded_keys[0])
         before = await way.eth_balance(account.address)
@@ -56,7 +56,7 @@ async def test_a_transaction_that_goes_through_is_sent_and_mined_and_costs_its_g
         assert before - await way.eth_balance(account.address) == counted.wei + 5
 
 
-async def test_what_the_contracts_would_refuse_is_never_sent_and_costs_nothing(node: EmbeddedChain) -> None:
+async def test_a_transaction_that_would_revert_is_not_sent_and_costs_nothing(node: EmbeddedChain) -> None:
     deployer, friend = (Account.from_key(key) for key in node.funded_keys[:2])
     await deploy(node.provider, deployer)
     async with Chain(node.provider, account=friend, timing=QUICK) as chain:
@@ -67,7 +67,7 @@ async def test_what_the_contracts_would_refuse_is_never_sent_and_costs_nothing(n
         assert (counted.gas_used, counted.wei) == (0, 0)
 
 
-async def test_a_node_that_falls_silent_is_lost_once_and_each_question_fails(node: EmbeddedChain) -> None:
+async def test_an_outage_counts_once_and_each_failed_request(node: EmbeddedChain) -> None:
     line = _Line(node)
     async with Node(line, timing=replace(QUICK, attempts=2)) as way:
         for silence in (1, 2):

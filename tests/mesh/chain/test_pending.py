@@ -1,4 +1,4 @@
-"""Transactions that an earlier life has left behind, and the journal that tells of them."""
+"""Pending transactions of earlier processes, with and without a transaction folder."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _files(folder: Path) -> list[Path]:
     return [path for path in folder.rglob("*") if path.is_file()]
 
 
-async def test_what_was_mined_long_ago_is_not_what_is_meant_now(anvil: Anvil) -> None:
+async def test_a_transaction_that_was_mined_long_ago_is_sent_as_a_new_one(anvil: Anvil) -> None:
     async with open_sender(anvil, replace(SHORT, repeat_within=0)) as (node, sender):
         friend = unused_address()
         with pytest.raises(TransactionTimeout):
@@ -37,7 +37,7 @@ async def test_what_was_mined_long_ago_is_not_what_is_meant_now(anvil: Anvil) ->
         assert await node.eth_balance(friend) == 10
 
 
-async def test_what_an_earlier_life_left_in_the_pool_is_not_collided_with(anvil: Anvil) -> None:
+async def test_pending_transactions_of_an_earlier_process_keep_their_nonces(anvil: Anvil) -> None:
     friend = unused_address()
     async with open_sender(anvil, SHORT) as (_, sender):
         with pytest.raises(TransactionTimeout):
@@ -71,7 +71,7 @@ async def test_a_restarted_process_sends_what_the_node_forgot_again(anvil: Anvil
     assert _files(tmp_path) == [], "what is settled is not kept"
 
 
-async def test_a_forgotten_transaction_gives_its_number_to_another(anvil: Anvil, tmp_path: Path) -> None:
+async def test_the_nonce_of_a_forgotten_transaction_is_used_again(anvil: Anvil, tmp_path: Path) -> None:
     friend = unused_address()
     await dropped(anvil, friend, transactions=tmp_path)
     async with open_sender(anvil, transactions=tmp_path) as (node, sender):
@@ -82,9 +82,7 @@ async def test_a_forgotten_transaction_gives_its_number_to_another(anvil: Anvil,
         assert await node.eth_balance(friend) == 7
 
 
-async def test_what_waits_behind_a_stuck_transaction_of_an_earlier_life_gets_it_moving(
-    anvil: Anvil, tmp_path: Path
-) -> None:
+async def test_a_stuck_transaction_of_an_earlier_process_is_replaced(anvil: Anvil, tmp_path: Path) -> None:
     friend = unused_address()
     async with open_sender(anvil, SHORT, transactions=tmp_path) as (node, sender):
         with pytest.raises(TransactionTimeout) as stuck:
@@ -113,7 +111,7 @@ async def test_a_transaction_folder_belongs_to_one_chain(tmp_path: Path) -> None
     assert [path.name for path in _files(tmp_path)] == ["000000000000.jsonl"] * 2
 
 
-async def test_a_number_that_another_transaction_took_at_last_is_replaced(anvil: Anvil) -> None:
+async def test_a_transaction_that_lost_its_nonce_is_sent_with_the_next(anvil: Anvil) -> None:
     """Somebody sends with the same key and number through another node, and wins."""
     account, friend = Account.from_key(anvil.private_keys[0]), unused_address()
     async with Node(anvil.url, timing=QUICK) as node:
@@ -172,7 +170,7 @@ async def test_processes_that_share_a_folder_never_use_the_same_nonce(tmp_path: 
         assert await node.eth_balance(friend) == 18
 
 
-async def test_a_folder_that_can_not_be_written_is_one_clear_error(anvil: Anvil, tmp_path: Path) -> None:
+async def test_a_folder_that_can_not_be_written_is_an_error(anvil: Anvil, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     async with open_sender(anvil, transactions=tmp_path / "file") as (_, sender):
         with pytest.raises(ConfigurationError, match="can't keep sent transactions"):

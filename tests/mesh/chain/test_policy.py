@@ -1,4 +1,4 @@
-"""What gas may cost."""
+"""Fees, and the ceiling for them."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ async def test_above_the_ceiling_nothing_is_sent(anvil: Anvil) -> None:
         assert await node.transaction_count(sender.account.address, pending=True) == 0
 
 
-async def test_with_patience_a_transaction_waits_for_the_price_to_come_down(anvil: Anvil) -> None:
+async def test_with_patience_a_transaction_waits_for_a_lower_price(anvil: Anvil) -> None:
     async with Node(anvil.url, timing=QUICK, fees=FeePolicy(ceiling=20 * GWEI, patience=20)) as node:
         friend = unused_address()
         await _next_base_fee(node, 30 * GWEI)
@@ -69,7 +69,7 @@ async def test_never_more_than_the_ceiling_is_offered(anvil: Anvil) -> None:
     assert int(sent["type"], 16) == 2
 
 
-async def test_a_replacement_is_dearer_by_what_nodes_want_or_there_is_none(anvil: Anvil) -> None:
+async def test_a_replacement_offers_what_nodes_require_or_is_not_made(anvil: Anvil) -> None:
     async with Node(anvil.url, timing=QUICK) as node:
         policy, market = FeePolicy(ceiling=100 * GWEI), await node.gas_market()
         bumped = policy.replacement(market, Fees(50 * GWEI, 7))
@@ -90,7 +90,7 @@ class _Plain(HttpTransport):
         return await super().make_request(method, params)
 
 
-async def test_a_node_without_a_word_for_priority_fees_is_asked_for_its_price(anvil: Anvil) -> None:
+async def test_without_a_suggested_priority_fee_the_gas_price_is_used(anvil: Anvil) -> None:
     wire = _Plain(anvil.url)
     async with Node(wire, timing=QUICK) as node:
         base = (await node.latest_header()).base_fee or 0
@@ -103,6 +103,6 @@ async def test_a_node_without_a_word_for_priority_fees_is_asked_for_its_price(an
 
 
 @pytest.mark.parametrize("wrong", [{"ceiling": 0}, {"patience": -1}, {"bump_percent": 9}])
-def test_a_policy_that_can_not_be_is_refused(wrong: dict[str, Any]) -> None:
+def test_invalid_policies_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ConfigurationError, match="ceiling above zero"):
         FeePolicy(**wrong)

@@ -1,4 +1,4 @@
-"""Processes: several that share one embedded chain over JSON-RPC, and the one that it runs in."""
+"""Several processes that share one embedded chain, and the recursion limit in its process."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ async def _child(program: str, *arguments: str) -> tuple[int | None, str]:
     return process.returncode, (out + errors).decode()
 
 
-async def test_processes_with_accounts_of_their_own_and_with_the_same_one_lose_nothing() -> None:
+async def test_processes_with_separate_and_shared_accounts_lose_no_transaction() -> None:
     friend = Account.from_key(new_private_key()).address
     async with serve_embedded(port=0) as served:
         deployer = Account.from_key(served.node.funded_keys[0])

@@ -1,4 +1,4 @@
-"""Why contracts refuse, in the words of several nodes."""
+"""Decoding reverts, as several nodes report them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NOT_A_PROVIDER = keccak256(b"NotAProvider(address)")[:4] + encode(["address"], [
     ],
     ids=["geth", "anvil", "hardhat", "parity"],
 )
-def test_a_custom_error_is_found_where_a_node_puts_it(error: dict[str, Any]) -> None:
+def test_custom_errors_are_found_wherever_nodes_put_them(error: dict[str, Any]) -> None:
     reverted = decode_revert(error)
     assert reverted is not None
     assert (reverted.reason, reverted.arguments) == ("NotAProvider", (ADDRESS,))
@@ -33,7 +33,7 @@ def test_a_custom_error_is_found_where_a_node_puts_it(error: dict[str, Any]) -> 
     assert reverted.hint.startswith("stake on the lighthouse first")
 
 
-def test_all_that_there_is_advice_for_is_an_error_of_the_contracts() -> None:
+def test_every_hint_is_for_an_error_of_the_contracts() -> None:
     known = {name for name, _ in custom_errors().values()}
     assert REVERT_HINTS.keys() - known == {"OutOfGas"}, "which no contract says"
 
@@ -47,7 +47,7 @@ def test_all_that_there_is_advice_for_is_an_error_of_the_contracts() -> None:
         {},
     ],
 )
-def test_other_errors_are_no_refusals_of_a_contract(error: dict[str, Any]) -> None:
+def test_other_errors_are_not_reverts(error: dict[str, Any]) -> None:
     assert decode_revert(error) is None
 
 
@@ -55,19 +55,19 @@ def test_a_plain_revert_gives_its_text() -> None:
     assert explain(bytes.fromhex("08c379a0") + encode(["string"], ["too late"])).reason == "too late"
 
 
-def test_a_text_without_data_is_taken_from_the_message() -> None:
+def test_without_data_the_reason_is_taken_from_the_message() -> None:
     reverted = decode_revert({"code": 3, "message": "execution reverted: too late"})
     assert reverted is not None
     assert reverted.reason == "too late"
 
 
-def test_a_panic_tells_its_code() -> None:
+def test_a_panic_has_its_code() -> None:
     panic = explain(bytes.fromhex("4e487b71") + encode(["uint256"], [0x11]))
     assert (panic.reason, panic.arguments) == ("Panic", (0x11,))
 
 
 @pytest.mark.parametrize("data", [b"", b"\1", b"\xde\xad\xbe\xef", NOT_A_PROVIDER[:10], bytes.fromhex("08c379a0ff")])
-def test_data_that_means_nothing_is_kept(data: bytes) -> None:
+def test_unknown_revert_data_is_kept(data: bytes) -> None:
     reverted = explain(data)
     assert (reverted.reason, reverted.arguments, reverted.data) == ("", (), data)
 

@@ -1,4 +1,4 @@
-"""What tokens say of themselves."""
+"""Descriptions of tokens."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 
 
-async def test_the_networks_token_is_described_by_itself(market: DeployedMarket) -> None:
+async def test_the_token_of_the_network_is_described(market: DeployedMarket) -> None:
     async with market.chain() as chain:
         token = await chain.tokens.info()
         assert (
@@ -26,7 +26,7 @@ async def test_the_networks_token_is_described_by_itself(market: DeployedMarket)
     assert token.total_supply >= 1_000_000 * XRT
 
 
-async def test_what_is_no_token_is_one_clear_error(market: DeployedMarket) -> None:
+async def test_an_address_without_a_token_is_an_error(market: DeployedMarket) -> None:
     async with market.chain() as chain:
         with no_contracts("totalSupply"):
             await chain.tokens.info(market.stranger.address)
@@ -46,7 +46,7 @@ def _answering(word: bytes) -> bytes:
     return b"\x7f" + word.ljust(32, b"\0") + bytes.fromhex("60005260206000f3")
 
 
-async def test_a_token_of_the_first_years_answers_its_symbol_as_32_bytes(market: DeployedMarket) -> None:
+async def test_a_symbol_of_32_bytes_is_decoded(market: DeployedMarket) -> None:
     address = await _deployed(market, _answering(b"MKR"))
     async with market.chain() as chain:
         token = await chain.tokens.info(address)
@@ -54,7 +54,7 @@ async def test_a_token_of_the_first_years_answers_its_symbol_as_32_bytes(market:
     assert token.decimals == 0, "what is no number of decimals is none"
 
 
-async def test_a_token_that_says_nothing_has_no_symbol_and_whole_units(market: DeployedMarket) -> None:
+async def test_a_token_without_a_description_has_no_symbol_and_no_decimals(market: DeployedMarket) -> None:
     """It has `totalSupply` alone: any other call is refused."""
     supply = bytes.fromhex("60003560e01c6318160ddd14601357600080fd5b600760005260206000f3")
     address = await _deployed(market, supply)
@@ -64,7 +64,7 @@ async def test_a_token_that_says_nothing_has_no_symbol_and_whole_units(market: D
         )
 
 
-async def test_what_a_token_calls_itself_can_not_write_to_a_terminal(market: DeployedMarket) -> None:
+async def test_control_characters_in_a_tokens_name_are_removed(market: DeployedMarket) -> None:
     address = await _deployed(market, _answering(b"\x1b[31mXRT\n\xe2\x80\xae"))
     async with market.chain() as chain:
         assert (await chain.tokens.info(address)).symbol == "[31mXRT"

@@ -1,4 +1,4 @@
-"""Entries on disk, as several processes see them: locks belong to an open file, so two journals stand for two."""
+"""The transaction store. Locks belong to an open file, so two stores stand for two processes."""
 
 from __future__ import annotations
 
@@ -32,9 +32,7 @@ def _entry(nonce: int) -> PendingTransaction:
     return PendingTransaction(nonce=nonce, fields=fields, versions=[SignedTransaction(b"\x01", "0x01")])
 
 
-def test_an_entry_is_anothers_while_it_is_held_and_anyones_afterwards(
-    one: TransactionStore, other: TransactionStore
-) -> None:
+def test_an_entry_can_be_locked_by_one_process_at_a_time(one: TransactionStore, other: TransactionStore) -> None:
     entry = _entry(7)
     hold = one.add(entry)
     assert hold is not None
@@ -50,7 +48,7 @@ def test_an_entry_is_anothers_while_it_is_held_and_anyones_afterwards(
     assert one.lock(entry) is None
 
 
-def test_an_entry_that_is_removed_is_gone_for_all(
+def test_a_removed_entry_is_gone_for_all_processes(
     one: TransactionStore, other: TransactionStore, tmp_path: Path
 ) -> None:
     hold = one.add(_entry(7))
@@ -60,7 +58,7 @@ def test_an_entry_that_is_removed_is_gone_for_all(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_all_versions_are_kept_and_a_line_that_was_cut_off_is_not_read(one: TransactionStore, tmp_path: Path) -> None:
+def test_all_versions_are_read_except_an_incomplete_last_line(one: TransactionStore, tmp_path: Path) -> None:
     entry = _entry(7)
     hold = one.add(entry)
     assert hold is not None
@@ -75,12 +73,12 @@ def test_all_versions_are_kept_and_a_line_that_was_cut_off_is_not_read(one: Tran
     assert left.fields["gasPrice"] == 2
 
 
-def test_what_is_ones_own_is_left_out(one: TransactionStore) -> None:
+def test_reading_leaves_out_ones_own_entries(one: TransactionStore) -> None:
     assert one.add(_entry(7)) is not None
     assert one.read({7}) == ([], frozenset())
 
 
-def test_a_version_after_one_that_was_cut_off_is_read(
+def test_a_version_after_an_incomplete_line_is_read(
     one: TransactionStore, other: TransactionStore, tmp_path: Path
 ) -> None:
     entry = _entry(7)
@@ -98,7 +96,7 @@ def test_a_version_after_one_that_was_cut_off_is_read(
     assert [signed.hash for signed in left.versions] == ["0x01", "0x02"]
 
 
-def test_a_full_disk_is_one_clear_line_and_leaves_nothing_behind(one: TransactionStore, tmp_path: Path) -> None:
+def test_a_full_disk_is_an_error_and_leaves_nothing_behind(one: TransactionStore, tmp_path: Path) -> None:
     with (
         file_size_limit(16),
         pytest.raises(ConfigurationError, match=f"^can't keep sent transactions in {tmp_path}: ") as caught,
@@ -123,7 +121,7 @@ def test_a_version_that_does_not_fit_leaves_the_others(one: TransactionStore, tm
     assert [signed.hash for signed in left.versions] == ["0x01", "0x02"]
 
 
-async def test_a_folder_that_is_gone_is_one_clear_line(one: TransactionStore, tmp_path: Path) -> None:
+async def test_a_missing_folder_is_an_error(one: TransactionStore, tmp_path: Path) -> None:
     outbox = PendingTransactions(one)
     entry = _entry(7)
     assert await outbox.add(entry)
@@ -133,7 +131,7 @@ async def test_a_folder_that_is_gone_is_one_clear_line(one: TransactionStore, tm
     outbox.abandon(entry)
 
 
-def test_a_damaged_entry_is_one_clear_line(one: TransactionStore, tmp_path: Path) -> None:
+def test_a_damaged_entry_is_an_error(one: TransactionStore, tmp_path: Path) -> None:
     (tmp_path / "000000000007.jsonl").write_text("garbage")
     with pytest.raises(ConfigurationError, match="holds no sent transaction"):
         one.read(())

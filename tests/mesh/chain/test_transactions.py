@@ -1,4 +1,4 @@
-"""Sending, when the way or the chain does not do what is hoped for."""
+"""Sending transactions when the connection, the node or the chain fails."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ async def node() -> AsyncIterator[EmbeddedChain]:
         yield node
 
 
-async def test_a_transaction_whose_answer_was_lost_goes_through_once(node: EmbeddedChain) -> None:
+async def test_a_transaction_whose_answer_was_lost_is_mined_once(node: EmbeddedChain) -> None:
     wire, friend = _Wire(node), unused_address()
     async with Node(wire, timing=QUICK) as way:
         sender = TransactionSender(way, Account.from_key(node.funded_keys[0]))
@@ -70,7 +70,7 @@ async def test_a_transaction_whose_answer_was_lost_goes_through_once(node: Embed
         assert await way.eth_balance(friend) == 5
 
 
-async def test_a_node_that_stays_away_while_sending_is_told(node: EmbeddedChain) -> None:
+async def test_a_node_that_is_lost_while_sending_is_an_error(node: EmbeddedChain) -> None:
     wire = _Wire(node)
     async with Node(wire, timing=QUICK) as way:
         sender = TransactionSender(way, Account.from_key(node.funded_keys[0]))
@@ -79,7 +79,7 @@ async def test_a_node_that_stays_away_while_sending_is_told(node: EmbeddedChain)
             await sender.send(to=unused_address(), data=b"", value=5)
 
 
-async def test_a_number_taken_by_another_client_is_replaced(node: EmbeddedChain) -> None:
+async def test_a_nonce_taken_by_another_client_is_replaced(node: EmbeddedChain) -> None:
     """Even by the very same transaction, byte for byte: it is another one all the same."""
     wire, friend = _Wire(node), unused_address()
     account = Account.from_key(node.funded_keys[0])
@@ -89,7 +89,7 @@ async def test_a_number_taken_by_another_client_is_replaced(node: EmbeddedChain)
         assert await one.eth_balance(friend) == 10
 
 
-async def test_what_fails_only_when_mined_is_explained(node: EmbeddedChain) -> None:
+async def test_a_transaction_that_fails_only_when_mined_has_its_reason(node: EmbeddedChain) -> None:
     """Between the simulation and the block somebody else takes the tokens."""
     wire = _Wire(node)
     deployer, friend = (Account.from_key(key) for key in node.funded_keys[:2])
@@ -106,7 +106,7 @@ async def test_what_fails_only_when_mined_is_explained(node: EmbeddedChain) -> N
         assert caught.value.arguments == (friend.address, 0, XRT)
 
 
-async def test_transactions_of_one_node_do_not_fight_for_numbers(node: EmbeddedChain) -> None:
+async def test_concurrent_transactions_of_one_node_get_different_nonces(node: EmbeddedChain) -> None:
     wire, friend = _Wire(node), unused_address()
     account = Account.from_key(node.funded_keys[0])
     async with Node(wire, timing=QUICK) as way:
@@ -135,7 +135,7 @@ class _Forgetful(HttpTransport):
         return await super().make_request(method, params)
 
 
-async def test_numbers_go_on_where_the_node_forgets_what_is_pending() -> None:
+async def test_nonces_continue_when_the_node_does_not_count_pending_transactions() -> None:
     friend = unused_address()
     async with Anvil(arguments=("--block-time", "1")) as anvil:
         forgetful = _Forgetful(anvil.url)
@@ -146,7 +146,7 @@ async def test_numbers_go_on_where_the_node_forgets_what_is_pending() -> None:
         await forgetful.close()
 
 
-async def test_a_transaction_that_is_not_mined_is_given_up_and_the_next_waits_behind_it() -> None:
+async def test_a_transaction_that_is_not_mined_times_out_and_keeps_its_nonce() -> None:
     timing = replace(QUICK, receipt_timeout=0.1)
     friend = unused_address()
     async with Anvil(arguments=("--no-mining",)) as anvil, Node(anvil.url, timing=timing) as node:
@@ -161,7 +161,7 @@ async def test_a_transaction_that_is_not_mined_is_given_up_and_the_next_waits_be
         assert await node.eth_balance(friend) == 3
 
 
-async def test_the_number_of_a_transaction_that_the_node_dropped_is_used_again() -> None:
+async def test_the_nonce_of_a_dropped_transaction_is_used_again() -> None:
     friend = unused_address()
     async with (
         Anvil(arguments=("--no-mining",)) as anvil,
@@ -185,7 +185,7 @@ async def test_a_chain_without_a_base_fee_is_paid_by_gas_price() -> None:
         assert await node.eth_balance(friend) == 1
 
 
-async def test_cancelling_does_not_hold_up_the_next(node: EmbeddedChain) -> None:
+async def test_cancelling_does_not_block_the_next_transaction(node: EmbeddedChain) -> None:
     wire, friend = _Wire(node), unused_address()
     reached = asyncio.Event()
 

@@ -33,7 +33,7 @@ async def _orders(market: DeployedMarket, generation: int, **fields: Any) -> tup
 
 
 @pytest.mark.parametrize("generation", [3, 5])
-async def test_a_job_is_done_by_the_calls_of_the_generation(market: DeployedMarket, generation: int) -> None:
+async def test_a_job_uses_the_calls_of_the_generation(market: DeployedMarket, generation: int) -> None:
     options: dict[str, Any] = {"contracts": "original", "generation": generation}
     async with market.chain(market.provider, **options) as chain:
         start = await chain.block_number()
@@ -56,9 +56,7 @@ async def test_generation_3s_result_of_a_failed_job_pays_the_promisee_back(marke
 
 
 @pytest.mark.parametrize("generation", [3, 5])
-async def test_a_liability_is_known_by_the_factorys_event_or_by_its_gas(
-    market: DeployedMarket, generation: int
-) -> None:
+async def test_liabilities_are_recognised_by_event_or_by_gas(market: DeployedMarket, generation: int) -> None:
     options: dict[str, Any] = {"contracts": "original", "generation": generation}
     async with market.chain(market.provider) as chain:
         start = await chain.block_number()
@@ -76,7 +74,7 @@ async def test_a_liability_is_known_by_the_factorys_event_or_by_its_gas(
 
 
 @pytest.mark.parametrize("generation", [3, 5])
-async def test_a_lighthouse_is_read_by_the_names_of_the_generation(market: DeployedMarket, generation: int) -> None:
+async def test_a_lighthouse_is_read_with_the_getters_of_the_generation(market: DeployedMarket, generation: int) -> None:
     options: dict[str, Any] = {"contracts": "original", "generation": generation}
     async with market.chain(market.provider) as ours, market.chain(market.provider, **options) as chain:
         assert await chain.lighthouses.get("airalab") == await ours.lighthouses.get("airalab")
@@ -92,7 +90,7 @@ async def test_names_are_those_of_the_generations_root(market: DeployedMarket) -
         )
 
 
-async def test_what_the_originals_lack_is_told(market: DeployedMarket) -> None:
+async def test_functions_that_the_originals_lack_raise_not_offered(market: DeployedMarket) -> None:
     result = market.result(market.stranger.address)
     async with market.chain(market.provider, contracts="original", generation=3) as chain:
         with pytest.raises(NotOffered, match="generation 3 offer no nonceOf") as caught:
@@ -111,7 +109,7 @@ async def test_what_the_originals_lack_is_told(market: DeployedMarket) -> None:
             await chain.liabilities.create("airalab", *await _orders(market, 3))
 
 
-async def test_contracts_that_never_were_are_refused(market: DeployedMarket) -> None:
+async def test_unknown_contract_versions_are_refused(market: DeployedMarket) -> None:
     for options in ({"contracts": "original", "generation": 4}, {"contracts": "other"}):
         with pytest.raises(ConfigurationError, match="there are no"):
             async with market.chain(factory=market.deployment.factory, xrt=market.deployment.xrt, **options):

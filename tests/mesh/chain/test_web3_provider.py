@@ -1,4 +1,4 @@
-"""The way to a node that is not there, is lost, or is no node."""
+"""Connections to nodes that are missing, lost, frozen or on another chain."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ async def _server(handler: Callable[[web.Request], Awaitable[web.StreamResponse]
 
 
 @pytest.mark.parametrize("scheme", ["http", "ws"])
-async def test_a_node_that_is_not_there_is_one_clear_error(scheme: str) -> None:
+async def test_a_missing_node_is_an_error(scheme: str) -> None:
     endpoint = f"{scheme}://127.0.0.1:{free_port()}"
     with pytest.raises(NodeUnreachable, match=endpoint) as caught:
         async with Chain(endpoint, timing=QUICK):
@@ -66,7 +66,7 @@ async def test_attempts_are_bounded_and_spaced() -> None:
     )
 
 
-async def test_a_node_that_comes_back_in_time_is_not_noticed() -> None:
+async def test_a_short_outage_is_bridged_by_retries() -> None:
     count = 0
 
     async def hesitant(request: web.Request) -> web.Response:
@@ -90,7 +90,7 @@ async def test_a_node_that_comes_back_in_time_is_not_noticed() -> None:
         ({"status": 404}, "404"),
     ],
 )
-async def test_what_is_no_node_is_found_out_at_once(response: dict[str, Any], why: str) -> None:
+async def test_a_server_that_is_not_a_node_fails_at_once(response: dict[str, Any], why: str) -> None:
     count = 0
 
     async def answer(request: web.Request) -> web.Response:
@@ -105,7 +105,7 @@ async def test_what_is_no_node_is_found_out_at_once(response: dict[str, Any], wh
     assert count == 1
 
 
-async def test_a_node_that_never_answers_is_given_up() -> None:
+async def test_a_node_that_never_answers_times_out() -> None:
     async def sleepy(request: web.Request) -> web.Response:
         await asyncio.Event().wait()
         raise AssertionError
@@ -116,7 +116,7 @@ async def test_a_node_that_never_answers_is_given_up() -> None:
                 pass
 
 
-async def test_an_error_that_comes_with_a_http_status_is_still_the_nodes_word() -> None:
+async def test_a_json_rpc_error_with_an_http_status_is_reported() -> None:
     async def rude(request: web.Request) -> web.Response:
         error = {"code": -32005, "message": "limit exceeded"}
         return web.json_response({"jsonrpc": "2.0", "id": 1, "error": error}, status=400)
@@ -129,13 +129,13 @@ async def test_an_error_that_comes_with_a_http_status_is_still_the_nodes_word() 
 
 
 @pytest.mark.parametrize("endpoint", ["", "127.0.0.1:8545", "ftp://127.0.0.1"])
-def test_a_text_that_is_no_endpoint_is_refused(endpoint: str) -> None:
+def test_invalid_endpoints_are_refused(endpoint: str) -> None:
     with pytest.raises(ConfigurationError, match="not the address of a node"):
         Node(endpoint)
 
 
 @pytest.mark.parametrize("scheme", ["http", "ws"])
-async def test_a_node_that_goes_and_comes_again_is_found_again(scheme: str) -> None:
+async def test_a_restarted_node_is_connected_to_again(scheme: str) -> None:
     anvil = Anvil()
     endpoint = anvil.url if scheme == "http" else anvil.ws_url
     await asyncio.to_thread(anvil.start)
@@ -151,7 +151,7 @@ async def test_a_node_that_goes_and_comes_again_is_found_again(scheme: str) -> N
         await asyncio.to_thread(anvil.stop)
 
 
-async def test_a_websocket_that_closes_without_an_answer_is_not_waited_for() -> None:
+async def test_requests_fail_when_their_websocket_closes() -> None:
     async def hang_up(request: web.Request) -> web.WebSocketResponse:
         socket = web.WebSocketResponse()
         await socket.prepare(request)
@@ -170,7 +170,7 @@ async def test_many_requests_share_a_websocket() -> None:
         assert await asyncio.gather(*(node.block_number() for _ in range(50))) == [0] * 50
 
 
-async def test_a_closed_node_is_not_asked() -> None:
+async def test_a_closed_node_raises() -> None:
     async with EmbeddedChain() as chain, JsonRpcServer(chain.provider) as server:
         async with Node(server.url, timing=QUICK) as node:
             pass
@@ -180,7 +180,7 @@ async def test_a_closed_node_is_not_asked() -> None:
             _ = node.chain_id
 
 
-async def test_a_closed_embedded_chain_is_told_as_closed() -> None:
+async def test_a_closed_embedded_chain_raises() -> None:
     async with EmbeddedChain() as chain, Node(chain.provider, timing=QUICK) as node:
         await chain.__aexit__(None, None, None)
         with pytest.raises(ClosedError, match="embedded"):
@@ -188,7 +188,7 @@ async def test_a_closed_embedded_chain_is_told_as_closed() -> None:
 
 
 @pytest.mark.parametrize("scheme", ["http", "ws"])
-async def test_of_several_nodes_the_next_is_asked_when_one_goes(scheme: str) -> None:
+async def test_the_next_node_is_asked_when_one_fails(scheme: str) -> None:
     async with Anvil() as first, Anvil() as second:
         urls = [anvil.url if scheme == "http" else anvil.ws_url for anvil in (first, second)]
         async with Node(urls, timing=replace(QUICK, attempts=1)) as node:
@@ -205,7 +205,7 @@ async def test_of_several_nodes_the_next_is_asked_when_one_goes(scheme: str) -> 
     assert caught.value.endpoint == ", ".join(urls)
 
 
-async def test_a_frozen_node_is_passed_over_once_and_not_asked_first_again() -> None:
+async def test_a_frozen_node_is_skipped_and_asked_last_afterwards() -> None:
     async with Anvil() as frozen, Anvil() as other:
         timing = replace(QUICK, request_timeout=2)
         async with Node(f"{frozen.url}, {other.url}", timing=timing) as node:
@@ -218,13 +218,13 @@ async def test_a_frozen_node_is_passed_over_once_and_not_asked_first_again() -> 
             await asyncio.to_thread(frozen.resume)
 
 
-async def test_a_node_that_is_not_there_at_the_start_is_passed_over() -> None:
+async def test_a_node_that_is_missing_at_the_start_is_skipped() -> None:
     async with Anvil() as anvil, Node(f"http://127.0.0.1:{free_port()},{anvil.url}", timing=QUICK) as node:
         assert node.chain_id == 31337
 
 
 @pytest.mark.parametrize("scheme", ["http", "ws"])
-async def test_nodes_of_different_chains_are_not_opened_together(scheme: str) -> None:
+async def test_nodes_of_different_chains_are_refused(scheme: str) -> None:
     async with Anvil() as anvil, Anvil(arguments=("--chain-id", "4")) as other:
         urls = [one.url if scheme == "http" else one.ws_url for one in (anvil, other)]
         with pytest.raises(
@@ -236,7 +236,7 @@ async def test_nodes_of_different_chains_are_not_opened_together(scheme: str) ->
     assert caught.value.hint
 
 
-async def test_a_node_of_another_chain_that_comes_later_is_not_taken_for_one_of_this() -> None:
+async def test_a_node_of_another_chain_that_starts_later_is_skipped() -> None:
     other = Anvil(arguments=("--chain-id", "4"))
     async with Anvil() as anvil, Node((anvil.url, other.url), timing=replace(QUICK, attempts=1)) as node, other:
         await asyncio.to_thread(anvil.kill)
@@ -244,7 +244,7 @@ async def test_a_node_of_another_chain_that_comes_later_is_not_taken_for_one_of_
             await node.block_number()
 
 
-async def test_a_node_that_comes_back_on_another_chain_is_not_taken_for_what_it_was() -> None:
+async def test_a_node_that_restarts_on_another_chain_is_skipped() -> None:
     first, second = Anvil(), Anvil()
     async with second, Node((first.url, second.url), timing=replace(QUICK, attempts=1)) as node:
         async with first:
@@ -259,7 +259,7 @@ async def test_a_node_that_comes_back_on_another_chain_is_not_taken_for_what_it_
             await asyncio.to_thread(second.start)
 
 
-async def test_a_node_that_is_asked_too_often_is_asked_again_whatever_it_says() -> None:
+async def test_too_many_requests_are_retried() -> None:
     count = 0
 
     async def busy(request: web.Request) -> web.Response:
@@ -278,12 +278,12 @@ async def test_a_node_that_is_asked_too_often_is_asked_again_whatever_it_says() 
     "wrong",
     [{"attempts": 0}, {"request_timeout": 0}, {"receipt_timeout": 0}, {"retry_delay": -1}, {"repeat_within": -1}],
 )
-def test_times_that_can_not_be_are_refused(wrong: dict[str, Any]) -> None:
+def test_invalid_timings_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ConfigurationError, match="above zero"):
         replace(QUICK, **wrong)
 
 
 @pytest.mark.parametrize("endpoint", [(), "http://127.0.0.1:1,", ["http://127.0.0.1:1", "ftp://x"]])
-def test_every_one_of_several_endpoints_is_an_address(endpoint: Any) -> None:
+def test_each_of_several_endpoints_is_validated(endpoint: Any) -> None:
     with pytest.raises(ConfigurationError, match="not the address of a node"):
         Node(endpoint)

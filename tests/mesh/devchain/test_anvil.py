@@ -1,4 +1,4 @@
-"""Anvil as a part of this program: started, watched, stopped, its chain kept."""
+"""Starting, watching and stopping anvil, and keeping its chain."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def is_alive(pid: int) -> bool:
     return True
 
 
-async def test_it_serves_for_the_body_and_is_gone_after_it(program: Path) -> None:
+async def test_anvil_runs_for_the_body_and_stops_after_it(program: Path) -> None:
     async with serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=None) as node:
         pid, port = node.pid, int(node.url.rpartition(":")[2])
         for url in (node.url, node.url.replace("http", "ws", 1)):
@@ -54,7 +54,7 @@ async def test_it_serves_for_the_body_and_is_gone_after_it(program: Path) -> Non
     assert not answers(port)
 
 
-async def test_blocks_come_by_time_where_that_is_asked_for(program: Path) -> None:
+async def test_empty_blocks_are_mined_with_a_block_time(program: Path) -> None:
     async with (
         asyncio.timeout(30),
         serve_anvil(program, host="127.0.0.1", port=0, block_time=0.1, state=None) as node,
@@ -64,7 +64,7 @@ async def test_blocks_come_by_time_where_that_is_asked_for(program: Path) -> Non
             await asyncio.sleep(0.02)
 
 
-async def test_an_end_of_its_own_ends_the_body_with_what_it_said(program: Path) -> None:
+async def test_an_anvil_that_ends_by_itself_ends_the_body_with_its_output(program: Path) -> None:
     async def serve() -> None:
         async with serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=None) as node:
             os.kill(node.pid, signal.SIGKILL)
@@ -75,7 +75,7 @@ async def test_an_end_of_its_own_ends_the_body_with_what_it_said(program: Path) 
     assert ended.value.exit_code == -9
 
 
-async def test_a_start_that_fails_says_why(tmp_path: Path) -> None:
+async def test_a_failed_start_has_its_reason(tmp_path: Path) -> None:
     broken = tmp_path / "anvil"
     broken.write_text("#!/bin/sh\necho 'the disk is on fire'\nexit 3\n")
     broken.chmod(stat.S_IRWXU)
@@ -85,7 +85,7 @@ async def test_a_start_that_fails_says_why(tmp_path: Path) -> None:
     assert ended.value.hint == "the disk is on fire"
 
 
-async def test_one_that_is_cancelled_while_it_starts_leaves_no_process(tmp_path: Path) -> None:
+async def test_cancelling_the_start_leaves_no_process(tmp_path: Path) -> None:
     slow = tmp_path / "anvil"
     slow.write_text(f"#!/bin/sh\necho $$ > {tmp_path}/pid\nexec sleep 600\n")
     slow.chmod(stat.S_IRWXU)
@@ -110,7 +110,7 @@ def _pid_in(path: Path) -> int:
     return int(text or 0)
 
 
-async def test_a_taken_port_is_one_clear_line(program: Path) -> None:
+async def test_a_taken_port_is_an_error(program: Path) -> None:
     async with serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=None) as node:
         port = int(node.url.rpartition(":")[2])
         with pytest.raises(ConfigurationError, match=rf"^can't listen on 127.0.0.1:{port}: Address already in use$"):
@@ -119,9 +119,7 @@ async def test_a_taken_port_is_one_clear_line(program: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"garbage", b"[]", b"{}", b"\xff"])
-async def test_a_state_that_is_none_is_one_clear_line_and_stays_as_it_is(
-    program: Path, tmp_path: Path, content: bytes
-) -> None:
+async def test_an_invalid_state_is_an_error_and_is_not_changed(program: Path, tmp_path: Path, content: bytes) -> None:
     state = tmp_path / "state.json"
     state.write_bytes(content)
     with pytest.raises(ConfigurationError, match="holds no chain of anvil"):
@@ -130,7 +128,7 @@ async def test_a_state_that_is_none_is_one_clear_line_and_stays_as_it_is(
     assert state.read_bytes() == content
 
 
-async def test_a_market_is_kept_with_all_that_happened_on_it(program: Path, tmp_path: Path) -> None:
+async def test_a_kept_state_has_the_market_and_its_history(program: Path, tmp_path: Path) -> None:
     settings, state = Settings(data_dir=str(tmp_path)), tmp_path / "new" / "state.json"
     port = free_port()
     async with serve_chain(
@@ -149,7 +147,7 @@ async def test_a_market_is_kept_with_all_that_happened_on_it(program: Path, tmp_
             assert list((await chain.lighthouses.get("airalab")).stakes) == [again.market.accounts["provider"].address]
 
 
-async def test_a_kept_chain_without_a_market_is_not_built_upon(program: Path, tmp_path: Path) -> None:
+async def test_a_kept_chain_without_a_market_is_an_error(program: Path, tmp_path: Path) -> None:
     state = tmp_path / "state.json"
     async with (
         serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=state) as node,
@@ -163,7 +161,7 @@ async def test_a_kept_chain_without_a_market_is_not_built_upon(program: Path, tm
             pytest.fail("it serves")
 
 
-def test_it_is_found_on_the_path_or_where_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_anvil_is_found_on_the_path_or_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     assert find_anvil(None) is None
     program = tmp_path / "anvil"

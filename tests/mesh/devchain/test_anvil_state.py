@@ -1,4 +1,4 @@
-"""A chain in a file: whole after a start, whatever cut off its writing."""
+"""The state file of anvil after crashes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 NOBODY = "0x00000000000000000000000000000000000000AA"
 
 
-async def test_a_chain_whose_writing_was_cut_off_goes_on_from_the_last_whole_one(
+async def test_a_damaged_state_is_replaced_by_the_last_whole_copy(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     program, state = require("anvil"), tmp_path / "state.json"
@@ -46,7 +46,7 @@ async def test_a_chain_whose_writing_was_cut_off_goes_on_from_the_last_whole_one
     assert "chain-state-restored" in logged_events(caplog)
 
 
-async def test_a_chain_that_was_killed_while_its_contracts_were_made_begins_anew(
+async def test_a_chain_that_was_killed_while_deploying_is_discarded(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     program, state = require("anvil"), tmp_path / "state.json"
@@ -66,7 +66,7 @@ async def test_a_chain_that_was_killed_while_its_contracts_were_made_begins_anew
         assert chain.market.deployment.lighthouse == made
 
 
-def test_without_a_whole_copy_half_a_chain_is_one_clear_line_and_stays_as_it_is(tmp_path: Path) -> None:
+def test_without_a_copy_a_damaged_state_is_an_error_and_is_not_changed(tmp_path: Path) -> None:
     state = tmp_path / "state.json"
     for file in (state, state_copy(state)):
         file.write_bytes(b'{"accounts": {')

@@ -1,4 +1,4 @@
-"""The served chain to develop on: its keyfiles, and what is said when it can't be served."""
+"""The served development chain: its keyfiles, and its errors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-async def test_its_keyfiles_are_those_of_people_with_money_and_outlive_it(tmp_path: Path) -> None:
+async def test_the_keyfiles_are_of_funded_accounts_and_remain(tmp_path: Path) -> None:
     settings = Settings(data_dir=str(tmp_path))
     async with serve_chain(settings, host="127.0.0.1", port=0, block_time=None) as served:
         accounts = [Account.from_keyfile(served.keys / f"{role}.json", served.keys / "password") for role in ROLES]
@@ -42,7 +42,7 @@ def assert_described(served: DevelopmentChain) -> None:
     assert lines[-1] == f"password    {served.keys / 'password'}"
 
 
-async def test_a_data_folder_that_is_a_file_is_one_clear_line(tmp_path: Path) -> None:
+async def test_a_data_folder_that_is_a_file_is_an_error(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_text("")
     with pytest.raises(ConfigurationError, match=f"^can't write keyfiles to {file}/development: Not a directory$"):

@@ -1,4 +1,4 @@
-"""The embedded chain as web3 sees it."""
+"""The embedded chain, used through web3."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ async def test_each_transaction_is_mined_in_a_block_of_its_own(node: EmbeddedCha
     assert abs(block["timestamp"] - time.time()) < 10
 
 
-async def test_a_block_has_the_time_of_day_at_which_it_was_mined(node: EmbeddedChain) -> None:
+async def test_a_block_has_the_time_at_which_it_was_mined(node: EmbeddedChain) -> None:
     web3 = AsyncWeb3(node.provider)
     wanted = (await web3.eth.get_block("latest"))["timestamp"] + 2
     while time.time() < wanted:
@@ -98,7 +98,7 @@ async def test_blocks_and_their_logs_are_found_by_hash(node: EmbeddedChain) -> N
     assert (transaction["to"], transaction["blockNumber"]) == (contract, 2)
 
 
-async def test_storage_and_code_are_read_now_and_then(node: EmbeddedChain) -> None:
+async def test_storage_and_code_are_read_at_any_block(node: EmbeddedChain) -> None:
     web3 = AsyncWeb3(node.provider)
     stores_42 = bytes.fromhex("602a600055" + "60006000f3")
     address = (await _send(web3, node.funded_keys[0], data=stores_42))["contractAddress"]
@@ -108,7 +108,7 @@ async def test_storage_and_code_are_read_now_and_then(node: EmbeddedChain) -> No
     assert len(await web3.eth.get_code(address, "earliest")) == 0
 
 
-async def test_what_runs_out_of_gas_is_told_as_that(node: EmbeddedChain) -> None:
+async def test_running_out_of_gas_has_its_own_error(node: EmbeddedChain) -> None:
     web3 = AsyncWeb3(node.provider)
     contract = await _deploy(web3, node.funded_keys[0], COSTLY)
     with pytest.raises(Web3RPCError, match="OutOfGas"):
@@ -125,7 +125,7 @@ async def test_blocks_are_mined_on_demand(node: EmbeddedChain) -> None:
     assert await AsyncWeb3(node.provider).eth.block_number == 3
 
 
-async def test_blocks_are_mined_by_time_where_asked() -> None:
+async def test_blocks_are_mined_with_a_block_time() -> None:
     async with EmbeddedChain(block_time=0.01) as node:
         web3 = AsyncWeb3(node.provider)
         async with asyncio.timeout(10):
@@ -150,7 +150,7 @@ async def test_a_transaction_that_reverts_is_mined_as_failed(node: EmbeddedChain
     assert receipt["gasUsed"] < 30_000
 
 
-async def test_a_contract_that_calls_itself_without_end_does_no_harm(node: EmbeddedChain) -> None:
+async def test_a_contract_that_calls_itself_without_end_is_an_error(node: EmbeddedChain) -> None:
     web3 = AsyncWeb3(node.provider)
     contract = await _deploy(web3, node.funded_keys[0], CALLS_ITSELF)
     with pytest.raises(Web3RPCError, match="too deep"):
@@ -238,7 +238,7 @@ async def test_a_transaction_without_funds_is_refused(node: EmbeddedChain) -> No
         await _send(web3, b"\7" * 32, to=Account.from_key(node.funded_keys[1]).address)
 
 
-async def test_garbage_is_no_transaction(node: EmbeddedChain) -> None:
+async def test_an_invalid_transaction_is_refused(node: EmbeddedChain) -> None:
     with pytest.raises(Web3RPCError, match="be decoded"):
         await AsyncWeb3(node.provider).eth.send_raw_transaction(b"\xc3\1\2\3")
 
@@ -248,7 +248,7 @@ def chain_threads() -> set[int | None]:
     return {thread.ident for thread in threading.enumerate() if "embedded-chain" in thread.name}
 
 
-async def test_all_work_is_done_in_one_thread_and_the_loop_goes_on(node: EmbeddedChain) -> None:
+async def test_the_event_loop_is_not_blocked_by_the_chain(node: EmbeddedChain) -> None:
     ticks, before = 0, chain_threads()
 
     async def tick() -> None:
@@ -264,7 +264,7 @@ async def test_all_work_is_done_in_one_thread_and_the_loop_goes_on(node: Embedde
     assert chain_threads() == before
 
 
-async def test_a_closed_chain_says_so() -> None:
+async def test_a_closed_embedded_chain_raises() -> None:
     async with EmbeddedChain() as node:
         pass
     with pytest.raises(ClosedError):

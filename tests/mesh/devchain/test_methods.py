@@ -1,4 +1,4 @@
-"""Filters that the embedded node keeps, by web3's own client and by hand."""
+"""The filters of the embedded node, used through web3 and directly."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def values(logs: list[Any]) -> list[int]:
     ]
 
 
-async def test_web3_polls_for_what_is_new(node: EmbeddedChain, chain: Chain) -> None:
+async def test_web3_filters_return_new_logs_and_blocks(node: EmbeddedChain, chain: Chain) -> None:
     web3: Any = AsyncWeb3(node.provider)
     logs = await web3.eth.filter({"address": chain.xrt})
     blocks = await web3.eth.filter("latest")
@@ -59,7 +59,7 @@ async def test_web3_polls_for_what_is_new(node: EmbeddedChain, chain: Chain) -> 
         await logs.get_new_entries()
 
 
-async def test_all_that_ever_was_is_had_by_a_filter_from_the_first_block(node: EmbeddedChain, chain: Chain) -> None:
+async def test_a_filter_from_the_first_block_returns_all_logs(node: EmbeddedChain, chain: Chain) -> None:
     """As the JavaScript of generation 3 lists the lighthouses."""
     name = await node.request("eth_newFilter", [{"address": chain.factory, "fromBlock": "0x0", "toBlock": "latest"}])
     found = await node.request("eth_getFilterLogs", [name])
@@ -70,7 +70,7 @@ async def test_all_that_ever_was_is_had_by_a_filter_from_the_first_block(node: E
     assert len(await node.request("eth_getFilterChanges", [name])) == 1
 
 
-async def test_a_filter_of_later_blocks_waits_for_them(node: EmbeddedChain, chain: Chain) -> None:
+async def test_a_filter_from_a_later_block_returns_nothing_before_it(node: EmbeddedChain, chain: Chain) -> None:
     later = await chain.block_number() + 2
     name = await node.request("eth_newFilter", [{"address": chain.xrt, "fromBlock": hex(later)}])
     for value in (1, 2):
@@ -78,7 +78,7 @@ async def test_a_filter_of_later_blocks_waits_for_them(node: EmbeddedChain, chai
     assert values(await node.request("eth_getFilterChanges", [name])) == [2]
 
 
-async def test_what_a_chain_that_was_taken_back_has_instead_is_new(node: EmbeddedChain, chain: Chain) -> None:
+async def test_logs_that_replace_reverted_ones_are_new(node: EmbeddedChain, chain: Chain) -> None:
     name = await node.request("eth_newFilter", [{"address": chain.xrt}])
     await chain.tokens.approve(FRIEND, 1)
     assert values(await node.request("eth_getFilterChanges", [name])) == [1]
@@ -88,7 +88,7 @@ async def test_what_a_chain_that_was_taken_back_has_instead_is_new(node: Embedde
     assert values(await node.request("eth_getFilterChanges", [name])) == [2]
 
 
-async def test_the_filter_that_was_asked_least_recently_makes_room(node: EmbeddedChain) -> None:
+async def test_the_least_recently_used_filter_is_removed(node: EmbeddedChain) -> None:
     first, second = [await node.request("eth_newBlockFilter", []) for _ in range(2)]
     await node.request("eth_getFilterChanges", [first])
     for _ in range(MAX_FILTERS - 1):
@@ -107,13 +107,13 @@ async def test_the_filter_that_was_asked_least_recently_makes_room(node: Embedde
         ("eth_getFilterLogs", [7]),
     ],
 )
-async def test_what_is_no_filter_is_refused(node: EmbeddedChain, method: str, params: list[Any]) -> None:
+async def test_invalid_filters_are_refused(node: EmbeddedChain, method: str, params: list[Any]) -> None:
     with pytest.raises(RpcError):
         await node.request(method, params)
     assert await node.request("eth_uninstallFilter", params) is False
 
 
-async def test_a_filter_of_blocks_has_no_logs(node: EmbeddedChain) -> None:
+async def test_a_block_filter_has_no_logs(node: EmbeddedChain) -> None:
     name = await node.request("eth_newBlockFilter", [])
     with pytest.raises(RpcError, match="of blocks"):
         await node.request("eth_getFilterLogs", [name])

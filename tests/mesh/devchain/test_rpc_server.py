@@ -44,7 +44,7 @@ async def test_a_batch_gets_its_results_in_order_and_nothing_for_a_notification(
     assert answers[1]["result"] == "0x2"
 
 
-async def test_only_notifications_get_no_body(url: str) -> None:
+async def test_notifications_alone_get_an_empty_response(url: str) -> None:
     assert await _post(url, [{"jsonrpc": "2.0", "method": "evm_mine"}]) == (204, None)
 
 
@@ -76,14 +76,14 @@ async def test_a_body_that_is_not_json_is_a_parse_error(url: str) -> None:
         assert (await response.json())["error"]["code"] == -32700
 
 
-async def test_a_page_may_not_ask_unless_its_origin_is_allowed() -> None:
+async def test_pages_of_other_origins_are_refused() -> None:
     request = {"jsonrpc": "2.0", "id": 1, "method": "eth_chainId", "params": []}
     async with EmbeddedChain() as node, JsonRpcServer(node.provider, allowed_origins=["http://page"]) as server:
         assert (await _post(server.url, request, Origin="http://elsewhere"))[0] == 403
         assert (await _post(server.url, request, Origin="http://page"))[0] == 200
 
 
-async def test_a_page_of_an_allowed_origin_may_ask_what_it_may_send() -> None:
+async def test_pages_of_allowed_origins_pass_the_preflight() -> None:
     async with (
         EmbeddedChain() as node,
         JsonRpcServer(node.provider, allowed_origins=["*"]) as server,
@@ -95,12 +95,12 @@ async def test_a_page_of_an_allowed_origin_may_ask_what_it_may_send() -> None:
         assert response.headers["Access-Control-Allow-Headers"] == "content-type"
 
 
-async def test_a_loopback_server_refuses_a_rebound_name(url: str) -> None:
+async def test_a_loopback_server_refuses_other_host_names(url: str) -> None:
     request = {"jsonrpc": "2.0", "id": 1, "method": "eth_chainId", "params": []}
     assert (await _post(url, request, Host="evil.example:80"))[0] == 403
 
 
-async def test_a_port_that_is_taken_is_one_clear_error(url: str) -> None:
+async def test_a_taken_port_is_an_error(url: str) -> None:
     port = int(url.rpartition(":")[2])
     with pytest.raises(ConfigurationError, match=str(port)):
         async with serve_embedded(port=port):

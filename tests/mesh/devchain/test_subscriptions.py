@@ -37,7 +37,7 @@ async def token(node: EmbeddedChain) -> AsyncIterator[tuple[Chain, Deployment]]:
         yield chain, deployment
 
 
-async def test_web3_hears_of_new_heads_and_of_the_logs_that_it_asked_for(
+async def test_web3_receives_new_heads_and_the_logs_it_subscribed_to(
     node: EmbeddedChain, server: JsonRpcServer
 ) -> None:
     async with token(node) as (chain, deployment), AsyncWeb3(WebSocketProvider(server.ws_url)) as web3:
@@ -71,13 +71,13 @@ async def test_a_websocket_answers_as_a_post_does(server: JsonRpcServer) -> None
         assert [answer["id"] for answer in await client.receive()] == [1, 2]
 
 
-async def test_our_own_client_works_over_it(node: EmbeddedChain, server: JsonRpcServer) -> None:
+async def test_our_client_works_over_a_websocket(node: EmbeddedChain, server: JsonRpcServer) -> None:
     async with token(node) as (_, deployment), Chain(server.ws_url, timing=QUICK) as chain:
         assert chain.xrt == deployment.xrt
         assert await asyncio.gather(*(chain.block_number() for _ in range(20))) == [deployment.block_number] * 20
 
 
-async def test_every_block_is_told_once_however_many_come_at_once(node: EmbeddedChain, server: JsonRpcServer) -> None:
+async def test_every_block_is_sent_once(node: EmbeddedChain, server: JsonRpcServer) -> None:
     async with connected(server) as client:
         subscription = await client.subscribe("newHeads")
         await node.mine(300)
@@ -85,7 +85,7 @@ async def test_every_block_is_told_once_however_many_come_at_once(node: Embedded
     assert numbers == list(range(1, 301))
 
 
-async def test_what_was_there_before_is_not_told(node: EmbeddedChain, server: JsonRpcServer) -> None:
+async def test_earlier_blocks_are_not_sent(node: EmbeddedChain, server: JsonRpcServer) -> None:
     async with connected(server) as early, connected(server) as late:
         first = await early.subscribe("newHeads")
         await node.mine(1)
@@ -95,7 +95,7 @@ async def test_what_was_there_before_is_not_told(node: EmbeddedChain, server: Js
         assert [int((await early.next_notification(first))["number"], 16) for _ in range(2)] == [1, 2]
 
 
-async def test_logs_of_replaced_blocks_are_removed_before_those_of_the_new_ones_come(
+async def test_logs_of_replaced_blocks_are_removed_before_new_ones_are_sent(
     node: EmbeddedChain, server: JsonRpcServer
 ) -> None:
     async with token(node) as (chain, deployment), connected(server) as client:
@@ -116,7 +116,7 @@ async def test_logs_of_replaced_blocks_are_removed_before_those_of_the_new_ones_
     ]
 
 
-async def test_a_chain_that_goes_back_behind_the_subscription_is_followed(
+async def test_a_chain_that_is_reverted_past_the_subscription_is_followed(
     node: EmbeddedChain, server: JsonRpcServer
 ) -> None:
     await node.mine(5)
@@ -130,7 +130,7 @@ async def test_a_chain_that_goes_back_behind_the_subscription_is_followed(
         assert int((await client.next_notification(subscription))["number"], 16) == 3
 
 
-async def test_nothing_comes_after_unsubscribing(node: EmbeddedChain, server: JsonRpcServer) -> None:
+async def test_nothing_is_sent_after_unsubscribing(node: EmbeddedChain, server: JsonRpcServer) -> None:
     async with connected(server) as client:
         one, other = await client.subscribe("newHeads"), await client.subscribe("newHeads")
         assert (await client.ask("eth_unsubscribe", one))["result"] is True
@@ -140,15 +140,13 @@ async def test_nothing_comes_after_unsubscribing(node: EmbeddedChain, server: Js
             await client.next_notification(other)
 
 
-async def test_a_subscription_is_of_one_connection(server: JsonRpcServer) -> None:
+async def test_a_subscription_belongs_to_one_connection(server: JsonRpcServer) -> None:
     async with connected(server) as one, connected(server) as other:
         subscription = await one.subscribe("newHeads")
         assert (await other.ask("eth_unsubscribe", subscription))["error"]["code"] == -32602
 
 
-async def test_what_polls_whole_blocks_finds_its_transactions_in_them(
-    node: EmbeddedChain, server: JsonRpcServer
-) -> None:
+async def test_whole_blocks_contain_their_transactions(node: EmbeddedChain, server: JsonRpcServer) -> None:
     """As the JavaScript of generation 3 does: by `to`, and then by the receipt's logs."""
     async with token(node) as (chain, deployment), Node(server.url, timing=QUICK) as way:
         receipt = await TransactionSender(chain.node, Account.from_key(node.funded_keys[0])).call(
@@ -178,18 +176,18 @@ async def test_what_polls_whole_blocks_finds_its_transactions_in_them(
         (["logs", {"topics": ["0x12"]}], -32602),
     ],
 )
-async def test_what_can_not_be_subscribed_to_is_refused(server: JsonRpcServer, params: list[Any], code: int) -> None:
+async def test_invalid_subscriptions_are_refused(server: JsonRpcServer, params: list[Any], code: int) -> None:
     async with connected(server) as client:
         assert (await client.ask("eth_subscribe", *params))["error"]["code"] == code
 
 
-async def test_nobody_subscribes_by_post(server: JsonRpcServer) -> None:
+async def test_post_has_no_subscriptions(server: JsonRpcServer) -> None:
     request = {"jsonrpc": "2.0", "id": 1, "method": "eth_subscribe", "params": ["newHeads"]}
     async with aiohttp.ClientSession() as session, session.post(server.url, json=request) as response:
         assert (await response.json())["error"]["code"] == -32601
 
 
-async def test_the_node_is_not_asked_when_nobody_is_subscribed(node: EmbeddedChain) -> None:
+async def test_the_node_is_polled_only_with_subscribers(node: EmbeddedChain) -> None:
     counting = Counting(node)
     async with JsonRpcServer(counting) as server:
         async with connected(server) as client:
@@ -215,7 +213,7 @@ class Counting(EmbeddedProvider):
         return await super().make_request(method, params)
 
 
-async def test_nothing_is_missed_while_the_node_behind_is_lost(node: EmbeddedChain) -> None:
+async def test_blocks_during_an_outage_of_the_node_are_sent_afterwards(node: EmbeddedChain) -> None:
     flaky = Counting(node)
     async with JsonRpcServer(flaky) as server, connected(server) as client:
         subscription = await client.subscribe("newHeads")
@@ -239,7 +237,7 @@ async def test_leaving_the_server_closes_its_sockets(node: EmbeddedChain) -> Non
         await session.close()
 
 
-async def test_a_page_may_not_open_a_socket_unless_its_origin_is_allowed(node: EmbeddedChain) -> None:
+async def test_pages_of_other_origins_can_not_open_a_websocket(node: EmbeddedChain) -> None:
     async with JsonRpcServer(node.provider, allowed_origins=["http://page"]) as server:
         with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
             async with connected(server, Origin="http://elsewhere"):
@@ -249,7 +247,7 @@ async def test_a_page_may_not_open_a_socket_unless_its_origin_is_allowed(node: E
             assert (await client.ask("eth_blockNumber"))["result"] == "0x0"
 
 
-async def test_a_browser_that_looks_in_is_told_what_this_is(server: JsonRpcServer) -> None:
+async def test_a_browser_gets_an_explanation(server: JsonRpcServer) -> None:
     async with aiohttp.ClientSession() as session, session.get(server.url) as response:
         assert response.status == 426
         assert "JSON-RPC" in await response.text()
