@@ -9,7 +9,7 @@ import asyncio
 import re
 from contextlib import aclosing, contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import pytest
 import pytest_asyncio
@@ -42,6 +42,8 @@ if TYPE_CHECKING:
     from web3.types import RPCEndpoint, RPCResponse
 
     from mesh.chain import BlockEvents, ChainEvent
+
+E = TypeVar("E", bound=Exception)
 
 QUICK = Timing(poll_interval=0.02, receipt_interval=0.01, attempts=2, retry_delay=0.01, receipt_timeout=30)
 PLAN = DeploymentPlan(refund_delay=10, timeout_blocks=5)
@@ -137,6 +139,14 @@ async def read_to(chain: Chain, first: int, last: int, *, lighthouses: Iterable[
 
 def events_of(blocks: list[BlockEvents]) -> list[ChainEvent]:
     return [event for block in blocks for event in block.events]
+
+
+@contextmanager
+def raises_with(kind: type[E], **fields: object) -> Iterator[pytest.ExceptionInfo[E]]:
+    """Expect an error of a class whose fields have these values."""
+    with pytest.raises(kind) as caught:
+        yield caught
+    assert {name: getattr(caught.value, name) for name in fields} == fields
 
 
 @contextmanager

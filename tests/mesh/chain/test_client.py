@@ -22,7 +22,7 @@ from mesh.chain import (
 from mesh.errors import ClosedError, InvalidAddress
 from schemas.address import ZERO_ADDRESS
 from schemas.wire import message_hash
-from tests.mesh.chain.conftest import no_contracts, reverted
+from tests.mesh.chain.conftest import no_contracts, raises_with, reverted
 
 if TYPE_CHECKING:
     from tests.mesh.chain.conftest import DeployedMarket
@@ -45,7 +45,7 @@ async def test_names_of_both_generations_lead_to_the_same_contracts(market: Depl
 
 async def test_invalid_and_unknown_names_raise_different_errors(market: DeployedMarket) -> None:
     async with market.chain() as chain:
-        with pytest.raises(UnknownName, match=r"none\.lighthouse"):
+        with raises_with(UnknownName, name="none.lighthouse.3.robonomics.eth"):
             await chain.names.address("none.lighthouse.3.robonomics.eth")
         with pytest.raises(UnknownName):
             await chain.names.address("somebody.eth")
@@ -219,7 +219,7 @@ async def test_only_contracts_of_the_factory_are_liabilities(market: DeployedMar
     async with market.chain() as chain:
         for address in (market.stranger.address, market.deployment.xrt):
             assert not await chain.liabilities.exists(address)
-            with pytest.raises(NotALiability, match=address):
+            with raises_with(NotALiability, address=address):
                 await chain.liabilities.get(address)
 
 

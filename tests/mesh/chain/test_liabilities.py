@@ -12,7 +12,7 @@ from mesh.chain import XRT, Account, Chain, NotALiability, NotOffered, new_priva
 from mesh.devchain import EmbeddedChain
 from mesh.errors import InvalidMessage
 from schemas import cancellation_hash
-from tests.mesh.chain.conftest import QUICK, Flaky, cid, prepare, reverted
+from tests.mesh.chain.conftest import QUICK, Flaky, cid, prepare, raises_with, reverted
 
 if TYPE_CHECKING:
     from tests.mesh.chain.conftest import DeployedMarket
@@ -56,7 +56,7 @@ async def test_an_invalid_signature_is_refused_before_the_contract_is_asked(mark
     liability = await _made(market)
     async with market.chain() as chain:
         for nonsense in ("", "0x12", "nonsense", bytes(65)):
-            with pytest.raises(InvalidMessage, match="signature"):
+            with raises_with(InvalidMessage, reason="signature"):
                 await chain.liabilities.cancel(liability, promisee_signature=nonsense, promisor_signature=bytes(65))
 
 
@@ -72,11 +72,11 @@ async def test_only_liabilities_can_be_cancelled_and_watched(market: DeployedMar
     nobody = Account.from_key(new_private_key()).address
     signature = _signed(market.promisee, nobody)
     async with market.chain(market.stranger) as chain:
-        with pytest.raises(NotALiability, match=nobody):
+        with raises_with(NotALiability, address=nobody):
             await chain.liabilities.cancel(nobody, promisee_signature=signature, promisor_signature=signature)
-        with pytest.raises(NotALiability, match=nobody):
+        with raises_with(NotALiability, address=nobody):
             await chain.liabilities.watch(nobody)
-        with pytest.raises(NotALiability, match=nobody):
+        with raises_with(NotALiability, address=nobody):
             await chain.liabilities.refund_state(nobody)
 
 
@@ -87,10 +87,10 @@ async def test_liabilities_of_the_originals_can_not_be_cancelled(market: Deploye
     options: dict[str, Any] = {"contracts": "original", "generation": generation}
     async with market.chain(market.provider, **options) as chain:
         assert liability in [found.address for found in await chain.liabilities.list()]  # recognised from now on
-        with pytest.raises(NotOffered, match="no cancellation") as caught:
+        with raises_with(NotOffered, what="cancellation", generation=generation) as caught:
             await chain.liabilities.cancel(liability, promisee_signature=signature, promisor_signature=signature)
         assert caught.value.hint
-        with pytest.raises(NotOffered, match="refund"):
+        with raises_with(NotOffered, what="refund", generation=generation):
             await chain.liabilities.refund_state(liability)
 
 

@@ -124,12 +124,13 @@ async def test_a_small_stake_and_missing_tokens_are_refused_before_anything_is_s
     await _beacon(market, "fourth")
     account = await _newcomer(market, holding=STAKE)
     async with market.chain(account) as chain:
-        with pytest.raises(StakeTooSmall, match="9 wn is below") as small:
+        with pytest.raises(StakeTooSmall) as small:
             await chain.lighthouses.become_provider("fourth", 9)
-        with pytest.raises(InsufficientTokens, match=f"has {STAKE} of the token") as poor:
+        with pytest.raises(InsufficientTokens) as poor:
             await chain.lighthouses.become_provider("fourth", STAKE + 1)
         assert await chain.node.transaction_count(account.address) == 0
     assert isinstance(small.value, InputError)
+    assert small.value.stake == 9
     assert (small.value.hint, poor.value.hint) != ("", "")
     assert (poor.value.account, poor.value.balance, poor.value.needed) == (account.address, STAKE, STAKE + 1)
 

@@ -41,7 +41,7 @@ async def test_above_the_ceiling_nothing_is_sent(anvil: Anvil) -> None:
     async with Node(anvil.url, timing=QUICK, fees=FeePolicy(ceiling=20 * GWEI)) as node:
         sender, friend = _sender(node, anvil), unused_address()
         await _next_base_fee(node, 30 * GWEI)
-        with pytest.raises(FeeTooHigh, match=r"31 gwei now, and the ceiling is 20 gwei") as caught:
+        with pytest.raises(FeeTooHigh) as caught:
             await sender.send(to=friend, data=b"", value=1)
         assert (caught.value.price, caught.value.ceiling) == (31 * GWEI, 20 * GWEI)
         assert caught.value.hint

@@ -12,7 +12,7 @@ import pytest
 
 from mesh.chain import XRT, Finalized, NotALiability, NotOffered
 from mesh.errors import ConfigurationError, InvalidMessage
-from tests.mesh.chain.conftest import cid, events_of, read_to
+from tests.mesh.chain.conftest import cid, events_of, raises_with, read_to
 
 if TYPE_CHECKING:
     from tests.mesh.chain.conftest import DeployedMarket
@@ -93,19 +93,19 @@ async def test_names_are_those_of_the_generations_root(market: DeployedMarket) -
 async def test_functions_that_the_originals_lack_raise_not_offered(market: DeployedMarket) -> None:
     result = market.result(market.stranger.address)
     async with market.chain(market.provider, contracts="original", generation=3) as chain:
-        with pytest.raises(NotOffered, match="generation 3 offer no nonceOf") as caught:
+        with raises_with(NotOffered, what="nonceOf", generation=3) as caught:
             await chain.liabilities.next_nonce()
         assert caught.value.hint
-        with pytest.raises(NotOffered, match="refund"):
+        with raises_with(NotOffered, what="refund"):
             await chain.liabilities.refund(market.stranger.address)
-        with pytest.raises(InvalidMessage, match="generation 3, the order of 5"):
+        with raises_with(InvalidMessage, reason="generation"):
             await chain.liabilities.create("airalab", *await _orders(market, 5))
     async with market.chain(market.provider, contracts="original", generation=5) as chain:
-        with pytest.raises(NotOffered, match="validator"):
+        with raises_with(NotOffered, what="finalization by a validator's own account", generation=5):
             await chain.liabilities.validate(result, agree=True)
-        with pytest.raises(NotOffered, match="refund"):
+        with raises_with(NotOffered, what="refund"):
             await chain.liabilities.refundable_from(market.stranger.address)
-        with pytest.raises(InvalidMessage, match="generation 5, the order of 3"):
+        with raises_with(InvalidMessage, reason="generation"):
             await chain.liabilities.create("airalab", *await _orders(market, 3))
 
 
