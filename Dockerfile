@@ -1,17 +1,17 @@
-# Three images of one file, each smaller than what it would be with all of the project in it:
+# Three images, each with only the parts of the project that it needs:
 #
-#   edge    a device on a serial line: no client of a chain, no HTTP server but for its metrics
+#   edge    a device on a serial line: no chain client, no HTTP server except for metrics
 #   server  router, provider, agent, person, operator, bridge (the default)
 #   chain   a server with anvil, and the script that makes the site of the demonstration
 #
-# Any base with Python 3.11 or later and its venv module does (Debian: python3, python3-venv, ca-certificates).
+# The base needs Python 3.11 or later with its venv module (Debian: python3, python3-venv, ca-certificates).
 ARG BASE=python:3.13-slim-bookworm
-# Where the program anvil comes from, /usr/local/bin/anvil.
+# The image that provides /usr/local/bin/anvil.
 ARG FOUNDRY=ghcr.io/foundry-rs/foundry:v1.7.1
 
 FROM ${FOUNDRY} AS foundry
 
-# pip stays behind in the stages that build: the environment that is copied out of them has none.
+# pip stays in the build stages: the environment that is copied from them has none.
 FROM ${BASE} AS tools
 WORKDIR /source
 COPY requirements/lock.txt requirements/
@@ -38,7 +38,7 @@ RUN /tools/bin/pip --python /opt/aira/bin/python install --quiet --no-cache-dir 
 COPY --from=project /wheels /wheels
 RUN /tools/bin/pip --python /opt/aira/bin/python install --quiet --no-cache-dir --no-index --no-deps /wheels/*.whl
 
-# A volume that is made at one of these folders belongs to the image's user.
+# A volume created at one of these folders belongs to the image's user.
 FROM ${BASE} AS runtime
 RUN groupadd --gid 10001 aira \
  && useradd --uid 10001 --gid aira --no-create-home --home-dir /var/lib/aira --shell /usr/sbin/nologin aira \
@@ -70,5 +70,5 @@ COPY --from=foundry /usr/local/bin/anvil /usr/local/bin/anvil
 COPY --chmod=0755 deploy/compose/make-site.sh /usr/local/bin/make-site
 USER 10001:10001
 
-# The last one is what is built when no target is named.
+# The last stage is the default target.
 FROM with-server AS server

@@ -1,9 +1,9 @@
 #!/bin/sh
-# Makes the site of the demonstration, once: an authority, a certificate for each member, a roster, and the accounts of
-# the development chain, each under a password of its own. What a member needs is put into a folder of its own, and is
-# all that the member gets to see. A site of yours is made by the same commands; see docs/sites.md.
+# Creates the site of the demonstration once: an authority, a certificate for each member, a roster, and the accounts of
+# the development chain, each with its own password. Each member has a folder with what it needs and sees nothing else.
+# The same commands create your own site; see docs/sites.md.
 #
-#   /site/authority  the site's certificate and key; nobody else has it
+#   /site/authority  the site's certificate and key; not shared with anyone
 #   /site/MEMBER     ca.pem, identity.pem, identity.key; roster.toml of routers; account.json and password of who signs
 #   /chain           the development chain's keyfiles, which it writes when it has its contracts
 #
@@ -23,7 +23,7 @@ if [ -e "$made" ]; then
     exit 0
 fi
 
-# A name for who has no account: nobody else's.
+# A unique address for a member without an account.
 some_address() {
     echo "0x$(od -An -tx1 -N20 /dev/urandom | tr -d ' \n')"
 }
@@ -43,7 +43,7 @@ account() {
         --from-keyfile "$keys/$2.json" --from-password-file "$keys/password" > /dev/null
 }
 
-# Each file comes to be as a whole, so that who waits for it never reads half of it.
+# Each file is created atomically, so that a waiting service never reads half of it.
 hand_over() {
     for file in "$work/$1"/*; do
         cp "$file" "$site/$1/.new"
