@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.content import ContentCorrupt, Exchange, Store
+from mesh.content import ContentCorrupt, DownloadTiming, Exchange, Store
 from schemas.unixfs import CHUNK_SIZE, cid_of_bytes
 from tests.support.content import answer_queries, sample_bytes
 from tests.support.waiting import until
@@ -98,7 +98,7 @@ async def test_a_silent_holder_does_not_delay_another(
     cid = holder_store.put_bytes(data)
     kept: list[zenoh.Query] = []
     silent = third_session.declare_queryable("aira/cid/*", kept.append)
-    async with Exchange(session, store) as exchange:
+    async with Exchange(session, store, timing=DownloadTiming(query_timeout=0.2)) as exchange:
         # At first the silent one is the only holder, so that it is asked and waited for.
         fetching = asyncio.create_task(exchange.fetch(cid, timeout=600))
         await until(lambda: kept, what="a query", seconds=30)
