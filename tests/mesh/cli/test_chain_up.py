@@ -21,7 +21,7 @@ from mesh.devchain.development import serve_chain
 from mesh.errors import ConfigurationError
 from mesh.settings import Settings
 from tests.mesh.cli.chains import columns
-from tests.support.commands import AIRA, SOON, Serving, aira, refused
+from tests.support.commands import AIRA, SOON, Serving, aira, invoke, refused
 from tests.support.development import variables_of
 from tests.support.peers import require
 from tests.support.ports import answers, free_port
@@ -75,9 +75,9 @@ def test_anvil_is_taken_where_it_is_on_the_path_and_stopped_with_the_command(
         assert said["chain"] == f"http://127.0.0.1:{port}"
         anvil = child_of(server.pid)
         person = variables_of("person", tmp_path, url=said["chain"], data_dir=str(tmp_path / "person"))
-        assert "anvil/" in aira("chain", "status", **person).stdout
-        assert aira("xrt", "transfer", NOBODY, "1.5", **person).returncode == 0
-        assert aira("xrt", "balance", **person).stdout == "998.5 XRT\n"
+        assert "anvil/" in invoke("chain", "status", **person).stdout
+        assert invoke("xrt", "transfer", NOBODY, "1.5", **person).returncode == 0
+        assert invoke("xrt", "balance", **person).stdout == "998.5 XRT\n"
         code, seconds = server.end(signal.SIGINT)
         assert (code, seconds < SOON) == (0, True), server.log()
         assert "Traceback" not in server.log()
@@ -117,7 +117,7 @@ def test_the_chain_is_kept_in_a_file(tmp_path: Path) -> None:
     for _ in range(2):
         with up(tmp_path, *options, port=0, says="passwordFile") as server:
             told.append(json.loads(server.log().splitlines()[0]))
-            status = aira("chain", "status", "--json", AIRA_WEB3_HTTP_PROVIDER=told[-1]["chain"])
+            status = invoke("chain", "status", "--json", AIRA_WEB3_HTTP_PROVIDER=told[-1]["chain"])
             told[-1]["block"] = json.loads(status.stdout)["blockNumber"]
             code, _ = server.end(signal.SIGTERM)
             assert code == 0
@@ -133,7 +133,7 @@ def test_the_embedded_chain_is_taken_where_there_is_no_anvil(tmp_path: Path) -> 
         assert set(told["accounts"]) == {"provider", "robot", "person"}
         keyfile = Path(told["accounts"]["robot"]["keyfile"])
         assert keyfile.is_file()
-        status = aira("chain", "status", "--json", AIRA_WEB3_HTTP_PROVIDER=told["chain"])
+        status = invoke("chain", "status", "--json", AIRA_WEB3_HTTP_PROVIDER=told["chain"])
         assert json.loads(status.stdout)["factory"] == told["factory"]
 
 

@@ -16,6 +16,7 @@ from mesh.cli.errors import HealthUnavailable, InvalidServerAddress
 from mesh.errors import ConfigurationError
 from mesh.settings import Settings
 from schemas.status import ALIVE
+from tests.mesh.cli.chains import columns
 from tests.support.commands import AIRA, Serving, invoke, refused
 from tests.support.ports import free_port
 from tests.support.scraping import health, scraped
@@ -68,7 +69,9 @@ def test_a_router_is_well_and_the_exit_code_says_so(listen: str) -> None:
 async def test_aira_up_tells_the_markets_of_both_generations_apart(listen: str, tmp_path: Path) -> None:
     options = ("--port", "0", "--listen", f"tcp/127.0.0.1:{free_port()}", "--data-dir", tmp_path)
     url = f"http://{listen}"
-    with Serving(*AIRA, "up", "--engine", "embedded", *options, "--metrics-listen", listen, says="provider    0x"):
+    command = (*AIRA, "up", "--engine", "embedded", *options, "--metrics-listen", listen)
+    with Serving(*command, says="provider    0x") as server:
+        assert columns(server.log())["engine"] == "embedded"
         status, parts = await health(url)
         assert (status, set(parts.values())) == (200, {ALIVE})
         assert parts.keys() == {

@@ -60,6 +60,7 @@ class JsonMarket:
         script.write_text(ROBOT_CODE)
         model = cid_of_file(EXAMPLES / "model.md")
         self.robot = self.serving(sys.executable, script, model, says="account 0x", role="robot")
+        self._done = ""
 
     def serving(self, *command: str | Path, says: str, role: str = "provider") -> Serving:
         return Serving(*command, says=says, variables=self.variables(role) | {"AIRA_LOG_FORMAT": "json"})
@@ -75,6 +76,13 @@ class JsonMarket:
         done = invoke("logs", self.addresses[role], "--json", *options, AIRA_CONNECT=self.endpoint)
         assert (done.returncode, done.stderr) == (0, "")
         return [json.loads(line) for line in done.stdout.splitlines()]
+
+    @property
+    def job(self) -> str:
+        """The address of the contract of a job that is done and paid, the same for all tests."""
+        if not self._done:
+            self._done = self.do_a_job()
+        return self._done
 
     def do_a_job(self) -> str:
         """Have a job done and paid; the address of its contract."""
@@ -101,8 +109,7 @@ def market(tmp_path_factory: pytest.TempPathFactory) -> Iterator[JsonMarket]:
 
 
 def test_the_events_of_a_job_are_found_by_its_contract_with_agent_and_provider(market: JsonMarket) -> None:
-    liability = market.do_a_job()
-    other = market.do_a_job()
+    liability, other = market.job, market.do_a_job()
 
     def of(role: str) -> list[dict[str, Any]]:
         return market.logs(role, "--liability", liability.lower())
@@ -134,7 +141,7 @@ def test_the_events_of_a_job_are_found_by_its_contract_with_agent_and_provider(m
 
 
 def test_people_read_the_same_as_in_the_roles_own_log_and_nothing_steers_their_terminal(market: JsonMarket) -> None:
-    liability = market.do_a_job()
+    liability = market.job
     done = invoke("logs", market.addresses["robot"], "--liability", liability, AIRA_CONNECT=market.endpoint)
     assert done.returncode == 0
     lines = done.stdout.splitlines()
@@ -145,7 +152,7 @@ def test_people_read_the_same_as_in_the_roles_own_log_and_nothing_steers_their_t
 
 
 def test_levels_and_lines_select(market: JsonMarket) -> None:
-    market.do_a_job()
+    assert market.job
     assert {event["level"] for event in market.logs("robot", "--level", "error")} == {"error"}
     assert len(market.logs("robot", "--lines", "3")) == 3
     assert market.logs("robot", "--lines", "0") == []

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import pty
-import subprocess
+import sys
 from typing import TYPE_CHECKING
 
 import pytest
 
+from mesh.cli import main
 from tests.support.bags import Bag, BagMessage, string
-from tests.support.commands import AIRA
 from tests.support.objectives import objective
 
 if TYPE_CHECKING:
@@ -32,31 +32,32 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def done(folder: Path, words: str, *, stderr: int) -> str:
-    """What a command says on its standard output, its standard error being `stderr`."""
+def call(folder: Path, words: str, stderr: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run a command in this process with this file descriptor as its standard error."""
     named = {"FILE": str(folder / "it.mcap"), "BAG": str(folder / "it.bag")}
-    command = [*map(str, AIRA), *(named.get(word, word) for word in words.split())]
+    command = [named.get(word, word) for word in words.split()]
     if "convert" in words:
         command.append(str(folder / f"{os.urandom(4).hex()}.mcap"))
-    environment = {**os.environ, "AIRA_DATA_DIR": str(folder / "data"), "TERM": "xterm", "COLUMNS": "100"}
-    return subprocess.run(
-        command,
-        stdout=subprocess.PIPE,
-        stderr=stderr,
-        stdin=subprocess.DEVNULL,
-        env=environment,
-        timeout=120,
-        check=False,
-    ).stdout.decode()
+    monkeypatch.setenv("AIRA_DATA_DIR", str(folder / "data"))
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "100")
+    with open(stderr, "w") as stream, monkeypatch.context() as patch:
+        patch.setattr(sys, "stderr", stream)
+        with pytest.raises(SystemExit) as ended:
+            main(command)
+    assert ended.value.code == (1 if "verify" in words else 0)
 
 
 @pytest.mark.parametrize("words", COMMANDS)
-def test_long_work_shows_a_bar_on_a_terminal_only(folder: Path, words: str) -> None:
+def test_long_work_shows_a_bar_on_a_terminal_only(
+    folder: Path, words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     terminal, inside = pty.openpty()
-    printed = done(folder, words, stderr=inside)
-    os.close(inside)
+    call(folder, words, os.dup(inside), monkeypatch)
     shown = os.read(terminal, 1 << 16).decode()
+    os.close(inside)
     os.close(terminal)
+    printed = capsys.readouterr().out
     assert COMMANDS[words] in shown
     assert "100%" in shown
     assert "%]" not in printed
@@ -64,8 +65,10 @@ def test_long_work_shows_a_bar_on_a_terminal_only(folder: Path, words: str) -> N
 
 
 @pytest.mark.parametrize("words", COMMANDS)
-def test_where_nobody_watches_there_is_no_bar(folder: Path, words: str) -> None:
+def test_where_nobody_watches_there_is_no_bar(
+    folder: Path, words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     silent = folder / "stderr"
-    with silent.open("wb") as stream:
-        printed = done(folder, words, stderr=stream.fileno())
-    assert COMMANDS[words] not in silent.read_text() + printed
+    silent.touch()
+    call(folder, words, os.open(silent, os.O_WRONLY), monkeypatch)
+    assert COMMANDS[words] not in silent.read_text() + capsys.readouterr().out

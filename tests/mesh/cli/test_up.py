@@ -40,11 +40,6 @@ def test_anvil_is_taken_where_it_is_on_the_path(tmp_path: Path, on_path: dict[st
         assert columns(server.log())["engine"] == f"anvil ({tmp_path}/programs/anvil)"
 
 
-def test_the_embedded_chain_can_be_asked_for(tmp_path: Path, on_path: dict[str, str]) -> None:
-    with up(tmp_path, "--engine", "embedded", **on_path) as server:
-        assert columns(server.log())["engine"] == "embedded"
-
-
 async def test_the_chain_is_kept_in_a_file(tmp_path: Path) -> None:
     options = ("--anvil", require("anvil"), "--state", tmp_path / "chain.json")
     first_blocks = []
