@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import select
 import sys
 from typing import TYPE_CHECKING
 
@@ -54,12 +55,13 @@ def test_long_work_shows_a_bar_on_a_terminal_only(
 ) -> None:
     terminal, inside = pty.openpty()
     call(folder, words, os.dup(inside), monkeypatch)
-    shown = os.read(terminal, 1 << 16).decode()
+    shown = ""
+    while not (COMMANDS[words] in shown and "100%" in shown):
+        assert select.select([terminal], [], [], 30)[0], shown
+        shown += os.read(terminal, 1 << 16).decode()
     os.close(inside)
     os.close(terminal)
     printed = capsys.readouterr().out
-    assert COMMANDS[words] in shown
-    assert "100%" in shown
     assert "%]" not in printed
     assert COMMANDS[words] not in printed
 
