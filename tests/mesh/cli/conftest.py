@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.mesh.cli.chains import Town
+from tests.mesh.cli.served_chain import ServedChain
 from tests.support.market import founded, place
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ __all__ = ["founded", "place"]
 
 
 @pytest.fixture(scope="module")
-def town(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Town]:
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServedChain]:
     """A served chain with the contracts, and people with money; a module's tests share it."""
-    with Town(tmp_path_factory.mktemp("town")) as founded:
-        yield founded
+    with ServedChain(tmp_path_factory.mktemp("served")) as served:
+        yield served

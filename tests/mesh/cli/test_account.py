@@ -27,7 +27,7 @@ from mesh.cli.errors import (
     PasswordFileUnusable,
 )
 from mesh.errors import AiraError, ConfigurationError, InputError
-from tests.mesh.cli.chains import PASSWORD, columns, write_quick_keyfile
+from tests.mesh.cli.served_chain import PASSWORD, columns, write_quick_keyfile
 from tests.support.commands import AIRA, refused
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from click.testing import Result
 
-    from tests.mesh.cli.chains import Town
+    from tests.mesh.cli.served_chain import ServedChain
 
 
 def account(*arguments: str | Path) -> Result:
@@ -166,17 +166,17 @@ def test_show_is_of_the_settings_account_unless_a_keyfile_is_given(made: tuple[P
     refused(done, AccountMissing)
 
 
-def test_show_asks_the_chain_for_what_the_account_holds(town: Town) -> None:
-    person = town.people["person"]
-    said = columns(town.aira("account", "show", "--balance", AIRA_KEYFILE_PASSWORD_FILE="").stdout)
+def test_show_asks_the_chain_for_what_the_account_holds(served: ServedChain) -> None:
+    person = served.people["person"]
+    said = columns(served.aira("account", "show", "--balance", AIRA_KEYFILE_PASSWORD_FILE="").stdout)
     assert said["address"] == person.address
     assert said["XRT"] == "1,000"
     assert said["ETH"].startswith("999,999.9")
     assert said["order nonce"] == "0"
-    told = town.told("account", "show", person.keyfile, "--balance", AIRA_KEYFILE="")
+    told = served.run_json("account", "show", person.keyfile, "--balance", AIRA_KEYFILE="")
     assert told == {
         "address": person.address,
-        "wei": str(town.ask("person", lambda chain: chain.tokens.eth_balance())),
+        "wei": str(served.ask("person", lambda chain: chain.tokens.eth_balance())),
         "wn": str(1_000 * XRT),
         "nonce": 0,
     }

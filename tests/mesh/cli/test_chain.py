@@ -14,7 +14,7 @@ from mesh.chain.errors import InsufficientFunds, NoContracts, NodeUnreachable
 from mesh.cli.chain import DEPLOYMENT_GAS
 from mesh.cli.errors import AlreadyDeployed, InvalidAmount, InvalidLighthouse
 from mesh.errors import ConfigurationError, InvalidAddress
-from tests.mesh.cli.chains import Town, columns, write_quick_keyfile
+from tests.mesh.cli.served_chain import ServedChain, columns, write_quick_keyfile
 from tests.support.commands import invoke, refused
 from tests.support.nodes import Anvil
 from tests.support.ports import free_port
@@ -29,16 +29,16 @@ DEPLOY = ("chain", "deploy", "--lighthouse", "first", "--minimal-stake", "2.5", 
 
 
 @pytest.fixture
-def desert(tmp_path: Path) -> Iterator[Town]:
+def bare(tmp_path: Path) -> Iterator[ServedChain]:
     """A served chain on which nothing was deployed."""
-    with Town(tmp_path, is_deployed=False) as place:
+    with ServedChain(tmp_path, is_deployed=False) as place:
         yield place
 
 
 def test_a_deployment_says_all_addresses_and_can_be_used_with_the_settings_that_it_prints(
-    desert: Town, tmp_path: Path
+    bare: ServedChain, tmp_path: Path
 ) -> None:
-    done = desert.aira(*DEPLOY)
+    done = bare.aira(*DEPLOY)
     assert done.exit_code == 0, done.output
     facts, _, options = done.stdout.partition("\nsettings of those who use it:\n\n")
     said = columns(facts)
@@ -47,41 +47,41 @@ def test_a_deployment_says_all_addresses_and_can_be_used_with_the_settings_that_
     (tmp_path / "aira.toml").write_text(options)
     settings = tomllib.loads(options)
     assert settings["ens_contract"] == said["ENS registry"]
-    assert settings["web3_http_provider"] == desert.url
-    variables = {"AIRA_CONFIG": str(tmp_path / "aira.toml"), "AIRA_WEB3_HTTP_PROVIDER": desert.url}
-    status = columns(desert.aira("chain", "status", **variables).stdout)
+    assert settings["web3_http_provider"] == bare.url
+    variables = {"AIRA_CONFIG": str(tmp_path / "aira.toml"), "AIRA_WEB3_HTTP_PROVIDER": bare.url}
+    status = columns(bare.aira("chain", "status", **variables).stdout)
     assert status["factory"] == said["factory"]
     assert status["XRT"] == said["XRT"]
     assert status["lighthouse"] == said["lighthouse"]
     assert status["account"].endswith(" ETH, 1,000,000 XRT")
-    market = desert.told("lighthouse", "info", **variables)
+    market = bare.run_json("lighthouse", "info", **variables)
     assert (market["minimalStake"], market["timeoutBlocks"]) == (str(5 * XRT // 2), 7)
 
 
-def test_a_second_deployment_has_to_be_asked_for(desert: Town) -> None:
-    first = desert.told(*DEPLOY, by="provider")
-    hint = refused(desert.aira(*DEPLOY, by="provider"), AlreadyDeployed, first["factory"])
+def test_a_second_deployment_has_to_be_asked_for(bare: ServedChain) -> None:
+    first = bare.run_json(*DEPLOY, by="provider")
+    hint = refused(bare.aira(*DEPLOY, by="provider"), AlreadyDeployed, first["factory"])
     assert "--again" in hint
-    second = desert.told(*DEPLOY, "--again", by="provider")
+    second = bare.run_json(*DEPLOY, "--again", by="provider")
     assert second["factory"] != first["factory"]
     assert second["settings"]["ens_contract"] == second["ens"] != first["ens"]
-    told = desert.told("chain", "status", AIRA_ENS_CONTRACT=second["ens"])
+    told = bare.run_json("chain", "status", AIRA_ENS_CONTRACT=second["ens"])
     assert (told["factory"], told["isOurCode"]) == (second["factory"], True)
 
 
-def test_an_account_that_can_not_pay_for_all_of_it_deploys_nothing(desert: Town, tmp_path: Path) -> None:
+def test_an_account_that_can_not_pay_for_all_of_it_deploys_nothing(bare: ServedChain, tmp_path: Path) -> None:
     key = new_private_key()
     keyfile = write_quick_keyfile(tmp_path / "poor.json", key)
     address = Account.from_key(key).address
 
     async def give() -> None:
-        async with desert.chain("person").node as node:
-            await TransactionSender(node, desert.people["person"].account).send(to=address, data=b"", value=10**15)
+        async with bare.chain("person").node as node:
+            await TransactionSender(node, bare.people["person"].account).send(to=address, data=b"", value=10**15)
 
-    desert.run(give())
-    hint = refused(desert.aira(*DEPLOY, AIRA_KEYFILE=str(keyfile)), InsufficientFunds, address, "0.001 ETH")
+    bare.run(give())
+    hint = refused(bare.aira(*DEPLOY, AIRA_KEYFILE=str(keyfile)), InsufficientFunds, address, "0.001 ETH")
     assert "send ETH" in hint
-    assert columns(desert.aira("chain", "status").stdout)["block"].startswith("1, ")
+    assert columns(bare.aira("chain", "status").stdout)["block"].startswith("1, ")
 
 
 @pytest.mark.parametrize(
@@ -93,48 +93,48 @@ def test_an_account_that_can_not_pay_for_all_of_it_deploys_nothing(desert: Town,
     ],
 )
 def test_what_the_factory_would_refuse_at_the_end_is_refused_before_the_beginning(
-    desert: Town, options: tuple[str, str], error: type[AiraError], value: str
+    bare: ServedChain, options: tuple[str, str], error: type[AiraError], value: str
 ) -> None:
-    refused(desert.aira(*DEPLOY, *options), error, value)
-    assert columns(desert.aira("chain", "status").stdout)["block"].startswith("0, ")
+    refused(bare.aira(*DEPLOY, *options), error, value)
+    assert columns(bare.aira("chain", "status").stdout)["block"].startswith("0, ")
 
 
-def test_a_deployment_needs_an_account_and_a_node(desert: Town) -> None:
-    refused(desert.aira(*DEPLOY, AIRA_KEYFILE=""), ConfigurationError, "account")
+def test_a_deployment_needs_an_account_and_a_node(bare: ServedChain) -> None:
+    refused(bare.aira(*DEPLOY, AIRA_KEYFILE=""), ConfigurationError, "account")
     nowhere = f"http://127.0.0.1:{free_port()}"
-    refused(desert.aira(*DEPLOY, AIRA_WEB3_HTTP_PROVIDER=nowhere), NodeUnreachable, nowhere)
+    refused(bare.aira(*DEPLOY, AIRA_WEB3_HTTP_PROVIDER=nowhere), NodeUnreachable, nowhere)
 
 
-def test_status_of_a_chain_without_contracts_tells_of_the_node_and_what_is_missing(desert: Town) -> None:
-    done = desert.aira("chain", "status")
+def test_status_of_a_chain_without_contracts_tells_of_the_node_and_what_is_missing(bare: ServedChain) -> None:
+    done = bare.aira("chain", "status")
     assert done.exit_code == 1
     said = columns(done.stdout)
-    assert said["node"].startswith(desert.url)
+    assert said["node"].startswith(bare.url)
     assert said["block"].startswith("0, ")
-    assert said["account"] == f"{desert.people['person'].address}  1,000,000 ETH"
+    assert said["account"] == f"{bare.people['person'].address}  1,000,000 ETH"
     assert "factory" not in said
     line, hint = done.stderr.splitlines()
     assert line.endswith(f"[{NoContracts.code}]")
     assert "aira chain deploy" in hint
 
 
-def test_status_shows_the_node_the_contracts_and_the_account(town: Town) -> None:
-    said = columns(town.aira("chain", "status").stdout)
-    deployment = town.deployment
-    assert said["node"] == f"{town.url}  aira-embedded/py-evm"
+def test_status_shows_the_node_the_contracts_and_the_account(served: ServedChain) -> None:
+    said = columns(served.aira("chain", "status").stdout)
+    deployment = served.deployment
+    assert said["node"] == f"{served.url}  aira-embedded/py-evm"
     assert said["base fee"].endswith(" gwei")
     assert said["contracts"] == "this project's, by their code"
     assert (said["ENS registry"], said["factory"], said["XRT"]) == (deployment.ens, deployment.factory, deployment.xrt)
     assert said["lighthouse"] == f"{deployment.lighthouse}  airalab.lighthouse.3.robonomics.eth"
-    assert said["account"].startswith(town.people["person"].address)
+    assert said["account"].startswith(served.people["person"].address)
     assert said["account"].endswith(" ETH, 1,000 XRT")
 
 
-def test_status_for_programs_has_the_same(town: Town) -> None:
-    told = town.told("chain", "status")
-    assert (told["node"], told["isOurCode"], told["wn"]) == (town.url, True, str(1_000 * XRT))
-    assert told["chainId"] == town.ask("person", _chain_id)
-    without = town.told("chain", "status", AIRA_KEYFILE="")
+def test_status_for_programs_has_the_same(served: ServedChain) -> None:
+    told = served.run_json("chain", "status")
+    assert (told["node"], told["isOurCode"], told["wn"]) == (served.url, True, str(1_000 * XRT))
+    assert told["chainId"] == served.ask("person", _chain_id)
+    without = served.run_json("chain", "status", AIRA_KEYFILE="")
     assert (without["account"], without["wei"], without["wn"]) == (None, None, None)
 
 
@@ -142,19 +142,19 @@ async def _chain_id(chain: Chain) -> int:
     return chain.chain_id
 
 
-def test_status_bears_a_lighthouse_that_is_not_there(town: Town) -> None:
-    said = columns(town.aira("chain", "status", "--lighthouse-contract", "nowhere").stdout)
+def test_status_bears_a_lighthouse_that_is_not_there(served: ServedChain) -> None:
+    said = columns(served.aira("chain", "status", "--lighthouse-contract", "nowhere").stdout)
     assert said["lighthouse"] == "none of that name  nowhere"
-    assert town.told("chain", "status", "--lighthouse-contract", "nowhere")["lighthouse"] is None
+    assert served.run_json("chain", "status", "--lighthouse-contract", "nowhere")["lighthouse"] is None
 
 
-def test_contracts_with_other_code_are_not_called_ours(town: Town) -> None:
-    told = town.told("chain", "status", AIRA_FACTORY_CONTRACT=town.deployment.lighthouse)
+def test_contracts_with_other_code_are_not_called_ours(served: ServedChain) -> None:
+    told = served.run_json("chain", "status", AIRA_FACTORY_CONTRACT=served.deployment.lighthouse)
     assert told["isOurCode"] is False
 
 
-def test_code_is_ours_with_any_immutables_and_with_no_other_difference(town: Town) -> None:
-    code = bytes(town.ask("person", _factory_code))
+def test_code_is_ours_with_any_immutables_and_with_no_other_difference(served: ServedChain) -> None:
+    code = bytes(served.ask("person", _factory_code))
     runtime = load_artifact("Factory").runtime
     assert code != runtime
     assert is_code_of("Factory", code)
@@ -205,19 +205,19 @@ ON_A_CHAIN = [
 ]
 
 
-def test_a_chain_without_the_contracts_is_one_clear_line_in_every_command(desert: Town) -> None:
+def test_a_chain_without_the_contracts_is_one_clear_line_in_every_command(bare: ServedChain) -> None:
     for command in ON_A_CHAIN:
-        hint = refused(desert.aira(*command), NoContracts)
+        hint = refused(bare.aira(*command), NoContracts)
         assert "aira chain deploy" in hint, command
 
 
 @pytest.mark.parametrize("command", [ON_A_CHAIN[0], ON_A_CHAIN[8], ON_A_CHAIN[12], ("chain", "status")])
-def test_a_node_that_is_not_there_is_one_clear_line(town: Town, command: tuple[str, ...]) -> None:
+def test_a_node_that_is_not_there_is_one_clear_line(served: ServedChain, command: tuple[str, ...]) -> None:
     nowhere = f"http://127.0.0.1:{free_port()}"
-    hint = refused(town.aira(*command, AIRA_WEB3_HTTP_PROVIDER=nowhere), NodeUnreachable, nowhere)
+    hint = refused(served.aira(*command, AIRA_WEB3_HTTP_PROVIDER=nowhere), NodeUnreachable, nowhere)
     assert "aira chain up" in hint
 
 
-def test_what_is_no_node_is_one_clear_line(town: Town) -> None:
-    refused(town.aira("xrt", "balance", AIRA_WEB3_HTTP_PROVIDER="localhost"), ConfigurationError, "localhost")
-    refused(town.aira("xrt", "balance", AIRA_ENS_CONTRACT="0x12"), InvalidAddress, "0x12")
+def test_what_is_no_node_is_one_clear_line(served: ServedChain) -> None:
+    refused(served.aira("xrt", "balance", AIRA_WEB3_HTTP_PROVIDER="localhost"), ConfigurationError, "localhost")
+    refused(served.aira("xrt", "balance", AIRA_ENS_CONTRACT="0x12"), InvalidAddress, "0x12")

@@ -20,7 +20,7 @@ from mesh.cli.errors import AnvilMissing
 from mesh.devchain.development import serve_chain
 from mesh.errors import ConfigurationError
 from mesh.settings import Settings
-from tests.mesh.cli.chains import columns
+from tests.mesh.cli.served_chain import columns
 from tests.support.commands import AIRA, SOON, Serving, aira, invoke, refused
 from tests.support.development import variables_of
 from tests.support.peers import require

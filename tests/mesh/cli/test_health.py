@@ -16,7 +16,7 @@ from mesh.cli.errors import HealthUnavailable, InvalidServerAddress
 from mesh.errors import ConfigurationError
 from mesh.settings import Settings
 from schemas.status import ALIVE
-from tests.mesh.cli.chains import columns
+from tests.mesh.cli.served_chain import columns
 from tests.support.commands import AIRA, Serving, invoke, refused
 from tests.support.ports import free_port
 from tests.support.scraping import health, scraped

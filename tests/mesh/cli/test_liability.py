@@ -13,7 +13,7 @@ from mesh.chain.errors import NotALiability
 from mesh.cli.errors import InvalidSignature, LiabilityEnded, NotAParty, NotRefundable, SignatureMissing
 from mesh.errors import InvalidAddress
 from schemas import Liability
-from tests.mesh.cli.chains import REFUND_DELAY, Town, columns
+from tests.mesh.cli.served_chain import REFUND_DELAY, ServedChain, columns
 from tests.support.commands import AIRA, Interrupted, Serving, aira, refused
 
 if TYPE_CHECKING:
@@ -22,63 +22,63 @@ if TYPE_CHECKING:
 COST = 1_500_000_000
 
 
-def held(town: Town, role: str) -> int:
-    return town.ask(role, lambda chain: chain.tokens.balance())
+def held(served: ServedChain, role: str) -> int:
+    return served.ask(role, lambda chain: chain.tokens.balance())
 
 
-def signature_of(town: Town, role: str, liability: str) -> str:
-    signature: str = town.told("liability", "cancel", liability, by=role)["signature"]
+def signature_of(served: ServedChain, role: str, liability: str) -> str:
+    signature: str = served.run_json("liability", "cancel", liability, by=role)["signature"]
     return signature
 
 
-def test_an_open_one_is_shown_with_its_money_and_from_when_on_that_can_be_had_back(town: Town) -> None:
-    address = town.agree(cost=COST, lighthouse_fee=7)
-    head = town.ask("person", lambda chain: chain.block_number())
-    said = columns(town.aira("liability", "show", address).stdout)
+def test_an_open_one_is_shown_with_its_money_and_from_when_on_that_can_be_had_back(served: ServedChain) -> None:
+    address = served.create_liability(cost=COST, lighthouse_fee=7)
+    head = served.ask("person", lambda chain: chain.block_number())
+    said = columns(served.aira("liability", "show", address).stdout)
     assert said["state"] == "open, the money is held"
-    assert said["promisee"] == f"{town.people['person'].address}  (you)"
-    assert said["promisor"] == town.people["robot"].address
-    assert (said["cost"], said["token"]) == ("1.5 XRT", town.deployment.xrt)
-    assert said["lighthouse"] == f"{town.deployment.lighthouse}  for 0.000000007 XRT"
+    assert said["promisee"] == f"{served.people['person'].address}  (you)"
+    assert said["promisor"] == served.people["robot"].address
+    assert (said["cost"], said["token"]) == ("1.5 XRT", served.deployment.xrt)
+    assert said["lighthouse"] == f"{served.deployment.lighthouse}  for 0.000000007 XRT"
     assert said["validator"] == "none"
     assert said["refund"] == f"possible from block {head + REFUND_DELAY:,} on, in {REFUND_DELAY} blocks"
     assert "result" not in said
 
 
-def test_json_is_the_record_of_the_wire_and_a_state(town: Town) -> None:
-    address = town.agree(cost=COST)
-    told = town.told("liability", "show", address)
+def test_json_is_the_record_of_the_wire_and_a_state(served: ServedChain) -> None:
+    address = served.create_liability(cost=COST)
+    told = served.run_json("liability", "show", address)
     assert (told.pop("state"), told.pop("refundableFrom") > 0) == ("open", True)
     record = Liability.decode(json.dumps(told).encode())
-    assert record == town.ask("robot", lambda chain: chain.liabilities.get(address))
-    cid = town.finish(address)
-    told = town.told("liability", "show", address)
+    assert record == served.ask("robot", lambda chain: chain.liabilities.get(address))
+    cid = served.finalize(address)
+    told = served.run_json("liability", "show", address)
     assert (told["state"], told["result"], told["refundableFrom"]) == ("paid", cid, None)
 
 
 @pytest.mark.parametrize(("success", "state"), [(True, "paid: "), (False, "failed: ")])
-def test_one_that_has_ended_is_shown_with_its_end(town: Town, success: bool, state: str) -> None:
-    address = town.agree(cost=COST)
-    cid = town.finish(address, success=success)
-    said = columns(town.aira("liability", "show", address, by="stranger").stdout)
+def test_one_that_has_ended_is_shown_with_its_end(served: ServedChain, success: bool, state: str) -> None:
+    address = served.create_liability(cost=COST)
+    cid = served.finalize(address, success=success)
+    said = columns(served.aira("liability", "show", address, by="stranger").stdout)
     assert said["state"].startswith(state)
     assert said["result"] == cid
-    assert said["promisee"] == town.people["person"].address
+    assert said["promisee"] == served.people["person"].address
     assert "refund" not in said
 
 
-def test_a_keyfile_is_not_needed_to_look(town: Town) -> None:
-    address = town.agree()
-    assert town.told("liability", "show", address, AIRA_KEYFILE="")["address"] == address
+def test_a_keyfile_is_not_needed_to_look(served: ServedChain) -> None:
+    address = served.create_liability()
+    assert served.run_json("liability", "show", address, AIRA_KEYFILE="")["address"] == address
 
 
-def test_the_list_is_the_accounts_and_can_be_narrowed(town: Town) -> None:
-    start = town.ask("person", lambda chain: chain.block_number()) + 1
-    ended, opened = town.agree(cost=COST), town.agree()
-    town.finish(ended)
+def test_the_list_is_the_accounts_and_can_be_narrowed(served: ServedChain) -> None:
+    start = served.ask("person", lambda chain: chain.block_number()) + 1
+    ended, opened = served.create_liability(cost=COST), served.create_liability()
+    served.finalize(ended)
 
     def listed(*options: str, by: str = "person") -> list[str]:
-        found = town.told("liability", "list", "--from-block", str(start), *options, by=by)
+        found = served.run_json("liability", "list", "--from-block", str(start), *options, by=by)
         return [liability["address"] for liability in found]
 
     assert listed() == listed(by="robot") == [ended, opened]
@@ -86,101 +86,101 @@ def test_the_list_is_the_accounts_and_can_be_narrowed(town: Town) -> None:
     assert listed("--state", "finalized") == [ended]
     assert listed(by="stranger") == []
     assert listed("--all", by="stranger") == [ended, opened]
-    assert listed("--account", town.people["robot"].address, by="stranger") == [ended, opened]
-    said = town.aira("liability", "list", "--from-block", str(start), by="robot").stdout
+    assert listed("--account", served.people["robot"].address, by="stranger") == [ended, opened]
+    said = served.aira("liability", "list", "--from-block", str(start), by="robot").stdout
     head, first, second = (line.split() for line in said.splitlines())
     assert head == ["LIABILITY", "STATE", "COST", "PROMISEE", "PROMISOR"]
-    person = town.people["person"].address
+    person = served.people["person"].address
     assert first == [ended, "paid", "1.5", "XRT", f"{person[:6]}…{person[-4:]}", "you"]
     assert second[:4] == [opened, "open", "0", "XRT"]
 
 
-def test_without_an_account_all_are_listed(town: Town) -> None:
-    address = town.agree()
-    assert address in [liability["address"] for liability in town.told("liability", "list", AIRA_KEYFILE="")]
+def test_without_an_account_all_are_listed(served: ServedChain) -> None:
+    address = served.create_liability()
+    assert address in [liability["address"] for liability in served.run_json("liability", "list", AIRA_KEYFILE="")]
 
 
-def test_an_empty_list_says_so(town: Town) -> None:
-    stranger = town.people["stranger"].address
-    done = town.aira("liability", "list", "--state", "open", by="stranger")
+def test_an_empty_list_says_so(served: ServedChain) -> None:
+    stranger = served.people["stranger"].address
+    done = served.aira("liability", "list", "--state", "open", by="stranger")
     assert (done.exit_code, done.stdout) == (0, f"no open liabilities of {stranger}\n")
-    assert town.told("liability", "list", by="stranger") == []
+    assert served.run_json("liability", "list", by="stranger") == []
 
 
-def test_both_parties_call_the_work_off(town: Town) -> None:
-    before = held(town, "person")
-    address = town.agree(cost=COST)
-    said = town.aira("liability", "cancel", address, by="robot").stdout
+def test_both_parties_call_the_work_off(served: ServedChain) -> None:
+    before = held(served, "person")
+    address = served.create_liability(cost=COST)
+    said = served.aira("liability", "cancel", address, by="robot").stdout
     command = said.splitlines()[-1]
     assert said.startswith(f"as the promisor, you agree to call off {address}")
-    assert town.people["person"].address in said
+    assert served.people["person"].address in said
     assert command.startswith(f"aira liability cancel {address} --signature 0x")
-    assert town.told("liability", "show", address)["state"] == "open", "one signature ends nothing"
-    done = town.aira(*command.split()[1:], by="person")
+    assert served.run_json("liability", "show", address)["state"] == "open", "one signature ends nothing"
+    done = served.aira(*command.split()[1:], by="person")
     ended = columns(done.stdout)
     assert ended["state"].startswith("called off without a result")
-    assert ended["paid back"] == f"1.5 XRT  to {town.people['person'].address}"
-    assert held(town, "person") == before
-    assert town.told("liability", "show", address)["state"] == "called-off"
+    assert ended["paid back"] == f"1.5 XRT  to {served.people['person'].address}"
+    assert held(served, "person") == before
+    assert served.run_json("liability", "show", address)["state"] == "called-off"
 
 
-def test_anybody_can_bring_both_signatures(town: Town) -> None:
-    address = town.agree(cost=COST)
-    signatures = [word for role in ("robot", "person") for word in ("--signature", signature_of(town, role, address))]
-    told = town.told("liability", "cancel", address, *signatures, by="stranger")
+def test_anybody_can_bring_both_signatures(served: ServedChain) -> None:
+    address = served.create_liability(cost=COST)
+    signatures = [word for role in ("robot", "person") for word in ("--signature", signature_of(served, role, address))]
+    told = served.run_json("liability", "cancel", address, *signatures, by="stranger")
     assert (told["state"], told["tx"][:2], told["gasUsed"] > 0) == ("called-off", "0x", True)
 
 
-def test_a_signature_for_programs_says_whose_is_needed(town: Town) -> None:
-    address = town.agree()
-    told = town.told("liability", "cancel", address)
-    assert (told["party"], told["signer"]) == ("promisee", town.people["person"].address)
-    assert told["needed"] == town.people["robot"].address
+def test_a_signature_for_programs_says_whose_is_needed(served: ServedChain) -> None:
+    address = served.create_liability()
+    told = served.run_json("liability", "cancel", address)
+    assert (told["party"], told["signer"]) == ("promisee", served.people["person"].address)
+    assert told["needed"] == served.people["robot"].address
 
 
-def test_a_signature_that_does_not_fit_is_one_clear_line(town: Town) -> None:
-    address, other = town.agree(), town.agree()
-    mine = signature_of(town, "person", address)
-    wrong = signature_of(town, "robot", other)
+def test_a_signature_that_does_not_fit_is_one_clear_line(served: ServedChain) -> None:
+    address, other = served.create_liability(), served.create_liability()
+    mine = signature_of(served, "person", address)
+    wrong = signature_of(served, "robot", other)
     cancel = ("liability", "cancel", address, "--signature")
-    refused(town.aira(*cancel, mine), SignatureMissing, "promisor")
-    refused(town.aira(*cancel, wrong), InvalidSignature)
-    refused(town.aira(*cancel, "0x12"), InvalidSignature)
-    refused(town.aira(*cancel, "rubbish"), InvalidSignature)
-    assert town.told("liability", "show", address)["state"] == "open"
+    refused(served.aira(*cancel, mine), SignatureMissing, "promisor")
+    refused(served.aira(*cancel, wrong), InvalidSignature)
+    refused(served.aira(*cancel, "0x12"), InvalidSignature)
+    refused(served.aira(*cancel, "rubbish"), InvalidSignature)
+    assert served.run_json("liability", "show", address)["state"] == "open"
 
 
-def test_who_is_no_party_can_not_call_off(town: Town) -> None:
-    refused(town.aira("liability", "cancel", town.agree(), by="stranger"), NotAParty)
+def test_who_is_no_party_can_not_call_off(served: ServedChain) -> None:
+    refused(served.aira("liability", "cancel", served.create_liability(), by="stranger"), NotAParty)
 
 
-def test_what_has_ended_can_not_be_called_off(town: Town) -> None:
-    address = town.agree()
-    town.finish(address)
-    refused(town.aira("liability", "cancel", address), LiabilityEnded, address, "paid")
-    refused(town.aira("liability", "cancel", address, "--refund"), LiabilityEnded, address, "paid")
+def test_what_has_ended_can_not_be_called_off(served: ServedChain) -> None:
+    address = served.create_liability()
+    served.finalize(address)
+    refused(served.aira("liability", "cancel", address), LiabilityEnded, address, "paid")
+    refused(served.aira("liability", "cancel", address, "--refund"), LiabilityEnded, address, "paid")
 
 
-def test_the_money_of_a_promisor_who_vanished_can_be_had_back_after_the_delay(town: Town) -> None:
-    before = held(town, "person")
-    address = town.agree(cost=COST)
-    hint = refused(town.aira("liability", "cancel", address, "--refund"), NotRefundable, address)
+def test_the_money_of_a_promisor_who_vanished_can_be_had_back_after_the_delay(served: ServedChain) -> None:
+    before = held(served, "person")
+    address = served.create_liability(cost=COST)
+    hint = refused(served.aira("liability", "cancel", address, "--refund"), NotRefundable, address)
     assert "both parties" in hint
-    town.mine(REFUND_DELAY - 1)
-    assert columns(town.aira("liability", "show", address).stdout)["refund"].startswith("possible now")
-    said = columns(town.aira("liability", "cancel", address, "--refund", by="stranger").stdout)
-    assert said["paid back"] == f"1.5 XRT  to {town.people['person'].address}"
-    assert held(town, "person") == before
+    served.mine(REFUND_DELAY - 1)
+    assert columns(served.aira("liability", "show", address).stdout)["refund"].startswith("possible now")
+    said = columns(served.aira("liability", "cancel", address, "--refund", by="stranger").stdout)
+    assert said["paid back"] == f"1.5 XRT  to {served.people['person'].address}"
+    assert held(served, "person") == before
 
 
-def test_a_refund_needs_no_signature(town: Town) -> None:
-    done = town.aira("liability", "cancel", town.agree(), "--refund", "--signature", "0x12")
+def test_a_refund_needs_no_signature(served: ServedChain) -> None:
+    done = served.aira("liability", "cancel", served.create_liability(), "--refund", "--signature", "0x12")
     assert (done.exit_code, "--refund needs no --signature" in done.stderr) == (2, True)
 
 
-def test_a_token_of_another_name_is_not_taken_for_xrt(town: Town) -> None:
+def test_a_token_of_another_name_is_not_taken_for_xrt(served: ServedChain) -> None:
     async def forge() -> str:
-        async with town.chain("person") as chain:
+        async with served.chain("person") as chain:
             data = chain.node.creation_code("XRT", 1_000 * XRT)
             assert chain.account is not None
             receipt = await TransactionSender(chain.node, chain.account).send(to=None, data=data)
@@ -188,85 +188,90 @@ def test_a_token_of_another_name_is_not_taken_for_xrt(town: Town) -> None:
             await chain.tokens.approve(chain.factory, XRT, token=receipt.contract)
             return receipt.contract
 
-    token = town.run(forge())
-    address = town.agree(cost=7, token=token)
-    said = columns(town.aira("liability", "show", address).stdout)
+    token = served.run(forge())
+    address = served.create_liability(cost=7, token=token)
+    said = columns(served.aira("liability", "show", address).stdout)
     assert said["cost"] == f"0.000000007 XRT ({token[:6]}…{token[-4:]})"
     assert said["token"] == token
 
 
 @pytest.mark.parametrize("command", ["show", "watch", "cancel"])
-def test_what_is_no_liability_is_one_clear_line(town: Town, command: str) -> None:
-    refused(town.aira("liability", command, town.deployment.xrt), NotALiability, town.deployment.xrt)
-    refused(town.aira("liability", command, "0x12"), InvalidAddress, "0x12")
+def test_what_is_no_liability_is_one_clear_line(served: ServedChain, command: str) -> None:
+    refused(served.aira("liability", command, served.deployment.xrt), NotALiability, served.deployment.xrt)
+    refused(served.aira("liability", command, "0x12"), InvalidAddress, "0x12")
 
 
-def test_watching_one_that_has_ended_shows_it_at_once(town: Town) -> None:
-    address = town.agree()
-    town.finish(address)
-    assert town.told("liability", "watch", address)["state"] == "paid"
+def test_watching_one_that_has_ended_shows_it_at_once(served: ServedChain) -> None:
+    address = served.create_liability()
+    served.finalize(address)
+    assert served.run_json("liability", "watch", address)["state"] == "paid"
 
 
 @pytest.fixture
-def watching(town: Town) -> Iterator[Serving]:
+def watching(served: ServedChain) -> Iterator[Serving]:
     """`aira liability watch`, as another process."""
-    with Serving(*AIRA, "liability", "watch", says="watching from block", variables=town.variables()) as server:
+    with Serving(*AIRA, "liability", "watch", says="watching from block", variables=served.variables()) as server:
         yield server
 
 
-def test_watching_all_tells_of_each_that_is_made_and_ends(town: Town, watching: Serving) -> None:
-    address = town.agree(cost=COST)
+def test_watching_all_tells_of_each_that_is_made_and_ends(served: ServedChain, watching: Serving) -> None:
+    address = served.create_liability(cost=COST)
     watching.wait_until_said(f"{address}  made ")
-    town.finish(address)
+    served.finalize(address)
     watching.wait_until_said(f"{address}  paid ")
-    person = town.people["robot"].address
+    person = served.people["robot"].address
     assert f"{person[:6]}…{person[-4:]} for you, 1.5 XRT" in watching.log()
     code, _ = watching.end(signal.SIGINT)
     assert code == 130
     assert "Traceback" not in watching.log()
 
 
-def test_watching_all_tells_what_a_reorganisation_takes_back(town: Town, watching: Serving) -> None:
-    address = town.agree(cost=COST)
+def test_watching_all_tells_what_a_reorganisation_takes_back(served: ServedChain, watching: Serving) -> None:
+    address = served.create_liability(cost=COST)
     watching.wait_until_said(f"{address}  made ")
-    town.replace_blocks(1)
+    served.replace_blocks(1)
     watching.wait_until_said(f"the chain was reorganised: {address} was not made after all")
 
 
-def test_watching_all_waits_for_a_node_that_is_lost(town: Town, watching: Serving) -> None:
-    with town.unreachable():
+def test_watching_all_waits_for_a_node_that_is_lost(served: ServedChain, watching: Serving) -> None:
+    with served.unreachable():
         watching.wait_until_said("waiting for it")
-    address = town.agree(cost=COST)
+    address = served.create_liability(cost=COST)
     watching.wait_until_said(f"{address}  made ")
     assert watching.log().count("waiting for it") == 1
     assert "Traceback" not in watching.log()
 
 
-def test_watching_one_shows_it_once_it_has_ended(town: Town) -> None:
-    address = town.agree(cost=COST)
+def test_watching_one_shows_it_once_it_has_ended(served: ServedChain) -> None:
+    address = served.create_liability(cost=COST)
     command = (*AIRA, "liability", "watch", address)
-    with Serving(*command, says="waiting for its end", variables=town.variables()) as watcher:
-        town.finish(address, success=False)
+    with Serving(*command, says="waiting for its end", variables=served.variables()) as watcher:
+        served.finalize(address, success=False)
         watcher.wait_until_said("state       failed: ")
 
 
-def test_watching_all_for_programs_is_an_object_a_line(town: Town) -> None:
-    block = town.ask("person", lambda chain: chain.block_number()) + 1
-    address = town.agree()
-    town.finish(address)
+def test_watching_all_for_programs_is_an_object_a_line(served: ServedChain) -> None:
+    block = served.ask("person", lambda chain: chain.block_number()) + 1
+    address = served.create_liability()
+    served.finalize(address)
     command = (*AIRA, "liability", "watch", "--json", "--from-block", str(block))
-    with Serving(*command, says='"ended"', variables=town.variables()) as watcher:
+    with Serving(*command, says='"ended"', variables=served.variables()) as watcher:
         told = [json.loads(line) for line in watcher.log().splitlines()]
     assert [(line["event"], line["liability"]["address"]) for line in told] == [("made", address), ("ended", address)]
 
 
-def test_ctrl_c_ends_the_watching_of_one(town: Town) -> None:
+def test_ctrl_c_ends_the_watching_of_one(served: ServedChain) -> None:
     interrupted = Interrupted(
-        "liability", "watch", town.agree(), at="waiting for its end", after=0.2, variables=town.variables()
+        "liability",
+        "watch",
+        served.create_liability(),
+        at="waiting for its end",
+        after=0.2,
+        variables=served.variables(),
     )
     assert (interrupted.code, interrupted.errors) == (130, "")
 
 
-def test_a_real_process_says_the_same(town: Town) -> None:
-    done = aira("liability", "show", town.deployment.xrt, **town.variables())
-    assert refused(done, NotALiability, town.deployment.xrt) == ""
+def test_a_real_process_says_the_same(served: ServedChain) -> None:
+    done = aira("liability", "show", served.deployment.xrt, **served.variables())
+    assert refused(done, NotALiability, served.deployment.xrt) == ""

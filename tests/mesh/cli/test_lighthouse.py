@@ -18,25 +18,25 @@ from mesh.cli.errors import (
     NotALighthouse,
     NotAProvider,
 )
-from tests.mesh.cli.chains import Town, columns
+from tests.mesh.cli.served_chain import ServedChain, columns
 from tests.support.commands import refused
 
 _numbers = count(1)
 
 
 @pytest.fixture
-def market(town: Town) -> str:
+def market(served: ServedChain) -> str:
     """A lighthouse of this test's own: two XRT at least, ten blocks."""
     name = f"market-{next(_numbers)}"
-    town.ask("provider", lambda chain: chain.lighthouses.create(minimal_stake=2 * XRT, timeout_blocks=10, name=name))
+    served.ask("provider", lambda chain: chain.lighthouses.create(minimal_stake=2 * XRT, timeout_blocks=10, name=name))
     return name
 
 
-def test_a_new_lighthouse_is_told_of_and_listed(town: Town) -> None:
-    made = town.told("lighthouse", "create", "brand-new", "--minimal-stake", "2.5", "--timeout-blocks", "7")
+def test_a_new_lighthouse_is_told_of_and_listed(served: ServedChain) -> None:
+    made = served.run_json("lighthouse", "create", "brand-new", "--minimal-stake", "2.5", "--timeout-blocks", "7")
     assert (made["name"], made["timeoutBlocks"]) == ("brand-new.lighthouse.3.robonomics.eth", 7)
-    listed = town.told("lighthouse", "list")
-    assert listed[0]["lighthouse"] == town.deployment.lighthouse
+    listed = served.run_json("lighthouse", "list")
+    assert listed[0]["lighthouse"] == served.deployment.lighthouse
     assert listed[-1] == {
         "lighthouse": made["lighthouse"],
         "name": "brand-new",
@@ -50,131 +50,134 @@ def test_a_new_lighthouse_is_told_of_and_listed(town: Town) -> None:
     }
 
 
-def test_creating_says_what_was_made(town: Town) -> None:
-    said = columns(town.aira("lighthouse", "create", "spoken", "--minimal-stake", "5wn").stdout)
+def test_creating_says_what_was_made(served: ServedChain) -> None:
+    said = columns(served.aira("lighthouse", "create", "spoken", "--minimal-stake", "5wn").stdout)
     assert said["name"] == "spoken.lighthouse.3.robonomics.eth"
     assert (said["minimal stake"], said["timeout"]) == ("0.000000005 XRT", "25 blocks")
 
 
-def test_the_list_has_a_line_for_each_since_a_block(town: Town, market: str) -> None:
-    head, first, *rest = town.aira("lighthouse", "list").stdout.splitlines()
+def test_the_list_has_a_line_for_each_since_a_block(served: ServedChain, market: str) -> None:
+    head, first, *rest = served.aira("lighthouse", "list").stdout.splitlines()
     assert head.split() == ["NAME", "ADDRESS", "MINIMAL", "STAKE", "TIMEOUT", "PROVIDERS", "STAKED"]
-    assert first.split() == ["airalab", town.deployment.lighthouse, "1", "XRT", "5", "blocks", "1", "100", "XRT"]
+    assert first.split() == ["airalab", served.deployment.lighthouse, "1", "XRT", "5", "blocks", "1", "100", "XRT"]
     assert rest[-1].split()[0] == market
-    block = town.ask("person", lambda chain: chain.block_number())
-    since = town.aira("lighthouse", "list", "--from-block", str(block)).stdout
+    block = served.ask("person", lambda chain: chain.block_number())
+    since = served.aira("lighthouse", "list", "--from-block", str(block)).stdout
     assert [line.split()[0] for line in since.splitlines()] == ["NAME", market]
-    done = town.aira("lighthouse", "list", "--from-block", str(block + 1))
+    done = served.aira("lighthouse", "list", "--from-block", str(block + 1))
     assert done.stdout == f"no lighthouse was made here since block {block + 1:,}\n"
 
 
-def test_joining_approves_what_is_missing_and_leaving_gives_it_back(town: Town, market: str) -> None:
-    person = town.people["person"].address
-    before = town.ask("person", lambda chain: chain.tokens.balance())
-    said = columns(town.aira("lighthouse", "join", market, "5").stdout)
+def test_joining_approves_what_is_missing_and_leaving_gives_it_back(served: ServedChain, market: str) -> None:
+    person = served.people["person"].address
+    before = served.ask("person", lambda chain: chain.tokens.balance())
+    said = columns(served.aira("lighthouse", "join", market, "5").stdout)
     assert (said["stake"], said["a turn"]) == ("5 XRT", "2 transactions")
-    assert town.ask("person", lambda chain: chain.tokens.balance()) == before - 5 * XRT
-    more = town.told("lighthouse", "join", market, "1000000000wn")
+    assert served.ask("person", lambda chain: chain.tokens.balance()) == before - 5 * XRT
+    more = served.run_json("lighthouse", "join", market, "1000000000wn")
     assert (more["stake"], more["quota"], more["isProvider"]) == (str(6 * XRT), 3, True)
-    less = town.told("lighthouse", "leave", market, "2")
+    less = served.run_json("lighthouse", "leave", market, "2")
     assert (less["provider"], less["stake"], less["quota"]) == (person, str(4 * XRT), 2)
-    said = columns(town.aira("lighthouse", "leave", market).stdout)
+    said = columns(served.aira("lighthouse", "leave", market).stdout)
     assert said["stake"] == "0 XRT"
     assert said["provider"] == f"{person}  (no more)"
-    assert town.ask("person", lambda chain: chain.tokens.balance()) == before
+    assert served.ask("person", lambda chain: chain.tokens.balance()) == before
 
 
-def test_taking_off_so_much_that_too_little_remains_takes_all(town: Town, market: str) -> None:
-    town.told("lighthouse", "join", market, "3")
-    told = town.told("lighthouse", "leave", market, "2")
+def test_taking_off_so_much_that_too_little_remains_takes_all(served: ServedChain, market: str) -> None:
+    served.run_json("lighthouse", "join", market, "3")
+    told = served.run_json("lighthouse", "leave", market, "2")
     assert (told["stake"], told["isProvider"]) == ("0", False)
 
 
-def test_info_shows_providers_and_whose_turn_it_is(town: Town, market: str) -> None:
-    people = [town.people[role].address for role in ("robot", "person")]
+def test_info_shows_providers_and_whose_turn_it_is(served: ServedChain, market: str) -> None:
+    people = [served.people[role].address for role in ("robot", "person")]
     for role, stake in (("robot", "4"), ("person", "10")):
-        town.told("lighthouse", "join", market, stake, by=role)
-    told = town.told("lighthouse", "info", market)
+        served.run_json("lighthouse", "join", market, stake, by=role)
+    told = served.run_json("lighthouse", "info", market)
     assert [provider["provider"] for provider in told["providers"]] == people
     assert [provider["quota"] for provider in told["providers"]] == [2, 5]
     assert (told["current"], told["marker"], told["quota"]) == (people[0], 1, 2)
     assert [provider["maySend"] for provider in told["providers"]] == [True, False]
-    said = town.aira("lighthouse", "info", market).stdout
+    said = served.aira("lighthouse", "info", market).stdout
     assert columns(said)["turn"] == f"{people[0]}  (1 of 2), 2 transactions left"
     lines = [line.split() for line in said.splitlines()[-2:]]
     assert lines == [
         ["1", people[0], "4", "XRT", "2", "transactions", "yes"],
         ["2", people[1], "10", "XRT", "5", "transactions", "no"],
     ]
-    town.mine(25)
-    assert [provider["maySend"] for provider in town.told("lighthouse", "info", market)["providers"]] == [True, True]
+    served.mine(25)
+    assert [provider["maySend"] for provider in served.run_json("lighthouse", "info", market)["providers"]] == [
+        True,
+        True,
+    ]
 
 
-def test_info_is_by_default_of_the_settings_lighthouse(town: Town) -> None:
-    said = columns(town.aira("lighthouse", "info").stdout)
-    assert (said["lighthouse"], said["name"]) == (town.deployment.lighthouse, "airalab.lighthouse.3.robonomics.eth")
+def test_info_is_by_default_of_the_settings_lighthouse(served: ServedChain) -> None:
+    said = columns(served.aira("lighthouse", "info").stdout)
+    assert (said["lighthouse"], said["name"]) == (served.deployment.lighthouse, "airalab.lighthouse.3.robonomics.eth")
     assert said["minimal stake"] == "1 XRT"
 
 
-def test_info_of_an_empty_lighthouse_says_how_to_join(town: Town, market: str) -> None:
-    assert "aira lighthouse join" in columns(town.aira("lighthouse", "info", market).stdout)["providers"]
+def test_info_of_an_empty_lighthouse_says_how_to_join(served: ServedChain, market: str) -> None:
+    assert "aira lighthouse join" in columns(served.aira("lighthouse", "info", market).stdout)["providers"]
 
 
-def test_a_taken_name_is_one_clear_line(town: Town) -> None:
-    done = town.aira("lighthouse", "create", "airalab")
+def test_a_taken_name_is_one_clear_line(served: ServedChain) -> None:
+    done = served.aira("lighthouse", "create", "airalab")
     assert refused(done, NameTaken, "airalab.lighthouse.3.robonomics.eth") == "choose another name"
 
 
 @pytest.mark.parametrize("name", ["Airalab", "a b", "a.b", "", "a" * 33])
-def test_a_name_that_can_not_be_is_one_clear_line(town: Town, name: str) -> None:
-    refused(town.aira("lighthouse", "create", name), InvalidLighthouse, repr(name))
+def test_a_name_that_can_not_be_is_one_clear_line(served: ServedChain, name: str) -> None:
+    refused(served.aira("lighthouse", "create", name), InvalidLighthouse, repr(name))
 
 
 @pytest.mark.parametrize("stake", ["0", "0wn", str(2**128) + "wn"])
-def test_a_minimal_stake_that_can_not_be_is_one_clear_line(town: Town, stake: str) -> None:
-    refused(town.aira("lighthouse", "create", "staked", "--minimal-stake", stake), InvalidLighthouse)
+def test_a_minimal_stake_that_can_not_be_is_one_clear_line(served: ServedChain, stake: str) -> None:
+    refused(served.aira("lighthouse", "create", "staked", "--minimal-stake", stake), InvalidLighthouse)
 
 
-def test_a_stake_below_the_minimum_is_one_clear_line(town: Town, market: str) -> None:
-    hint = refused(town.aira("lighthouse", "join", market, "1.5"), InvalidStake, "1.5 XRT", "2 XRT")
+def test_a_stake_below_the_minimum_is_one_clear_line(served: ServedChain, market: str) -> None:
+    hint = refused(served.aira("lighthouse", "join", market, "1.5"), InvalidStake, "1.5 XRT", "2 XRT")
     assert hint == "stake 2 XRT or more"
-    refused(town.aira("lighthouse", "join", market, "0"), InvalidStake)
+    refused(served.aira("lighthouse", "join", market, "0"), InvalidStake)
 
 
-def test_a_stake_that_the_account_does_not_have_is_one_clear_line(town: Town, market: str) -> None:
-    refused(town.aira("lighthouse", "join", market, "3", by="stranger"), BalanceTooLow, "0 XRT", "3 XRT")
+def test_a_stake_that_the_account_does_not_have_is_one_clear_line(served: ServedChain, market: str) -> None:
+    refused(served.aira("lighthouse", "join", market, "3", by="stranger"), BalanceTooLow, "0 XRT", "3 XRT")
 
 
-def test_leaving_without_a_stake_is_one_clear_line(town: Town, market: str) -> None:
-    refused(town.aira("lighthouse", "leave", market), NotAProvider, market)
+def test_leaving_without_a_stake_is_one_clear_line(served: ServedChain, market: str) -> None:
+    refused(served.aira("lighthouse", "leave", market), NotAProvider, market)
 
 
-def test_taking_off_more_than_is_staked_is_one_clear_line(town: Town, market: str) -> None:
-    town.told("lighthouse", "join", market, "3")
-    refused(town.aira("lighthouse", "leave", market, "3.5"), InvalidStake, "3.5 XRT", "3 XRT")
+def test_taking_off_more_than_is_staked_is_one_clear_line(served: ServedChain, market: str) -> None:
+    served.run_json("lighthouse", "join", market, "3")
+    refused(served.aira("lighthouse", "leave", market, "3.5"), InvalidStake, "3.5 XRT", "3 XRT")
 
 
-def test_an_unknown_lighthouse_is_one_clear_line(town: Town) -> None:
+def test_an_unknown_lighthouse_is_one_clear_line(served: ServedChain) -> None:
     for command in (("info", "nowhere"), ("join", "nowhere", "1"), ("leave", "nowhere")):
-        refused(town.aira("lighthouse", *command), UnknownName, "nowhere.lighthouse.3.robonomics.eth")
+        refused(served.aira("lighthouse", *command), UnknownName, "nowhere.lighthouse.3.robonomics.eth")
 
 
-def test_what_is_no_lighthouse_is_one_clear_line(town: Town) -> None:
-    address = town.deployment.xrt
+def test_what_is_no_lighthouse_is_one_clear_line(served: ServedChain) -> None:
+    address = served.deployment.xrt
     for command in (("info", address), ("join", address, "1"), ("leave", address)):
-        refused(town.aira("lighthouse", *command), NotALighthouse, address)
+        refused(served.aira("lighthouse", *command), NotALighthouse, address)
 
 
-def test_without_a_name_the_settings_lighthouse_is_joined_and_left(town: Town, market: str) -> None:
+def test_without_a_name_the_settings_lighthouse_is_joined_and_left(served: ServedChain, market: str) -> None:
     at = ("--lighthouse-contract", market)
-    assert town.told("lighthouse", "join", "4", *at)["name"] == market
-    assert town.told("lighthouse", "leave", "2", *at)["stake"] == str(2 * XRT)
-    assert town.told("lighthouse", "leave", *at)["stake"] == "0"
+    assert served.run_json("lighthouse", "join", "4", *at)["name"] == market
+    assert served.run_json("lighthouse", "leave", "2", *at)["stake"] == str(2 * XRT)
+    assert served.run_json("lighthouse", "leave", *at)["stake"] == "0"
 
 
-def test_words_in_a_wrong_order_or_number_are_one_clear_line(town: Town, market: str) -> None:
-    hint = refused(town.aira("lighthouse", "join", "20", market), InvalidAmount, market)
+def test_words_in_a_wrong_order_or_number_are_one_clear_line(served: ServedChain, market: str) -> None:
+    hint = refused(served.aira("lighthouse", "join", "20", market), InvalidAmount, market)
     assert hint == f"the lighthouse comes first: {market} 20"
-    assert f"join {market} 20" in refused(town.aira("lighthouse", "join", market), InvalidOptions, "VALUE")
-    refused(town.aira("lighthouse", "join", market, "much"), InvalidAmount, "much")
-    refused(town.aira("lighthouse", "leave", market, "1", "2"), InvalidOptions)
+    assert f"join {market} 20" in refused(served.aira("lighthouse", "join", market), InvalidOptions, "VALUE")
+    refused(served.aira("lighthouse", "join", market, "much"), InvalidAmount, "much")
+    refused(served.aira("lighthouse", "leave", market, "1", "2"), InvalidOptions)

@@ -15,7 +15,7 @@ from mesh.errors import InputError
 from mesh.network import ServiceFailed
 from schemas.message_requests import SendDemand
 from schemas.rpc import GUARDED, SERVICES, FinishLiability, Nothing, ReadLiability, StartLiability, TransferRequest
-from tests.mesh.cli.chains import columns
+from tests.mesh.cli.served_chain import columns
 from tests.support.market import offering
 from tests.support.objectives import objective
 from tests.support.orders import LIGHTHOUSE, STRANGER, demand

@@ -17,7 +17,7 @@ from mesh.devchain import JsonRpcServer
 from mesh.errors import InvalidAddress
 from mesh.settings import Settings
 from schemas.status import ContentMetrics, MarketStatus, Status, StoreUse, Work
-from tests.mesh.cli.chains import columns
+from tests.mesh.cli.served_chain import columns
 from tests.mesh.market.floor import QUICK
 from tests.mesh.watching.test_presence import WAY, bridge_status, status
 from tests.support.market import MODEL, offering, offering_unseen

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from mesh.chain import Node
 from mesh.cli import main
 from mesh.cli.errors import AnvilMissing
-from tests.mesh.cli.chains import columns
+from tests.mesh.cli.served_chain import columns
 from tests.support.commands import AIRA, Serving, refused
 from tests.support.peers import require
 from tests.support.ports import free_port

@@ -11,7 +11,7 @@ from mesh.chain.accounts import KeyfileError, WrongPassword
 from mesh.chain.errors import InsufficientFunds, NodeUnreachable, UnknownName
 from mesh.cli.errors import AccountMissing, BalanceTooLow, InvalidAmount, NotAToken
 from mesh.errors import ConfigurationError, InputError
-from tests.mesh.cli.chains import MONEY, Town, columns, write_quick_keyfile
+from tests.mesh.cli.served_chain import MONEY, ServedChain, columns, write_quick_keyfile
 from tests.support.commands import refused
 from tests.support.ports import free_port
 
@@ -21,61 +21,61 @@ if TYPE_CHECKING:
 NOBODY = "0x00000000000000000000000000000000000000AA"
 
 
-def held(town: Town, who: str) -> int:
-    return town.ask("provider", lambda chain: chain.tokens.balance(who))
+def held(served: ServedChain, who: str) -> int:
+    return served.ask("provider", lambda chain: chain.tokens.balance(who))
 
 
 @pytest.fixture
-def poor(town: Town, tmp_path: Path) -> dict[str, str]:
+def poor(served: ServedChain, tmp_path: Path) -> dict[str, str]:
     """The variables of somebody without ETH."""
     keyfile = write_quick_keyfile(tmp_path / "poor.json", new_private_key())
     return {"AIRA_KEYFILE": str(keyfile)}
 
 
-def test_the_balance_is_that_of_the_settings_account_and_needs_no_password(town: Town) -> None:
-    address = town.people["robot"].address
-    done = town.aira("xrt", "balance", by="robot", AIRA_KEYFILE_PASSWORD_FILE="")
+def test_the_balance_is_that_of_the_settings_account_and_needs_no_password(served: ServedChain) -> None:
+    address = served.people["robot"].address
+    done = served.aira("xrt", "balance", by="robot", AIRA_KEYFILE_PASSWORD_FILE="")
     assert (done.exit_code, done.stdout) == (0, "1,000 XRT\n")
-    assert town.told("xrt", "balance", address, by="person") == {
+    assert served.run_json("xrt", "balance", address, by="person") == {
         "account": address,
-        "token": town.deployment.xrt,
+        "token": served.deployment.xrt,
         "symbol": "XRT",
         "decimals": 9,
         "balance": str(MONEY),
     }
 
 
-def test_a_transfer_is_in_xrt_unless_its_ending_says_wn(town: Town) -> None:
-    before = held(town, town.people["person"].address)
-    done = columns(town.aira("xrt", "transfer", NOBODY, "1.5").stdout)
+def test_a_transfer_is_in_xrt_unless_its_ending_says_wn(served: ServedChain) -> None:
+    before = held(served, served.people["person"].address)
+    done = columns(served.aira("xrt", "transfer", NOBODY, "1.5").stdout)
     assert (done["sent"], done["to"]) == ("1.5 XRT", NOBODY)
     assert done["transaction"].startswith("0x")
-    told = town.told("xrt", "transfer", NOBODY, "7wn")
+    told = served.run_json("xrt", "transfer", NOBODY, "7wn")
     assert (told["amount"], told["balance"]) == ("7", str(before - 1_500_000_007))
-    assert held(town, NOBODY) == 1_500_000_007
+    assert held(served, NOBODY) == 1_500_000_007
 
 
-def test_an_allowance_is_by_default_the_factorys_and_can_be_given_and_taken_back(town: Town) -> None:
-    assert town.told("xrt", "allowance")["spender"] == town.deployment.factory
-    done = columns(town.aira("xrt", "approve", "airalab", "2.5").stdout)
-    assert (done["spender"], done["may take"]) == (town.deployment.lighthouse, "2.5 XRT")
-    assert town.aira("xrt", "allowance", "airalab").stdout == "2.5 XRT\n"
-    person = town.people["person"].address
-    told = town.told("xrt", "allowance", "airalab.lighthouse.5.robonomics.eth", "--owner", person, by="robot")
+def test_an_allowance_is_by_default_the_factorys_and_can_be_given_and_taken_back(served: ServedChain) -> None:
+    assert served.run_json("xrt", "allowance")["spender"] == served.deployment.factory
+    done = columns(served.aira("xrt", "approve", "airalab", "2.5").stdout)
+    assert (done["spender"], done["may take"]) == (served.deployment.lighthouse, "2.5 XRT")
+    assert served.aira("xrt", "allowance", "airalab").stdout == "2.5 XRT\n"
+    person = served.people["person"].address
+    told = served.run_json("xrt", "allowance", "airalab.lighthouse.5.robonomics.eth", "--owner", person, by="robot")
     assert (told["owner"], told["allowance"]) == (person, str(5 * XRT // 2))
-    assert town.told("xrt", "approve", "airalab", "0")["allowance"] == "0"
-    assert town.aira("xrt", "allowance", "airalab").stdout == "0 XRT\n"
+    assert served.run_json("xrt", "approve", "airalab", "0")["allowance"] == "0"
+    assert served.aira("xrt", "allowance", "airalab").stdout == "0 XRT\n"
 
 
-def test_another_token_counts_in_its_own_units(town: Town) -> None:
-    token = town.run(_deploy_token(town))
-    assert town.aira("xrt", "balance", "--token", token, by="provider").stdout == "123.45 XRT\n"
-    assert town.told("xrt", "balance", NOBODY, "--token", token, by="provider")["token"] == token
+def test_another_token_counts_in_its_own_units(served: ServedChain) -> None:
+    token = served.run(_deploy_token(served))
+    assert served.aira("xrt", "balance", "--token", token, by="provider").stdout == "123.45 XRT\n"
+    assert served.run_json("xrt", "balance", NOBODY, "--token", token, by="provider")["token"] == token
 
 
-async def _deploy_token(town: Town) -> str:
+async def _deploy_token(served: ServedChain) -> str:
     """Another ERC-20, with the same code as XRT."""
-    async with town.chain("provider") as chain:
+    async with served.chain("provider") as chain:
         data = chain.node.creation_code("XRT", 123_450_000_000)
         assert chain.account is not None
         receipt = await TransactionSender(chain.node, chain.account).send(to=None, data=data)
@@ -83,67 +83,67 @@ async def _deploy_token(town: Town) -> str:
         return receipt.contract
 
 
-def test_more_than_there_is_is_refused_before_anything_is_sent(town: Town) -> None:
-    done = town.aira("xrt", "transfer", NOBODY, "5000")
+def test_more_than_there_is_is_refused_before_anything_is_sent(served: ServedChain) -> None:
+    done = served.aira("xrt", "transfer", NOBODY, "5000")
     hint = refused(done, BalanceTooLow, "5,000 XRT")
     assert "smaller amount" in hint
 
 
 @pytest.mark.parametrize("amount", ["1,5", "lots", "1.0000000001", "5 ETH"])
-def test_what_is_no_amount_is_one_clear_line(town: Town, amount: str) -> None:
-    assert "1.5" in refused(town.aira("xrt", "transfer", NOBODY, amount), InvalidAmount, repr(amount))
+def test_what_is_no_amount_is_one_clear_line(served: ServedChain, amount: str) -> None:
+    assert "1.5" in refused(served.aira("xrt", "transfer", NOBODY, amount), InvalidAmount, repr(amount))
 
 
 @pytest.mark.parametrize("address", ["0x709", "robot", "0x70997970c51812dc3A010C7d01b50e0d17dc79C8"])
-def test_what_is_no_address_is_one_clear_line(town: Town, address: str) -> None:
-    refused(town.aira("xrt", "transfer", address, "1"), InputError, repr(address))
+def test_what_is_no_address_is_one_clear_line(served: ServedChain, address: str) -> None:
+    refused(served.aira("xrt", "transfer", address, "1"), InputError, repr(address))
 
 
-def test_an_unknown_name_is_one_clear_line(town: Town) -> None:
-    refused(town.aira("xrt", "balance", "no.3.robonomics.eth"), UnknownName, "no.3.robonomics.eth")
-    refused(town.aira("xrt", "allowance", "nowhere"), UnknownName, "nowhere.lighthouse.3.robonomics.eth")
+def test_an_unknown_name_is_one_clear_line(served: ServedChain) -> None:
+    refused(served.aira("xrt", "balance", "no.3.robonomics.eth"), UnknownName, "no.3.robonomics.eth")
+    refused(served.aira("xrt", "allowance", "nowhere"), UnknownName, "nowhere.lighthouse.3.robonomics.eth")
 
 
 @pytest.mark.parametrize("what", ["lighthouse", "person"])
-def test_what_is_no_token_is_one_clear_line(town: Town, what: str) -> None:
-    address = town.deployment.lighthouse if what == "lighthouse" else town.people["person"].address
-    refused(town.aira("xrt", "balance", "--token", address), NotAToken, address)
+def test_what_is_no_token_is_one_clear_line(served: ServedChain, what: str) -> None:
+    address = served.deployment.lighthouse if what == "lighthouse" else served.people["person"].address
+    refused(served.aira("xrt", "balance", "--token", address), NotAToken, address)
 
 
-def test_an_account_without_eth_is_told_so(town: Town, poor: dict[str, str]) -> None:
-    hint = refused(town.aira("xrt", "approve", "factory", "1", **poor), InsufficientFunds, "has 0 ")
+def test_an_account_without_eth_is_told_so(served: ServedChain, poor: dict[str, str]) -> None:
+    hint = refused(served.aira("xrt", "approve", "factory", "1", **poor), InsufficientFunds, "has 0 ")
     assert "send ETH to the account" in hint
 
 
-def test_an_account_without_xrt_is_told_so(town: Town, poor: dict[str, str]) -> None:
-    refused(town.aira("xrt", "transfer", NOBODY, "1", **poor), BalanceTooLow, "0 XRT", "1 XRT")
+def test_an_account_without_xrt_is_told_so(served: ServedChain, poor: dict[str, str]) -> None:
+    refused(served.aira("xrt", "transfer", NOBODY, "1", **poor), BalanceTooLow, "0 XRT", "1 XRT")
 
 
-def test_no_account_is_one_clear_line(town: Town) -> None:
-    assert "--keyfile" in refused(town.aira("xrt", "balance", AIRA_KEYFILE=""), AccountMissing)
-    refused(town.aira("xrt", "transfer", NOBODY, "1", AIRA_KEYFILE=""), ConfigurationError, "account")
+def test_no_account_is_one_clear_line(served: ServedChain) -> None:
+    assert "--keyfile" in refused(served.aira("xrt", "balance", AIRA_KEYFILE=""), AccountMissing)
+    refused(served.aira("xrt", "transfer", NOBODY, "1", AIRA_KEYFILE=""), ConfigurationError, "account")
 
 
-def test_an_absent_keyfile_and_a_wrong_password_are_one_clear_line(town: Town, tmp_path: Path) -> None:
+def test_an_absent_keyfile_and_a_wrong_password_are_one_clear_line(served: ServedChain, tmp_path: Path) -> None:
     absent = str(tmp_path / "absent.json")
     for command in (("balance",), ("transfer", NOBODY, "1")):
-        hint = refused(town.aira("xrt", *command, AIRA_KEYFILE=absent), KeyfileError, absent)
+        hint = refused(served.aira("xrt", *command, AIRA_KEYFILE=absent), KeyfileError, absent)
         assert hint == "make one with `aira account new`"
     (tmp_path / "wrong").write_text("guessed\n")
-    done = town.aira("xrt", "transfer", NOBODY, "1", AIRA_KEYFILE_PASSWORD_FILE=str(tmp_path / "wrong"))
+    done = served.aira("xrt", "transfer", NOBODY, "1", AIRA_KEYFILE_PASSWORD_FILE=str(tmp_path / "wrong"))
     refused(done, WrongPassword)
     assert "guessed" not in done.output
 
 
-def test_no_node_is_one_clear_line(town: Town) -> None:
+def test_no_node_is_one_clear_line(served: ServedChain) -> None:
     nowhere = f"http://127.0.0.1:{free_port()}"
-    refused(town.aira("xrt", "balance", AIRA_WEB3_HTTP_PROVIDER=nowhere), NodeUnreachable, nowhere)
+    refused(served.aira("xrt", "balance", AIRA_WEB3_HTTP_PROVIDER=nowhere), NodeUnreachable, nowhere)
 
 
-def test_what_was_received_can_be_sent_on(town: Town, tmp_path: Path) -> None:
+def test_what_was_received_can_be_sent_on(served: ServedChain, tmp_path: Path) -> None:
     key = new_private_key()
     address = Account.from_key(key).address
     keyfile = write_quick_keyfile(tmp_path / "new.json", key)
-    town.ask("provider", lambda chain: chain.tokens.send_eth(address, 10**18))
-    assert town.aira("xrt", "transfer", address, "3").exit_code == 0
-    assert town.told("xrt", "transfer", NOBODY, "1", AIRA_KEYFILE=str(keyfile))["balance"] == str(2 * XRT)
+    served.ask("provider", lambda chain: chain.tokens.send_eth(address, 10**18))
+    assert served.aira("xrt", "transfer", address, "3").exit_code == 0
+    assert served.run_json("xrt", "transfer", NOBODY, "1", AIRA_KEYFILE=str(keyfile))["balance"] == str(2 * XRT)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.mesh.cli.chains import Town
+from tests.mesh.cli.served_chain import ServedChain
 from tests.mesh.doctor.machines import Machine
 from tests.support.sites import Site
 
@@ -18,16 +18,16 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture(scope="module")
-def town(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Town]:
+def town(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServedChain]:
     """A served chain with the contracts, and people with money, who keep their files to themselves."""
-    with Town(tmp_path_factory.mktemp("town")) as founded:
+    with ServedChain(tmp_path_factory.mktemp("town")) as founded:
         for file in (founded.folder / "password", *(person.keyfile for person in founded.people.values())):
             file.chmod(0o600)
         yield founded
 
 
 @pytest.fixture
-def machine(town: Town, router: EmbeddedRouter, tmp_path: Path) -> Machine:
+def machine(town: ServedChain, router: EmbeddedRouter, tmp_path: Path) -> Machine:
     return Machine(town, router.endpoint, tmp_path)
 
 

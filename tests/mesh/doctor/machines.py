@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from mesh.doctor import DoctorContext
 from mesh.settings import Settings
-from tests.mesh.cli.chains import PASSWORD, Town
+from tests.mesh.cli.served_chain import PASSWORD, ServedChain
 from tests.mesh.doctor.examining import Found, examined
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class Machine:
     """Where the town's people are examined: with a router, and folders of their own."""
 
-    def __init__(self, town: Town, endpoint: str, folder: Path) -> None:
+    def __init__(self, town: ServedChain, endpoint: str, folder: Path) -> None:
         self.town = town
         self.endpoint = endpoint
         self.folder = folder

@@ -10,7 +10,7 @@ from mesh.chain import XRT, Account, Chain, DeploymentPlan, deploy, new_private_
 from mesh.doctor import CheckStatus, DoctorContext
 from mesh.doctor.account import ETH, Currency, at_least
 from mesh.settings import Settings
-from tests.mesh.cli.chains import PASSWORD, TIMING, write_quick_keyfile
+from tests.mesh.cli.served_chain import PASSWORD, TIMING, write_quick_keyfile
 from tests.mesh.doctor.examining import examined
 
 if TYPE_CHECKING:

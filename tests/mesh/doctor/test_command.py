@@ -14,7 +14,7 @@ from mesh.doctor.certificate import CertificateInfo
 from mesh.doctor.context import SerialSettings
 from mesh.identity import Member
 from mesh.settings import Settings
-from tests.mesh.cli.chains import PASSWORD, Town
+from tests.mesh.cli.served_chain import PASSWORD, ServedChain
 from tests.mesh.doctor.examining import settings_of
 from tests.support.commands import aira, run
 from tests.support.ports import free_port
@@ -35,7 +35,7 @@ def objects(done: subprocess.CompletedProcess[str]) -> list[dict[str, Any]]:
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
-def test_a_sound_machine_has_a_line_for_each_check_and_ends_with_0(town: Town, router: EmbeddedRouter) -> None:
+def test_a_sound_machine_has_a_line_for_each_check_and_ends_with_0(town: ServedChain, router: EmbeddedRouter) -> None:
     done = aira("doctor", "--role", "provider", "--connect", router.endpoint, **town.variables("provider"))
 
     assert (done.returncode, done.stderr) == (0, "")
@@ -52,7 +52,9 @@ def test_a_sound_machine_has_a_line_for_each_check_and_ends_with_0(town: Town, r
     assert PASSWORD not in done.stdout
 
 
-def test_a_warning_ends_with_0_and_is_named_at_the_end(town: Town, router: EmbeddedRouter, tmp_path: Path) -> None:
+def test_a_warning_ends_with_0_and_is_named_at_the_end(
+    town: ServedChain, router: EmbeddedRouter, tmp_path: Path
+) -> None:
     password = tmp_path / "password"
     password.write_text(PASSWORD)
     password.chmod(0o644)
@@ -79,7 +81,7 @@ def test_a_failure_says_what_to_do_what_was_not_tried_and_ends_with_1(tmp_path: 
     ]
 
 
-def test_json_is_an_object_a_check_with_four_names(town: Town, router: EmbeddedRouter) -> None:
+def test_json_is_an_object_a_check_with_four_names(town: ServedChain, router: EmbeddedRouter) -> None:
     variables = town.variables("robot") | {"AIRA_CONNECT": router.endpoint}
     done = aira("doctor", "--json", **variables)
     found = objects(done)
@@ -90,7 +92,7 @@ def test_json_is_an_object_a_check_with_four_names(town: Town, router: EmbeddedR
     assert {each["do"] for each in found} == {""}
 
 
-def test_json_of_a_failure_has_what_to_do(town: Town, router: EmbeddedRouter) -> None:
+def test_json_of_a_failure_has_what_to_do(town: ServedChain, router: EmbeddedRouter) -> None:
     done = aira("doctor", "--json", "--role", "provider", "--connect", router.endpoint, **town.variables("stranger"))
 
     assert done.returncode == 1
@@ -100,7 +102,7 @@ def test_json_of_a_failure_has_what_to_do(town: Town, router: EmbeddedRouter) ->
     assert "aira lighthouse join" in failed["do"]
 
 
-def test_a_wrong_password_is_shown_neither_as_it_is_nor_as_it_should_be(town: Town, tmp_path: Path) -> None:
+def test_a_wrong_password_is_shown_neither_as_it_is_nor_as_it_should_be(town: ServedChain, tmp_path: Path) -> None:
     (tmp_path / "password").write_text("open barley\n")
     variables = town.variables("robot") | {"AIRA_KEYFILE_PASSWORD_FILE": str(tmp_path / "password")}
     done = aira("doctor", "--json", "--role", "agent", **variables)
@@ -177,7 +179,7 @@ def test_the_role_follows_from_the_settings() -> None:
     )
 
 
-def test_nothing_is_left_behind(town: Town, router: EmbeddedRouter, tmp_path: Path) -> None:
+def test_nothing_is_left_behind(town: ServedChain, router: EmbeddedRouter, tmp_path: Path) -> None:
     before = sorted(os.listdir(tmp_path))
     variables = town.variables("robot") | {"AIRA_DATA_DIR": str(tmp_path / "state")}
     done = aira("doctor", "--connect", router.endpoint, **variables)

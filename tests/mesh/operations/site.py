@@ -12,7 +12,7 @@ from mesh.devchain.development import ALLOWANCE, ROLES, deploy_market
 from mesh.retry import RetryPolicy
 from mesh.settings import Settings
 from schemas import cid_of_bytes
-from tests.mesh.cli.chains import write_quick_keyfile
+from tests.mesh.cli.served_chain import write_quick_keyfile
 from tests.support.commands import AIRA, Serving
 from tests.support.objectives import objective
 

@@ -1,4 +1,4 @@
-"""A chain with the contracts, served to commands, and people with keyfiles who run them."""
+"""A chain with the contracts, served to commands, and accounts with keyfiles that run them."""
 
 from __future__ import annotations
 
@@ -55,10 +55,10 @@ def write_quick_keyfile(path: Path, key: bytes, password: str = PASSWORD) -> Pat
     return path
 
 
-class Town:
-    """A served chain in a thread of its own, and the people who live there: all but the stranger have XRT.
+class ServedChain:
+    """A chain served by a thread of its own, and accounts with keyfiles: all but the stranger have XRT.
 
-    `with Town(folder) as town`. `deployed=False` leaves the chain without contracts.
+    `with ServedChain(folder) as served`. `is_deployed=False` leaves the chain without contracts.
     """
 
     def __init__(self, folder: Path, *, plan: DeploymentPlan | None = None, is_deployed: bool = True) -> None:
@@ -66,7 +66,7 @@ class Town:
         self._plan = plan or DeploymentPlan(refund_delay=REFUND_DELAY, timeout_blocks=5)
         self._is_deployed = is_deployed
         self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="town")
+        self._thread = threading.Thread(target=self._loop.run_forever, name="served chain")
         self._stack = AsyncExitStack()
         self.people: dict[str, Person] = {}
         self.url = ""
@@ -75,7 +75,7 @@ class Town:
     def __enter__(self) -> Self:
         self._thread.start()
         try:
-            self.run(self._found())
+            self.run(self._start())
         except BaseException:
             self.__exit__()
             raise
@@ -88,7 +88,7 @@ class Town:
         self._loop.close()
 
     def run(self, work: Coroutine[Any, Any, T]) -> T:
-        """The outcome of what runs beside the chain."""
+        """Run a coroutine in the chain's thread; its result."""
         return asyncio.run_coroutine_threadsafe(work, self._loop).result(60)
 
     def chain(self, role: str) -> Chain:
@@ -96,7 +96,7 @@ class Town:
         return Chain(self._served.node.provider, account=self.people[role].account, timing=TIMING)
 
     def ask(self, role: str, question: Callable[[Chain], Coroutine[Any, Any, T]]) -> T:
-        """What one of the people learns or does on the chain."""
+        """Run `question` on the chain of one of the people; its answer."""
 
         async def asked() -> T:
             async with self.chain(role) as chain:
@@ -116,7 +116,7 @@ class Town:
 
     @contextmanager
     def unreachable(self) -> Iterator[None]:
-        """Nobody listens at the chain's address meanwhile."""
+        """The chain does not answer meanwhile."""
         self.run(self._served.server.__aexit__(None, None, None))
         try:
             yield
@@ -139,15 +139,15 @@ class Town:
         """Run a command in this process, as one of the people; `changes` of the variables."""
         return CliRunner().invoke(main, [str(word) for word in arguments], env=self.variables(by, **changes))
 
-    def told(self, *arguments: str | Path, by: str = "person", **changes: str) -> Any:
-        """What a command that goes well prints with `--json`."""
+    def run_json(self, *arguments: str | Path, by: str = "person", **changes: str) -> Any:
+        """Run a command with `--json`, which must succeed; what it prints."""
         done = self.aira(*arguments, "--json", by=by, **changes)
         assert (done.exit_code, done.stderr) == (0, ""), done.output
         assert done.stdout.count("\n") == 1
         return json.loads(done.stdout)
 
-    def agree(self, *, cost: int = 0, token: str = "", **fees: int) -> str:
-        """A new liability of the person's (promisee) and the robot's (promisor)."""
+    def create_liability(self, *, cost: int = 0, token: str = "", **fees: int) -> str:
+        """Create a liability of the person (promisee) and the robot (promisor); its address."""
         terms: dict[str, Any] = {
             "model": cid_of_bytes(b"a model"),
             "objective": cid_of_bytes(b"an objective"),
@@ -163,15 +163,15 @@ class Town:
         lighthouse = self.deployment.lighthouse
         return self.ask("provider", lambda chain: chain.liabilities.create(lighthouse, *signed)).liability
 
-    def finish(self, liability: str, *, success: bool = True) -> str:
-        """Bring the robot's result; its CID."""
+    def finalize(self, liability: str, *, success: bool = True) -> str:
+        """Finalize a liability with a result of the robot; its CID."""
         cid = cid_of_bytes(b"a recording")
         result = Result(liability=liability, result=cid, success=success)
         signed = self.people["robot"].account.signer.sign(result)
         self.ask("provider", lambda chain: chain.liabilities.finalize(self.deployment.lighthouse, signed))
         return cid
 
-    async def _found(self) -> None:
+    async def _start(self) -> None:
         self._served = await self._stack.enter_async_context(serve_embedded(port=0))
         self.url = self._served.url
         (self.folder / "password").write_text(PASSWORD + "\n")
@@ -181,9 +181,9 @@ class Town:
         if self._is_deployed:
             provider = self.people["provider"].account
             self.deployment = await deploy(self._served.node.provider, provider, plan=self._plan)
-            await self._share_out()
+            await self._fund()
 
-    async def _share_out(self) -> None:
+    async def _fund(self) -> None:
         lighthouse = self.deployment.lighthouse
         async with self.chain("provider") as chain:
             for role in ("robot", "person"):
