@@ -179,7 +179,7 @@ async def test_trading_without_account_is_one_clear_error(settings: Settings) ->
             agent.contract(LIGHTHOUSE),
             agent.finish(LIGHTHOUSE, success=True),
         ):
-            with pytest.raises(ConfigurationError, match="this agent has no account, it only watches") as caught:
+            with pytest.raises(ConfigurationError) as caught:
                 await attempt
             assert "keyfile" in caught.value.hint
         with pytest.raises(ConfigurationError):

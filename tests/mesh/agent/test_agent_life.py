@@ -31,7 +31,7 @@ __all__ = ["channel", "settings"]
 async def test_an_agent_that_does_not_run_says_so(settings: Settings) -> None:
     agent = Agent(settings=settings)
     for use in ("channel", "parts", "address"):
-        with pytest.raises(ClosedError, match="the agent is not running"):
+        with pytest.raises(ClosedError):
             getattr(agent, use)
     async with agent:
         assert agent.channel.lighthouse == MARKET

@@ -42,7 +42,7 @@ async def test_a_demand_becomes_a_contract_with_its_terms(place: Place, generati
 
 @GENERATIONS
 async def test_concurrent_demands_become_a_contract_each(place: Place, generation: int) -> None:
-    """Generation 5 counts the orders of an account: one that is overtaken has to be signed anew, on both sides."""
+    """Generation 5 counts the orders of an account: one that is overtaken is signed again, on both sides."""
     before = await place.balance("robot")
     async with place.provider(), working(place.agent("robot")), place.agent("person", generation=generation) as person:
         async with asyncio.timeout(60):
@@ -142,7 +142,7 @@ async def test_closing_the_agent_fails_the_wait_for_a_contract(place: Place) -> 
     async with place.agent("person") as person:
         demand = asyncio.create_task(person.demand(OBJECTIVE))
         await posted(person)
-    with pytest.raises(ClosedError, match="the agent has ended"):
+    with pytest.raises(ClosedError):
         await asyncio.wait_for(demand, 10)
     async with place.agent("person") as person:
         assert await waiting(person) == [], "nobody waits for it any more"
@@ -155,7 +155,7 @@ async def test_closing_the_agent_fails_the_wait_for_an_outcome(place: Place) -> 
             contract = await person.demand(job(place))
             outcome = asyncio.create_task(contract.outcome())
             await known(robot, contract.address)
-        with pytest.raises(ClosedError, match="the agent has ended"):
+        with pytest.raises(ClosedError):
             await asyncio.wait_for(outcome, 10)
         await robot.finish(contract.address, success=False)
 
@@ -282,6 +282,6 @@ async def test_a_contract_refunded_without_a_result_has_no_recording(place: Plac
         contract = await person.demand(job(place))
         await known(robot, contract.address)
         person.runtime.trader.finalized(contract.address, Outcome(success=False, result=""))
-        with pytest.raises(ContentUnavailable, match="was refunded without a result"):
+        with pytest.raises(ContentUnavailable):
             await contract.recording()
         await robot.finish(contract.address, success=False)

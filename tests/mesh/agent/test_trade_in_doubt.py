@@ -53,7 +53,7 @@ def rejection(place: Place, role: str, order: str, *, reason: str = "Unwanted") 
 
 
 def untrue_rejections(place: Place, order: str) -> list[Rejection]:
-    """Of another order; in a provider's name, unsigned, or signed by somebody else; by who is no provider."""
+    """Of another order; in a provider's name, unsigned, or signed by somebody else; by somebody who is no provider."""
     true = rejection(place, "provider", order)
     forged = rejection(place, "robot", order)
     return [

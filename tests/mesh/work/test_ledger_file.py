@@ -127,7 +127,7 @@ async def test_a_closed_ledger_says_so(path: Path) -> None:
     with pytest.raises(ClosedError):
         await ledger.cursor("listener")
     async with ledger:
-        with pytest.raises(ClosedError, match="open already"):
+        with pytest.raises(ClosedError):
             await ledger.__aenter__()
         await ledger.set_cursor("listener", 1)
     with pytest.raises(ClosedError):
@@ -139,11 +139,11 @@ async def test_a_full_disk_is_one_clear_line_and_nothing_is_half_written(ledger:
     address, signed = liability().address, message()
     room = path.with_name(path.name + "-wal").stat().st_size
     with file_size_limit(room):
-        with pytest.raises(LedgerUnusable, match=f"^can't use the ledger {path}: ") as caught:
+        with pytest.raises(LedgerUnusable) as caught:
             await ledger.set_phase(address, Phase.READY)
         with pytest.raises(LedgerUnusable):
             await ledger.complete(address, success=True, result=RESULT, note="", outgoing=signed)
-    assert "make room" in caught.value.hint
+    assert (caught.value.code, caught.value.path) == ("ledger-unusable", path)
     job = await ledger.job(address)
     assert job is not None
     assert (job.phase, await ledger.outbox(head=0)) == (Phase.INCOMING, [])

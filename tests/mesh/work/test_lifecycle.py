@@ -30,9 +30,9 @@ def test_the_chain_can_end_a_job_in_any_phase(phase: Phase) -> None:
     ],
 )
 def test_no_job_goes_back_or_skips_its_objective(phase: Phase, to: Phase) -> None:
-    with pytest.raises(WrongPhase, match=f"can't move to {to} {LIABILITY}: it is {phase}") as caught:
+    with pytest.raises(WrongPhase) as caught:
         advance(LIABILITY, phase, to)
-    assert caught.value.phase is phase
+    assert (caught.value.phase, caught.value.liability) == (phase, LIABILITY)
 
 
 def test_every_phase_has_its_next_ones_and_only_the_last_has_none() -> None:
