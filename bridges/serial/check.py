@@ -90,7 +90,7 @@ def _forbidden(path: Path) -> CheckResult:
     found = f"{path} can't be opened by {user}: no permission; it belongs to the group {group}"
     if about.st_gid == 0:
         return failed(
-            f"{found}, which nobody should be in", hint="have udev give it to the group dialout, and join that"
+            f"{found}, which no user should join", hint="let udev assign it to the group dialout, and join that"
         )
     return failed(found, hint=f"sudo usermod -aG {group} {user}, then log in again (a service: restart it)")
 

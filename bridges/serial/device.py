@@ -54,7 +54,7 @@ class Device:
     """The device `name` of a running agent, on whatever machine its `aira edge` runs.
 
     A call waits at most `patience` seconds for the device to be present and to finish. `in_doubt` says what happens
-    when the device was restarted during a call, so that nobody knows whether it did it: `fail`, or `again` to repeat
+    when the device was restarted during a call, so that it is not known whether it did it: `fail`, or `again` to repeat
     calls that do no harm when done twice.
     """
 

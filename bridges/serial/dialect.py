@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Final
 
-from bridges.serial.errors import BoardBusy, UnknownDialect
+from bridges.serial.errors import BoardBusy, BrokenDialect, UnknownDialect
 from mesh.plugins import entry_points
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ class CallStatus(Enum):
     READ = "read"
     """The board read on after it. It confirms no more: a message damaged on the line is skipped silently."""
     FAILED = "failed"
-    """It was not done, or nobody knows; see the reason."""
+    """It was not done, or this is not known; see the reason."""
 
 
 @dataclass(frozen=True)
@@ -237,9 +237,12 @@ def dialect_names() -> list[str]:
 
 
 def load_dialect(name: str) -> type[Dialect]:
-    """The installed dialect of that name, imported now. Raises `UnknownDialect`."""
+    """The installed dialect of that name, imported now. Raises `UnknownDialect`, `BrokenDialect`."""
     installed = entry_points(ENTRY_POINTS)
     if name not in installed:
         raise UnknownDialect(name, sorted(installed))
-    dialect: type[Dialect] = installed[name].load()
+    try:
+        dialect: type[Dialect] = installed[name].load()
+    except (ImportError, AttributeError) as error:
+        raise BrokenDialect(name, installed[name].package, error) from error
     return dialect

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from mesh.errors import AiraError, InputError, RemoteError
+from mesh.errors import AiraError, ConfigurationError, InputError, RemoteError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -56,6 +56,20 @@ class UnknownDialect(InputError):
         )
         self.name = name
         self.known = tuple(known)
+
+
+class BrokenDialect(ConfigurationError):
+    """A dialect that an installed package registers can't be imported."""
+
+    code = "dialect-broken"
+
+    def __init__(self, name: str, package: str, error: Exception) -> None:
+        super().__init__(
+            f"can't load the dialect {name!r} of {package}: {type(error).__name__}: {error}",
+            hint=f"reinstall or uninstall {package}",
+        )
+        self.name = name
+        self.package = package
 
 
 class InvalidBoardMessage(InputError):

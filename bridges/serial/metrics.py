@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     import zenoh
 
     from bridges.serial.dialect import LineCounters
-    from bridges.serial.edge import Edge
     from bridges.serial.line import SerialLine
 
 
@@ -65,15 +64,15 @@ class EdgeMetrics:
     """The metrics and health of an edge agent, also before it has started."""
 
     def __init__(self) -> None:
-        self._started: tuple[Edge, zenoh.Session] | None = None
+        self._started: tuple[EdgeCounters, zenoh.Session] | None = None
 
-    def attach(self, edge: Edge, session: zenoh.Session) -> None:
-        """Report this edge agent from now on."""
-        self._started = edge, session
+    def attach(self, counters: EdgeCounters, session: zenoh.Session) -> None:
+        """Report the edge agent with these counters from now on."""
+        self._started = counters, session
 
     def families(self) -> Iterable[MetricFamily]:
         """The metrics now."""
-        families = () if self._started is None else families_of(self._started[0].counters.statistics())
+        families = () if self._started is None else families_of(self._started[0].statistics())
         return (*families, health_metrics(self._parts()))
 
     def health(self) -> Health:
@@ -83,8 +82,8 @@ class EdgeMetrics:
     def _parts(self) -> Mapping[str, str]:
         if self._started is None:
             return {"start": STARTING}
-        edge, session = self._started
-        now = edge.counters.statistics()
+        counters, session = self._started
+        now = counters.statistics()
         linked = not session.is_closed() and bool(session.info.routers_zid())
         return {
             "channel": ALIVE if linked else "waits for a router",

@@ -96,7 +96,7 @@ def run_edge(
             signal.signal(number, lambda number, frame: edge.stop())
         words = f"edge of {device.agent}: {device.name} on {name}, {options.protocol}, Zenoh id {session.zid()}"
         if metrics is not None:
-            metrics.attach(edge, session)
+            metrics.attach(edge.counters, session)
         set_process_source(LogSource("edge", parse_address(device.agent)))
         announce(log, "edge-started", words, device=device.name)
         with answer_log_queries(session, device):

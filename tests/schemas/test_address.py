@@ -1,4 +1,4 @@
-"""Addresses and the names that may stand for them."""
+"""Addresses, and the ENS names that may replace them."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_one_letter_in_the_wrong_case_is_refused(raw: bytes, position: int) -> N
         "airalab.eth",
     ],
 )
-def test_what_is_no_address_is_refused(text: str) -> None:
+def test_invalid_addresses_are_refused(text: str) -> None:
     for function in (parse_address, address_bytes):
         with pytest.raises(InvalidAddress) as caught:
             function(text)
@@ -85,7 +85,7 @@ def test_what_is_no_address_is_refused(text: str) -> None:
 
 
 @given(st.text(max_size=60))
-def test_no_text_raises_anything_but_invalid_address(text: str) -> None:
+def test_any_text_is_an_address_or_raises_invalid_address(text: str) -> None:
     assert not is_ens_name(text) or "." in text
     with suppress(InvalidAddress):
         parse_address_or_name(text)
@@ -125,11 +125,11 @@ def test_names(text: str) -> None:
         "a" * 252 + ".eth",
     ],
 )
-def test_what_is_no_name(text: str) -> None:
+def test_texts_that_are_not_ens_names(text: str) -> None:
     assert not is_ens_name(text)
     with pytest.raises(InvalidAddress):
         parse_address_or_name(text)
 
 
-def test_address_where_a_name_may_stand() -> None:
+def test_an_address_or_a_name_is_parsed() -> None:
     assert parse_address_or_name(EIP_55[0].lower()) == EIP_55[0]

@@ -1,4 +1,4 @@
-"""CIDv0."""
+"""CIDv0 and base58."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ EMPTY_FILE = "QmbFMke1KXqnYyBBWxB74N4c5SBnJMVAiMNRcGu6x1AwQH"
 
 
 @given(st.binary(min_size=32, max_size=32))
-def test_every_digest_has_a_name_of_46_characters(digest: bytes) -> None:
+def test_every_digest_has_a_cid_of_46_characters(digest: bytes) -> None:
     text = cid_of_digest(digest)
     assert len(text) == 46
     assert text.startswith("Qm")
@@ -43,7 +43,7 @@ def test_every_digest_has_a_name_of_46_characters(digest: bytes) -> None:
         "bafkreihdwdcefgh4dqkjv67uzcmw7ojee6xedzdetojuzjevtenxquvyku",
     ],
 )
-def test_what_is_no_sha256_name_is_refused(text: str) -> None:
+def test_cids_of_other_hashes_are_refused(text: str) -> None:
     with pytest.raises(InvalidCid) as caught:
         parse_cid(text)
     assert caught.value.text == text
@@ -53,7 +53,7 @@ def test_what_is_no_sha256_name_is_refused(text: str) -> None:
     st.text(max_size=60)
     | st.text("123456789ABCDEFGHJKLMNPQRSTUVWXYZabcdefghijkmnopqrstuvwxyz", min_size=46, max_size=46)
 )
-def test_no_text_raises_anything_but_invalid_cid(text: str) -> None:
+def test_any_text_is_a_cid_or_raises_invalid_cid(text: str) -> None:
     with suppress(InvalidCid):
         assert format_cid(parse_cid(text)) == text
 
@@ -61,7 +61,7 @@ def test_no_text_raises_anything_but_invalid_cid(text: str) -> None:
 @pytest.mark.parametrize(
     "multihash", [b"", bytes(34), b"\x12\x20" + bytes(31), b"\x12\x20" + bytes(33), b"\x12\x21" + bytes(32)]
 )
-def test_other_multihashes_have_no_name(multihash: bytes) -> None:
+def test_other_multihashes_have_no_cid(multihash: bytes) -> None:
     with pytest.raises(InvalidCid):
         format_cid(multihash)
 
@@ -90,11 +90,11 @@ def test_known_pairs(raw: str, text: str) -> None:
 @given(st.binary(max_size=120))
 @example(bytes(range(256)))
 @example(bytes(40) + bytes(range(256)))
-def test_what_was_encoded_is_decoded(data: bytes) -> None:
+def test_base58_round_trip(data: bytes) -> None:
     assert decode_base58(encode_base58(data)) == data
 
 
 @pytest.mark.parametrize("text", ["0", "O", "I", "l", "a b", "a\n", "+", "é", "\ud800", "\uff11"])
-def test_what_is_not_in_the_alphabet_is_refused(text: str) -> None:
+def test_characters_outside_the_base58_alphabet_are_refused(text: str) -> None:
     with pytest.raises(InputError):
         decode_base58(text)

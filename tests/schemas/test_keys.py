@@ -34,7 +34,7 @@ from tests.schemas.samples import NONCE as HASH
 
 
 @pytest.mark.parametrize(("key", "text"), KEYS, ids=lambda value: value if isinstance(value, str) else "")
-def test_key_and_text_belong_together(key: Key, text: str) -> None:
+def test_a_key_and_its_text_convert_both_ways(key: Key, text: str) -> None:
     assert str(key) == text
     assert parse_key(text) == key
     assert type(parse_key(text)) is type(key)
@@ -53,7 +53,7 @@ def test_lighthouse_without_a_name_is_named_by_its_address() -> None:
 
 
 @pytest.mark.parametrize("topic", ["/blink", "/a/b/c", "/liability/eth_0x1/blink", "/~x", "/a.b", "/" + "a" * 256])
-def test_topics_come_back_as_they_were(topic: str) -> None:
+def test_topics_round_trip(topic: str) -> None:
     key = parse_key(str(ObjectiveTopicKey(A, L, topic)))
     assert isinstance(key, ObjectiveTopicKey)
     assert key.topic == topic
@@ -83,7 +83,7 @@ def test_topics_come_back_as_they_were(topic: str) -> None:
         "/" + "a" * 257,
     ],
 )
-def test_texts_that_no_key_may_hold_are_refused_in_topics(topic: str) -> None:
+def test_invalid_topics_are_refused(topic: str) -> None:
     for build in (ObjectiveTopicKey, LiabilityTopicKey):
         with pytest.raises(InvalidKey):
             build(A, L, topic)
@@ -92,7 +92,7 @@ def test_texts_that_no_key_may_hold_are_refused_in_topics(topic: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "*", "**", "a/b", "a b", "@a", "a\n", "\0", "é", "..", "a" * 257])
-def test_texts_that_no_key_may_hold_are_refused_in_names(text: str) -> None:
+def test_invalid_names_are_refused(text: str) -> None:
     with pytest.raises(InvalidKey):
         DeviceTopicKey(A, text, "/a")
     with pytest.raises(InvalidKey):
@@ -132,7 +132,7 @@ def test_agent_is_an_address(text: str) -> None:
         RpcKey(text, "start")
 
 
-def test_events_are_those_known() -> None:
+def test_unknown_events_are_refused() -> None:
     event: Any
     for event in ("transfer", "started", "*", "", "READY"):
         with pytest.raises(InvalidKey):
@@ -172,7 +172,7 @@ def test_events_are_those_known() -> None:
         f"aira/agent/{A}/liability/{L}/topic/" + "a/" * 300 + "a",
     ],
 )
-def test_what_is_no_key_is_refused(text: str) -> None:
+def test_invalid_keys_are_refused(text: str) -> None:
     with pytest.raises(InvalidKey):
         parse_key(text)
 
@@ -185,7 +185,7 @@ def test_what_is_no_key_is_refused(text: str) -> None:
         f"aira/{NAME}/result/{LIGHTHOUSE}/{HASH}",
     ],
 )
-def test_there_is_one_text_for_a_key(text: str) -> None:
+def test_only_the_canonical_text_of_a_key_is_accepted(text: str) -> None:
     with pytest.raises(InvalidKey, match="canonical"):
         parse_key(text)
 
@@ -212,7 +212,7 @@ chunks = st.sampled_from(
 
 
 @given(st.text(max_size=60) | st.lists(chunks | st.text(max_size=5), max_size=8).map("/".join))
-def test_no_text_raises_anything_but_invalid_key(text: str) -> None:
+def test_any_text_is_a_key_or_raises_invalid_key(text: str) -> None:
     with suppress(InvalidKey):
         assert str(parse_key(text)) == text
 

@@ -1,4 +1,4 @@
-"""Messages in services: as they are asked to be signed, and as they are handed over signed."""
+"""Requests to sign a message, and to publish a signed one."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def request_of(message: Demand | Offer | Result) -> SendDemand | SendOffer | Sen
 
 
 @given(orders(addresses))
-def test_a_signed_order_survives_being_handed_over(order: Order) -> None:
+def test_a_signed_order_survives_a_request(order: Order) -> None:
     request = request_of(order)
     assert type(request).decode(request.encode()).message() == order
 
 
 @given(results(addresses))
-def test_a_signed_result_survives_being_handed_over(result: Result) -> None:
+def test_a_signed_result_survives_a_request(result: Result) -> None:
     assert SendResult.decode(SendResult.of(result).encode()).message() == result
 
 
@@ -47,7 +47,7 @@ def sign_request(order: Order) -> dict[str, Any]:
     return {name: value for name, value in asdict(order).items() if name not in ("nonce", "sender", "signature")}
 
 
-def test_what_is_to_be_signed_becomes_the_message_without_its_signature() -> None:
+def test_a_request_to_sign_becomes_the_unsigned_message() -> None:
     demand = SignDemand(**sign_request(DEMAND)).unsigned(nonce=DEMAND.nonce, sender=None)
     assert demand == replace(DEMAND, signature="")
     offer = SignOffer(**sign_request(OFFER)).unsigned(nonce=OFFER.nonce, sender=None)
@@ -64,14 +64,14 @@ def test_a_counted_nonce_is_decimal_digits(nonce: str) -> None:
         replace(SendDemand.of(DEMAND_5), nonce=nonce).message()
 
 
-def test_a_request_says_everything_and_nothing_else() -> None:
+def test_a_request_with_missing_or_unknown_fields_is_refused() -> None:
     held = json.loads(SendDemand.of(DEMAND).encode())
     for wrong in (held | {"extra": 1}, {name: held[name] for name in held if name != "nonce"}, held | {"cost": 1}):
         with pytest.raises(InvalidRecord):
             SendDemand.decode(json.dumps(wrong).encode())
 
 
-def test_what_can_not_be_a_message_is_refused_when_it_is_made() -> None:
+def test_an_invalid_message_is_refused_when_it_is_built() -> None:
     with pytest.raises(InvalidMessage, match="objective"):
         replace(SendDemand.of(DEMAND), objective="the kitchen").message()
 

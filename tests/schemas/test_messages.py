@@ -1,4 +1,4 @@
-"""A message that exists is well-formed and in canonical form."""
+"""Every message object is well-formed and in canonical form; ENS names in messages."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def refused(**changes: Any) -> InvalidMessage:
     return caught.value
 
 
-def test_generation_is_told_by_the_sender() -> None:
+def test_the_sender_determines_the_generation() -> None:
     assert [order.generation for order in (DEMAND, OFFER, DEMAND_5, OFFER_5)] == [3, 3, 5, 5]
 
 
@@ -219,6 +219,6 @@ def test_name_that_maps_to_no_address_is_refused() -> None:
 
 
 @given(messages())
-def test_names_are_gone_after_resolving(message: Message) -> None:
+def test_a_resolved_message_has_no_names(message: Message) -> None:
     addresses = {name: checksum_address(keccak256(name.encode())[:20]) for name in names_in(message)}
     assert names_in(resolve_names(message, addresses)) == frozenset()

@@ -1,4 +1,4 @@
-"""The package as a whole: what it offers, and how light it is."""
+"""The package as a whole: its public names, and what importing it loads."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ HEAVY = ("web3", "eth_account", "eth_abi", "eth_utils", "zenoh", "mcap", "asynci
 
 
 def loaded_by(imports: str, names: tuple[str, ...]) -> str:
-    """Which of these modules a fresh interpreter has loaded after the imports."""
+    """Those of these modules that a fresh interpreter has loaded after the imports."""
     script = f"import sys; {imports}; print([name for name in {names} if name in sys.modules])"
     return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.strip()
 
 
-def test_importing_it_loads_nothing_heavy() -> None:
+def test_importing_the_package_loads_nothing_heavy() -> None:
     everything = "from schemas import *; import schemas.rpc"
     assert loaded_by(everything, HEAVY) == "[]"
 
 
-def test_keys_and_payloads_are_had_without_signatures() -> None:
+def test_keys_and_payloads_load_no_signatures() -> None:
     keys = "from schemas import DeviceTopicKey, Empty, String; import schemas.keys, schemas.payloads"
     assert loaded_by(keys, ("coincurve", "schemas.signing", "schemas.messages")) == "[]"
 
 
-def test_everything_it_names_is_there() -> None:
+def test_every_public_name_exists() -> None:
     assert len(set(schemas.__all__)) == len(schemas.__all__)
     assert all(hasattr(schemas, name) for name in schemas.__all__)
 
 
-def test_what_it_does_not_have_is_an_attribute_error() -> None:
+def test_an_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="no attribute 'Offre'"):
         _ = schemas.Offre

@@ -1,4 +1,4 @@
-"""Types of payloads, and the two ROS types that lessons use."""
+"""Types of payloads, the two ROS types of the lessons, and Python values as payloads."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from schemas.payloads import decode_value, encode_value
         (PayloadType("text/plain"), "text/plain"),
     ],
 )
-def test_type_and_encoding_belong_together(kind: PayloadType, text: str) -> None:
+def test_a_type_and_its_encoding_convert_both_ways(kind: PayloadType, text: str) -> None:
     assert kind.zenoh_encoding == text
     assert payload_type(text) == kind
     assert str(zenoh.Encoding(text)) == text
@@ -70,7 +70,7 @@ def test_every_string_survives(text: str) -> None:
 
 
 @pytest.mark.parametrize("payload", [b"", b"\0\0\0", b"\1\0\0\0", b"\1\0\0\0ab", b"\xff\xff\xff\xffa", b"\1\0\0\0\xff"])
-def test_what_is_no_string_is_refused(payload: bytes) -> None:
+def test_invalid_strings_are_refused(payload: bytes) -> None:
     with pytest.raises(InvalidPayload) as caught:
         String.decode(payload)
     assert caught.value.type_name == "std_msgs/String"
@@ -82,7 +82,7 @@ def test_text_without_utf_8_form_is_refused() -> None:
 
 
 @given(st.binary(max_size=40))
-def test_no_bytes_raise_anything_but_invalid_payload(payload: bytes) -> None:
+def test_any_bytes_decode_or_raise_invalid_payload(payload: bytes) -> None:
     for kind in (Empty, String):
         with suppress(InvalidPayload):
             assert kind.decode(payload).encode() == payload
@@ -119,7 +119,7 @@ def test_payload_is_read_by_its_type() -> None:
 
 
 @pytest.mark.parametrize("value", [object(), {1: object()}, {"a": 1j}, [10**5000]])
-def test_value_that_can_not_travel_is_refused(value: Any) -> None:
+def test_a_value_that_can_not_be_encoded_is_refused(value: Any) -> None:
     with pytest.raises(InvalidPayload):
         encode_value(value)
 

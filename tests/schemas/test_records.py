@@ -169,7 +169,7 @@ def test_demand_to_sign_has_the_names_of_the_message() -> None:
     ],
     ids=lambda data: repr(data[:20]),
 )
-def test_what_is_no_record_is_refused(data: bytes) -> None:
+def test_invalid_records_are_refused(data: bytes) -> None:
     with pytest.raises(InvalidRecord) as caught:
         StartLiability.decode(data)
     assert caught.value.kind == "StartLiability"
@@ -180,7 +180,7 @@ def test_what_is_no_record_is_refused(data: bytes) -> None:
     st.sampled_from(sorted({kind for service in SERVICES.values() for kind in service}, key=repr)),
     st.binary(max_size=100),
 )
-def test_no_bytes_raise_anything_but_invalid_record(kind: type[Record], data: bytes) -> None:
+def test_any_bytes_decode_or_raise_invalid_record(kind: type[Record], data: bytes) -> None:
     with suppress(InvalidRecord):
         kind.decode(data)
 

@@ -1,4 +1,4 @@
-"""Selectors find the keys that they are for, and no others."""
+"""Selectors match their keys, and no others."""
 
 from __future__ import annotations
 

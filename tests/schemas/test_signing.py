@@ -1,4 +1,4 @@
-"""Signing and verifying: one signature for a hash and a key, and no other passes."""
+"""Signing and verifying: one signature is valid for a hash and a key, and no other."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_address_is_that_of_the_key() -> None:
 
 
 @given(orders(addresses) | results(addresses), st.integers(1, CURVE_ORDER - 1))
-def test_what_was_signed_verifies(message: Order | Result, secret: int) -> None:
+def test_a_signed_message_verifies(message: Order | Result, secret: int) -> None:
     signer = Signer(secret.to_bytes(32, "big"))
     if not isinstance(message, Result) and message.sender is not None:
         message = msgspec.structs.replace(message, sender=signer.address)
@@ -94,7 +94,7 @@ def test_high_s_twin_is_refused() -> None:
     refused(signature[:32] + s.to_bytes(32, "big") + bytes([55 - signature[64]]))
 
 
-def test_highest_low_s_is_taken_and_the_next_refused() -> None:
+def test_the_highest_low_s_is_accepted_and_the_next_refused() -> None:
     half = CURVE_ORDER // 2
     r = SIGNER.sign_hash(DIGEST)[:32]
     assert recover(DIGEST, r + half.to_bytes(32, "big") + b"\x1b")
@@ -102,7 +102,7 @@ def test_highest_low_s_is_taken_and_the_next_refused() -> None:
 
 
 @pytest.mark.parametrize("v", [0, 1, 2, 3, 26, 29, 30, 255])
-def test_only_v_27_and_28_are_taken(v: int) -> None:
+def test_only_v_27_and_28_are_accepted(v: int) -> None:
     assert f"v is {v}" in refused(SIGNER.sign_hash(DIGEST)[:64] + bytes([v])).detail
 
 
@@ -120,7 +120,7 @@ def test_signature_of_another_length_is_refused() -> None:
 
 
 @given(st.binary(min_size=60, max_size=70))
-def test_no_bytes_raise_anything_but_invalid_message(signature: bytes) -> None:
+def test_any_bytes_verify_or_raise_invalid_message(signature: bytes) -> None:
     with suppress(InvalidMessage):
         assert recover(DIGEST, signature).startswith("0x")
 
@@ -138,7 +138,7 @@ def test_feedback_can_not_be_verified(fields: dict[str, object]) -> None:
     assert caught.value.reason == "unsigned"
 
 
-def test_names_have_to_be_resolved_before_verifying() -> None:
+def test_names_must_be_resolved_before_verifying() -> None:
     named = msgspec.structs.replace(DEMAND, lighthouse=LIGHTHOUSE_NAME)
     with pytest.raises(InvalidMessage) as caught:
         verify(encode(named))
@@ -154,7 +154,7 @@ def test_generation_5_order_must_be_signed_by_its_sender() -> None:
     assert caught.value.reason == "sender"
 
 
-def test_a_signer_signs_for_nobody_else() -> None:
+def test_a_signer_does_not_sign_for_another_sender() -> None:
     with pytest.raises(InvalidMessage) as caught:
         SIGNER.sign(DEMAND_5)
     assert caught.value.reason == "sender"
@@ -174,7 +174,7 @@ def test_changed_order_of_generation_5_is_refused() -> None:
 
 
 @pytest.mark.parametrize("key", [b"", bytes(32), bytes(31), b"\1" * 33, CURVE_ORDER.to_bytes(32, "big"), b"\xff" * 32])
-def test_what_is_no_private_key_is_refused(key: bytes) -> None:
+def test_invalid_private_keys_are_refused(key: bytes) -> None:
     with pytest.raises(InputError) as caught:
         Signer(key)
     assert key.hex() not in str(caught.value) or not key
@@ -211,7 +211,7 @@ def test_rejection_is_read_as_written() -> None:
     assert json.loads(rejection.encode()).keys() == {"order", "reason", "detail", "provider", "signature"}
 
 
-def test_a_signed_rejection_is_the_providers_word() -> None:
+def test_a_signed_rejection_is_signed() -> None:
     signer = Signer(b"\x07" * 32)
     rejection = Rejection(order=NONCE, reason="full", detail="later", provider=signer.address).signed_by(signer)
     assert rejection.is_signed
@@ -219,14 +219,14 @@ def test_a_signed_rejection_is_the_providers_word() -> None:
 
 
 @pytest.mark.parametrize("field", ["order", "reason", "detail", "provider", "signature"])
-def test_a_changed_rejection_is_nobodys_word(field: str) -> None:
+def test_a_changed_rejection_is_not_signed(field: str) -> None:
     signer = Signer(b"\x07" * 32)
     rejection = Rejection(order=NONCE, reason="full", detail="later", provider=signer.address).signed_by(signer)
     for other in ("", "0", SENDER, "ab" * 65):
         assert not replace(rejection, **{field: other}).is_signed
 
 
-def test_nobody_signs_for_another() -> None:
+def test_a_rejection_signed_by_another_account_is_not_signed() -> None:
     rejection = Rejection(order=NONCE, reason="full", detail="", provider=SENDER)
     assert not rejection.is_signed
     assert not rejection.signed_by(Signer(b"\x07" * 32)).is_signed

@@ -1,4 +1,4 @@
-"""Files as trees of blocks. The reference names are those that ipfs-unixfs-importer 17.1.1 gives the same contents."""
+"""Files as trees of blocks. The reference CIDs are those of ipfs-unixfs-importer 17.1.1 for the same contents."""
 
 from __future__ import annotations
 
@@ -94,22 +94,22 @@ def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("size", BY_SIZE)
-def test_names_of_edge_sizes(size: int) -> None:
+def test_cids_of_edge_sizes(size: int) -> None:
     assert cid_of_stream(pattern(size)) == BY_SIZE[size]
 
 
 @pytest.mark.usefixtures("small_chunks")
 @pytest.mark.parametrize("size", BY_SIZE_IN_SMALL_CHUNKS)
-def test_names_of_deep_trees(size: int) -> None:
+def test_cids_of_deep_trees(size: int) -> None:
     assert cid_of_stream(pattern(size)) == BY_SIZE_IN_SMALL_CHUNKS[size]
 
 
 @pytest.mark.parametrize("size", [C - 1, C, C + 1, 2 * C])
-def test_short_reads_are_made_up(size: int) -> None:
+def test_short_reads_do_not_change_the_cid(size: int) -> None:
     assert cid_of_stream(pattern(size, at_once=50_021)) == BY_SIZE[size]
 
 
-def test_bytes_streams_and_files_have_one_name(tmp_path: Path) -> None:
+def test_bytes_streams_and_files_have_the_same_cid(tmp_path: Path) -> None:
     data = UNIT * 5
     (tmp_path / "file").write_bytes(data)
     name = cid_of_bytes(data)
@@ -127,14 +127,14 @@ def test_missing_file_is_an_os_error(tmp_path: Path) -> None:
         cid_of_file(tmp_path / "nothing")
 
 
-def test_blocks_bear_the_names_of_their_bytes() -> None:
+def test_blocks_have_the_cids_of_their_bytes() -> None:
     for block in blocks_of_stream(pattern(3 * C + 1)):
         assert block.cid == cid_of_digest(sha256(block.data).digest())
 
 
 @pytest.mark.usefixtures("small_chunks")
 @pytest.mark.parametrize("size", [*range(30), *BY_SIZE_IN_SMALL_CHUNKS])
-def test_children_come_before_their_parents_and_make_up_the_file(size: int) -> None:
+def test_children_precede_their_parents_and_form_the_file(size: int) -> None:
     contents: dict[str, bytes] = {}
     sizes: dict[str, int] = {}
     content = b""
@@ -219,25 +219,25 @@ def test_raw_leaves_of_other_writers_are_read() -> None:
     ],
     ids=lambda data: data[:16].hex(),
 )
-def test_what_is_no_part_of_a_file_is_refused(data: bytes) -> None:
+def test_blocks_that_are_not_part_of_a_file_are_refused(data: bytes) -> None:
     with pytest.raises(InputError):
         parse_block(data)
 
 
-def test_links_to_other_kinds_of_names_are_refused() -> None:
+def test_links_with_other_kinds_of_cids_are_refused() -> None:
     cid_version_1 = write_bytes(1, b"\x01\x55\x12\x20" + bytes(32))
     with pytest.raises(InvalidCid):
         parse_block(node_bytes(FILE + write_number(3, 9) + write_number(4, 9), cid_version_1))
 
 
 @given(st.binary(max_size=200))
-def test_no_bytes_raise_anything_but_input_error(data: bytes) -> None:
+def test_any_bytes_parse_or_raise_input_error(data: bytes) -> None:
     with suppress(InputError):
         parse_block(data)
 
 
 @given(st.integers(0, 400), st.integers(0, 255))
-def test_no_damage_raises_anything_but_input_error(position: int, byte: int) -> None:
+def test_damaged_blocks_parse_or_raise_input_error(position: int, byte: int) -> None:
     position %= len(ROOT)
     for damaged in (ROOT[:position] + bytes([byte]) + ROOT[position + 1 :], ROOT[:position]):
         with suppress(InputError):

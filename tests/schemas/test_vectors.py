@@ -1,4 +1,4 @@
-"""The messages that legacy clients made are read, hashed, recovered, signed and written as those clients did."""
+"""Messages of legacy clients are decoded, hashed, verified, signed and encoded as by those clients."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ each_vector = pytest.mark.parametrize("vector", ALL_VECTORS, ids=lambda vector: 
 
 
 @each_vector
-def test_legacy_message_is_read_as_its_kind_with_its_hash_and_signer(vector: Vector) -> None:
+def test_a_legacy_message_decodes_with_its_kind_hash_and_signer(vector: Vector) -> None:
     verified = verify(vector.payload)
     assert isinstance(verified.message, KINDS[vector.kind])
     assert "0x" + verified.hash.hex() == vector.hash
@@ -31,7 +31,7 @@ def test_signing_again_gives_the_same_signature(vector: Vector) -> None:
 
 
 @each_vector
-def test_written_json_says_the_same(vector: Vector) -> None:
+def test_encoded_json_decodes_to_the_same_message(vector: Vector) -> None:
     assert json.loads(encode(decode(vector.payload))) == json.loads(vector.wire)
 
 

@@ -125,10 +125,10 @@ def test_nonce_that_looks_like_a_sender_has_no_contract_bytes() -> None:
 
 
 @given(addresses)
-def test_what_calls_a_liability_off_is_its_address_and_the_word(address: str) -> None:
+def test_a_cancellation_hashes_the_address_and_the_word(address: str) -> None:
     assert cancellation_hash(address) == keccak256(encode_packed(["address", "string"], [address, "cancel"]))
 
 
-def test_only_an_address_can_be_called_off() -> None:
+def test_only_an_address_can_be_cancelled() -> None:
     with pytest.raises(InvalidAddress):
         cancellation_hash(LIGHTHOUSE_NAME)

@@ -1,4 +1,4 @@
-"""The examples with a board, as their READMEs run them: every role a process of its own."""
+"""The examples with a board, run as in their READMEs: every role in its own process."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PROTOCOLS = ("frames", "rosserial")
 
 @pytest.fixture
 def market(tmp_path: Path) -> Iterator[dict[str, str]]:
-    """Router, chain and provider; the variables of the other processes, but for the keyfile."""
+    """Router, chain and provider; returns the environment variables of the other processes, without the keyfile."""
     endpoint, port = f"tcp/127.0.0.1:{free_port()}", free_port()
     up = ("up", "--data-dir", tmp_path, "--listen", endpoint, "--port", str(port))
     with Serving(*AIRA, *up, says="provider    0x"):
@@ -38,13 +38,13 @@ def market(tmp_path: Path) -> Iterator[dict[str, str]]:
 
 
 def as_role(role: str, market: dict[str, str]) -> dict[str, str]:
-    """The variables of a process that has this role's account."""
+    """The environment variables of a process with this role's account."""
     return market | {"AIRA_KEYFILE": f"{market['AIRA_DATA_DIR']}/development/{role}.json"}
 
 
 @contextmanager
 def at_work(example: str, sketch: str, protocol: str, market: dict[str, str]) -> Iterator[SimulatedBoard]:
-    """The example's robot with its board and its edge agent."""
+    """The robot of an example with its board and its edge agent, running."""
     script, variables = EXAMPLES / example / "robot.py", as_role("robot", market)
     with ExitStack() as stack:
         uno = stack.enter_context(board(f"examples/{example}/{sketch}_{protocol}"))

@@ -1,4 +1,4 @@
-"""A line to a simulated board, served by a thread, for tests that client to firmware without a mesh."""
+"""A line to a simulated board, served by a thread, for tests of firmware without a mesh."""
 
 from __future__ import annotations
 

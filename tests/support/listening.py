@@ -1,4 +1,4 @@
-"""Somebody in the mesh who takes note of all that is said."""
+"""A subscriber to everything in the mesh."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ if TYPE_CHECKING:
     import zenoh
 
 SOON: Final = 30.0
-"""Seconds in which what was said arrives."""
+"""Seconds in which messages arrive."""
 
 
 class Listener:
-    """Hears everything from now on: key, payload, encoding and when, in the order of arrival."""
+    """Records every sample from now on: key, payload, encoding and time, in the order of arrival."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._heard: list[tuple[str, bytes, str, float]] = []
@@ -24,12 +24,12 @@ class Listener:
         self._heard.append(said)
 
     def heard(self, count: int) -> list[tuple[str, bytes, str, float]]:
-        """What was said, once it is so much."""
+        """The samples, once there are `count`."""
         deadline = time.monotonic() + SOON
         while len(self._heard) < count and time.monotonic() < deadline:
             time.sleep(0.01)
         return list(self._heard)
 
     def keys(self, count: int) -> list[str]:
-        """The keys of what was said, once it is so much."""
+        """The keys of the samples, once there are `count`."""
         return [key for key, *_ in self.heard(count)]

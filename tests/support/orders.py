@@ -1,4 +1,4 @@
-"""Signed messages of people who exist in tests only."""
+"""Signed messages of accounts that exist in tests only."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _nonces = count(1)
 
 
 def terms(**changes: Any) -> dict[str, Any]:
-    """What a demand and an offer share, and a nonce of its own."""
+    """The fields that a demand and an offer share, with a new nonce."""
     return {
         "model": MODEL,
         "objective": OBJECTIVE,
@@ -39,23 +39,23 @@ def terms(**changes: Any) -> dict[str, Any]:
 
 
 def demand(*, signer: Signer = PERSON, **changes: Any) -> Demand:
-    """A signed demand; of generation 5 where `sender` and an integer `nonce` are given."""
+    """A signed demand; of generation 5 if `sender` and an integer `nonce` are given."""
     return signer.sign(Demand(**({"validator_fee": 0} | terms(**changes))))
 
 
 def offer(*, signer: Signer = ROBOT, **changes: Any) -> Offer:
-    """A signed offer, which agrees to the terms of a demand with the same changes."""
+    """A signed offer, which matches a demand with the same changes."""
     return signer.sign(Offer(**({"lighthouse_fee": 0} | terms(**changes))))
 
 
 def result(*, signer: Signer = ROBOT, **changes: Any) -> Result:
-    """A signed result, of a liability at some address unless it is given."""
+    """A signed result of some liability."""
     fields: dict[str, Any] = {"liability": LIGHTHOUSE, "result": RECORDING, "success": True}
     return signer.sign(Result(**(fields | changes)))
 
 
 def liability(**changes: Any) -> Liability:
-    """The contract, at an address that no chain knows, of such a demand and such an offer; its job has not ended."""
+    """The liability of such a demand and offer, at an address that is on no chain; its job has not ended."""
     fields: dict[str, Any] = {
         "address": CONTRACT,
         "model": MODEL,
