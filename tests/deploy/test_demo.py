@@ -37,7 +37,7 @@ async def test_a_market_comes_up_from_nothing_and_does_a_job_whose_story_is_in_t
     assert liability in demo.log("agent")
 
 
-async def test_nobody_has_more_rights_than_needed(demo: ComposeDeployment) -> None:
+async def test_services_run_with_minimal_rights(demo: ComposeDeployment) -> None:
     await demo.ready()
     for service in SERVICES:
         facts = demo.facts(service)
@@ -66,7 +66,7 @@ async def test_no_key_and_no_password_is_in_an_environment_a_command_line_or_a_l
             assert not found, f"{service} shows {found}"
 
 
-async def test_each_service_sees_its_own_secrets_and_nobody_elses(demo: ComposeDeployment) -> None:
+async def test_each_service_sees_only_its_own_secrets(demo: ComposeDeployment) -> None:
     await demo.ready()
     keys = set()
     for service in ("router", "provider", "agent"):

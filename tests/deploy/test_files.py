@@ -131,7 +131,7 @@ def test_the_second_file_builds_on_services_of_the_first() -> None:
         assert set(service["networks"]) <= {"north", "south", "wan"}, name
 
 
-def test_the_example_of_env_says_of_every_variable_what_is_in_force_without_it() -> None:
+def test_the_example_of_env_has_the_default_of_every_variable() -> None:
     used = dict(VARIABLE.findall(ONE_SITE.read_text()))
     told = dict(re.findall(r"^#([A-Z]\w*)=(.*)$", (ROOT / ".env.example").read_text(), re.MULTILINE))
     assert len(used) > 30

@@ -46,7 +46,7 @@ async def test_a_job_is_paid_though_a_site_is_cut_off_for_half_a_minute(sites: C
     assert (await job.settled())["success"]
 
 
-async def test_who_has_two_endpoints_goes_on_without_the_router_that_died(sites: ComposeDeployment) -> None:
+async def test_clients_with_two_endpoints_survive_a_dead_router(sites: ComposeDeployment) -> None:
     await sites.ready()
     job = sites.ask(PLAYED_SECONDS)
     await job.is_played()

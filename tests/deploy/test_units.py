@@ -159,7 +159,7 @@ def test_a_renewal_that_fails_waits_for_its_timer() -> None:
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="files are given to another user")
-def test_what_root_makes_in_a_state_belongs_to_its_service(tmp_path: Path) -> None:
+def test_files_created_by_root_belong_to_the_service(tmp_path: Path) -> None:
     state, elsewhere = tmp_path / "lib/arm", tmp_path / "elsewhere"
     state.mkdir(parents=True)
     elsewhere.touch()

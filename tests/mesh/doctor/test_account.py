@@ -71,7 +71,7 @@ async def test_an_account_without_ether_is_named_where_it_has_to_pay_gas(machine
     assert agent.one("ether").status is CheckStatus.WARN
 
 
-async def test_a_provider_without_a_stake_is_told_how_to_get_one(machine: Machine) -> None:
+async def test_a_provider_without_a_stake_gets_a_hint(machine: Machine) -> None:
     found = await machine.examined("provider", "stranger")
 
     cause = found.cause("stake")
@@ -95,7 +95,7 @@ async def test_a_missing_allowance_is_named_with_the_command_that_gives_it(machi
     assert "`aira xrt approve factory AMOUNT`" in result.hint
 
 
-async def test_the_turn_of_another_is_told(router: EmbeddedRouter, anvil: Anvil, tmp_path: Path) -> None:
+async def test_the_turn_of_another_provider_is_reported(router: EmbeddedRouter, anvil: Anvil, tmp_path: Path) -> None:
     first, second = (Account.from_key(key) for key in anvil.private_keys[:2])
     plan = DeploymentPlan(timeout_blocks=100)
     deployed = await deploy(anvil.url, first, plan=plan)
@@ -133,7 +133,7 @@ async def test_gas_above_the_own_ceiling_is_named(machine: Machine) -> None:
     ("wei", "asked"),
     [(1, "0.000000001 ETH"), (1_000_000_001, "0.000000002 ETH"), (10**18, "1 ETH"), (5 * 10**14, "0.0005 ETH")],
 )
-def test_what_is_asked_for_is_never_less_than_what_is_needed(wei: int, asked: str) -> None:
+def test_a_requested_amount_is_never_less_than_needed(wei: int, asked: str) -> None:
     assert at_least(wei, ETH) == asked
 
 

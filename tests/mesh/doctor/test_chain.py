@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from tests.mesh.doctor.machines import Machine
 
 
-async def test_an_agent_with_an_account_is_sound(machine: Machine) -> None:
+async def test_an_agent_with_an_account_passes(machine: Machine) -> None:
     found = await machine.examined("agent", "robot")
 
     assert found.failed == []
@@ -30,7 +30,7 @@ async def test_an_agent_with_an_account_is_sound(machine: Machine) -> None:
     assert "1,000 XRT" in found.one("tokens").message
 
 
-async def test_a_provider_with_a_stake_is_sound_and_told_whose_turn_it_is(machine: Machine) -> None:
+async def test_a_provider_with_a_stake_passes_and_sees_the_turn(machine: Machine) -> None:
     found = await machine.examined("provider", "provider")
 
     assert found.failed == []
@@ -38,7 +38,7 @@ async def test_a_provider_with_a_stake_is_sound_and_told_whose_turn_it_is(machin
     assert found.one("turn").message.startswith("its own, ")
 
 
-async def test_who_only_looks_on_needs_no_account_and_who_is_to_be_an_agent_does(machine: Machine) -> None:
+async def test_only_a_requested_agent_role_needs_an_account(machine: Machine) -> None:
     looking = await machine.examined(None)
     asked = await machine.examined("agent")
 
@@ -67,7 +67,7 @@ async def test_a_chain_that_is_not_the_expected_one_is_named_by_both_numbers(mac
     assert "contracts" not in found
 
 
-async def test_nodes_of_different_chains_are_told_apart(machine: Machine, anvil: Anvil) -> None:
+async def test_nodes_of_different_chains_fail(machine: Machine, anvil: Anvil) -> None:
     found = await machine.examined("bridge", web3_http_provider=f"{machine.town.url}, {anvil.url}")
 
     assert [result.ok for result in found["node"]] == [True, True]
@@ -75,9 +75,7 @@ async def test_nodes_of_different_chains_are_told_apart(machine: Machine, anvil:
     assert not found.one("chain").ok
 
 
-async def test_a_chain_without_the_contracts_is_named_and_what_else_is_wrong_is_not_blamed(
-    machine: Machine, anvil: Anvil
-) -> None:
+async def test_a_chain_without_the_contracts_fails_once(machine: Machine, anvil: Anvil) -> None:
     found = await machine.examined("agent", "robot", web3_http_provider=anvil.url)
 
     cause = found.cause("contracts")
@@ -104,7 +102,7 @@ async def test_an_address_that_is_no_lighthouse_of_the_factory_is_named(machine:
     assert "is no lighthouse of this factory" in found.cause("lighthouse")
 
 
-async def test_contracts_taken_for_the_original_ones_are_told_from_these(machine: Machine) -> None:
+async def test_the_wrong_kind_of_contracts_fails(machine: Machine) -> None:
     found = await machine.examined("agent", contracts="original")
 
     assert "not the original contracts, but this project's" in found.one("contracts").message
@@ -119,7 +117,7 @@ async def test_a_websocket_that_was_named_has_to_answer(machine: Machine) -> Non
     assert (await machine.examined(None, web3_ws_provider=alive)).one("websocket").ok
 
 
-async def test_what_is_no_address_of_a_node_is_a_finding(machine: Machine) -> None:
+async def test_a_malformed_node_address_fails(machine: Machine) -> None:
     assert "is not the address of a node" in (await machine.examined(None, web3_http_provider="8545")).cause("node")
 
 

@@ -37,7 +37,7 @@ async def made(*checks: Check, seconds: float = 30.0) -> dict[str, CheckResult |
         return {checked.name: checked.result async for checked in examined}
 
 
-async def test_what_is_found_comes_in_the_order_of_the_checks_and_not_in_that_of_their_ends() -> None:
+async def test_results_come_in_the_order_of_the_checks() -> None:
     second_is_done = asyncio.Event()
 
     async def first() -> CheckResult:
@@ -51,20 +51,20 @@ async def test_what_is_found_comes_in_the_order_of_the_checks_and_not_in_that_of
     assert list(await made(Check("one", first), Check("two", second))) == ["one", "two"]
 
 
-async def test_an_error_is_a_finding_with_what_it_says_and_what_it_says_to_do() -> None:
+async def test_an_error_is_a_failed_check_with_its_message_and_hint() -> None:
     found = await made(failing("node", RemoteError("nobody there", hint="start it")), check("disk", passed("fine")))
 
     assert found == {"node": CheckResult(CheckStatus.FAIL, "nobody there", "start it"), "disk": passed("fine")}
 
 
-async def test_something_is_to_be_done_even_about_an_error_without_a_hint() -> None:
+async def test_an_error_without_a_hint_gets_one() -> None:
     (result,) = (await made(failing("node", ConfigurationError("no")))).values()
 
     assert result is not None
     assert result.hint
 
 
-async def test_a_failure_of_the_program_itself_is_none_of_the_machine() -> None:
+async def test_an_unexpected_error_is_raised() -> None:
     with pytest.raises(KeyError, match="a bug"):
         await made(failing("node", KeyError("a bug")))
 
@@ -77,7 +77,7 @@ async def test_a_missing_package_is_named_with_the_extra_that_brings_it() -> Non
     )
 
 
-async def test_what_needs_something_that_failed_is_left_out_and_so_is_what_needs_that() -> None:
+async def test_checks_that_depend_on_a_failed_one_are_skipped() -> None:
     node = check("node", failed("dead", hint="start it"))
     chain = check("chain", passed("never made"), [node])
     account = check("account", passed("never made"), [chain])
@@ -97,7 +97,7 @@ async def test_of_a_group_one_is_enough_and_a_warning_is_no_failure() -> None:
     assert found["session"] == passed("open")
 
 
-async def test_who_has_no_answer_in_time_fails_and_holds_up_nobody() -> None:
+async def test_a_check_without_a_result_in_time_fails_and_delays_no_other() -> None:
     async def never() -> CheckResult:
         await asyncio.Event().wait()
         return passed("never")
@@ -127,7 +127,7 @@ async def test_a_call_that_blocks_for_ever_ends_with_the_time_too() -> None:
     assert not found["disk"].ok
 
 
-async def test_what_a_call_beside_the_loop_raises_is_raised() -> None:
+async def test_an_error_in_a_thread_is_raised() -> None:
     def refuse(words: str) -> None:
         raise RemoteError(words)
 
@@ -135,7 +135,7 @@ async def test_what_a_call_beside_the_loop_raises_is_raised() -> None:
         await in_thread(refuse, "not now")
 
 
-async def test_who_reads_no_further_ends_the_checks() -> None:
+async def test_closing_the_generator_cancels_the_checks() -> None:
     ended = asyncio.Event()
 
     async def long() -> CheckResult:

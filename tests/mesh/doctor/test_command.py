@@ -66,7 +66,7 @@ def test_a_warning_ends_with_0_and_is_named_at_the_end(
     assert f"-> chmod 600 {password}\n" in done.stdout
 
 
-def test_a_failure_says_what_to_do_what_was_not_tried_and_ends_with_1(tmp_path: Path) -> None:
+def test_a_failure_prints_a_hint_and_the_skipped_checks_and_exits_with_1(tmp_path: Path) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with at_most(30):
         done = aira("doctor", "--role", "operator", "--connect", endpoint)
@@ -215,7 +215,7 @@ def test_an_edge_machine_is_examined_without_what_only_other_roles_need(tmp_path
     assert found["denied write"]["found"] == "refused, as it should be: a write in the jobs of its agent"
 
 
-def test_another_role_there_is_told_what_is_missing() -> None:
+def test_a_missing_package_is_reported() -> None:
     done = run(sys.executable, "-c", SMALL, "doctor", "--json", "--role", "agent")
 
     (node,) = [each for each in objects(done) if each["name"] == "node"]

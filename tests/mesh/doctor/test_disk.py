@@ -28,7 +28,7 @@ print(*{look}, sep="\\n")
 """
 
 
-def test_a_folder_that_takes_a_file_is_sound_and_keeps_nothing_of_it(tmp_path: Path) -> None:
+def test_a_writable_folder_passes_and_is_left_empty(tmp_path: Path) -> None:
     result = check_data_folder(tmp_path)
 
     assert result.status is CheckStatus.OK
@@ -57,7 +57,7 @@ def test_a_folder_of_another_user_is_named_with_both_and_the_cure(tmp_path: Path
     assert "--data-dir" in do
 
 
-def test_what_is_above_a_folder_that_is_yet_to_be_made_stays_whose_it_is(tmp_path: Path) -> None:
+def test_the_hint_never_changes_the_owner_of_a_parent_folder(tmp_path: Path) -> None:
     folder = tmp_path / "aira" / "state"
     for parent in tmp_path.parents:
         if parent.stat().st_uid == os.geteuid() and parent != parent.parent:
@@ -97,7 +97,7 @@ async def test_a_data_dir_that_is_a_file_is_named(tmp_path: Path) -> None:
     assert "disk space" not in found
 
 
-def test_a_full_disk_is_said_to_be_full(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_as_full(tmp_path: Path) -> None:
     with file_size_limit(1024):
         result = check_data_folder(tmp_path)
 
@@ -107,11 +107,11 @@ def test_a_full_disk_is_said_to_be_full(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_room_for_all_that_may_be_kept_is_sound(tmp_path: Path) -> None:
+def test_enough_space_for_the_content_limit_passes(tmp_path: Path) -> None:
     assert check_disk_space(tmp_path, content_limit=1024).status is CheckStatus.OK
 
 
-def test_a_limit_beyond_the_disk_is_a_warning_that_counts_what_is_kept(tmp_path: Path) -> None:
+def test_a_content_limit_beyond_the_disk_is_a_warning(tmp_path: Path) -> None:
     store = tmp_path / "0xAb" / "content"
     store.mkdir(parents=True)
     (store / "Qm").write_bytes(b"")

@@ -23,7 +23,7 @@ ROUTERS = pytest.mark.parametrize("kind", ["wheel", "zenohd"])
 
 
 @ROUTERS
-async def test_a_member_of_a_site_is_let_in_heeded_and_denied_what_is_not_his(site: Site, kind: str) -> None:
+async def test_a_member_of_a_site_is_admitted_and_denied_forbidden_writes(site: Site, kind: str) -> None:
     arm = site.enlist(Member(name="arm-1", address=ARM, roles=("agent",)))
     with site.open_router(kind):
         found = await examined(context_of_member(site, arm))
@@ -38,7 +38,7 @@ async def test_a_member_of_a_site_is_let_in_heeded_and_denied_what_is_not_his(si
 
 
 @pytest.mark.parametrize("role", ["agent", "person", "provider", "operator", "bridge", "watcher"])
-async def test_every_role_is_sound_where_it_is_given_its_rights(site: Site, role: Role) -> None:
+async def test_every_role_passes_with_its_rights(site: Site, role: Role) -> None:
     folder = site.enlist(Member(name="somebody", address=ARM, roles=(role,)))
     with site.open_router("wheel"):
         found = await examined(context_of_member(site, folder))
@@ -93,7 +93,7 @@ async def test_a_certificate_that_ends_soon_is_a_warning_with_its_end(site: Site
 
 @ROUTERS
 @pytest.mark.parametrize("revoked", [False, True], ids=["not in the roster", "revoked"])
-async def test_who_is_let_in_and_not_heeded_is_told_so(site: Site, kind: str, revoked: bool) -> None:
+async def test_an_identity_without_rights_fails(site: Site, kind: str, revoked: bool) -> None:
     site.enlist(Member(name="other", address=AGENT, roles=("agent",)))
     if revoked:
         arm = site.enlist(Member(name="arm", address=ARM, roles=("agent",), revoked=True))

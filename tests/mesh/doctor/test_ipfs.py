@@ -31,7 +31,7 @@ async def found_at(api: str, **options: Any) -> Found:
     )
 
 
-async def test_a_daemon_with_pubsub_is_sound_and_named(js_ipfs: JsIpfs) -> None:
+async def test_a_daemon_with_pubsub_passes(js_ipfs: JsIpfs) -> None:
     found = await found_at(js_ipfs.api)
 
     assert found.failed == []
@@ -39,7 +39,7 @@ async def test_a_daemon_with_pubsub_is_sound_and_named(js_ipfs: JsIpfs) -> None:
     assert found.one("ipfs pubsub").message.startswith("enabled; ")
 
 
-async def test_a_daemon_without_pubsub_is_told_how_to_get_it_and_one_that_knows_nobody_is_a_warning() -> None:
+async def test_a_daemon_without_pubsub_fails_and_one_without_peers_is_a_warning() -> None:
     with Mute() as mute:
         found = await found_at(mute.api)
 
@@ -49,7 +49,7 @@ async def test_a_daemon_without_pubsub_is_told_how_to_get_it_and_one_that_knows_
     assert "--ipfs-swarm-connect" in found.one("ipfs swarm").hint
 
 
-async def test_a_daemon_that_wants_a_password_is_told_from_one_that_is_not_there(tmp_path: Path) -> None:
+async def test_a_daemon_that_denies_access_fails(tmp_path: Path) -> None:
     secret = tmp_path / "authorization"
     secret.write_text("Bearer wrong")
     async with RecentDaemon(authorization="Bearer right") as recent:

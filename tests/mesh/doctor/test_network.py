@@ -32,7 +32,7 @@ ARM = "0x" + "0a" * 20
 ROUTERS = pytest.mark.parametrize("kind", ["wheel", "zenohd"])
 
 
-async def test_the_open_router_of_one_machine_is_said_to_be_open(router: EmbeddedRouter) -> None:
+async def test_an_open_router_on_loopback_passes(router: EmbeddedRouter) -> None:
     found = await examined(DoctorContext(settings=Settings(connect=(router.endpoint,)), requested_role="operator"))
 
     assert found.failed == []
@@ -65,7 +65,7 @@ async def test_a_dead_router_beside_a_living_one_is_seen(router: EmbeddedRouter)
     assert found.one("own write").ok
 
 
-async def test_a_name_that_does_not_resolve_is_told_from_a_router_that_is_not_there() -> None:
+async def test_an_unknown_host_name_is_reported() -> None:
     found = await examined(
         DoctorContext(settings=Settings(connect=("tcp/no-such-host.invalid:7447",)), requested_role="operator")
     )
@@ -87,7 +87,7 @@ def other_server() -> Iterator[str]:
         server.server_close()
 
 
-async def test_what_answers_and_is_no_router_is_found_by_the_session(other_server: str) -> None:
+async def test_a_server_that_is_no_router_fails_the_session_check(other_server: str) -> None:
     found = await examined(DoctorContext(settings=Settings(connect=(other_server,)), requested_role="operator"))
 
     assert "no Zenoh router at" in found.cause("session")
@@ -115,7 +115,7 @@ def open_router(site: Site, kind: str) -> AbstractContextManager[object]:
 
 
 @ROUTERS
-async def test_a_router_that_lets_pass_what_the_roster_denies_is_found_out(site: Site, kind: str) -> None:
+async def test_a_router_that_forwards_denied_writes_fails(site: Site, kind: str) -> None:
     arm = site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
     with open_router(site, kind):
         found = await examined(context_of_member(site, arm))

@@ -32,7 +32,7 @@ def settings_everywhere(site: Site, hosts: tuple[str, ...]) -> Settings:
 
 
 @HOSTS
-async def test_a_router_on_every_address_is_sound(site: Site, hosts: tuple[str, ...]) -> None:
+async def test_a_router_on_every_address_passes(site: Site, hosts: tuple[str, ...]) -> None:
     settings = settings_everywhere(site, hosts)
     session = zenoh.open(router_endpoints(settings).config())
     try:

@@ -42,7 +42,7 @@ def silent() -> Iterator[str]:
     os.close(slave)
 
 
-def test_a_port_that_opens_is_sound(silent: str) -> None:
+def test_a_port_that_opens_passes(silent: str) -> None:
     assert check.check_port(SerialSettings(port=silent)).message == f"{silent} opens at 57,600 baud"
 
 
@@ -74,7 +74,7 @@ def test_a_port_without_permission_is_named_with_its_group_and_the_cure(silent: 
     assert "log in again" in do
 
 
-def test_a_port_that_another_program_uses_is_told_from_a_forbidden_one(silent: str) -> None:
+def test_a_port_in_use_is_reported(silent: str) -> None:
     port = SerialPort(Path(silent), baud=57_600)
     try:
         done = run(sys.executable, "-c", LOOK, silent)
@@ -87,14 +87,14 @@ def test_a_port_that_another_program_uses_is_told_from_a_forbidden_one(silent: s
     assert "fuser" in do
 
 
-def test_a_file_that_is_no_port_is_said_to_be_none() -> None:
+def test_a_file_that_is_no_port_fails() -> None:
     result = check.check_port(SerialSettings(port="/dev/null"))
 
     assert not result.ok
     assert "it is not a serial port" in result.message
 
 
-def test_a_port_on_which_nobody_answers_is_told_what_may_be_wrong(silent: str) -> None:
+def test_a_port_without_an_answering_board_fails(silent: str) -> None:
     result = check.check_board(SerialSettings(port=silent), timeout=0.5)
 
     assert not result.ok
@@ -102,7 +102,7 @@ def test_a_port_on_which_nobody_answers_is_told_what_may_be_wrong(silent: str) -
     assert "--protocol rosserial" in result.hint
 
 
-def test_a_board_that_answers_is_named_with_what_it_speaks() -> None:
+def test_an_answering_board_is_reported_with_its_protocol() -> None:
     with board(COUNTER) as there:
         result = check.check_board(SerialSettings(port=str(there.port)))
 

@@ -61,7 +61,7 @@ async def pair(near: str, far: str) -> AsyncIterator[SessionPair]:
             await asyncio.to_thread(session.close)
 
 
-async def test_what_was_written_before_is_not_taken_for_what_is_timed(router: EmbeddedRouter) -> None:
+async def test_earlier_writes_do_not_count_for_the_round_trip(router: EmbeddedRouter) -> None:
     async with far_from(router.endpoint) as far, pair(router.endpoint, far) as both:
         took = await both.round_trip("aira/test/doctor/far")
 
@@ -69,7 +69,7 @@ async def test_what_was_written_before_is_not_taken_for_what_is_timed(router: Em
     assert took >= FAR
 
 
-async def test_nothing_is_said_of_what_is_denied_where_not_even_the_rest_comes_through(
+async def test_denied_writes_are_not_judged_if_allowed_ones_do_not_arrive(
     router: EmbeddedRouter,
 ) -> None:
     async with pair(router.endpoint, router.endpoint) as both:

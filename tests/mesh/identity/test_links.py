@@ -81,7 +81,7 @@ async def test_linked_routers_carry_one_market_also_after_one_was_away(site: Sit
                     await until_it_arrives(arms.session, screens.session)
 
 
-async def test_who_is_no_router_in_the_roster_links_nothing(site: Site) -> None:
+async def test_a_router_that_is_not_in_the_roster_links_nothing(site: Site) -> None:
     arm = site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
     screen = site.enlist(Member(name="screen", address=SCREEN, roles=("watcher",)))
     rogue, port = site.certify("rogue", SECOND, "router", hosts=("127.0.0.1",)), free_port()

@@ -134,7 +134,7 @@ def known(stage: Stage, who: str) -> bool:
 
 
 @pytest.mark.parametrize(("kind", "expected"), [(zenoh.SampleKind.PUT, PUT), (zenoh.SampleKind.DELETE, DELETE)])
-async def test_each_writes_what_is_its_own_and_nothing_else(
+async def test_each_member_writes_only_what_it_may(
     stage: Stage, kind: zenoh.SampleKind, expected: dict[str, set[str]]
 ) -> None:
     assert await heard_by_witness(stage, kind, expected) == expected
@@ -197,7 +197,7 @@ async def test_each_is_answered_where_it_may_ask(stage: Stage) -> None:
     assert {who: named(who, answered[who]) for who in WHO} == GET
 
 
-async def test_each_hears_what_it_may_read(stage: Stage) -> None:
+async def test_each_member_receives_what_it_may_read(stage: Stage) -> None:
     heard = defaultdict[str, set[str]](set)
     for who in WHO:
         for key in KEYS[who].values():
@@ -215,7 +215,7 @@ async def test_each_hears_what_it_may_read(stage: Stage) -> None:
     assert {who: named(who, heard[who]) for who in WHO} == SUBSCRIBE
 
 
-async def test_each_sees_who_is_present_where_it_may(stage: Stage) -> None:
+async def test_each_member_sees_presence_where_it_may(stage: Stage) -> None:
     for key in {key for who in WHO for key in KEYS[who].values()}:
         stage.keep(stage.witness.liveliness().declare_token(key))
     stage.are_past()

@@ -22,7 +22,7 @@ def member(**more: str) -> str:
     return "[[member]]\n" + "".join(f"{name} = {value}\n" for name, value in fields.items() if value)
 
 
-def test_an_empty_roster_admits_nobody_to_the_markets_of_both_generations() -> None:
+def test_an_empty_roster_has_both_markets_and_no_members() -> None:
     roster = roster_from("", where="it")
 
     assert roster.member == ()
@@ -80,7 +80,7 @@ def test_an_edge_agent_serves_its_own_device_unless_another_is_named() -> None:
         (member() + member(address=f'"{OTHER}"'), "the roster it: the name 'arm' is there twice"),
     ],
 )
-def test_what_is_wrong_is_said_in_a_line_with_its_place(text: str, said: str) -> None:
+def test_errors_name_the_place_in_the_roster(text: str, said: str) -> None:
     with pytest.raises(RosterError) as error:
         roster_from(text, where="it")
 
@@ -88,7 +88,7 @@ def test_what_is_wrong_is_said_in_a_line_with_its_place(text: str, said: str) ->
     assert "\n" not in str(error.value)
 
 
-def test_an_unknown_role_names_the_roles_that_there_are() -> None:
+def test_an_unknown_role_lists_the_roles() -> None:
     with pytest.raises(RosterError) as error:
         roster_from(member(roles='["king"]'), where="it")
 
@@ -109,7 +109,7 @@ def test_an_entry_reads_back_as_its_member() -> None:
     assert roster_from(entry_of(odd), where="it").member == (odd,)
 
 
-def test_members_are_added_without_touching_what_is_there(tmp_path: Path) -> None:
+def test_adding_a_member_keeps_the_rest_of_the_file(tmp_path: Path) -> None:
     file = tmp_path / "new" / "roster.toml"
     arm = Member(name="arm", address=ARM, roles=("agent",), fingerprint="ab" * 32)
 

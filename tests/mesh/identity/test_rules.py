@@ -57,7 +57,7 @@ def test_only_the_own_space_may_be_deleted_in() -> None:
 
 
 @pytest.mark.parametrize("role", [role for role in ROLES if role != "router"])
-def test_nobody_writes_in_the_name_of_another(role: Role) -> None:
+def test_no_member_writes_as_another(role: Role) -> None:
     for right in (Right.PUT, Right.DELETE, Right.TOKEN):
         for key in allowed((role,), right, agent=ARM, device="arm"):
             assert ARM in key or key.startswith(f"aira/{MARKET}/"), key
@@ -85,7 +85,7 @@ def test_each_market_is_opened_and_no_other() -> None:
     assert puts == (f"aira/agent/{ARM}/**", f"aira/{MARKET}/demand/*/*", "aira/b.eth/demand/*/*")
 
 
-def test_zenoh_denies_what_is_not_allowed_and_knows_members_by_either_spelling() -> None:
+def test_zenoh_denies_by_default_and_knows_both_spellings_of_an_address() -> None:
     rules = access_control(roster("watcher"))
 
     assert (rules["enabled"], rules["default_permission"]) == (True, "deny")

@@ -100,7 +100,7 @@ async def test_a_header_can_t_ask_for_memory(archive: Path, tmp_path: Path, kind
         tracemalloc.stop()
 
 
-async def test_a_file_that_is_there_twice_is_refused(archive: Path, tmp_path: Path) -> None:
+async def test_a_duplicate_file_is_refused(archive: Path, tmp_path: Path) -> None:
     forged = forge(archive, tmp_path / "forged", lambda members: members.insert(2, members[1]))
     assert "no part of a state" in await refused(forged, tmp_path)
 

@@ -63,7 +63,7 @@ async def test_content_is_included_as_requested(
     assert {data for name, data in members(tmp_path / "it").items() if "content/Qm" in name} == held
 
 
-async def test_what_jobs_need_and_nobody_holds_is_named(folder: Folder, tmp_path: Path) -> None:
+async def test_missing_content_of_jobs_is_reported(folder: Folder, tmp_path: Path) -> None:
     missing = cid_of_bytes(b"gone")
     async with Ledger(folder.ledger) as ledger:
         await ledger.add_job(liability("two", objective=missing))
@@ -164,13 +164,13 @@ async def test_a_backup_replaces_an_earlier_one_only_when_it_is_whole(folder: Fo
     assert names_in(tmp_path) == ["data", "it"]
 
 
-async def test_a_folder_without_state_is_said_to_have_none(tmp_path: Path) -> None:
+async def test_a_folder_without_state_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "content").mkdir()
     with pytest.raises(NoState):
         await back_up(tmp_path, tmp_path / "it", content=ContentScope.NEEDED)
 
 
-async def test_a_full_disk_is_told_and_leaves_no_file(folder: Folder, tmp_path: Path) -> None:
+async def test_a_full_disk_is_an_error_and_leaves_no_file(folder: Folder, tmp_path: Path) -> None:
     with Store(folder.home / "content") as store:
         store.put_bytes(os.urandom(3 << 20), pin="user")
     with file_size_limit(1 << 20), pytest.raises(Exception, match=r"(full|room)"):
@@ -178,7 +178,7 @@ async def test_a_full_disk_is_told_and_leaves_no_file(folder: Folder, tmp_path: 
     assert not (tmp_path / "it").exists()
 
 
-async def test_the_inventory_tells_what_is_there(folder: Folder) -> None:
+async def test_the_inventory_lists_the_state(folder: Folder) -> None:
     found = await take_inventory(folder.path)
     (account,) = found.accounts
     (chain,) = account.chains
@@ -187,12 +187,12 @@ async def test_the_inventory_tells_what_is_there(folder: Folder) -> None:
     assert (account.in_use, found.transactions) == (False, 1)
 
 
-async def test_the_inventory_says_who_is_at_work(folder: Folder) -> None:
+async def test_the_inventory_shows_agents_in_use(folder: Folder) -> None:
     with Store(folder.home / "content"):
         assert (await take_inventory(folder.path)).accounts[0].in_use
 
 
-async def test_a_backup_says_what_it_is(folder: Folder, tmp_path: Path) -> None:
+async def test_a_backup_describes_itself(folder: Folder, tmp_path: Path) -> None:
     await back_up(folder.path, tmp_path / "it", content=ContentScope.ALL)
     found = examine_archive(tmp_path / "it")
     assert found.files == {"content": 2, "ledgers": 1, "pins": 1, "recordings": 1, "transactions": 1}

@@ -108,7 +108,7 @@ async def test_after_a_restore_every_job_ends_once(place: Place) -> None:
     ], "what the chain has paid is not played again"
 
 
-async def test_what_was_paid_since_the_backup_is_not_played_however_slowly_the_chain_is_read(
+async def test_jobs_paid_since_the_backup_are_not_repeated_even_if_the_chain_is_slow(
     place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot, disk, archive = Robot(place), place.folder / "robot", place.folder / "backup"

@@ -209,7 +209,7 @@ async def test_a_newer_ledger_is_not_backed_up(folder: Folder, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("data", [b"no ledger", b"SQLite format 3\x00" + bytes(4096)])
-async def test_a_ledger_that_is_none_is_refused(archive: Path, tmp_path: Path, data: bytes) -> None:
+async def test_a_file_that_is_no_ledger_is_refused(archive: Path, tmp_path: Path, data: bytes) -> None:
     with pytest.raises((LedgerUnusable, ArchiveUnusable)):
         await restore(forge_ledger(archive, tmp_path / "forged", data), tmp_path / "new")
     assert names_in(tmp_path / "new") == []
@@ -252,13 +252,13 @@ def forge_ledger(archive: Path, forged: Path, data: bytes) -> Path:
     return forge(archive, forged, change)
 
 
-async def test_a_full_disk_is_told_and_changes_nothing(archive: Path, tmp_path: Path) -> None:
+async def test_a_full_disk_is_an_error_and_changes_nothing(archive: Path, tmp_path: Path) -> None:
     with file_size_limit(4096), pytest.raises(Exception, match=r"(?i)full"):
         await restore(archive, tmp_path / "new")
     assert names_in(tmp_path / "new") == []
 
 
-async def test_a_folder_that_can_t_be_written_is_told(archive: Path, tmp_path: Path) -> None:
+async def test_an_unwritable_folder_is_an_error(archive: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(ConfigurationError, match="can't restore to"):
         await restore(archive, tmp_path / "file")

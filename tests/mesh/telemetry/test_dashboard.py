@@ -163,7 +163,7 @@ def panels() -> list[dict[str, Any]]:
 
 def test_the_dashboard_has_its_rows_and_no_two_panels_in_one_place() -> None:
     rows = [panel["title"] for panel in panels() if panel["type"] == "row"]
-    assert rows == ["Health", "Market", "JobTracker", "Money", "Network", "Devices", "Bridge"]
+    assert rows == ["Health", "Market", "Jobs", "Money", "Network", "Devices", "Bridge"]
     assert len({panel["id"] for panel in panels()}) == len(panels())
     taken: set[tuple[int, int]] = set()
     for panel in panels():
@@ -178,7 +178,7 @@ def test_the_dashboard_has_its_rows_and_no_two_panels_in_one_place() -> None:
         taken |= cells
 
 
-def test_every_alert_says_what_it_is_and_what_to_look_at() -> None:
+def test_every_alert_has_a_summary_and_a_description() -> None:
     rules = ALERTS.read_text().split("- alert: ")[1:]
 
     assert len(rules) >= 5

@@ -78,7 +78,7 @@ def test_facts_are_members_of_the_json_object_and_never_replace_a_field() -> Non
 
 
 @pytest.mark.parametrize("write", [human_line, json_line])
-def test_what_a_stranger_says_stays_on_one_line_and_steers_no_terminal(write: Any) -> None:
+def test_untrusted_text_stays_on_one_line_and_can_not_control_the_terminal(write: Any) -> None:
     line = write(event_of(record("%s of %s", HOSTILE, "him")))
     assert line.isprintable(), ascii(line)
     assert len(line.splitlines()) == 1

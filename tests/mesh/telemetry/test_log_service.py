@@ -46,8 +46,9 @@ def kept(caplog: pytest.LogCaptureFixture, request: pytest.FixtureRequest) -> It
 
 
 async def logs(place: Place, role: str, **asked: Any) -> LogsRead:
-    """What the role tells of its log."""
+    """The events that a role serves."""
     async with Network(Endpoints(connect=(place.endpoint,))) as network:
+        await until_answered(network.session, str(RpcKey(place.address(role), "logs")))
         reply = await call(network.session, place.address(role), "logs", ReadLogs(**asked))
     assert isinstance(reply, LogsRead)
     return reply

@@ -17,7 +17,7 @@ def rendered(*families: MetricFamily) -> Scrape:
     return Scrape(text.decode())
 
 
-def test_a_counter_and_a_gauge_are_told_with_their_kind_and_meaning() -> None:
+def test_a_counter_and_a_gauge_are_rendered_with_type_and_help() -> None:
     figures = rendered(counter("aira_jobs_done_total", "Jobs done", 3), gauge("aira_queue", "What waits", 1.5))
 
     assert (figures("aira_jobs_done_total"), figures("aira_queue")) == (3, 1.5)
@@ -28,7 +28,7 @@ def test_a_counter_and_a_gauge_are_told_with_their_kind_and_meaning() -> None:
     assert figures.families["aira_queue"].type == "gauge"
 
 
-def test_labels_are_told_whatever_they_hold() -> None:
+def test_labels_may_hold_any_text() -> None:
     strange = 'a "quoted"\nline \\ and ☃'
 
     figures = rendered(by_label("aira_x", "gauge", "x", "reason", {strange: 1, "plain": 2}))
@@ -84,7 +84,7 @@ def test_one_name_can_not_mean_two_things() -> None:
         ({"channel": "waits for a router", "executor": "alive"}, False),
     ],
 )
-def test_who_has_a_part_that_waits_is_not_well(parts: dict[str, str], ok: bool) -> None:
+def test_a_waiting_part_is_unhealthy(parts: dict[str, str], ok: bool) -> None:
     health = Health.of(parts)
 
     assert health.ok is ok
@@ -92,7 +92,7 @@ def test_who_has_a_part_that_waits_is_not_well(parts: dict[str, str], ok: bool) 
     assert sum(sample.value for sample in health_metrics(parts).samples) == (2 if ok else 1)
 
 
-def test_health_keeps_what_opens_doors_to_itself() -> None:
+def test_health_removes_secrets() -> None:
     why = "waits: no node answers at https://me:hunter2@node.example/v3/0123456789abcdef0123 (401)"
 
     assert Health.of({"start": why}).parts == {"start": "waits: no node answers at https://node.example/v3/… (401)"}

@@ -86,10 +86,10 @@ async def settled(url: str, **expected: float) -> Scrape:
     return await scraped(url)
 
 
-async def test_a_job_moves_exactly_the_figures_of_its_provider_that_it_has_to(
+async def test_a_job_changes_exactly_these_metrics_of_its_provider(
     place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(chain_figures, "FRESH", 0.0)
+    monkeypatch.setattr(chain_figures, "MAX_AGE", 0.0)
     lighthouse = place.market.deployment.lighthouse_name
     async with provider_at(place) as url, blinking(place), place.agent("person") as person:
         before, eth = await scraped(url), await place.chains["provider"].tokens.eth_balance()
@@ -121,7 +121,7 @@ async def test_a_job_moves_exactly_the_figures_of_its_provider_that_it_has_to(
         assert (after("aira_orders_open"), after("aira_transactions_waiting")) == (0, 0)
 
 
-async def test_a_job_moves_exactly_the_figures_of_its_agent_that_it_has_to(place: Place) -> None:
+async def test_a_job_changes_exactly_these_metrics_of_its_agent(place: Place) -> None:
     async with provider_at(place), blinking(place) as robot, place.agent("person") as person:
         url = url_of(robot)
         before = await scraped(url)
@@ -174,7 +174,7 @@ async def test_a_job_that_is_under_way_stands_in_its_phase_for_longer_and_longer
         assert await standing() == 0
 
 
-async def test_what_is_refused_is_counted_under_its_reason(place: Place) -> None:
+async def test_refused_messages_are_counted_by_reason(place: Place) -> None:
     async with provider_at(place) as url, place.agent("person") as person:
         before, session = await scraped(url), person.parts.network.session
         name = place.market.deployment.lighthouse_name
@@ -215,7 +215,7 @@ async def _is(url: str, expected: tuple[int, dict[str, str]]) -> bool:
     return await health(url) == expected
 
 
-async def test_an_agent_that_only_watches_tells_what_it_hears(place: Place) -> None:
+async def test_an_agent_without_an_account_reports_what_it_receives(place: Place) -> None:
     watcher = place.agent("person", metrics_listen=HERE)
     watcher._account = None
     heard: list[object] = []
@@ -234,7 +234,7 @@ async def test_an_agent_that_only_watches_tells_what_it_hears(place: Place) -> N
         assert figures("aira_network_links") == 1
 
 
-async def test_an_order_that_is_no_use_is_a_rejection_under_its_reason(place: Place) -> None:
+async def test_rejected_orders_are_counted_by_reason(place: Place) -> None:
     """The person has taken back the allowance that the demand needs."""
     async with provider_at(place) as url, place.agent("robot") as robot, place.agent("person") as person:
         before = await scraped(url)
@@ -256,8 +256,10 @@ async def test_an_order_that_is_no_use_is_a_rejection_under_its_reason(place: Pl
         assert "aira_contracts_created_total" not in changes
 
 
-async def test_a_balance_that_the_node_does_not_tell_is_left_out(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(chain_figures, "FRESH", 0.0)
+async def test_a_balance_that_the_node_does_not_return_is_left_out(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(chain_figures, "MAX_AGE", 0.0)
     chain = place.chains["robot"]
 
     async def unreachable(address: str | None = None) -> int:

@@ -164,7 +164,7 @@ async def test_an_agent_that_comes_later_is_shown_too(market: Market) -> None:
     assert (await market.next()).agent == STRANGER.address
 
 
-async def test_with_a_model_only_what_concerns_it_is_shown(router: EmbeddedRouter) -> None:
+async def test_with_a_model_only_its_events_are_shown(router: EmbeddedRouter) -> None:
     async with watched(router, MODEL) as market:
         other, wanted = demand(model=OTHER_MODEL), demand()
         market.channel.publish(other)

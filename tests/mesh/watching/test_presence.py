@@ -122,7 +122,7 @@ async def meeting(router: EmbeddedRouter) -> AsyncIterator[Meeting]:
         yield Meeting(seen, reader, shown, writer)
 
 
-async def test_everybody_who_shows_itself_is_seen_by_role_and_address(meeting: Meeting) -> None:
+async def test_announced_agents_are_listed_by_role_and_address(meeting: Meeting) -> None:
     assert await present(meeting.seen) == []
     meeting.shown.announce("provider", PERSON.address)
     meeting.shown.announce("agent", ROBOT.address)
@@ -131,13 +131,13 @@ async def test_everybody_who_shows_itself_is_seen_by_role_and_address(meeting: M
     assert found == sorted(found)
 
 
-async def test_the_turn_of_a_bridge_is_nobody_of_its_own(meeting: Meeting) -> None:
+async def test_the_turn_token_of_a_bridge_is_no_peer(meeting: Meeting) -> None:
     meeting.shown.announce("bridge-turn-0-00000000000000ff", STRANGER.address)
     meeting.shown.announce("bridge", STRANGER.address)
     await meeting.see(PresentPeer("bridge", STRANGER.address))
 
 
-async def test_who_is_asked_answers_for_each_of_its_roles(meeting: Meeting) -> None:
+async def test_an_address_reports_the_status_of_each_role(meeting: Meeting) -> None:
     both = status(), status(lighthouse="other.lighthouse.3.robonomics.eth", role="provider")
     async with meeting.telling(*both):
 
@@ -158,7 +158,7 @@ async def test_a_bridge_answers_too(meeting: Meeting) -> None:
         assert await statuses(meeting.session, meeting.seen, [peer]) == {peer: bridge_status()}
 
 
-async def test_nobody_and_silence_are_no_answer(meeting: Meeting) -> None:
+async def test_no_reply_is_no_status(meeting: Meeting) -> None:
     assert await status_of(meeting.session, STRANGER.address, MARKET) == []
     silent = asyncio.Event()
 
@@ -172,7 +172,7 @@ async def test_nobody_and_silence_are_no_answer(meeting: Meeting) -> None:
         assert await status_of(meeting.session, ROBOT.address, MARKET, timeout=QUICK) == []
 
 
-async def test_nobody_is_believed_about_another_or_another_lighthouse(meeting: Meeting) -> None:
+async def test_statuses_of_other_addresses_and_lighthouses_are_ignored(meeting: Meeting) -> None:
     peer = PresentPeer("agent", ROBOT.address)
     key = str(RpcKey(ROBOT.address, "status"))
     lies = (status(address=STRANGER.address).encode(), b"\xff", b"{}", status(lighthouse="another.eth").encode())
@@ -185,6 +185,6 @@ async def test_nobody_is_believed_about_another_or_another_lighthouse(meeting: M
         assert {found.lighthouse for found in told} <= {"another.eth"}
 
 
-def test_what_a_newer_version_says_besides_is_no_reason_not_to_read_the_rest() -> None:
+def test_unknown_fields_of_newer_versions_are_ignored() -> None:
     newer = status().encode()[:-1] + b',"mood":"fine"}'
     assert Status.decode(newer) == status()
