@@ -64,7 +64,11 @@ class _ActiveCommand:
 
 
 class RosserialDialect(Dialect):
-    """rosserial. `parameters` are what a sketch may request, by name; `clock` gives the time that boards ask for."""
+    """rosserial. `parameters` are what a sketch may request, by name; `clock` gives the time that boards ask for.
+
+    `settle_time` is how long the next command waits, in seconds, if some answers to requests behind the last one are
+    missing: longer for a board that runs slower than its line.
+    """
 
     def __init__(
         self,
@@ -176,7 +180,7 @@ class RosserialDialect(Dialect):
             self._settled_at, self._answers_expected = now + self._settle_time, self._active.requests
             self._finish(CallStatus.READ, "", "", now)
         if self.info is None or self._settled_at is not None:
-            self._settled_at = now + self._settle_time
+            self._settled_at = now + (SETTLE_TIME if self.info is None else self._settle_time)
             self._answers_expected -= (kind, info.id) == self._last_announced
             if self.info is not None and self._answers_expected <= 0:
                 self._settle(now)
