@@ -114,7 +114,7 @@ async def _introduce(bridge: IpfsBridge, network: Network, stack: AsyncExitStack
         services.offer("logs", LogService("bridge", "").logs)
 
 
-async def _network(settings: Settings, stack: AsyncExitStack, *, waiting: Callable[[str], None]) -> Network:
+async def _network(settings: NetworkSettings, stack: AsyncExitStack, *, waiting: Callable[[str], None]) -> Network:
     """The session, once there is a router; `waiting` is called with the error while there is none."""
     from mesh.composition import endpoints_of
     from mesh.network import Network
@@ -132,7 +132,7 @@ async def _network(settings: Settings, stack: AsyncExitStack, *, waiting: Callab
             return network
 
 
-def _chain(settings: Settings) -> Callable[[], Chain] | None:
+def _chain(settings: ChainSettings) -> Callable[[], Chain] | None:
     """A factory of chain clients, None if the settings name no node. Raises `ConfigurationError`."""
     from mesh.composition import chain_of
 
