@@ -16,7 +16,7 @@ from mesh.errors import ConfigurationError, NetworkUnavailable
 from mesh.outage_log import OutageLog
 from mesh.retry import Backoff
 from mesh.running import run_until_stopped
-from mesh.settings import ChainSettings, NetworkSettings, TelemetrySettings, options_of
+from mesh.settings import ChainSettings, IpfsSettings, NetworkSettings, TelemetrySettings, options_of
 from mesh.telemetry.context import LogSource
 from mesh.telemetry.logs import LogService, set_process_source
 from schemas import parse_address
@@ -37,11 +37,7 @@ log = logging.getLogger(__name__)
 @click.option("--lighthouse", "lighthouses", multiple=True, metavar="NAME", help="a channel to bridge; repeatable")
 @with_settings(
     *options_of(NetworkSettings),
-    "ipfs_http_provider",
-    "ipfs_authorization_file",
-    "ipfs_gateway",
-    "ipfs_public_providers",
-    "ipfs_swarm_connect",
+    *options_of(IpfsSettings),
     "lighthouse_contract",
     "objective_size_limit",
     "content_limit",
