@@ -18,7 +18,7 @@ from mesh.errors import InvalidAddress
 from mesh.settings import Settings
 from schemas.status import ContentMetrics, MarketStatus, Status, StoreUse, Work
 from tests.mesh.cli.served_chain import columns
-from tests.mesh.market.floor import QUICK
+from tests.mesh.market.local_market import QUICK
 from tests.mesh.watching.test_presence import WAY, bridge_status, status
 from tests.support.market import MODEL, offering, offering_unseen
 from tests.support.objectives import objective

@@ -1,4 +1,4 @@
-"""A market founded on an embedded chain, and the floor on which a test's traders and providers meet."""
+"""A market on an embedded chain that all tests share, and a local market for each test."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.mesh.market.floor import Floor
+from tests.mesh.market.local_market import LocalMarket
 from tests.support.market import Founded, founded
 
 if TYPE_CHECKING:
@@ -18,8 +18,8 @@ __all__ = ["founded"]
 
 
 @pytest.fixture
-async def floor(founded: Founded, router: EmbeddedRouter) -> AsyncIterator[Floor]:
-    """The market's floor of this test's own."""
+async def local(founded: Founded, router: EmbeddedRouter) -> AsyncIterator[LocalMarket]:
+    """A local market for one test."""
     node = founded.node
-    async with Floor(founded.market, router.endpoint, node=node.provider, keys=node.funded_keys) as opened:
+    async with LocalMarket(founded.market, router.endpoint, node=node.provider, keys=node.funded_keys) as opened:
         yield opened

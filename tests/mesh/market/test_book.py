@@ -32,14 +32,14 @@ def book(*orders: Verified[Any], limit: int = 100) -> OrderBook:
     return filled
 
 
-def test_a_demand_and_an_offer_that_agree_match_whichever_comes_first() -> None:
+def test_a_demand_and_an_offer_with_equal_terms_match_in_either_order() -> None:
     demand, offer = verified_demand(), verified_offer()
 
     assert book(demand).add(offer) == Match(demand, offer)
     assert book(offer).add(demand) == Match(demand, offer)
 
 
-def test_a_match_leaves_neither_open() -> None:
+def test_matched_orders_leave_the_book() -> None:
     demand, offer = verified_demand(), verified_offer()
     matched = book(demand)
     matched.add(offer)
@@ -68,7 +68,7 @@ def test_orders_that_differ_in_a_term_do_not_match(difference: dict[str, Any]) -
     assert book(verified_demand()).add(offer) == Added(offer)
 
 
-def test_fees_deadlines_and_nonces_need_not_agree() -> None:
+def test_fees_deadlines_and_nonces_may_differ() -> None:
     demand, offer = verified_demand(validator_fee=1, deadline=5), verified_offer(lighthouse_fee=2, deadline=6)
 
     assert book(demand).add(offer) == Match(demand, offer)
@@ -81,7 +81,7 @@ def test_orders_of_generation_5_match_among_themselves() -> None:
     assert book(demand).add(offer) == Match(demand, offer)
 
 
-def test_who_came_first_is_matched_first() -> None:
+def test_the_oldest_order_is_matched_first() -> None:
     offers = [verified_offer() for _ in range(3)]
     waiting = book(*offers)
 
@@ -90,7 +90,7 @@ def test_who_came_first_is_matched_first() -> None:
     assert [match.offer for match in matched if isinstance(match, Match)] == offers
 
 
-def test_one_who_left_the_middle_is_passed_over() -> None:
+def test_an_order_removed_from_the_middle_is_not_matched() -> None:
     offers = [verified_offer() for _ in range(3)]
     waiting = book(*offers)
     assert waiting.remove(order_id(offers[1])) == offers[1]
@@ -101,7 +101,7 @@ def test_one_who_left_the_middle_is_passed_over() -> None:
     assert isinstance(matched[2], Added)
 
 
-def test_one_who_was_put_back_waits_at_the_end() -> None:
+def test_an_order_that_was_put_back_waits_at_the_end() -> None:
     offers = [verified_offer() for _ in range(2)]
     waiting = book(*offers)
     waiting.remove(order_id(offers[0]))
@@ -113,7 +113,7 @@ def test_one_who_was_put_back_waits_at_the_end() -> None:
     assert match.offer == offers[1]
 
 
-def test_an_order_that_is_not_open_can_not_be_removed() -> None:
+def test_removing_an_order_that_is_not_open_returns_none() -> None:
     demand = verified_demand()
     emptied = book(demand)
 
@@ -126,7 +126,7 @@ def test_an_order_of_another_lighthouse_is_refused() -> None:
     assert book().add(verified_demand(lighthouse=TOKEN)) is Refusal.LIGHTHOUSE
 
 
-def test_an_order_whose_deadline_is_not_ahead_is_refused() -> None:
+def test_an_order_whose_deadline_has_passed_is_refused() -> None:
     late = book()
     late.expire(10)
 
@@ -140,7 +140,7 @@ def test_an_open_order_is_refused_a_second_time() -> None:
     assert book(demand).add(demand) is Refusal.DUPLICATE
 
 
-def test_an_order_that_left_may_come_again() -> None:
+def test_an_order_that_left_can_be_added_again() -> None:
     demand = verified_demand()
     again = book(demand)
     again.remove(order_id(demand))
@@ -148,7 +148,7 @@ def test_an_order_that_left_may_come_again() -> None:
     assert again.add(demand) == Added(demand)
 
 
-def test_a_full_book_refuses_but_goes_on_matching() -> None:
+def test_a_full_book_refuses_orders_but_still_matches() -> None:
     demand, offer = verified_demand(), verified_offer()
     full = book(demand, limit=1)
 
@@ -171,14 +171,14 @@ def test_equal_terms_signed_by_two_people_are_two_orders() -> None:
     assert list(both.orders()) == [first]
 
 
-def test_two_people_s_equal_orders_expire_both() -> None:
+def test_equal_orders_of_two_people_both_expire() -> None:
     same = terms(deadline=5)
     pair = [verify_message(signer.sign(Demand(**same, validator_fee=0))) for signer in (PERSON, STRANGER)]
 
     assert book(*pair).expire(5) == pair
 
 
-def test_orders_expire_at_their_deadline_in_the_order_of_their_deadlines() -> None:
+def test_orders_expire_in_the_order_of_their_deadlines() -> None:
     orders = [verified_demand(deadline=deadline) for deadline in (7, 5, 6, 5)]
     aging = book(*orders)
 
@@ -195,13 +195,13 @@ def test_an_expired_order_is_not_matched() -> None:
 
 
 @pytest.mark.parametrize("head", [10**9, 2**256])
-def test_a_head_far_ahead_costs_no_more_than_what_is_due(head: int) -> None:
+def test_a_head_far_ahead_takes_no_more_time_than_the_expired_orders(head: int) -> None:
     orders = [verified_demand(deadline=2**255), verified_demand(deadline=2**256 - 1), verified_demand(deadline=10**8)]
 
     assert set(map(order_id, book(*orders).expire(head))) >= {order_id(orders[2])}
 
 
-def test_a_head_that_goes_back_brings_nothing_back_and_takes_nothing_out() -> None:
+def test_a_lower_head_changes_nothing() -> None:
     orders = [verified_demand(deadline=20), verified_demand(deadline=21)]
     reorganised = book(*orders)
     assert reorganised.expire(20) == [orders[0]]
@@ -213,7 +213,7 @@ def test_a_head_that_goes_back_brings_nothing_back_and_takes_nothing_out() -> No
     assert reorganised.expire(21) == [orders[1]]
 
 
-def test_one_who_left_before_his_deadline_does_not_expire() -> None:
+def test_an_order_that_left_before_its_deadline_does_not_expire() -> None:
     demand = verified_demand(deadline=5)
     aging = book(demand, verified_demand(deadline=5))
     aging.remove(order_id(demand))
@@ -221,7 +221,7 @@ def test_one_who_left_before_his_deadline_does_not_expire() -> None:
     assert demand not in aging.expire(5)
 
 
-def test_one_who_left_and_came_again_expires_once() -> None:
+def test_an_order_that_left_and_was_added_again_expires_once() -> None:
     demand = verified_demand(deadline=5)
     aging = book(demand)
     aging.remove(order_id(demand))
@@ -232,7 +232,7 @@ def test_one_who_left_and_came_again_expires_once() -> None:
 
 
 @pytest.mark.parametrize("how", ["removed", "matched", "expired"])
-def test_nothing_holds_an_order_that_left(how: str) -> None:
+def test_the_book_holds_no_reference_to_an_order_that_left(how: str) -> None:
     kept = book(verified_demand(cost=1), verified_demand(cost=1))
     gone = verified_demand(deadline=5)
     before = sys.getrefcount(gone)
@@ -250,7 +250,7 @@ def test_nothing_holds_an_order_that_left(how: str) -> None:
     assert sys.getrefcount(gone) == before
 
 
-def test_orders_that_come_and_go_leave_nothing_behind_whatever_their_deadlines() -> None:
+def test_memory_is_bounded_when_orders_come_and_go_with_any_deadlines() -> None:
     pairs = [
         (verified_demand(cost=number, deadline=2**256 - 1 - number), verified_offer(cost=number, deadline=2**255))
         for number in range(500)
@@ -275,7 +275,7 @@ def test_orders_that_come_and_go_leave_nothing_behind_whatever_their_deadlines()
     assert grown < 30 * STALE
 
 
-def test_the_lists_of_what_is_due_are_made_anew_without_losing_any() -> None:
+def test_rebuilding_the_deadline_lists_loses_no_order() -> None:
     stays = [verified_demand(cost=1, deadline=number) for number in range(10, 20)]
     aging = book(*stays, limit=10_000)
     comes_and_goes = verified_demand(cost=2, deadline=15)

@@ -19,7 +19,7 @@ def settled() -> Settled:
     return Settled("0xdef", gas_used=100_000, wei=2 * 10**14, minted=42_000)
 
 
-def test_a_whole_job_is_summed_up() -> None:
+def test_earnings_of_a_whole_job() -> None:
     ledger = EarningsLedger()
     ledger.created(created(), fee=5)
     ledger.finalized(ADDRESS, settled())
@@ -49,7 +49,7 @@ def test_a_reorganisation_takes_off_what_it_reverts() -> None:
     )
 
 
-def test_what_others_did_is_not_taken_off() -> None:
+def test_a_reorganisation_does_not_take_off_what_others_did() -> None:
     ledger = EarningsLedger()
     ledger.liability_reverted(ADDRESS)
     ledger.finalization_reverted(ADDRESS)
@@ -63,7 +63,7 @@ def test_rejections_are_counted_by_reason() -> None:
     assert ledger.earnings().rejected == {"full": 2, "expired": 1}
 
 
-def test_the_account_is_one_line() -> None:
+def test_earnings_as_text_are_one_line() -> None:
     ledger = EarningsLedger()
     ledger.created(created(), fee=2 * 10**9)
     ledger.finalized(ADDRESS, settled())
@@ -74,7 +74,7 @@ def test_the_account_is_one_line() -> None:
     )
 
 
-def test_what_was_entered_only_grows_and_what_was_reverted_is_apart() -> None:
+def test_turnover_only_grows_and_counts_reverted_entries_separately() -> None:
     ledger = EarningsLedger()
     ledger.matched()
     ledger.created(created(), fee=5)
@@ -89,7 +89,7 @@ def test_what_was_entered_only_grows_and_what_was_reverted_is_apart() -> None:
     assert ledger.earnings().created == 1
 
 
-def test_reasons_that_strangers_invent_are_counted_apart_up_to_a_limit() -> None:
+def test_a_limited_number_of_reasons_is_counted_separately() -> None:
     ledger = EarningsLedger()
     ledger.rejected("DeadlineReached")
     for number in range(1000):

@@ -1,4 +1,4 @@
-"""A provider whose node fails, is away, or does not mine; and one without ETH."""
+"""A provider whose node fails, is away, or does not mine; and a provider without ETH."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from mesh.devchain import JsonRpcServer
 from mesh.devchain.development import deploy_market
 from mesh.retry import RetryPolicy
 from schemas import cid_of_bytes, parse_cid
-from tests.mesh.market.floor import QUICK, Floor
-from tests.mesh.market.troubles import events, outages, until_read, works_on
+from tests.mesh.market.local_market import QUICK, LocalMarket
+from tests.mesh.market.observation import events, outages, until_read, works_on
 from tests.support.ports import free_port
 from tests.support.waiting import until
 
@@ -31,19 +31,19 @@ if TYPE_CHECKING:
 
 
 @asynccontextmanager
-async def served(floor: Floor, port: int) -> AsyncIterator[str]:
-    assert not isinstance(floor.node, str)
-    async with JsonRpcServer(floor.node, port=port) as server:
+async def served(local: LocalMarket, port: int) -> AsyncIterator[str]:
+    assert not isinstance(local.node, str)
+    async with JsonRpcServer(local.node, port=port) as server:
         yield server.url
 
 
-class Moody(AsyncBaseProvider):
-    """The floor's node, whose simulations of what holds some bytes fail so many times as `fails` says."""
+class FailingNode(AsyncBaseProvider):
+    """The market's node; its gas estimates of calls that contain `data` fail `times` times, as `fails` says."""
 
-    def __init__(self, floor: Floor, data: bytes, *, times: float = math.inf, fails: str = "silence") -> None:
+    def __init__(self, local: LocalMarket, data: bytes, *, times: float = math.inf, fails: str = "silence") -> None:
         super().__init__()
-        assert not isinstance(floor.node, str)
-        self._node, self._data, self._fails = floor.node, data.hex(), fails
+        assert not isinstance(local.node, str)
+        self._node, self._data, self._fails = local.node, data.hex(), fails
         self.left = times
 
     async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
@@ -56,133 +56,133 @@ class Moody(AsyncBaseProvider):
 
 
 @pytest.mark.parametrize("fails", ["silence", "refusal"])
-async def test_a_node_that_fails_now_and_then_costs_no_order_and_no_result(floor: Floor, fails: str) -> None:
-    node = Moody(floor, b"", times=3, fails=fails)
-    async with floor.provider(endpoint=node) as provider:
-        demand = floor.demand()
-        floor.publish(demand, floor.offer())
-        liability = await floor.liability_of(demand)
+async def test_temporary_failures_of_the_node_lose_no_order_and_no_result(local: LocalMarket, fails: str) -> None:
+    node = FailingNode(local, b"", times=3, fails=fails)
+    async with local.provider(endpoint=node) as provider:
+        demand = local.demand()
+        local.publish(demand, local.offer())
+        liability = await local.liability_of(demand)
         assert node.left == 0
 
         node.left = 3
-        floor.publish(floor.result(liability.address))
+        local.publish(local.result(liability.address))
         await until(lambda: provider.earnings().finalized == 1)
         assert node.left == 0
-    assert floor.rejections == []
+    assert local.rejections == []
 
 
 @pytest.mark.parametrize("fails", ["silence", "refusal"])
-async def test_others_go_first_while_a_transaction_waits_that_the_node_never_takes(floor: Floor, fails: str) -> None:
+async def test_others_go_first_while_a_transaction_waits_that_the_node_refuses(local: LocalMarket, fails: str) -> None:
     objective = cid_of_bytes(fails.encode())
-    node, retry = Moody(floor, parse_cid(objective), fails=fails), RetryPolicy(initial=3600.0, ceiling=3600.0)
-    async with floor.provider(endpoint=node, retry=retry) as provider:
-        guilty, offer = (make(cost=0, objective=objective) for make in (floor.demand, floor.offer))
-        floor.publish(guilty, offer)
-        assert await works_on(floor, provider)
-        assert floor.rejections == []
+    node, retry = FailingNode(local, parse_cid(objective), fails=fails), RetryPolicy(initial=3600.0, ceiling=3600.0)
+    async with local.provider(endpoint=node, retry=retry) as provider:
+        bad, offer = (make(cost=0, objective=objective) for make in (local.demand, local.offer))
+        local.publish(bad, offer)
+        assert await works_on(local, provider)
+        assert local.rejections == []
 
 
 @pytest.mark.parametrize("fails", ["silence", "refusal"])
-async def test_a_transaction_that_the_node_never_takes_is_rejected_after_the_last_attempt(
-    floor: Floor, fails: str
+async def test_a_transaction_that_the_node_refuses_is_rejected_after_the_last_attempt(
+    local: LocalMarket, fails: str
 ) -> None:
     objective = cid_of_bytes(fails.encode())
-    async with floor.provider(endpoint=Moody(floor, parse_cid(objective), fails=fails)):
-        floor.publish(*(make(cost=0, objective=objective) for make in (floor.demand, floor.offer)))
-        await until(lambda: len(floor.rejections) == 2)
-        assert {one.reason for one in floor.rejections} == {
+    async with local.provider(endpoint=FailingNode(local, parse_cid(objective), fails=fails)):
+        local.publish(*(make(cost=0, objective=objective) for make in (local.demand, local.offer)))
+        await until(lambda: len(local.rejections) == 2)
+        assert {one.reason for one in local.rejections} == {
             "NodeUnreachable" if fails == "silence" else "RequestRefused"
         }
 
 
-async def test_a_node_that_is_away_for_a_while_costs_no_order_and_no_result(
-    floor: Floor, caplog: pytest.LogCaptureFixture
+async def test_an_outage_of_the_node_loses_no_order_and_no_result(
+    local: LocalMarket, caplog: pytest.LogCaptureFixture
 ) -> None:
     port = free_port()
-    node = served(floor, port)
-    async with floor.provider(endpoint=await node.__aenter__()) as provider:
-        first, second = floor.demand(cost=0), floor.demand(cost=0)
-        floor.publish(first, floor.offer(cost=0))
-        liability = await floor.liability_of(first)
-        await until_read(floor, provider)
+    node = served(local, port)
+    async with local.provider(endpoint=await node.__aenter__()) as provider:
+        first, second = local.demand(cost=0), local.demand(cost=0)
+        local.publish(first, local.offer(cost=0))
+        liability = await local.liability_of(first)
+        await until_read(local, provider)
 
         await node.__aexit__(None, None, None)
-        floor.publish(second, floor.offer(cost=0), floor.result(liability.address))
+        local.publish(second, local.offer(cost=0), local.result(liability.address))
         await until(lambda: outages(caplog, "transactions") and outages(caplog, "chain"))
 
-        async with served(floor, port):
-            await floor.liability_of(second)
+        async with served(local, port):
+            await local.liability_of(second)
             await until(lambda: provider.earnings().finalized == 1)
-            last = floor.demand(cost=1, deadline=await floor.chain.block_number() + 2)
-            floor.publish(last)
+            last = local.demand(cost=1, deadline=await local.chain.block_number() + 2)
+            local.publish(last)
             await until(lambda: len(provider.book) == 1)
-            await floor.mine(2)
+            await local.mine(2)
             await until(lambda: len(provider.book) == 0)
             assert len(outages(caplog, "chain")) == 1
             assert len(outages(caplog, "transactions")) == 1
-    assert floor.rejections == []
+    assert local.rejections == []
 
 
-async def test_a_provider_without_eth_says_so_and_goes_on_when_it_has_some(
-    floor: Floor, caplog: pytest.LogCaptureFixture
+async def test_a_provider_without_eth_logs_it_and_goes_on_when_it_has_some(
+    local: LocalMarket, caplog: pytest.LogCaptureFixture
 ) -> None:
-    await floor.found_lighthouse(timeout_blocks=1000, rival=5)
-    async with floor.chain_of("rival") as rival:
+    await local.create_lighthouse(timeout_blocks=1000, rival=5)
+    async with local.chain_of("rival") as rival:
         balance, price = await rival.tokens.eth_balance(), await rival.node.gas_price()
-        await rival.tokens.send_eth(floor.address("person"), balance - 100_000 * price)
-        async with floor.provider("rival"):
-            demand = floor.demand()
-            floor.publish(demand, floor.offer())
+        await rival.tokens.send_eth(local.address("person"), balance - 100_000 * price)
+        async with local.provider("rival"):
+            demand = local.demand()
+            local.publish(demand, local.offer())
             await until(lambda: outages(caplog, "transactions") == ["insufficient-funds"])
 
-            await floor.chain.tokens.send_eth(floor.address("rival"), balance - 10**18)
+            await local.chain.tokens.send_eth(local.address("rival"), balance - 10**18)
 
-            await floor.liability_of(demand)
-            assert floor.rejections == []
+            await local.liability_of(demand)
+            assert local.rejections == []
 
 
-async def test_a_transaction_that_is_not_mined_for_long_is_waited_for(
+async def test_a_transaction_that_is_not_mined_in_time_is_sent_again(
     anvil: Anvil, router: EmbeddedRouter, caplog: pytest.LogCaptureFixture
 ) -> None:
     market = await deploy_market(anvil.url, anvil.private_keys)
     hasty = replace(QUICK, receipt_timeout=0.2)
-    floor = Floor(market, router.endpoint, node=anvil.url, keys=anvil.private_keys)
-    async with floor, floor.provider(timing=hasty) as provider:
-        await floor.request("evm_setAutomine", False)
-        demand = floor.demand()
-        floor.publish(demand, floor.offer())
+    local = LocalMarket(market, router.endpoint, node=anvil.url, keys=anvil.private_keys)
+    async with local, local.provider(timing=hasty) as provider:
+        await local.request("evm_setAutomine", False)
+        demand = local.demand()
+        local.publish(demand, local.offer())
         await until(lambda: outages(caplog, "transactions") == ["transaction-timeout"])
 
-        await floor.request("evm_setIntervalMining", 1)
+        await local.request("evm_setIntervalMining", 1)
 
-        await floor.liability_of(demand)
+        await local.liability_of(demand)
         await until(lambda: len(provider.book) == 0)
-        assert floor.rejections == []
+        assert local.rejections == []
 
 
-async def test_gas_that_is_too_dear_is_waited_for_and_said_once(
+async def test_a_transaction_waits_for_cheaper_gas_and_logs_it_once(
     anvil: Anvil, router: EmbeddedRouter, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")
     market = await deploy_market(anvil.url, anvil.private_keys)
-    floor = Floor(market, router.endpoint, node=anvil.url, keys=anvil.private_keys)
-    async with floor, floor.provider() as provider:
-        await base_fee(floor, 900 * GWEI)
-        demand = floor.demand()
-        floor.publish(demand, floor.offer())
+    local = LocalMarket(market, router.endpoint, node=anvil.url, keys=anvil.private_keys)
+    async with local, local.provider() as provider:
+        await base_fee(local, 900 * GWEI)
+        demand = local.demand()
+        local.publish(demand, local.offer())
         await until(lambda: outages(caplog, "transactions"))
         await asyncio.sleep(0.5)  # for some more attempts
         assert outages(caplog, "transactions") == ["fee-too-high"]
 
-        await base_fee(floor, GWEI)
+        await base_fee(local, GWEI)
 
-        await floor.liability_of(demand)
+        await local.liability_of(demand)
         await until(lambda: provider.earnings().created == 1)
         assert len(events(caplog, "transactions-recovered")) == 1
-        assert floor.rejections == []
+        assert local.rejections == []
 
 
-async def base_fee(floor: Floor, wei: int) -> None:
-    """Have a block in which gas costs so much."""
-    await floor.request("anvil_setNextBlockBaseFeePerGas", hex(wei))
-    await floor.request("evm_mine")
+async def base_fee(local: LocalMarket, wei: int) -> None:
+    """Mine a block with this base fee."""
+    await local.request("anvil_setNextBlockBaseFeePerGas", hex(wei))
+    await local.request("evm_mine")

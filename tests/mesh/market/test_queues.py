@@ -1,4 +1,4 @@
-"""Queues by key: their order, removal from anywhere, and nothing left behind."""
+"""Queues by key: order, removal, and memory."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from mesh.market.queues import QueueNode, Queues
 
 
 class Item:
-    """Something that a weak reference can watch."""
+    """An object that can have a weak reference."""
 
 
 def items(queues: Queues[str, int], key: str) -> list[int]:
-    """What stands at `key`, taken out in turn."""
+    """The items at `key`, removed one after the other."""
     taken = []
     while (node := queues.first(key)) is not None:
         queues.remove(key, node)
@@ -35,13 +35,13 @@ def test_a_key_without_a_queue_has_no_first() -> None:
     assert Queues[str, int]().first("a") is None
 
 
-def test_what_came_first_is_first() -> None:
+def test_the_oldest_node_is_first() -> None:
     queues, _ = filled(1, 2, 3)
 
     assert items(queues, "a") == [1, 2, 3]
 
 
-def test_one_can_be_taken_out_of_the_front_the_middle_and_the_end() -> None:
+def test_a_node_can_be_removed_from_front_middle_and_end() -> None:
     for gone in range(5):
         queues, nodes = filled(*range(5))
         queues.remove("a", nodes[gone])
@@ -49,7 +49,7 @@ def test_one_can_be_taken_out_of_the_front_the_middle_and_the_end() -> None:
         assert items(queues, "a") == [number for number in range(5) if number != gone]
 
 
-def test_a_link_that_was_taken_out_may_stand_again_at_the_end() -> None:
+def test_a_removed_node_can_be_appended_again() -> None:
     queues, nodes = filled(1, 2, 3)
     queues.remove("a", nodes[0])
     queues.append("a", nodes[0])
@@ -57,7 +57,7 @@ def test_a_link_that_was_taken_out_may_stand_again_at_the_end() -> None:
     assert items(queues, "a") == [2, 3, 1]
 
 
-def test_keys_have_queues_of_their_own_and_an_empty_one_is_gone() -> None:
+def test_each_key_has_its_own_queue_and_an_empty_queue_is_dropped() -> None:
     queues, (node,) = filled(1)
     other = QueueNode(2)
     queues.append("b", other)
@@ -69,7 +69,7 @@ def test_keys_have_queues_of_their_own_and_an_empty_one_is_gone() -> None:
     assert queues.first("b") is other
 
 
-def test_nothing_holds_what_was_taken_out() -> None:
+def test_the_queues_hold_no_reference_to_a_removed_item() -> None:
     queues: Queues[str, Item] = Queues()
     nodes = [QueueNode(Item()) for _ in range(3)]
     for node in nodes:
@@ -83,7 +83,7 @@ def test_nothing_holds_what_was_taken_out() -> None:
 
 
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 9) | st.none())))
-def test_it_does_what_lists_do(steps: list[tuple[str, int | None]]) -> None:
+def test_the_queues_behave_like_lists(steps: list[tuple[str, int | None]]) -> None:
     queues: Queues[str, int] = Queues()
     expected: dict[str, list[QueueNode[int]]] = {key: [] for key in "abc"}
     for number, (key, position) in enumerate(steps):

@@ -7,7 +7,7 @@ from schemas import Demand, Offer, Result, verify_message
 from tests.support.orders import result, verified_demand, verified_offer
 
 
-def test_messages_are_taken_out_by_kind_and_once() -> None:
+def test_messages_are_popped_by_kind_and_once() -> None:
     demand, offer, ended = verified_demand(), verified_offer(), verify_message(result())
     messages = SettledMessages()
     messages.add("a", demand, None, offer)

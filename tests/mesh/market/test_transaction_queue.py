@@ -13,23 +13,23 @@ from mesh.chain import InsufficientFunds, NodeUnreachable, RequestRefused, Rever
 from mesh.market.earnings import EarningsLedger
 from mesh.market.transaction_queue import TransactionQueue
 from mesh.retry import RetryPolicy
-from tests.mesh.market.floor import QUICK_RETRY
+from tests.mesh.market.local_market import QUICK_RETRY
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from tests.mesh.market.floor import Floor
+    from tests.mesh.market.local_market import LocalMarket
 
 NEVER = RetryPolicy(initial=3600, ceiling=3600)
 
 
 @asynccontextmanager
-async def queue_of(floor: Floor, **options: Any) -> AsyncIterator[TransactionQueue]:
+async def queue_of(local: LocalMarket, **options: Any) -> AsyncIterator[TransactionQueue]:
     """The transactions of the market's provider."""
     parts: dict[str, Any] = {"earnings": EarningsLedger(), "retry": QUICK_RETRY} | options
-    async with floor.chain_of("provider") as chain:
-        yield TransactionQueue(chain, floor.lighthouse, head=lambda: 0, **parts)
+    async with local.chain_of("provider") as chain:
+        yield TransactionQueue(chain, local.lighthouse, head=lambda: 0, **parts)
 
 
 class Transaction:
@@ -46,7 +46,7 @@ class Transaction:
         return self.sent
 
 
-async def test_transactions_are_sent_in_their_order_one_at_a_time(floor: Floor) -> None:
+async def test_transactions_are_sent_in_their_order_one_at_a_time(local: LocalMarket) -> None:
     events: list[str] = []
 
     async def transaction(name: str) -> str:
@@ -55,19 +55,19 @@ async def test_transactions_are_sent_in_their_order_one_at_a_time(floor: Floor) 
         events.append(f"{name} ends")
         return name
 
-    async with queue_of(floor) as queue:
+    async with queue_of(local) as queue:
         assert await asyncio.gather(*(queue.send(partial(transaction, name)) for name in "abc")) == ["a", "b", "c"]
 
     assert events == ["a begins", "a ends", "b begins", "b ends", "c begins", "c ends"]
 
 
-async def test_new_work_waits_while_the_queue_is_full(floor: Floor) -> None:
+async def test_new_work_waits_while_the_queue_is_full(local: LocalMarket) -> None:
     free = asyncio.Event()
 
     async def transaction() -> None:
         await free.wait()
 
-    async with queue_of(floor, limit=2) as queue, asyncio.TaskGroup() as tasks:
+    async with queue_of(local, limit=2) as queue, asyncio.TaskGroup() as tasks:
         for _ in range(2):  # the first is being sent, the second waits
             async with asyncio.timeout(5):
                 await queue.has_room()
@@ -85,11 +85,11 @@ async def test_new_work_waits_while_the_queue_is_full(floor: Floor) -> None:
             await waiting
 
 
-async def test_tasks_created_just_before_count_as_queued(floor: Floor) -> None:
+async def test_tasks_created_just_before_count_as_queued(local: LocalMarket) -> None:
     async def transaction() -> None:
         await asyncio.Event().wait()
 
-    async with queue_of(floor, limit=2) as queue:
+    async with queue_of(local, limit=2) as queue:
         tasks = [asyncio.create_task(queue.send(transaction)) for _ in range(3)]
         waiting = asyncio.create_task(queue.has_room())
         await asyncio.sleep(0.01)
@@ -98,21 +98,21 @@ async def test_tasks_created_just_before_count_as_queued(floor: Floor) -> None:
             task.cancel()
 
 
-async def test_an_unexpected_error_is_raised_and_the_next_transaction_goes_on(floor: Floor) -> None:
-    async with queue_of(floor) as queue:
+async def test_an_unexpected_error_is_raised_and_the_next_transaction_goes_on(local: LocalMarket) -> None:
+    async with queue_of(local) as queue:
         with pytest.raises(ZeroDivisionError):
             await queue.send(Transaction(ZeroDivisionError()))
         assert await queue.send(Transaction()) == 1
 
 
-async def test_transactions_that_wait_when_all_is_cancelled_are_never_sent(floor: Floor) -> None:
+async def test_transactions_that_wait_when_all_is_cancelled_are_never_sent(local: LocalMarket) -> None:
     begun: list[int] = []
 
     async def transaction(number: int) -> None:
         begun.append(number)
         await asyncio.Event().wait()
 
-    async with queue_of(floor) as queue:
+    async with queue_of(local) as queue:
         tasks = [asyncio.create_task(queue.send(partial(transaction, number))) for number in range(3)]
         await until(lambda: begun)
         for task in tasks:
@@ -123,9 +123,9 @@ async def test_transactions_that_wait_when_all_is_cancelled_are_never_sent(floor
 
 
 @pytest.mark.parametrize("reason", ["NotYourTurn", "NotAProvider"])
-async def test_a_failure_that_may_pass_is_tried_again_until_the_last_attempt(floor: Floor, reason: str) -> None:
+async def test_a_failure_that_may_pass_is_tried_again_until_the_last_attempt(local: LocalMarket, reason: str) -> None:
     ledger, transaction = EarningsLedger(), Transaction(*(Reverted(reason, gas_used=1000, wei=7) for _ in range(99)))
-    async with queue_of(floor, earnings=ledger) as queue:
+    async with queue_of(local, earnings=ledger) as queue:
         with pytest.raises(Reverted) as caught:
             await queue.send(transaction)
 
@@ -134,24 +134,24 @@ async def test_a_failure_that_may_pass_is_tried_again_until_the_last_attempt(flo
     assert (ledger.earnings().gas_used, ledger.earnings().spent) == (8000, 56)
 
 
-async def test_what_the_contracts_refuse_is_raised_at_once(floor: Floor) -> None:
+async def test_what_the_contracts_refuse_is_raised_at_once(local: LocalMarket) -> None:
     transaction = Transaction(Reverted("OrderUsed"))
-    async with queue_of(floor) as queue:
+    async with queue_of(local) as queue:
         with pytest.raises(Reverted):
             await queue.send(transaction)
         assert not queue.is_down
     assert transaction.sent == 1
 
 
-async def test_a_transaction_with_too_little_eth_is_tried_again_without_limit(floor: Floor) -> None:
-    short = InsufficientFunds(floor.address("provider"), balance=0, needed=1)
-    async with queue_of(floor) as queue:
+async def test_a_transaction_with_too_little_eth_is_tried_again_without_limit(local: LocalMarket) -> None:
+    short = InsufficientFunds(local.address("provider"), balance=0, needed=1)
+    async with queue_of(local) as queue:
         assert await queue.send(Transaction(*[short] * 10)) == 11
         assert not queue.is_down
 
 
-async def test_others_are_sent_while_a_transaction_waits_for_its_next_attempt(floor: Floor) -> None:
-    async with queue_of(floor, retry=NEVER) as queue:
+async def test_others_are_sent_while_a_transaction_waits_for_its_next_attempt(local: LocalMarket) -> None:
+    async with queue_of(local, retry=NEVER) as queue:
         task = asyncio.create_task(queue.send(Transaction(NodeUnreachable("http://node", "silence"))))
         await until(lambda: queue.is_down)
         assert queue.waiting == 1
@@ -160,8 +160,8 @@ async def test_others_are_sent_while_a_transaction_waits_for_its_next_attempt(fl
         task.cancel()
 
 
-async def test_no_more_than_a_limit_waits_for_the_next_attempt(floor: Floor) -> None:
-    async with queue_of(floor, retry=NEVER, set_aside_limit=1) as queue:
+async def test_no_more_than_a_limit_waits_for_the_next_attempt(local: LocalMarket) -> None:
+    async with queue_of(local, retry=NEVER, set_aside_limit=1) as queue:
         task = asyncio.create_task(queue.send(Transaction(RequestRefused("eth_call", -32005, "too many requests"))))
         await until(lambda: queue.waiting == 1 and queue.is_down)
         with pytest.raises(RequestRefused):

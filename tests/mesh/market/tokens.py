@@ -1,4 +1,4 @@
-"""Tokens that mean harm, as bytecode: whatever is called on them, they do the same."""
+"""Malicious tokens as bytecode: every call has the same effect."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from mesh.chain import Chain
 
 BURNS_ALL_GAS = bytes.fromhex("fe")
-"""INVALID: the call's gas is gone."""
+"""INVALID, which uses up all gas of the call."""
 
 
 def refuses_with(error: str) -> bytes:
@@ -29,7 +29,7 @@ def says(text: bytes) -> bytes:
 
 
 async def deploy_token(chain: Chain, code: bytes) -> str:
-    """Put code on the chain; its address."""
+    """Deploy code, and return its address."""
     # PUSH1 size, DUP1, PUSH1 11, PUSH1 0, CODECOPY, PUSH1 0, RETURN
     creation = bytes((0x60, len(code), 0x80, 0x60, 11, 0x60, 0, 0x39, 0x60, 0, 0xF3)) + code
     assert chain.account is not None

@@ -10,21 +10,21 @@ if TYPE_CHECKING:
     import pytest
 
     from mesh.market.provider import Provider
-    from tests.mesh.market.floor import Floor
+    from tests.mesh.market.local_market import LocalMarket
 
 
-async def works_on(floor: Floor, provider: Provider) -> bool:
+async def works_on(local: LocalMarket, provider: Provider) -> bool:
     """Whether the provider creates the contract of two good orders."""
-    demand = floor.demand()
-    floor.publish(demand, floor.offer())
-    await floor.liability_of(demand)
+    demand = local.demand()
+    local.publish(demand, local.offer())
+    await local.liability_of(demand)
     await until(lambda: provider.earnings().created > 0)
     return True
 
 
-async def until_read(floor: Floor, provider: Provider) -> None:
+async def until_read(local: LocalMarket, provider: Provider) -> None:
     """Wait until the provider has read the chain up to its latest block."""
-    head = await floor.chain.block_number()
+    head = await local.chain.block_number()
     await until(lambda: provider.settlement.head >= head)
 
 

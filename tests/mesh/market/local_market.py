@@ -1,4 +1,4 @@
-"""Where a test's traders and providers meet: a router, a founded market, and people with accounts on its chain."""
+"""A market for one test: a router, a lighthouse, and accounts of traders and providers."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ STAKE = XRT
 _names = count(1)
 
 
-class Floor:
-    """`async with Floor(market, endpoint, node=…, keys=…) as floor`: where the chain's node and the router are.
+class LocalMarket:
+    """`async with LocalMarket(market, endpoint, node=…, keys=…) as local`, at a router and a chain node.
 
     The person and the robot of the market trade; `rival` and `poor` are further accounts, which have ETH and no XRT.
     """
@@ -65,19 +65,19 @@ class Floor:
         await self._stack.aclose()
 
     async def new_session(self) -> zenoh.Session:
-        """A session of its own on the floor's router."""
+        """A new session with the router."""
         network = await self._stack.enter_async_context(Network(Endpoints(connect=(self.endpoint,))))
         return network.session
 
     async def trade_at(self, lighthouse: str, market: str) -> None:
-        """Post messages, and hear rejections, at this lighthouse (address and name) from now on."""
+        """Publish messages and receive rejections at this lighthouse (address and name) from now on."""
         self.lighthouse, self.market = lighthouse, market
         self.channel = await self._stack.enter_async_context(Channel(self.session, market))
         selector = market_selector(market, "reject")
         self._stack.enter_context(self.session.declare_subscriber(selector, self._rejected))
 
-    async def found_lighthouse(self, *, timeout_blocks: int, **stakes: int) -> None:
-        """Make a lighthouse where the named accounts stake so many transactions a turn, and trade there."""
+    async def create_lighthouse(self, *, timeout_blocks: int, **stakes: int) -> None:
+        """Create a lighthouse where the named accounts have these quotas, and trade there."""
         async with self.chain_of("provider") as chain:
             made = await chain.lighthouses.create(
                 minimal_stake=STAKE,
@@ -91,7 +91,7 @@ class Floor:
         await self.trade_at(made.lighthouse, f"{made.name}.lighthouse.3.robonomics.eth")
 
     async def stake(self, role: str, lighthouse: str, turns: int) -> None:
-        """Stake so many transactions a turn, which the account must have."""
+        """Stake for a quota of `turns` transactions; the account must have the XRT."""
         async with self.chain_of(role) as chain:
             await chain.tokens.approve(lighthouse, turns * STAKE)
             await chain.lighthouses.refill(lighthouse, turns * STAKE)
@@ -126,7 +126,7 @@ class Floor:
         timing: Timing = QUICK,
         **options: Any,
     ) -> AsyncIterator[Provider]:
-        """A provider at work, whom the traders reach."""
+        """A running provider that the traders can reach."""
         session = await self.new_session()
         async with (
             self.chain_of(role, endpoint, timing=timing) as chain,
@@ -139,11 +139,11 @@ class Floor:
             yield provider
 
     def demand(self, role: str = "person", **changes: Any) -> Demand:
-        """A signed demand for XRT at this lighthouse, which costs nothing unless told otherwise."""
+        """A signed demand at this lighthouse, with the cost 0 by default."""
         return self.accounts[role].signer.sign(Demand(**({"validator_fee": 0} | self._terms(changes))))
 
     def offer(self, role: str = "robot", **changes: Any) -> Offer:
-        """A signed offer that agrees to a demand with the same changes."""
+        """A signed offer that matches a demand with the same changes."""
         return self.accounts[role].signer.sign(Offer(**({"lighthouse_fee": 0} | self._terms(changes))))
 
     def result(self, liability: str, role: str = "robot", **changes: Any) -> Result:
@@ -152,12 +152,12 @@ class Floor:
         return self.accounts[role].signer.sign(Result(**(fields | changes)))
 
     def publish(self, *messages: SignedMessage) -> None:
-        """Post messages, as their signers would."""
+        """Publish messages."""
         for message in messages:
             self.channel.publish(message)
 
     async def liability_of(self, order: Demand | Offer) -> Liability:
-        """The liability that an order becomes."""
+        """Wait for the liability that is created from an order."""
         found: list[Liability] = []
 
         async def search() -> bool:
@@ -168,7 +168,7 @@ class Floor:
         return found[0]
 
     async def liabilities_of(self, order: Demand | Offer) -> list[Liability]:
-        """The liabilities that an order has become on this floor: at most one, if all is well."""
+        """The liabilities that were created from an order: at most one, unless something is wrong."""
         digest = message_hash(order)
         made = []
         async for block in self.chain.follow(self.started):
@@ -182,7 +182,7 @@ class Floor:
         raise AssertionError
 
     async def rejection_of(self, message: SignedMessage) -> Rejection:
-        """Why a message was rejected, once it is."""
+        """Wait for the rejection of a message."""
         await until(lambda: self._rejections_of(message), what=f"a rejection of the {type(message).__name__}")
         return self._rejections_of(message)[0]
 

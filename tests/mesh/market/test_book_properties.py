@@ -1,4 +1,4 @@
-"""The order book against one that is as simple as can be, by chance."""
+"""Random operations on the order book, compared with a naive book."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class NaiveBook:
-    """The rules, in lists that are searched from end to end."""
+    """The same rules, with lists that are searched from end to end."""
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
@@ -60,7 +60,7 @@ def agree(one: Order, other: Order) -> bool:
 
 
 def pool() -> list[Verified[Any]]:
-    """Orders that often agree, expire together, are signed by two people, or belong elsewhere."""
+    """Orders that often match, expire together, have two signers, or name another lighthouse."""
     orders: list[Verified[Any]] = []
     for cost in (1, 2):
         for deadline in (3, 4, 8, 9):
@@ -79,7 +79,7 @@ POOL = pool()
 
 
 class BookAgainstNaiveBook(RuleBasedStateMachine):
-    """Whatever is done to a book, it says and holds what the naive one does."""
+    """After any operations the book returns and holds the same as the naive one."""
 
     @initialize(limit=st.sampled_from([1, 3, 8, 100]))
     def begin(self, limit: int) -> None:
@@ -113,7 +113,7 @@ class BookAgainstNaiveBook(RuleBasedStateMachine):
 
 
 def by_deadline(orders: list[Verified[Any]]) -> list[tuple[int, set[bytes]]]:
-    """Deadlines in the order in which they came, with what expired at each."""
+    """The deadlines in their order, with the orders that expired at each."""
     deadlines = [order.message.deadline for order in orders]
     assert deadlines == sorted(deadlines)
     return [
