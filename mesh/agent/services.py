@@ -66,7 +66,8 @@ def offer_services(parts: AgentComponents, executor: Executor, *, has_handlers: 
     """Offer all services of an agent; `has_handlers` if its own code does the jobs."""
     services = {
         **job_services(executor),
-        **reading_services(parts),
+        **balance_services(parts),
+        **allowance_services(parts),
         **spending_services(parts),
         **MessageServices(parts).services(),
     }
@@ -122,11 +123,11 @@ async def _done(work: Awaitable[object]) -> Done:
     return Done(True)
 
 
-def reading_services(parts: AgentComponents) -> dict[str, Service]:
-    """`eth/…`: what accounts have and allow. Accounts are addresses or ENS names; errors of the chain go to the caller.
+def balance_services(parts: AgentComponents) -> dict[str, Service]:
+    """`eth/…`: the account, the head, and what accounts have. Errors of the chain go to the caller.
 
-    Ether is in wei. Tokens are those of the setting `erc20_token`, also for services with `xrt` in their names, as in
-    the legacy stack.
+    Accounts are addresses or ENS names. Ether is in wei. Tokens are those of the setting `erc20_token`, also for
+    services with `xrt` in their names, as in the legacy stack.
     """
     chain, tokens = parts.chain, parts.chain.tokens
     account, token = parts.signer.address, parts.settings.erc20_token
@@ -149,12 +150,6 @@ def reading_services(parts: AgentComponents) -> dict[str, Service]:
     async def xrt_balance(_request: Nothing) -> Balance:
         return Balance(await tokens.balance(account, token=token))
 
-    async def account_xrt_allowance(request: AccountToAddressAllowance) -> Allowance:
-        return Allowance(await tokens.allowance(request.account, request.to, token=token))
-
-    async def xrt_allowance(_request: Nothing) -> Allowance:
-        return Allowance(await tokens.allowance(account, chain.factory, token=token))
-
     return {
         "eth/accounts": accounts,
         "eth/current_block": current_block,
@@ -162,9 +157,20 @@ def reading_services(parts: AgentComponents) -> dict[str, Service]:
         "eth/eth_balance": eth_balance,
         "eth/account_xrt_balance": account_xrt_balance,
         "eth/xrt_balance": xrt_balance,
-        "eth/account_xrt_allowance": account_xrt_allowance,
-        "eth/xrt_allowance": xrt_allowance,
     }
+
+
+def allowance_services(parts: AgentComponents) -> dict[str, Service]:
+    """`eth/…`: what one account may take of another's tokens, and the factory of the agent's."""
+    chain, account, token = parts.chain, parts.signer.address, parts.settings.erc20_token
+
+    async def account_xrt_allowance(request: AccountToAddressAllowance) -> Allowance:
+        return Allowance(await chain.tokens.allowance(request.account, request.to, token=token))
+
+    async def xrt_allowance(_request: Nothing) -> Allowance:
+        return Allowance(await chain.tokens.allowance(account, chain.factory, token=token))
+
+    return {"eth/account_xrt_allowance": account_xrt_allowance, "eth/xrt_allowance": xrt_allowance}
 
 
 def spending_services(parts: AgentComponents) -> dict[str, Service]:
