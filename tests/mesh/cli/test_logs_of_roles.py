@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 EXAMPLES = Path(__file__).parents[3] / "examples" / "hello_mesh"
 
+PHASE_EVENTS = ("job-accepted", "job-ready", "job-started", "job-finished", "job-finalized")
+
 ROBOT_CODE = """
 import logging, sys
 from mesh import Agent
@@ -115,19 +117,19 @@ def test_the_events_of_a_job_are_found_by_its_contract_with_agent_and_provider(m
         return market.logs(role, "--liability", liability.lower())
 
     wait_until(
-        lambda: "finalized, paid" in {event["message"] for event in of("robot")}, what="the end", seconds=SECONDS
+        lambda: "job-finalized" in {event.get("event") for event in of("robot")}, what="the end", seconds=SECONDS
     )
     worked, provided = of("robot"), of("provider")
     for events in (worked, provided):
         assert {event["liability"] for event in events} == {liability} != {other}
-    words = [event["message"].split(",")[0] for event in worked]
-    for word in ("incoming", "ready", "running", "complete", "finalized"):
-        assert words.count(word) == 1, words
-    assert words.count("the lamp\nis on \x1b[2J") == 3
+    names = [event.get("event") for event in worked]
+    for name in PHASE_EVENTS:
+        assert names.count(name) == 1, names
+    assert [event["message"] for event in worked].count("the lamp\nis on \x1b[2J") == 3
     failures = [event for event in worked if event["level"] == "error"]
     assert {event["error"] for event in failures} == {"ZeroDivisionError: division by zero"}
     assert all("in phase\n" in event["trace"] for event in failures)
-    assert [event["message"].split(",")[0] for event in provided] == ["created", "finalized"]
+    assert [event["event"] for event in provided] == ["contract-created", "contract-finalized"]
     assert len(provided[0]["demand"]) == len(provided[0]["offer"]) == 64
     assert {(event["role"], event["address"]) for event in provided} == {("provider", market.addresses["provider"])}
 
@@ -165,7 +167,7 @@ def test_following_goes_on_over_restarts_of_the_agent(market: JsonMarket) -> Non
     with Follower(robot, "--lines", "1", "--json", endpoint=market.endpoint) as follower:
         follower.until("{")
         liability = market.do_a_job()
-        follower.until(f"finalized, paid|{liability}")
+        follower.until(f"job-finalized|{liability}")
         market.robot.kill()
         follower.until("aira: nobody answers now; waiting")
         market.robot.start()
@@ -173,13 +175,13 @@ def test_following_goes_on_over_restarts_of_the_agent(market: JsonMarket) -> Non
         follower.until("aira: it has begun anew at ")
         follower.until('"sequence": 1, |account 0x')
         again = market.do_a_job()
-        said = follower.until(f"finalized, paid|{again}")
+        said = follower.until(f"job-finalized|{again}")
         assert follower.interrupt() == 130
     events = [json.loads(line) for line in said.splitlines() if line.startswith("{")]
     for address in (liability, again):
-        words = [event["message"].split(",")[0] for event in events if event.get("liability") == address]
-        for word in ("incoming", "ready", "running", "complete", "finalized"):
-            assert words.count(word) == 1, words
+        names = [event.get("event") for event in events if event.get("liability") == address]
+        for name in PHASE_EVENTS:
+            assert names.count(name) == 1, names
 
 
 def test_the_service_can_be_called_as_any_other(market: JsonMarket) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from typing import TYPE_CHECKING
 
 import pytest
@@ -19,7 +20,7 @@ from mesh.recording import Recorder, RecordingAbout
 from mesh.recording.errors import NotARecording
 from schemas import String, cid_of_bytes
 from schemas.payloads import STRING
-from tests.support.commands import Interrupted, refused
+from tests.support.commands import AIRA, Serving, refused
 from tests.support.listening import Listener
 from tests.support.objectives import objective, timed
 from tests.support.ports import free_endpoint
@@ -134,9 +135,9 @@ def test_ten_minutes_in_a_moment(stage: Stage, listener: Listener, options: list
 
 def test_ctrl_c_ends_it(stage: Stage, listener: Listener) -> None:
     stage.path.write_bytes(timed([("/go", "one", 0), ("/go", "two", 3600 * SECOND)]))
-    done = Interrupted(*stage.words(stage.path, "--to", "lab/stage"), after=4.0)
-    assert (done.code, done.errors) == (130, "")
-    assert listener.keys(1) == ["lab/stage/go"]
+    with Serving(*AIRA, *stage.words(stage.path, "--to", "lab/stage"), says="") as playing:
+        assert listener.keys(1) == ["lab/stage/go"]
+        assert (playing.end(signal.SIGINT)[0], playing.log()) == (130, "")
 
 
 @pytest.mark.parametrize(
