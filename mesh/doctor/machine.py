@@ -89,8 +89,11 @@ def _apart(ahead: float) -> str:
     return f"{duration(abs(ahead))} {'ahead of' if ahead > 0 else 'behind'}"
 
 
-def check_data_folder(folder: Path) -> CheckResult:
-    """Whether a file can be written and synced in the state's folder, or where that will be created."""
+def check_data_folder(folder: Path, *, slow: float = SLOW) -> CheckResult:
+    """Whether a file can be written and synced in the state's folder, or where that will be created.
+
+    Taking more than `slow` seconds is a warning.
+    """
     there = _nearest(folder)
     began = time.monotonic()
     try:
@@ -101,7 +104,7 @@ def check_data_folder(folder: Path) -> CheckResult:
     except OSError as error:
         return _refused(folder, there, error)
     took = time.monotonic() - began
-    if took > SLOW:
+    if took > slow:
         return warning(
             f"{there} takes {took:.1f} s to write and sync a small file",
             hint="use a local disk for --data-dir; each step of a job waits for it",

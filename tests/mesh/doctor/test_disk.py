@@ -29,7 +29,7 @@ print(*{look}, sep="\\n")
 
 
 def test_a_writable_folder_passes_and_is_left_empty(tmp_path: Path) -> None:
-    result = check_data_folder(tmp_path)
+    result = check_data_folder(tmp_path, slow=60)
 
     assert result.status is CheckStatus.OK
     assert result.message.startswith(f"{tmp_path} is written and synced in ")
@@ -37,7 +37,7 @@ def test_a_writable_folder_passes_and_is_left_empty(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_is_yet_to_be_made_is_looked_at_where_it_will_be(tmp_path: Path) -> None:
-    result = check_data_folder(tmp_path / "a" / "b")
+    result = check_data_folder(tmp_path / "a" / "b", slow=60)
 
     assert result.message == f"{tmp_path / 'a' / 'b'} will be created at the start; {tmp_path} is writable"
     assert not (tmp_path / "a").exists()
@@ -99,7 +99,7 @@ async def test_a_data_dir_that_is_a_file_is_named(tmp_path: Path) -> None:
 
 def test_a_full_disk_is_reported_as_full(tmp_path: Path) -> None:
     with file_size_limit(1024):
-        result = check_data_folder(tmp_path)
+        result = check_data_folder(tmp_path, slow=60)
 
     assert not result.ok
     assert result.message.startswith(f"the disk of {tmp_path} is full")
@@ -127,3 +127,10 @@ def test_a_content_limit_beyond_the_disk_is_a_warning(tmp_path: Path) -> None:
 def test_a_disk_without_room_for_a_ledger_fails(tmp_path: Path) -> None:
     assert not check_disk_space(tmp_path, content_limit=1024, least=1024**6).ok
     assert check_disk_space(tmp_path, content_limit=1024, least=LEAST).ok
+
+
+def test_a_slow_disk_is_a_warning(tmp_path: Path) -> None:
+    result = check_data_folder(tmp_path, slow=0)
+
+    assert result.status is CheckStatus.WARN
+    assert "--data-dir" in result.hint
