@@ -64,7 +64,7 @@ def may_pass(error: NodeUnreachable | RequestRefused | Reverted) -> bool:
 
 
 @dataclass(slots=True)
-class _Attempts:
+class _SendAttempts:
     """The attempts at one transaction."""
 
     since: int
@@ -132,7 +132,7 @@ class TransactionQueue:
         Raises what `transaction` raises: `Reverted` when the contracts refuse it; after the last attempt also
         `NodeUnreachable`, `RequestRefused`, and `Reverted` with an error of `OUT_OF_TURN`.
         """
-        attempts = _Attempts(self._head(), Backoff(self._retry))
+        attempts = _SendAttempts(self._head(), Backoff(self._retry))
         funds = Backoff(self._chain.node.timing.outage_retry)
         while True:
             try:
@@ -162,7 +162,7 @@ class TransactionQueue:
         finally:
             self._sending.release()
 
-    async def _wait_aside(self, attempts: _Attempts, error: NodeUnreachable | RequestRefused | Reverted) -> None:
+    async def _wait_aside(self, attempts: _SendAttempts, error: NodeUnreachable | RequestRefused | Reverted) -> None:
         """Wait for the next attempt at a transaction while others are sent; raise `error` where there is none."""
         delay = attempts.backoff.next_delay() if may_pass(error) else None
         if delay is None or attempts.busy >= BUSY_SECONDS or self._set_aside >= self._set_aside_limit:
@@ -174,7 +174,7 @@ class TransactionQueue:
         finally:
             self._set_aside -= 1
 
-    async def _send_in_turn(self, transaction: Callable[[], Awaitable[T]], attempts: _Attempts) -> T:
+    async def _send_in_turn(self, transaction: Callable[[], Awaitable[T]], attempts: _SendAttempts) -> T:
         """Send a transaction now. Raises also failures that may pass, where the node works and it is our turn."""
         loop, backoff = asyncio.get_running_loop(), Backoff(self._chain.node.timing.outage_retry)
         while True:
