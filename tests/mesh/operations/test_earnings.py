@@ -75,7 +75,7 @@ def logged(caplog: pytest.LogCaptureFixture) -> list[str]:
 async def test_changed_earnings_are_logged_regularly(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(command, "REPORT", 0.01)
+    monkeypatch.setattr(command, "REPORT_INTERVAL", 0.01)
     caplog.set_level(logging.INFO, command.__name__)
     ledger = EarningsLedger()
     reporting = asyncio.create_task(command._report(ledger.earnings))
