@@ -113,6 +113,6 @@ def test_the_argument_chooses_the_lamp(protocol: str, market: dict[str, str], tm
         green = demand("blink_arguments", "green.mcap", out, market)
         assert "refunded" in green.stdout, green.stdout + green.stderr
         assert green.returncode == 1
-        assert "the job was not done, and its cost came back" in green.stderr
+        assert "[job-not-done]" in green.stderr
         assert uno.pins == []
     assert [text for text, _ in said_on(out, "/aira/note")] == ["there is no green lamp"]
