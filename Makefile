@@ -53,7 +53,7 @@ lint: $(INSTALLED) ## style, types, the import rule, and the built contracts whe
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy $(wildcard $(TYPED))
-	@$(BIN)/lint-imports
+	@$(BIN)/lint-imports --no-cache
 	@if command -v npm > /dev/null; then $(MAKE) --no-print-directory contracts-check; \
 		else echo "contracts not checked: npm is not installed"; fi
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mesh.telemetry.context import log_event
+from mesh.log_context import log_event
 
 if TYPE_CHECKING:
     import logging

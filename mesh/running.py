@@ -57,7 +57,7 @@ def report(error: AiraError) -> None:
 
     A server that logs in JSON logs an event instead.
     """
-    from mesh.telemetry.context import log_event  # here, as most commands never need it
+    from mesh.log_context import log_event  # here, as most commands never need it
     from mesh.telemetry.events import without_secrets
     from mesh.telemetry.logs import logs_json
 

@@ -18,9 +18,9 @@ from bridges.ipfs.publishers import BRIDGE_MARK, PUBLISH_RETRY, IpfsPublisher, M
 from bridges.ipfs.relay import QUEUE_LIMIT, MessageRelay, RelayOutcome
 from bridges.ipfs.status import BridgeHealth, changes_between, counters_of
 from mesh.errors import InvalidMessage
+from mesh.log_context import log_event
 from mesh.network import Pump, call_in_loop
 from mesh.role import Role
-from mesh.telemetry.context import log_event
 from schemas import lighthouse_selector
 from schemas.status import BridgeStatus, bridge_status_key
 

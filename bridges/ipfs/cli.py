@@ -13,11 +13,11 @@ import click
 from mesh.cli.options import with_settings
 from mesh.cli.output import announce
 from mesh.errors import ConfigurationError, NetworkUnavailable
+from mesh.log_context import LogSource
 from mesh.outage_log import OutageLog
 from mesh.retry import Backoff
 from mesh.running import run_until_stopped
 from mesh.settings import ChainSettings, IpfsSettings, NetworkSettings, TelemetrySettings, options_of
-from mesh.telemetry.context import LogSource
 from mesh.telemetry.logs import LogService, set_process_source
 from schemas import parse_address
 

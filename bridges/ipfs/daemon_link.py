@@ -7,9 +7,9 @@ import logging
 from typing import TYPE_CHECKING, Final
 
 from bridges.ipfs.errors import IpfsError
+from mesh.log_context import log_event
 from mesh.outage_log import OutageLog
 from mesh.retry import Backoff, RetryPolicy
-from mesh.telemetry.context import log_event
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable

@@ -13,9 +13,9 @@ import zenoh
 from bridges.ipfs.errors import DaemonRefused, DaemonUnreachable, NoPeers, PublishedOutOfOrder
 from bridges.ipfs.journal import Side
 from bridges.ipfs.status import RateMeter
+from mesh.log_context import log_event
 from mesh.network import NetworkChange
 from mesh.retry import Backoff, RetryPolicy
-from mesh.telemetry.context import log_event
 
 if TYPE_CHECKING:
     from collections.abc import Callable

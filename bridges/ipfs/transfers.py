@@ -16,7 +16,7 @@ from bridges.ipfs.addresses import base_url, without_credentials
 from bridges.ipfs.errors import DaemonRefused, DaemonUnreachable, IpfsError
 from mesh.content import ContentUnavailable, is_block
 from mesh.errors import ClosedError
-from mesh.telemetry.context import log_event
+from mesh.log_context import log_event
 from schemas import InputError, parse_block
 from schemas.unixfs import MAX_BLOCK_SIZE
 

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import msgspec
 
 from mesh.errors import AiraError, ChainError, InvalidMessage
+from mesh.log_context import log_event
 from mesh.network.validation import key_of
 from mesh.outage_log import OutageLog
 from mesh.retry import REMOTE, Backoff, RetryPolicy
-from mesh.telemetry.context import log_event
 from schemas import (
     Demand,
     FeedbackKey,

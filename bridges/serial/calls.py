@@ -10,7 +10,7 @@ import msgspec
 from bridges.serial.dialect import CallStatus
 from bridges.serial.errors import CALL_ERRORS
 from mesh.errors import InvalidKey
-from mesh.telemetry.context import log_event
+from mesh.log_context import log_event
 from schemas.errors import InvalidPayload
 from schemas.keys import EventKey, parse_key
 from schemas.payloads import EMPTY, JSON, STRING, PayloadType, String

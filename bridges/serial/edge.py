@@ -27,7 +27,7 @@ from bridges.serial.line import SerialLine
 from bridges.serial.metrics import EdgeCounters
 from bridges.serial.naming import ABOUT, PRESENT, DeviceId, TopicNames
 from mesh.errors import InvalidKey
-from mesh.telemetry.context import liability_context, log_event
+from mesh.log_context import liability_context, log_event
 from schemas.key_chunks import topic_chunks
 from schemas.keys import DeviceTopicKey, LiabilityTopicKey, event_selector, parse_key
 from schemas.payloads import STRING, String, payload_type

@@ -28,7 +28,7 @@ from bridges.serial.dialect import (
 )
 from bridges.serial.errors import InvalidBoardMessage
 from bridges.serial.frames import BOARD_ID, SEQUENCES, BoardDescription, Frame, FrameDecoder, FrameKind, encode_frame
-from mesh.telemetry.context import log_event
+from mesh.log_context import log_event
 from schemas.errors import InvalidPayload
 from schemas.payloads import JSON, RAW
 

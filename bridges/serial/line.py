@@ -19,7 +19,7 @@ import serial
 
 from bridges.serial.errors import InvalidPort, LineError, PortBusy, PortForbidden, PortMissing
 from mesh.errors import InputError
-from mesh.telemetry.context import log_event
+from mesh.log_context import log_event
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

@@ -18,10 +18,10 @@ from bridges.serial.line import PortName
 from bridges.serial.naming import LOG, PRESENT
 from mesh.cli.output import announce
 from mesh.errors import AiraError
+from mesh.log_context import LogSource
 from mesh.network.connecting import SessionOpening
 from mesh.running import INTERRUPTED
 from mesh.starting import file_delays
-from mesh.telemetry.context import LogSource
 from mesh.telemetry.logs import LogService, set_process_source
 from schemas.address import parse_address
 from schemas.logs import ReadLogs

@@ -26,7 +26,7 @@ from bridges.serial.dialect import (
 from bridges.serial.errors import InvalidBoardMessage
 from bridges.serial.rosserial import ASK_TOPICS, RosserialDecoder, RosserialMessage
 from bridges.serial.rosserial_topics import TopicTable, known_type
-from mesh.telemetry.context import log_event
+from mesh.log_context import log_event
 from schemas.errors import InvalidPayload
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 from bridges.serial import rosserial
 from bridges.serial.dialect import BoardTopic, DeviceInfo, Flow
 from bridges.serial.errors import InvalidBoardMessage
-from mesh.telemetry.context import log_event
+from mesh.log_context import log_event
 from schemas.errors import InvalidKey, InvalidPayload
 from schemas.key_chunks import topic_chunks
 from schemas.payloads import EMPTY, STRING, Empty, PayloadType, String

@@ -13,10 +13,10 @@ from mesh.agent.status import WatcherStatus
 from mesh.background import Background
 from mesh.composition import load_account
 from mesh.errors import ClosedError, ConfigurationError
+from mesh.log_context import LogSource, log_event, source_context
 from mesh.role import Lifecycle
 from mesh.settings import load
 from mesh.starting import open_when_ready, wait_for_files
-from mesh.telemetry.context import LogSource, log_event, source_context
 from mesh.telemetry.logs import set_process_source
 from mesh.telemetry.serving import Telemetry
 from mesh.work.outbox import RESEND

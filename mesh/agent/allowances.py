@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from mesh.agent.errors import FundsShort
 from mesh.chain import Reverted
-from mesh.telemetry.context import log_event
+from mesh.log_context import log_event
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

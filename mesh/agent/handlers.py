@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 from mesh.errors import AiraError
-from mesh.telemetry.context import log_event
+from mesh.log_context import log_event
 from mesh.work.job import TopicHandlers
 from schemas import Demand, Liability, Offer, Result, Verified
 

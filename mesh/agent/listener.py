@@ -28,7 +28,7 @@ from mesh.chain import (
     RequestRefused,
     Transfer,
 )
-from mesh.telemetry.context import liability_context, log_event, with_liability_context
+from mesh.log_context import liability_context, log_event, with_liability_context
 from mesh.work.lifecycle import TO_BE_DONE, Phase, advance
 from mesh.work.outbox import result_identity
 from schemas.keys import EthEventKey

@@ -9,8 +9,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.background import Background
+from mesh.log_context import log_event
 from mesh.network import call_in_loop
-from mesh.telemetry.context import log_event
 from schemas import InvalidRecord, market_selector
 from schemas.signing import Rejection
 

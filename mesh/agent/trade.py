@@ -15,9 +15,9 @@ from mesh.agent.contract import Contract, Outcome
 from mesh.agent.errors import LiabilityReverted, OrderExpired, OrderRejected
 from mesh.agent.rejections import Rejections
 from mesh.errors import AiraError, ClosedError
+from mesh.log_context import log_event
 from mesh.market.book import Refusal
 from mesh.role import Lifecycle
-from mesh.telemetry.context import log_event
 from schemas import ZERO_ADDRESS, Demand, Offer, message_hash
 
 if TYPE_CHECKING:

@@ -25,8 +25,8 @@ from mesh.chain.confirmation import (
 from mesh.chain.errors import FeeTooHigh, InsufficientFunds, NodeUnreachable, RequestRefused, Reverted
 from mesh.chain.node_metrics import TransactionOutcome
 from mesh.chain.transaction_store import PendingTransaction, effect_of
+from mesh.log_context import log_event
 from mesh.retry import Backoff, RetryPolicy
-from mesh.telemetry.context import log_event
 from schemas.address import parse_address
 
 if TYPE_CHECKING:

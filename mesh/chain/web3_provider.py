@@ -18,8 +18,8 @@ from mesh.chain.node_metrics import NodeMetrics
 from mesh.chain.reverts import decode_revert
 from mesh.chain.transports import HttpTransport, WebSocketTransport
 from mesh.errors import AiraError, ClosedError, ConfigurationError
+from mesh.log_context import log_event
 from mesh.retry import Backoff
-from mesh.telemetry.context import log_event
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -99,7 +99,7 @@ class LiabilityEvent:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LiabilityReverted:
+class EventReverted:
     """A reorganisation reverted the creation or the end of a liability."""
 
     what: str
@@ -133,7 +133,7 @@ class _PrintedOutages(OutageLog):
         self._has_failed = False
 
 
-async def _follow(chain: Chain, cursor: int) -> AsyncIterator[LiabilityEvent | LiabilityReverted]:
+async def _follow(chain: Chain, cursor: int) -> AsyncIterator[LiabilityEvent | EventReverted]:
     """What happens to liabilities from a block on. Waits while the node is lost, and prints that once."""
     outages = _PrintedOutages()
     async with aclosing(chain.follow(cursor, outages=outages)) as blocks:
@@ -142,15 +142,15 @@ async def _follow(chain: Chain, cursor: int) -> AsyncIterator[LiabilityEvent | L
                 yield event
 
 
-async def _liability_events(chain: Chain, block: BlockEvents) -> list[LiabilityEvent | LiabilityReverted]:
+async def _liability_events(chain: Chain, block: BlockEvents) -> list[LiabilityEvent | EventReverted]:
     """The events of liabilities in a block or a reorganisation, in order."""
     from mesh.chain import Finalized, NewLiability, NoContracts, Reorganisation
 
     words = {NewLiability: "made", Finalized: "ended"}
-    found: list[LiabilityEvent | LiabilityReverted] = []
+    found: list[LiabilityEvent | EventReverted] = []
     for event in block.reverted_events if isinstance(block, Reorganisation) else ():
         if isinstance(event, NewLiability | Finalized):
-            found.append(LiabilityReverted(what=words[type(event)], liability=event.liability, tx=event.tx))
+            found.append(EventReverted(what=words[type(event)], liability=event.liability, tx=event.tx))
     for event in block.events:
         if not isinstance(event, NewLiability | Finalized):
             continue

@@ -18,10 +18,10 @@ from mesh.cli.files import require_new_file, require_readable, write_error
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import format_duration, format_size, plural, print_json, progress, run_sync
 from mesh.errors import InvalidKey
+from mesh.log_context import log_event
 from mesh.recording import GENEROUS, Recorder, RecordingAbout, bag_to_mcap, messages_in, open_objective, pack
 from mesh.running import run_until_stopped
 from mesh.settings import NetworkSettings, options_of
-from mesh.telemetry.context import log_event
 from schemas import cid_of_file
 from schemas.keys import DeviceTopicKey, LiabilityTopicKey, ObjectiveTopicKey, parse_key
 from schemas.payloads import payload_type

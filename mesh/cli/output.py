@@ -115,7 +115,7 @@ def announce(log: Logger, event: str, text: str, **fields: object) -> None:
     """
     import logging
 
-    from mesh.telemetry.context import log_event
+    from mesh.log_context import log_event
     from mesh.telemetry.logs import process_log
 
     own = process_log()

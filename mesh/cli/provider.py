@@ -14,9 +14,9 @@ from msgspec.structs import asdict
 from mesh.background import Background
 from mesh.cli.options import with_settings
 from mesh.cli.output import announce
+from mesh.log_context import LogSource, log_event
 from mesh.running import run_until_stopped
 from mesh.settings import ChainSettings, NetworkSettings, TelemetrySettings, options_of
-from mesh.telemetry.context import LogSource, log_event
 from mesh.telemetry.logs import set_process_source
 from mesh.telemetry.serving import Telemetry
 

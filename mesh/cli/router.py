@@ -13,10 +13,10 @@ from mesh.cli.errors import FileUnwritable, RosterMissing
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import announce, print_json, print_table, printable
 from mesh.errors import AiraError
+from mesh.log_context import log_event
 from mesh.outage_log import OutageLog
 from mesh.running import fail, run_until_stopped
 from mesh.settings import TelemetrySettings, options_of
-from mesh.telemetry.context import log_event
 from mesh.telemetry.serving import Telemetry
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ import zenoh
 from mesh.content.dag import is_block
 from mesh.content.errors import ContentCorrupt, ContentUnavailable
 from mesh.errors import ClosedError, ContentError
+from mesh.log_context import log_event
 from mesh.retry import Backoff, RetryPolicy
-from mesh.telemetry.context import log_event
 from schemas.keys import CidKey
 from schemas.unixfs import MAX_BLOCK_SIZE
 

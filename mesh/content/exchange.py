@@ -15,7 +15,7 @@ import zenoh
 
 from mesh.content.download import HOLDER, BlockRequester, Download, DownloadTiming
 from mesh.errors import AiraError, ClosedError, InvalidKey
-from mesh.telemetry.context import log_event
+from mesh.log_context import log_event
 from schemas.keys import CidKey, parse_key
 
 if TYPE_CHECKING:

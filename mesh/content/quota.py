@@ -16,7 +16,7 @@ from mesh.content.errors import ContentTooLarge, QuotaReached
 from mesh.content.files import PART_PREFIX, PUT_PREFIX, TemporaryFile, directory_lock, is_locked, sync_directory
 from mesh.content.recovery import DAMAGED_SUFFIX, delete_leftovers
 from mesh.errors import InputError
-from mesh.telemetry.context import log_event
+from mesh.log_context import log_event
 from schemas.cid import CID_LENGTH, parse_cid
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from mesh.content.errors import StoreDamaged
 from mesh.content.files import PART_PREFIX, PUT_PREFIX, TemporaryFile, directory_lock, is_locked, stamp, sync_directory
 from mesh.content.index import BlockIndex
 from mesh.errors import InvalidCid
-from mesh.telemetry.context import log_event
+from mesh.log_context import log_event
 from schemas.cid import parse_cid
 
 if TYPE_CHECKING:

@@ -35,7 +35,7 @@ from mesh.content.files import (
 from mesh.content.quota import CopyingStream, check_label
 from mesh.content.recovery import is_cid, set_aside
 from mesh.errors import ContentError
-from mesh.telemetry.context import log_event
+from mesh.log_context import log_event
 from schemas.cid import parse_cid
 from schemas.unixfs import CHUNK_SIZE, cid_of_stream
 

@@ -11,7 +11,7 @@ import logging
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 
 from mesh.errors import AiraError
-from mesh.telemetry.context import log_event
+from mesh.log_context import log_event
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping

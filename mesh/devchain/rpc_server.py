@@ -14,7 +14,7 @@ from aiohttp import WSMsgType, web
 from mesh.devchain.jsonrpc import INVALID_PARAMS, Dispatcher, RpcError
 from mesh.devchain.subscriptions import Subscriptions
 from mesh.errors import ConfigurationError
-from mesh.telemetry.context import log_event
+from mesh.log_context import log_event
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable

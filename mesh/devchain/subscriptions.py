@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 from mesh.chain.errors import METHOD_NOT_FOUND
 from mesh.devchain.jsonrpc import INVALID_PARAMS, RpcError, parse_data
-from mesh.telemetry.context import log_event
+from mesh.log_context import log_event
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Sequence

@@ -10,27 +10,29 @@ import asyncio
 from typing import TYPE_CHECKING, Any
 
 from mesh.chain import InsufficientFunds
+from mesh.chain.metrics import ChainMetrics
+from mesh.log_context import LogSource, source_context
 from mesh.market.book import LIMIT, Match, OrderBook, Refusal
 from mesh.market.earnings import Earnings, EarningsLedger
 from mesh.market.order_book_service import OrderBookService
-from mesh.market.provider_status import ProviderProcess, ProviderStatusService
+from mesh.market.provider_status import ProviderStatusService
 from mesh.market.settlement import OPEN_LIABILITIES, Settlement
 from mesh.market.transaction_queue import LEAST_GAS, RETRY, NoStake, TransactionQueue
 from mesh.network.channel import Channel
+from mesh.network.metrics import link_state, network_families
 from mesh.network.services import Services
 from mesh.role import Role
-from mesh.telemetry.context import LogSource, source_context
 from mesh.telemetry.logs import LogService
 from schemas import Demand, Offer, Result
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping, Sequence
     from contextlib import AsyncExitStack
 
     import zenoh
 
     from mesh.chain import Chain
-    from mesh.network import Subscription
+    from mesh.network import Network, Subscription
     from mesh.retry import RetryPolicy
     from mesh.telemetry.metrics import MetricFamily
 
@@ -150,6 +152,30 @@ class Provider(Role):
         async for result in self.results:
             await self.queue.has_room()
             await self.settlement.add_result(result)
+
+
+class ProviderProcess:
+    """A process with the open `providers` of one account on `chain`, in `network`: one, or one for each lighthouse."""
+
+    def __init__(self, network: Network, chain: Chain, providers: Sequence[Provider]) -> None:
+        self._network = network
+        self._chain = ChainMetrics(chain)
+        self._providers = providers
+
+    async def measure(self) -> tuple[MetricFamily, ...]:
+        """The metrics of session, chain and account, and those of each provider with its lighthouse."""
+        families = [*network_families(self._network), *await self._chain.measure()]
+        for provider in self._providers:
+            families += await provider.measure()
+        return tuple(families)
+
+    def health(self) -> Mapping[str, str]:
+        """The state of each part; with several providers, their parts name the lighthouse."""
+        parts = {"channel": link_state(self._network)}
+        for provider in self._providers:
+            of = f" of {provider.channel.lighthouse}" if len(self._providers) > 1 else ""
+            parts |= {f"{part}{of}": state for part, state in provider.health().items()}
+        return parts
 
 
 async def check_account(chain: Chain, lighthouse: str) -> None:

@@ -1,4 +1,4 @@
-"""The status, health and metrics of a provider, and of a process with one or more providers."""
+"""The status, health and metrics of a provider."""
 
 from __future__ import annotations
 
@@ -6,23 +6,22 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import mesh
-from mesh.chain.metrics import CachedMetrics, ChainMetrics, reading_families
-from mesh.network.metrics import link_state, message_families, network_families
+from mesh.chain.metrics import CachedMetrics, reading_families
+from mesh.network.metrics import message_families
 from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge, labelled
 from schemas.status import ALIVE, MarketStatus, Status
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Sequence
 
     import zenoh
 
     from mesh.chain import Chain
     from mesh.market.book import OrderBook
     from mesh.market.earnings import EarningsLedger
-    from mesh.market.provider import Provider
     from mesh.market.settlement import Settlement
     from mesh.market.transaction_queue import TransactionQueue
-    from mesh.network import Channel, Network, Subscription
+    from mesh.network import Channel, Subscription
     from schemas.rpc import Nothing
 
 
@@ -142,27 +141,3 @@ class ProviderStatusService:
             gauge("aira_turn", "1 while it is this provider's turn, 0 otherwise", float(is_turn)),
             gauge("aira_lighthouse_providers", "Providers with a stake at the lighthouse", len(state.stakes)),
         )
-
-
-class ProviderProcess:
-    """A process with the open `providers` of one account on `chain`, in `network`: one, or one for each lighthouse."""
-
-    def __init__(self, network: Network, chain: Chain, providers: Sequence[Provider]) -> None:
-        self._network = network
-        self._chain = ChainMetrics(chain)
-        self._providers = providers
-
-    async def measure(self) -> tuple[MetricFamily, ...]:
-        """The metrics of session, chain and account, and those of each provider with its lighthouse."""
-        families = [*network_families(self._network), *await self._chain.measure()]
-        for provider in self._providers:
-            families += await provider.measure()
-        return tuple(families)
-
-    def health(self) -> Mapping[str, str]:
-        """The state of each part; with several providers, their parts name the lighthouse."""
-        parts = {"channel": link_state(self._network)}
-        for provider in self._providers:
-            of = f" of {provider.channel.lighthouse}" if len(self._providers) > 1 else ""
-            parts |= {f"{part}{of}": state for part, state in provider.health().items()}
-        return parts

@@ -25,10 +25,10 @@ from mesh.chain import (
     Reverted,
 )
 from mesh.errors import AiraError, InputError
+from mesh.log_context import liability_context, log_event
 from mesh.market.book import ORDER_USED, Match, Refusal, at_fault, reason_word
 from mesh.outage_log import OutageLog
 from mesh.retry import Backoff
-from mesh.telemetry.context import liability_context, log_event
 from schemas import ZERO_ADDRESS, Demand, Offer, RejectKey, Result, address_bytes
 from schemas.signing import Rejection
 

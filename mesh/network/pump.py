@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypeVar
 import zenoh
 
 from mesh.errors import ClosedError
-from mesh.telemetry.context import log_event
+from mesh.log_context import log_event
 
 if TYPE_CHECKING:
     from collections.abc import Callable

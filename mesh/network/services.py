@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypeAlias
 import zenoh
 
 from mesh.errors import AiraError, ClosedError, RemoteError
+from mesh.log_context import log_event
 from mesh.network.pump import call_in_loop
-from mesh.telemetry.context import log_event
 from schemas import InvalidRecord, Record, RpcKey
 from schemas.rpc import SERVICES, SPENDING
 

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, Self
 import zenoh
 
 from mesh.errors import ClosedError
+from mesh.log_context import log_event
 from mesh.network.connecting import SessionOpening
 from mesh.network.pump import call_in_loop
-from mesh.telemetry.context import log_event
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator

@@ -14,10 +14,10 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final, Self
 
 from mesh.errors import ClosedError
+from mesh.log_context import log_event
 from mesh.recording.errors import RecordingFailed
 from mesh.recording.mcap_writer import check_message
 from mesh.recording.partial import PartialFile, PendingMessage
-from mesh.telemetry.context import log_event
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from mesh.errors import ConfigurationError
+from mesh.log_context import log_event
 from mesh.settings.groups import DEFAULTS, MEANING, OPTIONS, Settings
-from mesh.telemetry.context import log_event
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 from msgspec.structs import replace
 
-from mesh.telemetry import context
+from mesh import log_context as context
 from schemas.logs import LEVELS, LogEvent
 
 if TYPE_CHECKING:
     import logging
 
-    from mesh.telemetry.context import LogSource
+    from mesh.log_context import LogSource
 
 MAX_MESSAGE: Final = 4_000
 """Characters kept of a message; an event must fit into a reply."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from msgspec.structs import replace
 
 from mesh.errors import AiraError, InputError
-from mesh.telemetry.context import UNKNOWN_SOURCE, LogSource, log_event
+from mesh.log_context import UNKNOWN_SOURCE, LogSource, log_event
 from mesh.telemetry.events import event_of, human_line, json_line, timestamp
 from schemas.logs import LEVELS, LogsRead
 from schemas.records import MAX_RECORD_SIZE

@@ -20,7 +20,7 @@ from prometheus_client.registry import Collector, CollectorRegistry
 
 import mesh
 from mesh.errors import AiraError, ConfigurationError
-from mesh.telemetry.context import log_event
+from mesh.log_context import log_event
 from mesh.telemetry.metrics import merged
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ import msgspec
 from mesh.background import Background
 from mesh.content import Exchange, Store
 from mesh.errors import AiraError
+from mesh.log_context import log_event
 from mesh.recording import Limits, open_objective
-from mesh.telemetry.context import log_event
 from mesh.watching.market import JobEvent, RecentSet
 from schemas import Result, Verified
 from schemas.payloads import decode_value

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from msgspec.structs import replace
 
 from mesh.errors import AiraError, ClosedError, ContentError, InputError
-from mesh.telemetry.context import liability_context, log_event, with_liability_context
+from mesh.log_context import liability_context, log_event, with_liability_context
 from mesh.work.database import LedgerUnusable
 from mesh.work.lifecycle import STARTABLE, TO_BE_DONE, Phase, WrongPhase, advance
 from mesh.work.outbox import outgoing

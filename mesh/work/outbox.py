@@ -10,8 +10,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from mesh.log_context import log_event
 from mesh.retry import Backoff, RetryPolicy
-from mesh.telemetry.context import log_event
 from mesh.work.ledger import Outgoing
 from schemas import Demand, Offer, Result, decode, encode, message_hash
 

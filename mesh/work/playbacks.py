@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import mesh
 from mesh.errors import AiraError
+from mesh.log_context import liability_context, log_event
 from mesh.recording import AtOnce, RecordedTimes, Recorders, RecordingAbout
-from mesh.telemetry.context import liability_context, log_event
 from mesh.work.lifecycle import Phase
 from mesh.work.run import JobRun
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Final
 
 import zenoh
 
+from mesh.log_context import log_event
 from mesh.recording import AtOnce, Unrecordable, play
-from mesh.telemetry.context import log_event
 from mesh.work.job import HandlerCancelled, Job
 from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey, parse_key, topic_selector
 from schemas.payloads import STRING, PayloadType, String, payload_type

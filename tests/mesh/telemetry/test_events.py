@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from mesh.telemetry.context import LogSource, liability_context, log_event, source_context, with_liability_context
+from mesh.log_context import LogSource, liability_context, log_event, source_context, with_liability_context
 from mesh.telemetry.events import MAX_EVENT, MAX_MESSAGE, event_of, human_line, json_line, without_secrets
 from schemas.logs import LogEvent
 from tests.support.orders import ROBOT, STRANGER

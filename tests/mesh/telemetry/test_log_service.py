@@ -10,8 +10,8 @@ import pytest
 
 from mesh.agent import Agent
 from mesh.identity import Member
+from mesh.log_context import LogSource, liability_context, source_context
 from mesh.network import Endpoints, Network, ServiceFailed, Services, call
-from mesh.telemetry.context import LogSource, liability_context, source_context
 from mesh.telemetry.logs import LogHandler, LogService, keep_log
 from mesh.watching.logs import LogReader
 from schemas import RpcKey

@@ -1,0 +1,94 @@
+"""One name, one thing: class names, error codes and log events of the whole project, read from its source."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import defaultdict
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+from schemas.errors import AiraError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+ROOT: Final = Path(__file__).parents[1]
+PACKAGES: Final = ("schemas", "mesh", "bridges")
+SHARED: Final[dict[str, str]] = {}
+"""Class names that are defined in several modules on purpose, each with the reason."""
+LEVELS: Final = frozenset({"info", "warning", "error", "exception", "critical"})
+KEBAB: Final = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
+
+
+def sources() -> Iterator[tuple[str, ast.Module]]:
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            yield str(path.relative_to(ROOT)), ast.parse(path.read_text())
+
+
+def error_classes(root: type[AiraError] = AiraError) -> Iterator[type[AiraError]]:
+    for kind in root.__subclasses__():
+        yield kind
+        yield from error_classes(kind)
+
+
+def is_log_call(node: ast.AST) -> bool:
+    match node:
+        case ast.Call(func=ast.Attribute(value=ast.Name(id="log" | "_log"), attr=level)):
+            return level in LEVELS
+    return False
+
+
+def event_of(call: ast.Call, function: ast.AST) -> ast.expr | None:
+    """The first argument of `log_event(…)` in `extra`, given there or by a local variable."""
+    extra = next((keyword.value for keyword in call.keywords if keyword.arg == "extra"), None)
+    if isinstance(extra, ast.Name):
+        assigned = [
+            node.value
+            for node in ast.walk(function)
+            if isinstance(node, ast.Assign) and any(ast.unparse(target) == extra.id for target in node.targets)
+        ]
+        extra = assigned[-1] if assigned else None
+    if isinstance(extra, ast.Call) and ast.unparse(extra.func).endswith("log_event"):
+        return extra.args[0]
+    return None
+
+
+def test_a_class_name_is_defined_in_one_module() -> None:
+    homes: dict[str, set[str]] = defaultdict(set)
+    for path, tree in sources():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ClassDef):
+                homes[node.name].add(path)
+
+    assert {name: sorted(paths) for name, paths in homes.items() if len(paths) > 1 and name not in SHARED} == {}
+
+
+def test_every_error_class_has_a_code_of_its_own() -> None:
+    for path, _ in sources():
+        if "__main__" not in path:
+            import_module(path.removesuffix(".py").removesuffix("/__init__").replace("/", "."))
+    codes = {kind: kind.__dict__.get("code") for kind in error_classes() if kind.__module__.startswith(PACKAGES)}
+
+    assert all(code and KEBAB.fullmatch(code) for code in codes.values()), codes
+    assert len(set(codes.values())) == len(codes)
+
+
+@pytest.mark.parametrize(("path", "tree"), [pytest.param(path, tree, id=path) for path, tree in sources()])
+def test_every_log_event_has_a_stable_name(path: str, tree: ast.Module) -> None:
+    functions: list[ast.AST] = [
+        node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    ]
+    for function in functions or [tree]:
+        for node in ast.walk(function):
+            if isinstance(node, ast.Call) and is_log_call(node):
+                name = event_of(node, function)
+                where = f"{path}:{node.lineno}"
+                assert name is not None, f"{where}: no `extra=log_event(…)`"
+                if isinstance(name, ast.Constant):
+                    assert KEBAB.fullmatch(str(name.value)), where
+                    assert name.value != "unnamed", where
