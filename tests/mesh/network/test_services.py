@@ -1,13 +1,13 @@
-"""Services between two agents on a real router: replies, errors, missing agents, and closing."""
+"""Services between two agents on a real router: replies, errors, missing agents, and many requests."""
 
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.errors import AiraError, ClosedError
+from mesh.errors import AiraError
 from mesh.network import ServiceFailed, Services, call
 from mesh.network.services import CONCURRENT_REQUESTS
 from schemas import InvalidRecord, RpcKey
@@ -26,8 +26,6 @@ from tests.support.orders import LIGHTHOUSE, PERSON, liability
 from tests.support.waiting import at_most, until, until_answered
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     import zenoh
 
     from schemas import Record
@@ -211,105 +209,3 @@ async def test_requests_beyond_the_limit_get_an_error_reply(here: zenoh.Session,
         answered = await asyncio.to_thread(lambda: [reply.ok is not None for one in waiting for reply in one])
         assert answered == [True] * CONCURRENT_REQUESTS
         assert await call(here, ADDRESS, "start", REQUEST) == Done(True)
-
-
-async def test_closing_cancels_requests_in_progress(here: zenoh.Session, there: zenoh.Session) -> None:
-    begun = asyncio.Event()
-    ended: list[str] = []
-
-    async def start(request: StartLiability) -> Done:
-        begun.set()
-        try:
-            await asyncio.Event().wait()
-        finally:
-            ended.append("handler")
-        raise AssertionError
-
-    async with offering(there, here, start=start):
-        asking = asyncio.create_task(call(here, ADDRESS, "start", REQUEST))
-        await begun.wait()
-
-    assert ended == ["handler"]
-    with at_most(2), pytest.raises(ServiceFailed) as error:
-        await asking
-    assert error.value.reason == "no-agent"
-    with at_most(2), pytest.raises(ServiceFailed) as error:
-        await call(here, ADDRESS, "start", REQUEST)
-    assert error.value.reason == "no-agent"
-
-
-class CapturingSession:
-    """A session that keeps the callback of a queryable, to deliver a query after the queryable was withdrawn."""
-
-    deliver: Callable[[zenoh.Query], None]
-
-    def declare_queryable(self, key: str, callback: Callable[[zenoh.Query], None]) -> None:
-        self.deliver = callback
-
-    def is_closed(self) -> bool:
-        return True
-
-
-async def test_a_query_that_arrives_while_closing_is_dropped(here: zenoh.Session, there: zenoh.Session) -> None:
-    asked: list[zenoh.Query] = []
-    session = CapturingSession()
-    async with Services(cast("zenoh.Session", session), ADDRESS) as services:
-        services.offer("start", done)
-    with there.declare_queryable("test", asked.append):
-        await until_answered(here, "test")
-        asking = asyncio.create_task(asyncio.to_thread(lambda: list(here.get("test"))))
-        await until(lambda: asked)
-
-        session.deliver(asked.pop())
-
-        with at_most(2):
-            assert await asking == []
-
-
-async def test_closing_after_the_session_was_closed_does_not_hang(there: zenoh.Session, here: zenoh.Session) -> None:
-    begun = asyncio.Event()
-
-    async def start(request: StartLiability) -> Done:
-        begun.set()
-        await asyncio.Event().wait()
-        raise AssertionError
-
-    async with asyncio.timeout(3):
-        async with offering(there, here, start=start):
-            asking = asyncio.create_task(call(here, ADDRESS, "start", REQUEST))
-            await begun.wait()
-            there.close()  # type: ignore[no-untyped-call]
-
-        with pytest.raises(ServiceFailed):
-            await asking
-
-
-async def test_cancelling_a_call_takes_effect_at_once(here: zenoh.Session, there: zenoh.Session) -> None:
-    begun = asyncio.Event()
-
-    async def start(request: StartLiability) -> Done:
-        begun.set()
-        await asyncio.Event().wait()
-        raise AssertionError
-
-    def ask_in_a_loop_of_its_own() -> None:
-        async def ask() -> None:
-            async with asyncio.timeout(0.3):
-                await call(here, ADDRESS, "start", REQUEST, timeout=30)
-
-        with pytest.raises(TimeoutError):
-            asyncio.run(ask())
-
-    async with offering(there, here, start=start):
-        with at_most(3):  # the loop ends when its threads have ended
-            await asyncio.to_thread(ask_in_a_loop_of_its_own)
-        assert begun.is_set()
-
-
-async def test_services_are_offered_only_inside_async_with(here: zenoh.Session) -> None:
-    services = Services(here, ADDRESS)
-    for _ in range(2):
-        with pytest.raises(ClosedError):
-            services.offer("start", done)
-        async with services:
-            pass
