@@ -23,7 +23,7 @@ def demo(images: Images, tmp_path_factory: pytest.TempPathFactory) -> Iterator[C
         yield market
 
 
-async def test_a_market_comes_up_from_nothing_and_does_a_job_whose_story_is_in_the_logs(
+async def test_a_new_market_starts_and_does_a_job_that_the_logs_show(
     demo: ComposeDeployment,
 ) -> None:
     await demo.ready()
@@ -77,14 +77,14 @@ async def test_each_service_sees_only_its_own_secrets(demo: ComposeDeployment) -
     assert len(keys) == 3
 
 
-async def test_taking_it_down_with_its_volumes_leaves_nothing(images: Images, demo: ComposeDeployment) -> None:
+async def test_down_with_volumes_leaves_nothing(images: Images, demo: ComposeDeployment) -> None:
     await demo.ready()
     assert {left.split()[0] for left in demo.leftovers()} == {"container", "pod", "volume", "network"}
     demo.down()
     assert demo.leftovers() == []
 
 
-def test_an_edge_device_gets_no_client_of_a_chain(images: Images) -> None:
+def test_the_edge_image_has_no_chain_client(images: Images) -> None:
     look = "import importlib.util as u, serial, mesh; print(*filter(u.find_spec, ['web3', 'eth_account', 'pip']))"
     run = ["run", "--rm", "--network", "none", images.name("edge")]
     assert images.engine(*run, "python", "-c", look) == "\n"

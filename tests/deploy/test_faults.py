@@ -28,7 +28,7 @@ def market(images: Images, tmp_path_factory: pytest.TempPathFactory) -> Iterator
 
 
 @pytest.mark.parametrize("service", ["router", "provider", "agent"])
-async def test_a_job_is_paid_though_a_service_is_killed_and_comes_back(market: ComposeDeployment, service: str) -> None:
+async def test_a_job_is_paid_after_a_service_was_killed_and_restarted(market: ComposeDeployment, service: str) -> None:
     await market.ready()
     job = market.ask(PLAYED_SECONDS)
     await job.is_played()
@@ -38,7 +38,7 @@ async def test_a_job_is_paid_though_a_service_is_killed_and_comes_back(market: C
     assert (await job.settled())["success"]
 
 
-async def test_a_job_is_paid_though_the_chain_is_killed_and_comes_back_with_its_state(
+async def test_a_job_is_paid_after_the_chain_was_killed_and_restarted_with_its_state(
     market: ComposeDeployment,
 ) -> None:
     await market.ready()
@@ -51,7 +51,7 @@ async def test_a_job_is_paid_though_the_chain_is_killed_and_comes_back_with_its_
     assert (await job.settled())["success"]
 
 
-async def test_a_job_is_paid_though_its_robot_is_cut_off_for_half_a_minute(market: ComposeDeployment) -> None:
+async def test_a_job_is_paid_after_its_robot_was_disconnected_for_half_a_minute(market: ComposeDeployment) -> None:
     await market.ready()
     job = market.ask(PLAYED_SECONDS)
     await job.is_played()
@@ -63,7 +63,7 @@ async def test_a_job_is_paid_though_its_robot_is_cut_off_for_half_a_minute(marke
     assert (await job.settled())["success"]
 
 
-async def test_a_job_is_paid_though_its_robot_stands_still_for_a_while(market: ComposeDeployment) -> None:
+async def test_a_job_is_paid_after_its_robot_was_paused(market: ComposeDeployment) -> None:
     await market.ready()
     job = market.ask(PLAYED_SECONDS)
     await job.is_played()

@@ -53,7 +53,7 @@ def versions(lock: str) -> dict[str, set[str]]:
 
 
 @pytest.mark.parametrize("lock", ["edge.txt", "server.txt"])
-def test_the_images_are_made_of_the_versions_that_are_tested(lock: str) -> None:
+def test_the_images_use_the_tested_versions(lock: str) -> None:
     tested, used = versions("lock.txt"), versions(lock)
     assert len(used) > 10
     for requirement, hashes in used.items():
@@ -61,7 +61,7 @@ def test_the_images_are_made_of_the_versions_that_are_tested(lock: str) -> None:
         assert hashes <= tested[requirement], requirement
 
 
-def test_an_edge_image_has_no_client_of_a_chain() -> None:
+def test_the_edge_image_installs_no_chain_client() -> None:
     names = {requirement.split("==")[0] for requirement in versions("edge.txt")}
     assert {"eclipse-zenoh", "pyserial"} <= names
     assert not names & {"web3", "eth-account", "aiohttp", "cryptography", "pytest"}
@@ -76,14 +76,14 @@ def test_no_image_runs_as_root(target: str) -> None:
     assert users[-1] == "10001:10001"
 
 
-def test_each_service_is_of_an_image_that_the_dockerfile_makes() -> None:
+def test_each_service_uses_an_image_of_the_dockerfile() -> None:
     for name, service in services().items():
         if name not in FOREIGN:
             assert service["build"]["target"] in stages(), name
             assert f"-{service['build']['target']}:" in service["image"], name
 
 
-def test_no_service_may_more_than_it_needs() -> None:
+def test_services_have_minimal_rights() -> None:
     for name, service in services().items():
         assert service["read_only"] is True, name
         assert service["cap_drop"] == ["ALL"], name
@@ -101,7 +101,7 @@ def test_a_variable_of_a_service_is_a_setting_and_names_files_only() -> None:
                 assert re.fullmatch(r"/secrets/[a-z.]+", value), f"{name}: {variable}"
 
 
-def test_a_service_gets_its_own_secrets_and_only_to_read() -> None:
+def test_a_service_gets_only_its_own_secrets_and_read_only() -> None:
     seen: dict[str, str] = {}
     for name, service in services().items():
         for mount in service.get("volumes", []):
@@ -111,13 +111,13 @@ def test_a_service_gets_its_own_secrets_and_only_to_read() -> None:
     assert len(seen) == 7
 
 
-def test_no_port_is_open_to_other_machines_unless_it_is_asked_for() -> None:
+def test_no_port_is_open_to_other_machines_by_default() -> None:
     for name, service in services().items():
         for port in service.get("ports", []):
             assert re.fullmatch(r"\$\{MESH_\w+_PORT:-127\.0\.0\.1::\d+\}", port), f"{name}: {port}"
 
 
-def test_no_volume_is_called_as_the_beginning_of_another() -> None:
+def test_no_volume_name_is_a_prefix_of_another() -> None:
     """Podman takes such a name for the other one, and then does not remove it."""
     for file in (ONE_SITE, TWO_SITES):
         names = list(compose(file)["volumes"])
@@ -152,6 +152,6 @@ def test_a_default_is_the_same_wherever_a_variable_is_used() -> None:
 
 
 @pytest.mark.parametrize("script", sorted((ROOT / "deploy" / "compose").glob("*.sh")), ids=lambda script: script.name)
-def test_a_script_of_the_services_is_one_of_any_shell(script: Path) -> None:
+def test_the_scripts_of_the_services_run_in_any_posix_shell(script: Path) -> None:
     assert script.read_text().startswith("#!/bin/sh\n")
     subprocess.run(["sh", "-n", script], timeout=60, check=True)

@@ -59,7 +59,7 @@ def test_systemd_finds_nothing_wrong(machine: Path, unit: str) -> None:
     assert (done.returncode, said) == (0, [])
 
 
-def test_systemd_would_find_a_word_that_it_does_not_know(machine: Path) -> None:
+def test_systemd_reports_an_unknown_directive(machine: Path) -> None:
     """What the tests above stand on."""
     unit = machine / "etc/systemd/system/aira-wrong.service"
     unit.write_text((UNITS / "aira-router.service").read_text().replace("MemoryMax", "MemoryMaximum"))
@@ -70,7 +70,7 @@ def test_systemd_would_find_a_word_that_it_does_not_know(machine: Path) -> None:
 
 
 @pytest.mark.parametrize("unit", SERVICES)
-def test_a_service_that_was_taken_over_can_do_little(machine: Path, unit: str) -> None:
+def test_services_are_sandboxed(machine: Path, unit: str) -> None:
     done = analyze(machine, "security", "--offline=true", "--no-pager", f"--threshold={MOST_EXPOSED * 10:.0f}", unit)
     assert done.returncode == 0, done.stdout
     found = re.search(r"Overall exposure level for \S+: ([\d.]+)", done.stdout)
@@ -97,7 +97,7 @@ def units() -> list[Path]:
 
 
 @pytest.mark.parametrize("unit", [path.name for path in UNITS.glob("*.service")])
-def test_the_command_of_a_unit_is_one_of_ours(unit: str) -> None:
+def test_the_command_of_a_unit_exists(unit: str) -> None:
     """With `--help` behind it: its words and options are known."""
     (start,) = [line for line in lines((UNITS / unit).read_text()) if line.startswith("ExecStart=")]
     words = shlex.split(start.partition("=")[2])
@@ -142,7 +142,7 @@ def test_each_secret_that_a_unit_names_is_a_credential_of_it(unit: str) -> None:
 
 
 @pytest.mark.parametrize("unit", [path.name for path in UNITS.glob("*.service")])
-def test_a_unit_says_nothing_that_the_common_file_says_otherwise(unit: str) -> None:
+def test_a_unit_does_not_contradict_the_common_file(unit: str) -> None:
     """A file in aira-.service.d is read after the unit, and wins: what is to differ is in a file of its own."""
     common = {line.partition("=")[0] for line in lines((UNITS / "aira-.service.d/10-every-service.conf").read_text())}
     own = {line.partition("=")[0] for line in lines((UNITS / unit).read_text())}
@@ -182,7 +182,7 @@ def test_files_created_by_root_belong_to_the_service(tmp_path: Path) -> None:
     assert elsewhere.stat().st_uid == 0
 
 
-def test_the_installer_writes_no_file_of_yours_over(machine: Path) -> None:
+def test_the_installer_overwrites_no_file_of_the_user(machine: Path) -> None:
     rules = machine / "etc/udev/rules.d/60-aira-devices.rules"
     rules.write_text("my own")
     subprocess.run([UNITS / "install"], env={**os.environ, "DESTDIR": str(machine)}, check=True, capture_output=True)
@@ -190,7 +190,7 @@ def test_the_installer_writes_no_file_of_yours_over(machine: Path) -> None:
     assert (machine / "etc/aira/members").is_dir()
 
 
-def test_the_user_is_one_that_sysusers_makes(tmp_path: Path) -> None:
+def test_sysusers_creates_the_user_of_the_units(tmp_path: Path) -> None:
     sysusers = shutil.which("systemd-sysusers")
     if sysusers is None:
         require("systemd-analyze")

@@ -25,7 +25,7 @@ VOLTS = {"dust": 0.5, "CO": 1.0, "LPG": 1.5, "methane": 2.0, "smoke": 2.5, "hydr
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_who_asks_for_nothing_is_told_what_the_sensors_measure(
+def test_a_person_gets_the_measurements_of_the_sensors(
     protocol: str, market: dict[str, str], tmp_path: Path
 ) -> None:
     out, png = tmp_path / "air.mcap", tmp_path / "air.png"

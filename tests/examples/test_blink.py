@@ -59,7 +59,7 @@ def assert_three_blinks(changes: list[PinChange]) -> None:
         ("blink_arguments", "green", {"topic": "/blink", "data": "green"}),
     ],
 )
-def test_the_objectives_can_be_made_again_as_the_readmes_say(
+def test_the_readme_commands_reproduce_the_objectives(
     example: str, name: str, line: dict[str, str], tmp_path: Path
 ) -> None:
     readme = (EXAMPLES / example / "README.md").read_text()

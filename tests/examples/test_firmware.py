@@ -24,7 +24,7 @@ def library(request: pytest.FixtureRequest) -> Path:
     return folder
 
 
-def test_a_library_says_what_the_ide_asks(library: Path) -> None:
+def test_a_library_has_the_properties_that_the_ide_needs(library: Path) -> None:
     properties = dict(line.split("=", 1) for line in (library / "library.properties").read_text().splitlines())
     assert properties.keys() >= FIELDS
     assert properties["name"] == library.name

@@ -97,7 +97,7 @@ async def test_cancelling_the_body_from_outside_stays_a_cancellation() -> None:
     assert ended == ["a"]
 
 
-async def test_a_task_may_end_before_the_body() -> None:
+async def test_a_task_can_end_before_the_body() -> None:
     done: list[str] = []
 
     async def short(name: str) -> None:

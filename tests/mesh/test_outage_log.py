@@ -46,7 +46,7 @@ def test_it_is_down_until_it_has_recovered(outages: OutageLog) -> None:
     assert down == [False, True, False]
 
 
-def test_its_end_is_logged_once_and_then_it_may_begin_again(
+def test_the_end_of_an_outage_is_logged_once_and_a_later_outage_is_new(
     outages: OutageLog, caplog: pytest.LogCaptureFixture
 ) -> None:
     outages.recovered("it goes on")

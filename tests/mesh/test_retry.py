@@ -50,6 +50,6 @@ async def test_wait_sleeps_and_a_success_starts_over() -> None:
 @pytest.mark.parametrize(
     "options", [{"initial": -1.0}, {"initial": 2.0, "ceiling": 1.0}, {"factor": 0.5}, {"jitter": 1.5}, {"attempts": 0}]
 )
-def test_what_is_no_policy_is_refused(options: dict[str, float]) -> None:
+def test_an_invalid_policy_is_refused(options: dict[str, float]) -> None:
     with pytest.raises(ConfigurationError):
         RetryPolicy(**options)  # type: ignore[arg-type]

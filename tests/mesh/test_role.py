@@ -55,7 +55,7 @@ async def test_a_role_works_while_it_is_open_and_closes_in_reverse_order() -> No
     assert not role.is_open
 
 
-async def test_a_closed_role_does_not_run_and_an_open_one_does_not_open_again() -> None:
+async def test_a_closed_role_can_not_run_and_an_open_one_can_not_be_opened_twice() -> None:
     role = ExampleRole()
     with pytest.raises(ClosedError, match="this example is not open"):
         await role.run()

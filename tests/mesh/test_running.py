@@ -80,7 +80,7 @@ def signalled(call: str, *signals: signal.Signals) -> tuple[int, str, str]:
 
 
 @pytest.mark.parametrize("how", ["run_to_end", "run_until_stopped"])
-def test_a_program_goes_on_after_its_main_function(how: str) -> None:
+def test_a_program_continues_after_its_main_function(how: str) -> None:
     done = ended(f"{how}(done)")
     assert (done.returncode, done.stdout, done.stderr) == (0, "done\nafter\n", "")
 

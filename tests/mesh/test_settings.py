@@ -20,7 +20,7 @@ def written(path: Path, text: str) -> Path:
     return file
 
 
-def test_without_anything_the_legacy_defaults_hold() -> None:
+def test_the_defaults_are_those_of_the_legacy_network() -> None:
     settings = load(environ=NOTHING)
 
     assert settings == Settings()
@@ -42,7 +42,7 @@ def test_the_names_of_the_contracts_are_those_of_the_generation() -> None:
     assert settings.xrt_contract == settings.erc20_token == "xrt.5.robonomics.eth"
 
 
-def test_names_that_are_given_are_kept_whatever_the_generation() -> None:
+def test_configured_names_are_kept_in_every_generation() -> None:
     given = {"factory_contract": "0xFactory", "lighthouse_contract": "mine.lighthouse.3.robonomics.eth"}
 
     settings = load(environ=NOTHING, flags=given | {"generation": 5, "erc20_token": "dai.test"})
@@ -51,11 +51,11 @@ def test_names_that_are_given_are_kept_whatever_the_generation() -> None:
     assert (settings.erc20_token, settings.xrt_contract) == ("dai.test", "xrt.5.robonomics.eth")
 
 
-def test_an_empty_name_is_one_that_is_not_given() -> None:
+def test_an_empty_name_means_the_default() -> None:
     assert load(environ={"AIRA_FACTORY_CONTRACT": "", "AIRA_GENERATION": "5"}) == Settings(generation=5)
 
 
-def test_the_websocket_is_used_where_there_is_no_other_address() -> None:
+def test_the_websocket_is_used_without_an_http_address() -> None:
     assert Settings().node == "http://127.0.0.1:8545"
     assert load(environ={"AIRA_WEB3_HTTP_PROVIDER": " "}).node == "ws://127.0.0.1:8546"
     assert Settings(web3_http_provider="http://a:1, ws://b:2").node == "http://a:1, ws://b:2"
@@ -63,7 +63,7 @@ def test_the_websocket_is_used_where_there_is_no_other_address() -> None:
         Settings(web3_http_provider="", web3_ws_provider="").node  # noqa: B018
 
 
-def test_variables_win_over_the_file_and_flags_over_both(tmp_path: Path) -> None:
+def test_variables_override_the_file_and_flags_override_both(tmp_path: Path) -> None:
     file = written(tmp_path, 'recording_topics = "file"\nens_contract = "file"\ndata_dir = "file"\n')
 
     settings = load(path=file, environ={"AIRA_ENS_CONTRACT": "env", "AIRA_DATA_DIR": "env"}, flags={"data_dir": "flag"})
@@ -81,7 +81,7 @@ def test_the_process_environment_is_read_by_default(monkeypatch: pytest.MonkeyPa
     assert load().erc20_token == "other.3.robonomics.eth"
 
 
-def test_variables_are_texts_and_become_what_the_option_is() -> None:
+def test_variables_are_converted_to_the_type_of_the_option() -> None:
     settings = load(
         environ={
             "AIRA_GENERATION": "5",
@@ -116,7 +116,7 @@ def test_a_file_has_typed_values(tmp_path: Path) -> None:
         ("ens", "listen"),
     ],
 )
-def test_an_unknown_option_in_the_file_names_the_nearest(tmp_path: Path, wrong: str, right: str) -> None:
+def test_an_unknown_option_in_the_file_suggests_the_nearest(tmp_path: Path, wrong: str, right: str) -> None:
     file = written(tmp_path, f'{wrong} = "x"\n')
 
     with pytest.raises(ConfigurationError, match=f"unknown option '{wrong}' in .*aira.toml") as error:
@@ -125,14 +125,14 @@ def test_an_unknown_option_in_the_file_names_the_nearest(tmp_path: Path, wrong: 
     assert error.value.hint == f"did you mean {right!r}?"
 
 
-def test_an_unknown_variable_names_the_nearest_option() -> None:
+def test_an_unknown_variable_suggests_the_nearest_option() -> None:
     with pytest.raises(ConfigurationError, match="unknown option 'keyfil' in the environment") as error:
         load(environ={"AIRA_KEYFIL": "x"})
 
     assert "'keyfile'" in error.value.hint
 
 
-def test_an_unknown_flag_names_the_nearest_option() -> None:
+def test_an_unknown_flag_suggests_the_nearest_option() -> None:
     with pytest.raises(ConfigurationError, match="unknown option 'datadir' in the flags") as error:
         load(environ=NOTHING, flags={"datadir": "x"})
 
@@ -146,9 +146,7 @@ def test_variables_of_other_programs_and_of_the_tests_are_no_options() -> None:
 
 
 @pytest.mark.parametrize("where", ["file", "environment"])
-def test_a_retired_option_is_reported_and_not_obeyed(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, where: str
-) -> None:
+def test_a_retired_option_is_reported_and_ignored(tmp_path: Path, caplog: pytest.LogCaptureFixture, where: str) -> None:
     file = written(tmp_path, "master_check_interval = 1\n") if where == "file" else None
     environ = {"AIRA_MASTER_CHECK_INTERVAL": "1"} if where == "environment" else {}
 
@@ -182,14 +180,14 @@ def test_a_retired_option_is_reported_and_not_obeyed(
         ("connect", [1]),
     ],
 )
-def test_a_value_that_can_not_be_names_its_option_and_what_it_means(option: str, value: Any) -> None:
+def test_an_invalid_value_is_reported_with_its_option_and_meaning(option: str, value: Any) -> None:
     with pytest.raises(ConfigurationError, match=f"^the setting {option} is invalid: [^\n]+$") as error:
         load(environ=NOTHING, flags={option: value})
 
     assert error.value.hint == f"{option}: {MEANING[option]}"
 
 
-def test_a_file_that_is_not_there_is_one_clear_line(tmp_path: Path) -> None:
+def test_a_missing_file_is_one_clear_line(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"^can't read the settings .*none\.toml: No such file or directory$"):
         load(path=tmp_path / "none.toml", environ=NOTHING)
 
@@ -217,7 +215,7 @@ def test_keyfile_and_data_folder_may_be_in_the_home_folder() -> None:
     assert settings.state_directory == Path.home() / "aira"
 
 
-def test_without_a_data_folder_the_users_own_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_default_data_folder_is_in_the_users_home(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_DATA_HOME", "/somewhere")
     assert Settings().state_directory == Path("/somewhere/aira")
 
@@ -225,15 +223,15 @@ def test_without_a_data_folder_the_users_own_is_taken(monkeypatch: pytest.Monkey
     assert Settings().state_directory == Path.home() / ".local/share/aira"
 
 
-def test_every_option_has_its_meaning_in_words() -> None:
+def test_every_option_has_a_description() -> None:
     assert set(MEANING) == set(OPTIONS)
 
 
-def test_what_decides_of_the_chain_are_options() -> None:
+def test_the_names_that_decide_about_the_chain_are_options() -> None:
     assert set(OPTIONS) >= set(options_of(ChainSettings))
 
 
-def test_the_file_that_aira_config_names_is_read(tmp_path: Path) -> None:
+def test_the_file_named_by_aira_config_is_read(tmp_path: Path) -> None:
     path = tmp_path / "aira.toml"
     path.write_text('lighthouse_contract = "named.lighthouse.3.robonomics.eth"\n')
 

@@ -77,7 +77,7 @@ def test_a_server_that_was_stopped_ends_normally(number: signal.Signals) -> None
 
 @BOTH
 @pytest.mark.parametrize("stopped", [True, False])
-def test_the_signal_handlers_of_before_are_restored(number: signal.Signals, stopped: bool) -> None:
+def test_the_previous_signal_handlers_are_restored(number: signal.Signals, stopped: bool) -> None:
     received: list[int] = []
     before = signal.signal(number, lambda number, frame: received.append(number))
     try:

@@ -47,7 +47,7 @@ def test_with_a_time_limit_it_does_not_wait_for_files(tmp_path: Path, caplog: py
     assert caplog.messages == []
 
 
-def test_a_folder_in_place_of_a_file_is_left_to_its_reader(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_folder_in_place_of_a_file_counts_as_present(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "account.json").mkdir()
     (tmp_path / "password").write_text("secret\n")
     assert list(file_delays(settings(tmp_path))) == []

@@ -21,7 +21,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache"
 
 
-def test_installing_goes_on_when_a_recipe_fails_and_says_why_at_the_end(cache: Path) -> None:
+def test_installing_continues_when_a_recipe_fails_and_reports_it_at_the_end(cache: Path) -> None:
     nothing_but_python = {"PATH": "/nowhere", "PIP_NO_INDEX": "1", "PIP_CONFIG_FILE": os.devnull}
     done = subprocess.run(
         [sys.executable, "-m", "peers.install"],
@@ -44,7 +44,7 @@ def test_installing_goes_on_when_a_recipe_fails_and_says_why_at_the_end(cache: P
 
 
 @pytest.mark.parametrize(("required", "code"), [("0", 0), ("1", 1)])
-def test_missing_peers_are_an_error_only_where_all_are_asked_for(
+def test_missing_peers_are_an_error_only_if_all_are_required(
     cache: Path, monkeypatch: pytest.MonkeyPatch, required: str, code: int
 ) -> None:
     monkeypatch.setattr(install, "RECIPES", ())
@@ -52,7 +52,7 @@ def test_missing_peers_are_an_error_only_where_all_are_asked_for(
     assert install.main() == code
 
 
-def test_a_half_installed_folder_is_not_taken_for_a_peer(cache: Path) -> None:
+def test_a_partly_installed_folder_is_not_complete(cache: Path) -> None:
     program = CHAIN.folder / "node_modules/@foundry-rs/anvil-linux-amd64/bin/anvil"
     program.parent.mkdir(parents=True)
     program.touch()
@@ -74,7 +74,7 @@ def test_another_version_of_a_crate_is_not_complete(cache: Path) -> None:
     assert not CargoRecipe(crate=ROUTER.crate, version="1.10.0").is_complete()
 
 
-def test_a_base_image_is_made_again_for_other_packages_and_for_other_certificates(
+def test_a_base_image_is_rebuilt_for_other_packages_or_certificates(
     cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     certificates = tmp_path / "certificates"
@@ -87,7 +87,7 @@ def test_a_base_image_is_made_again_for_other_packages_and_for_other_certificate
     assert not BASE.is_complete()
 
 
-def test_lock_files_leave_the_registry_to_the_machine() -> None:
+def test_lock_files_name_no_registry() -> None:
     locks = [*(ROOT / "peers").rglob("package-lock.json"), *(ROOT / "peers/pip").glob("*.txt")]
     locks.append(ROOT / "requirements/lock.txt")
     assert len(locks) == 5
@@ -97,12 +97,12 @@ def test_lock_files_leave_the_registry_to_the_machine() -> None:
 
 
 @pytest.mark.parametrize("manifest", ["chain", "ipfs"])
-def test_recipes_of_npm_pin_exact_versions(manifest: str) -> None:
+def test_npm_recipes_pin_exact_versions(manifest: str) -> None:
     package = json.loads((ROOT / "peers/npm" / manifest / "package.json").read_text())
     assert all(version[0].isdigit() for version in package["dependencies"].values())
 
 
-def test_where_a_peer_is_can_be_asked_from_a_shell(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_path_of_a_peer_can_be_printed_from_a_shell(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert where.main(["anvil"]) == 1
     assert capsys.readouterr().err == "anvil: not installed: run `make peers`\n"
     assert where.main(["python"]) == 1
@@ -111,7 +111,7 @@ def test_where_a_peer_is_can_be_asked_from_a_shell(cache: Path, capsys: pytest.C
     assert capsys.readouterr().err == "one name is needed: python -m peers.where NAME\n"
 
 
-def test_a_peer_that_is_there_is_named_by_its_path(
+def test_an_installed_peer_is_named_by_its_path(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     program = tmp_path / "ipfs"

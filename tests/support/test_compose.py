@@ -51,7 +51,7 @@ def is_answered(project: Project, file: str = "") -> bool:
         return False
 
 
-async def test_services_find_each_other_by_name_and_what_they_say_is_kept(project: Project) -> None:
+async def test_services_find_each_other_by_name_and_their_logs_are_kept(project: Project) -> None:
     await until(lambda: is_answered(project), what="an answer of web")
     assert '"GET / HTTP/1.1" 200' in project.log("web")
 
@@ -64,14 +64,14 @@ async def test_a_killed_service_comes_back_with_its_state(project: Project) -> N
     await until(lambda: is_answered(project, "kept"), what="an answer of web")
 
 
-async def test_a_frozen_service_answers_nobody_until_it_goes_on(project: Project) -> None:
+async def test_a_paused_service_does_not_answer_until_it_is_resumed(project: Project) -> None:
     project.pause("web")
     assert not is_answered(project)
     project.unpause("web")
     await until(lambda: is_answered(project), what="an answer of web")
 
 
-async def test_a_service_off_its_network_is_reached_by_nobody_until_it_is_joined_again(project: Project) -> None:
+async def test_a_disconnected_service_is_unreachable_until_it_is_reconnected(project: Project) -> None:
     project.disconnect("web")
     assert not is_answered(project)
     assert project.is_running("web")
@@ -79,7 +79,7 @@ async def test_a_service_off_its_network_is_reached_by_nobody_until_it_is_joined
     await until(lambda: is_answered(project), what="an answer of web")
 
 
-def test_taking_down_leaves_nothing_and_so_does_force(engine: Engine, tmp_path: Path) -> None:
+def test_down_leaves_nothing_and_neither_does_removal_by_force(engine: Engine, tmp_path: Path) -> None:
     (tmp_path / "compose.yml").write_text(COMPOSE)
     with Project(engine, tmp_path, files=[tmp_path / "compose.yml"]) as project:
         project.up()
@@ -92,11 +92,11 @@ def test_taking_down_leaves_nothing_and_so_does_force(engine: Engine, tmp_path: 
     assert project.leftovers() == []
 
 
-def test_a_command_that_takes_too_long_is_ended_with_what_it_started(engine: Engine) -> None:
+def test_a_command_that_takes_too_long_is_killed_with_its_children(engine: Engine) -> None:
     with at_most(10), pytest.raises(EngineFailed, match=r"sleep 60: took longer than 0\.5 s\nfirst words"):
         engine.run(["sh", "-c", "echo first words; sleep 60; true sleep 60"], seconds=0.5)
 
 
-def test_a_command_that_fails_says_what_podman_said(engine: Engine) -> None:
+def test_the_error_of_a_failed_command_has_the_output_of_podman(engine: Engine) -> None:
     with pytest.raises(EngineFailed, match=r"ended with 125\n.*no such container"):
         engine("logs", "aira-nobody")

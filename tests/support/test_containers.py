@@ -27,7 +27,7 @@ def test_podman_knows_its_host() -> None:
 
 
 @pytest.mark.parametrize(("name", "words"), [("runc", "runc version"), ("debootstrap", "debootstrap 1.")])
-def test_what_podman_needs_is_there(name: str, words: str) -> None:
+def test_the_requirements_of_podman_are_installed(name: str, words: str) -> None:
     assert said(require(name), "--version").startswith(words)
 
 
@@ -37,7 +37,7 @@ def test_podman_compose_is_the_pinned_version() -> None:
 
 
 @pytest.mark.compose
-def test_the_base_image_has_python_and_trusts_whom_this_machine_trusts(engine: Engine) -> None:
+def test_the_base_image_has_python_and_the_certificates_of_this_machine(engine: Engine) -> None:
     look = "import hashlib, os, venv; print(hashlib.sha256(open(os.environ['PIP_CERT'], 'rb').read()).hexdigest())"
     trusted = hashlib.sha256(CERTIFICATES.read_bytes()).hexdigest()
     assert engine("run", "--rm", "--network", "none", BASE_IMAGE, "python3", "-c", look) == f"{trusted}\n"
@@ -45,7 +45,7 @@ def test_the_base_image_has_python_and_trusts_whom_this_machine_trusts(engine: E
 
 @pytest.mark.compose
 @pytest.mark.parametrize(("required", "outcome"), [("0", pytest.skip.Exception), ("1", pytest.fail.Exception)])
-def test_where_no_container_runs_the_reason_is_told(
+def test_the_reason_is_reported_when_no_container_runs(
     engine: Engine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, required: str, outcome: type[Exception]
 ) -> None:
     (tmp_path / "containers.conf").write_text('[engine]\nruntime = "a runtime that is not there"\n')

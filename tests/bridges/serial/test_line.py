@@ -35,7 +35,7 @@ def test_a_text_that_names_no_port_is_refused(text: str) -> None:
         PortName(text)
 
 
-def test_a_file_that_is_no_terminal_is_refused(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_terminal_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.touch()
     for each in (path, tmp_path):

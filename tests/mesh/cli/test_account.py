@@ -56,7 +56,7 @@ def test_a_new_account_is_printed_and_can_be_used(made: tuple[Path, Path, Result
     assert done.stdout == f"{Account.from_keyfile(keyfile, password).address}\n"
 
 
-def test_key_and_password_are_for_their_owner_only(made: tuple[Path, Path, Result]) -> None:
+def test_key_and_password_are_readable_by_their_owner_only(made: tuple[Path, Path, Result]) -> None:
     for path in made[:2]:
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
 
@@ -82,7 +82,7 @@ def test_a_keyfile_is_never_overwritten(made: tuple[Path, Path, Result], tmp_pat
     assert not (tmp_path / "password").exists(), "no password without an account"
 
 
-def test_a_password_that_is_there_is_used_its_first_line(tmp_path: Path) -> None:
+def test_the_first_line_of_an_existing_password_file_is_used(tmp_path: Path) -> None:
     password = tmp_path / "password"
     password.write_text("open sesame\nand other notes\n")
     done = account("new", tmp_path / "key.json", "--password-file", password)
@@ -111,7 +111,7 @@ def test_a_password_file_that_can_not_be_read_is_one_clear_line(tmp_path: Path) 
     refused(done, PasswordFileUnusable, password)
 
 
-def test_a_folder_that_can_not_be_made_is_one_clear_line(tmp_path: Path) -> None:
+def test_a_folder_that_can_not_be_created_is_one_clear_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     done = account("new", tmp_path / "file" / "key.json", "--password-file", tmp_path / "password")
     refused(done, FileUnwritable)
@@ -126,7 +126,7 @@ def test_a_folder_that_can_not_be_made_is_one_clear_line(tmp_path: Path) -> None
         ("{}", AccountMissing),
     ],
 )
-def test_what_is_no_keyfile_is_one_clear_line(tmp_path: Path, content: str | None, error: type[AiraError]) -> None:
+def test_an_invalid_keyfile_is_one_clear_line(tmp_path: Path, content: str | None, error: type[AiraError]) -> None:
     keyfile = tmp_path / "key.json"
     if content is not None:
         keyfile.write_text(content)
@@ -153,20 +153,20 @@ def assert_imported(folder: Path, done: Result) -> None:
     assert stat.S_IMODE((folder / "key.json").stat().st_mode) == 0o600
 
 
-def test_new_and_show_speak_json(made: tuple[Path, Path, Result], tmp_path: Path) -> None:
+def test_new_and_show_print_json(made: tuple[Path, Path, Result], tmp_path: Path) -> None:
     address = made[2].stdout.strip()
     assert json.loads(account("show", made[0], "--json").stdout) == {"address": address, "keyfile": str(made[0])}
     told = json.loads(account("new", tmp_path / "key.json", "--password-file", made[1], "--json").stdout)
     assert told == {"address": account("show", told["keyfile"]).stdout.strip(), "keyfile": str(tmp_path / "key.json")}
 
 
-def test_show_is_of_the_settings_account_unless_a_keyfile_is_given(made: tuple[Path, Path, Result]) -> None:
+def test_show_uses_the_settings_account_unless_a_keyfile_is_given(made: tuple[Path, Path, Result]) -> None:
     assert account("show", "--keyfile", made[0]).stdout == made[2].stdout
     done = account("show")
     refused(done, AccountMissing)
 
 
-def test_show_asks_the_chain_for_what_the_account_holds(served: ServedChain) -> None:
+def test_show_reads_the_balances_from_the_chain(served: ServedChain) -> None:
     person = served.people["person"]
     said = columns(served.aira("account", "show", "--balance", AIRA_KEYFILE_PASSWORD_FILE="").stdout)
     assert said["address"] == person.address
@@ -210,14 +210,14 @@ def test_the_password_of_the_other_keyfile_may_come_from_the_standard_input(tmp_
 
 
 @pytest.mark.parametrize("given", ["", "\n", "a key", KEY[:-1], KEY + "00", "0" * 64, "g" + KEY[1:], "0x" + "é" * 64])
-def test_what_is_no_private_key_is_refused_without_showing_it(tmp_path: Path, given: str) -> None:
+def test_an_invalid_private_key_is_refused_without_printing_it(tmp_path: Path, given: str) -> None:
     done = imported(tmp_path, given=given)
     refused(done, InputError, "private key")
     assert not given.strip() or given.strip() not in done.output
     assert not (tmp_path / "key.json").exists()
 
 
-def test_a_key_is_not_taken_as_an_argument(tmp_path: Path) -> None:
+def test_a_key_is_not_accepted_as_an_argument(tmp_path: Path) -> None:
     for written in (KEY, "0x" + KEY):
         done = account("import", tmp_path / written, "--password-file", tmp_path / "password")
         refused(done, InvalidPrivateKey)
@@ -225,7 +225,7 @@ def test_a_key_is_not_taken_as_an_argument(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_import_overwrites_nothing_and_asks_for_nothing_then(tmp_path: Path) -> None:
+def test_an_import_overwrites_nothing_and_does_not_prompt_first(tmp_path: Path) -> None:
     (tmp_path / "key.json").write_text("mine")
     done = imported(tmp_path)
     refused(done, FileExists, tmp_path / "key.json")
@@ -276,7 +276,7 @@ class Typing:
         return self._process.wait(60)
 
 
-def test_a_key_that_is_typed_is_not_shown(tmp_path: Path) -> None:
+def test_a_typed_key_is_not_echoed(tmp_path: Path) -> None:
     typing = Typing(tmp_path)
     typing.until("private key: ")
     typing.type(f"{KEY}\n")
@@ -285,7 +285,7 @@ def test_a_key_that_is_typed_is_not_shown(tmp_path: Path) -> None:
     assert KEY not in typing.shown
 
 
-def test_ctrl_c_at_the_question_ends_it(tmp_path: Path) -> None:
+def test_ctrl_c_at_the_prompt_ends_the_command(tmp_path: Path) -> None:
     typing = Typing(tmp_path)
     typing.until("private key: ")
     typing._process.send_signal(signal.SIGINT)

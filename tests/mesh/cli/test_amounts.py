@@ -58,7 +58,7 @@ def test_an_amount_is_read(unit: Unit, text: str, amount: int) -> None:
         (POINT, str(UNLIMITED + 1), "is more than a contract can count"),
     ],
 )
-def test_what_is_no_amount_is_refused_with_an_example(unit: Unit, text: str, words: str) -> None:
+def test_an_invalid_amount_is_refused_with_an_example(unit: Unit, text: str, words: str) -> None:
     with pytest.raises(InputError) as refused:
         unit.parse(text)
     assert words in str(refused.value)
@@ -82,6 +82,6 @@ def test_an_amount_is_shown_with_all_its_digits(unit: Unit, amount: int, text: s
 
 
 @given(amount=st.integers(0, UNLIMITED - 1), decimals=st.integers(0, 30))
-def test_what_is_shown_is_read_as_the_same_amount(amount: int, decimals: int) -> None:
+def test_a_printed_amount_is_read_as_the_same_amount(amount: int, decimals: int) -> None:
     unit = Unit("TKN", decimals)
     assert unit.parse(unit.show(amount).replace(",", "")) == amount

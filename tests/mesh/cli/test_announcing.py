@@ -23,7 +23,7 @@ LINE = "router tcp/here 100%; chain http://there"
 
 
 @pytest.mark.parametrize("form", ["human", "json"])
-def test_the_event_is_one_line_and_people_see_all_of_them(form: str) -> None:
+def test_json_logs_have_one_line_and_people_see_all_lines(form: str) -> None:
     done = run(sys.executable, "-c", PROGRAM.format(form=form))
 
     assert done.returncode == 0, done.stderr

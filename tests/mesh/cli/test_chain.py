@@ -35,9 +35,7 @@ def bare(tmp_path: Path) -> Iterator[ServedChain]:
         yield place
 
 
-def test_a_deployment_says_all_addresses_and_can_be_used_with_the_settings_that_it_prints(
-    bare: ServedChain, tmp_path: Path
-) -> None:
+def test_a_deployment_prints_all_addresses_and_the_settings_to_use_it(bare: ServedChain, tmp_path: Path) -> None:
     done = bare.aira(*DEPLOY)
     assert done.exit_code == 0, done.output
     facts, _, options = done.stdout.partition("\nsettings of those who use it:\n\n")
@@ -58,7 +56,7 @@ def test_a_deployment_says_all_addresses_and_can_be_used_with_the_settings_that_
     assert (market["minimalStake"], market["timeoutBlocks"]) == (str(5 * XRT // 2), 7)
 
 
-def test_a_second_deployment_has_to_be_asked_for(bare: ServedChain) -> None:
+def test_a_second_deployment_needs_a_flag(bare: ServedChain) -> None:
     first = bare.run_json(*DEPLOY, by="provider")
     hint = refused(bare.aira(*DEPLOY, by="provider"), AlreadyDeployed, first["factory"])
     assert "--again" in hint
@@ -69,7 +67,7 @@ def test_a_second_deployment_has_to_be_asked_for(bare: ServedChain) -> None:
     assert (told["factory"], told["isOurCode"]) == (second["factory"], True)
 
 
-def test_an_account_that_can_not_pay_for_all_of_it_deploys_nothing(bare: ServedChain, tmp_path: Path) -> None:
+def test_an_account_that_can_not_pay_for_everything_deploys_nothing(bare: ServedChain, tmp_path: Path) -> None:
     key = new_private_key()
     keyfile = write_quick_keyfile(tmp_path / "poor.json", key)
     address = Account.from_key(key).address
@@ -92,7 +90,7 @@ def test_an_account_that_can_not_pay_for_all_of_it_deploys_nothing(bare: ServedC
         (("--minimal-stake", "much"), InvalidAmount, "much"),
     ],
 )
-def test_what_the_factory_would_refuse_at_the_end_is_refused_before_the_beginning(
+def test_values_that_the_factory_would_refuse_are_refused_before_the_first_transaction(
     bare: ServedChain, options: tuple[str, str], error: type[AiraError], value: str
 ) -> None:
     refused(bare.aira(*DEPLOY, *options), error, value)
@@ -105,7 +103,7 @@ def test_a_deployment_needs_an_account_and_a_node(bare: ServedChain) -> None:
     refused(bare.aira(*DEPLOY, AIRA_WEB3_HTTP_PROVIDER=nowhere), NodeUnreachable, nowhere)
 
 
-def test_status_of_a_chain_without_contracts_tells_of_the_node_and_what_is_missing(bare: ServedChain) -> None:
+def test_status_of_a_chain_without_contracts_shows_the_node_and_what_is_missing(bare: ServedChain) -> None:
     done = bare.aira("chain", "status")
     assert done.exit_code == 1
     said = columns(done.stdout)
@@ -130,7 +128,7 @@ def test_status_shows_the_node_the_contracts_and_the_account(served: ServedChain
     assert said["account"].endswith(" ETH, 1,000 XRT")
 
 
-def test_status_for_programs_has_the_same(served: ServedChain) -> None:
+def test_status_prints_json(served: ServedChain) -> None:
     told = served.run_json("chain", "status")
     assert (told["node"], told["isOurCode"], told["wn"]) == (served.url, True, str(1_000 * XRT))
     assert told["chainId"] == served.ask("person", _chain_id)
@@ -142,18 +140,18 @@ async def _chain_id(chain: Chain) -> int:
     return chain.chain_id
 
 
-def test_status_bears_a_lighthouse_that_is_not_there(served: ServedChain) -> None:
+def test_status_works_with_an_unknown_lighthouse(served: ServedChain) -> None:
     said = columns(served.aira("chain", "status", "--lighthouse-contract", "nowhere").stdout)
     assert said["lighthouse"] == "none of that name  nowhere"
     assert served.run_json("chain", "status", "--lighthouse-contract", "nowhere")["lighthouse"] is None
 
 
-def test_contracts_with_other_code_are_not_called_ours(served: ServedChain) -> None:
+def test_contracts_with_other_code_are_not_reported_as_this_projects(served: ServedChain) -> None:
     told = served.run_json("chain", "status", AIRA_FACTORY_CONTRACT=served.deployment.lighthouse)
     assert told["isOurCode"] is False
 
 
-def test_code_is_ours_with_any_immutables_and_with_no_other_difference(served: ServedChain) -> None:
+def test_code_is_this_projects_if_only_immutables_differ(served: ServedChain) -> None:
     code = bytes(served.ask("person", _factory_code))
     runtime = load_artifact("Factory").runtime
     assert code != runtime
@@ -169,7 +167,7 @@ async def _factory_code(chain: Chain) -> bytes:
     return await chain.node.code(chain.factory)
 
 
-def test_contracts_can_be_deployed_to_a_node_of_others(tmp_path: Path) -> None:
+def test_contracts_can_be_deployed_to_an_external_node(tmp_path: Path) -> None:
     with Anvil() as node:
         keyfile = write_quick_keyfile(tmp_path / "deployer.json", node.private_keys[3])
         (tmp_path / "password").write_text("open sesame\n")
@@ -212,12 +210,12 @@ def test_a_chain_without_the_contracts_is_one_clear_line_in_every_command(bare: 
 
 
 @pytest.mark.parametrize("command", [ON_A_CHAIN[0], ON_A_CHAIN[8], ON_A_CHAIN[12], ("chain", "status")])
-def test_a_node_that_is_not_there_is_one_clear_line(served: ServedChain, command: tuple[str, ...]) -> None:
+def test_an_unreachable_node_is_one_clear_line(served: ServedChain, command: tuple[str, ...]) -> None:
     nowhere = f"http://127.0.0.1:{free_port()}"
     hint = refused(served.aira(*command, AIRA_WEB3_HTTP_PROVIDER=nowhere), NodeUnreachable, nowhere)
     assert "aira chain up" in hint
 
 
-def test_what_is_no_node_is_one_clear_line(served: ServedChain) -> None:
+def test_a_server_that_is_no_node_is_one_clear_line(served: ServedChain) -> None:
     refused(served.aira("xrt", "balance", AIRA_WEB3_HTTP_PROVIDER="localhost"), ConfigurationError, "localhost")
     refused(served.aira("xrt", "balance", AIRA_ENS_CONTRACT="0x12"), InvalidAddress, "0x12")

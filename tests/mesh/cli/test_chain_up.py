@@ -65,9 +65,7 @@ def on_path(tmp_path: Path) -> dict[str, str]:
     return {"PATH": f"{folder}:{os.environ['PATH']}"}
 
 
-def test_anvil_is_taken_where_it_is_on_the_path_and_stopped_with_the_command(
-    tmp_path: Path, on_path: dict[str, str]
-) -> None:
+def test_anvil_on_the_path_is_used_and_stopped_with_the_command(tmp_path: Path, on_path: dict[str, str]) -> None:
     port = free_port()
     with up(tmp_path, port=port, **on_path) as server:
         said = columns(server.log())
@@ -94,7 +92,7 @@ def test_anvil_does_not_outlive_a_command_that_is_killed(tmp_path: Path) -> None
         wait_until(lambda: not is_running(anvil) and not answers(port), what="the end of anvil")
 
 
-def test_a_crash_of_anvil_is_told_and_ends_the_command(tmp_path: Path) -> None:
+def test_a_crash_of_anvil_is_logged_and_ends_the_command(tmp_path: Path) -> None:
     with up(tmp_path, "--anvil", require("anvil"), port=free_port()) as server:
         os.kill(child_of(server.pid), signal.SIGKILL)
         wait_until(lambda: not is_running(server.pid), what="the end of the command")
@@ -126,7 +124,7 @@ def test_the_chain_is_kept_in_a_file(tmp_path: Path) -> None:
     assert first == second
 
 
-def test_the_embedded_chain_is_taken_where_there_is_no_anvil(tmp_path: Path) -> None:
+def test_the_embedded_chain_is_used_without_anvil(tmp_path: Path) -> None:
     with up(tmp_path, "--json", port=0, says="passwordFile", PATH="/nowhere:/usr/bin:/bin") as server:
         told = json.loads(server.log().splitlines()[0])
         assert told["engine"] == "embedded"
@@ -137,18 +135,18 @@ def test_the_embedded_chain_is_taken_where_there_is_no_anvil(tmp_path: Path) -> 
         assert json.loads(status.stdout)["factory"] == told["factory"]
 
 
-def test_the_embedded_chain_can_be_asked_for(tmp_path: Path, on_path: dict[str, str]) -> None:
+def test_the_embedded_chain_can_be_selected(tmp_path: Path, on_path: dict[str, str]) -> None:
     with up(tmp_path, "--engine", "embedded", port=0, **on_path) as server:
         assert columns(server.log())["engine"] == "embedded"
 
 
-def test_anvil_that_is_not_there_is_one_clear_line(tmp_path: Path) -> None:
+def test_a_missing_anvil_is_one_clear_line(tmp_path: Path) -> None:
     hint = refused(failing("--engine", "anvil", PATH=str(tmp_path)), AnvilMissing)
     assert "--engine embedded" in hint
     refused(failing("--anvil", tmp_path / "anvil"), ConfigurationError, tmp_path / "anvil")
 
 
-def test_the_embedded_chain_can_not_be_kept(tmp_path: Path) -> None:
+def test_the_embedded_chain_has_no_state_file(tmp_path: Path) -> None:
     state = ("--state", tmp_path / "chain.json")
     assert "--anvil FILE" in refused(failing(*state, PATH=str(tmp_path)), AnvilMissing, "--state")
     refused(failing(*state, "--engine", "embedded"), AnvilMissing, "--engine embedded")
@@ -163,13 +161,13 @@ def test_a_taken_port_is_one_clear_line(tmp_path: Path, engine: str, on_path: di
         assert "choose another port" in hint
 
 
-def test_a_state_that_is_none_is_one_clear_line(tmp_path: Path) -> None:
+def test_an_invalid_state_file_is_one_clear_line(tmp_path: Path) -> None:
     (tmp_path / "state.json").write_text("garbage")
     options = ("--anvil", require("anvil"), "--state", tmp_path / "state.json", "--port", "0", "--data-dir", tmp_path)
     refused(failing(*options), ConfigurationError)
 
 
-async def test_a_transaction_that_is_not_mined_can_be_left_and_is_not_sent_twice(tmp_path: Path) -> None:
+async def test_waiting_for_an_unmined_transaction_can_be_interrupted_and_it_is_not_sent_twice(tmp_path: Path) -> None:
     settings = Settings(data_dir=str(tmp_path))
     anvil = require("anvil")
     async with serve_chain(settings, host="127.0.0.1", port=0, block_time=None, anvil=anvil) as served:

@@ -32,19 +32,19 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-def test_one_file_is_answered_by_its_cid_alone(file: Path) -> None:
+def test_for_one_file_only_its_cid_is_printed(file: Path) -> None:
     done = cid(file)
     assert (done.exit_code, done.stdout) == (0, f"{cid_of_bytes(CONTENT)}\n")
 
 
-def test_several_files_are_answered_by_a_line_each(file: Path, tmp_path: Path) -> None:
+def test_for_several_files_a_line_each_is_printed(file: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     other.write_bytes(b"")
     done = cid(file, other)
     assert done.stdout == f"{cid_of_bytes(CONTENT)}  {file}\n{cid_of_bytes(b'')}  {other}\n"
 
 
-def test_a_dash_is_the_standard_input() -> None:
+def test_a_dash_reads_the_standard_input() -> None:
     assert cid("-", given=CONTENT).stdout == f"{cid_of_bytes(CONTENT)}\n"
 
 
@@ -59,7 +59,7 @@ def test_a_folder_is_one_clear_line(tmp_path: Path) -> None:
     refused(done, FileUnreadable, tmp_path, "Is a directory")
 
 
-def test_without_files_it_says_how_it_is_used() -> None:
+def test_without_files_the_usage_is_printed() -> None:
     done = cid()
     assert done.exit_code == 2
     assert "Missing argument 'FILES...'" in done.stderr
@@ -72,7 +72,7 @@ def test_the_script_and_the_module_do_the_same(file: Path) -> None:
     assert script.stdout == expected
 
 
-def test_no_chain_and_no_network_is_loaded_for_it(file: Path) -> None:
+def test_it_does_not_import_the_chain_or_the_network(file: Path) -> None:
     program = (
         "import sys; from mesh.cli import main\n"
         f"main(['cid', {str(file)!r}], standalone_mode=False)\n"

@@ -43,7 +43,7 @@ def test_an_empty_flag_wins_over_a_variable() -> None:
         ("demo", "--generation", "4"),
     ],
 )
-def test_a_number_that_can_not_be_names_its_flag(arguments: tuple[str, ...]) -> None:
+def test_an_error_of_an_invalid_number_names_its_flag(arguments: tuple[str, ...]) -> None:
     done = aira(*arguments)
     assert done.exit_code == 2
     assert f"Invalid value for '{arguments[-2]}'" in done.stderr
@@ -56,14 +56,14 @@ def test_seconds_are_finite(option: str, value: str) -> None:
     refused(done, ConfigurationError, option[2:].replace("-", "_"))
 
 
-def test_an_unknown_flag_names_those_that_are_near() -> None:
+def test_an_unknown_flag_suggests_similar_ones() -> None:
     done = aira("settings", "--fetch-timeot", "3")
     assert done.exit_code == 2
     assert "--fetch-timeout" in done.stderr
 
 
 @pytest.mark.parametrize("command", ["demand", "peers", "provider", "router", "settings", "status", "up", "watch"])
-def test_a_mistaken_variable_is_one_clear_line_in_every_command_with_settings(command: str) -> None:
+def test_an_invalid_variable_is_one_clear_line_in_every_command_with_settings(command: str) -> None:
     needed = ("--model", CID, "--objective", CID) if command == "demand" else ()
     done = aira(command, *needed, AIRA_KEYFILL="x")
     refused(done, ConfigurationError, "'keyfill'", "environment")

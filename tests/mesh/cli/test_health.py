@@ -54,7 +54,7 @@ def answering(answer: bytes) -> Iterator[str]:
         thread.join()
 
 
-def test_a_router_is_well_and_the_exit_code_says_so(listen: str) -> None:
+def test_a_healthy_router_ends_with_exit_code_0(listen: str) -> None:
     with Serving(
         *AIRA, "router", "--listen", f"tcp/127.0.0.1:{free_port()}", "--metrics-listen", listen, says="without a roster"
     ):
@@ -66,7 +66,7 @@ def test_a_router_is_well_and_the_exit_code_says_so(listen: str) -> None:
         assert (everywhere.returncode, everywhere.stdout) == (0, "router  alive\n")
 
 
-async def test_aira_up_tells_the_markets_of_both_generations_apart(listen: str, tmp_path: Path) -> None:
+async def test_aira_up_has_metrics_of_both_generations(listen: str, tmp_path: Path) -> None:
     options = ("--port", "0", "--listen", f"tcp/127.0.0.1:{free_port()}", "--data-dir", tmp_path)
     url = f"http://{listen}"
     command = (*AIRA, "up", "--engine", "embedded", *options, "--metrics-listen", listen)
@@ -84,7 +84,7 @@ async def test_aira_up_tells_the_markets_of_both_generations_apart(listen: str, 
         assert invoke("health", "--url", url).returncode == 0
 
 
-async def test_a_chain_tells_how_high_it_is(listen: str, tmp_path: Path) -> None:
+async def test_a_chain_reports_its_block_number(listen: str, tmp_path: Path) -> None:
     options = ("--port", "0", "--engine", "embedded", "--data-dir", tmp_path)
     url = f"http://{listen}"
     with Serving(*AIRA, "chain", "up", *options, "--metrics-listen", listen, says="password"):
@@ -96,7 +96,7 @@ async def test_a_chain_tells_how_high_it_is(listen: str, tmp_path: Path) -> None
         assert (await scraped(url))("aira_chain_head_block") > 0
 
 
-async def test_a_provider_that_waits_for_its_node_says_so(listen: str, tmp_path: Path) -> None:
+async def test_a_provider_that_waits_for_its_node_is_unhealthy(listen: str, tmp_path: Path) -> None:
     keyfile, password = tmp_path / "key.json", tmp_path / "password"
     password.write_text("open sesame\n")
     assert invoke("account", "new", keyfile, "--password-file", password).returncode == 0
@@ -117,7 +117,7 @@ async def test_a_provider_that_waits_for_its_node_says_so(listen: str, tmp_path:
 
 
 @pytest.mark.parametrize("command", [("router",), ("up", "--port", "0"), ("chain", "up", "--port", "0")])
-def test_a_port_that_is_taken_is_one_clear_line(command: tuple[str, ...], tmp_path: Path) -> None:
+def test_a_taken_port_is_one_clear_line(command: tuple[str, ...], tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         place = f"127.0.0.1:{taken.getsockname()[1]}"
         done = invoke(
@@ -130,25 +130,25 @@ def test_a_port_that_is_taken_is_one_clear_line(command: tuple[str, ...], tmp_pa
     assert refused(done, ConfigurationError, place, "Address already in use")
 
 
-def test_a_place_that_is_none_is_one_clear_line() -> None:
+def test_an_invalid_listen_address_is_one_clear_line() -> None:
     done = invoke("router", "--metrics-listen", "9464", AIRA_LISTEN=f"tcp/127.0.0.1:{free_port()}")
 
     refused(done, ConfigurationError, "'9464'")
 
 
-def test_where_nobody_answers_is_one_clear_line_and_code_1(listen: str) -> None:
+def test_a_closed_port_is_one_clear_line_and_code_1(listen: str) -> None:
     done = invoke("health", "--url", f"http://{listen}")
 
     refused(done, HealthUnavailable, listen, "Connection refused")
 
 
-def test_a_host_that_can_not_be_one_is_one_clear_line_and_code_1() -> None:
+def test_an_impossible_host_is_one_clear_line_and_code_1() -> None:
     done = invoke("health", "--url", "http://no..host:9464")
 
     refused(done, HealthUnavailable, "no..host:9464")
 
 
-def test_a_demand_leaves_metrics_to_the_servers_with_the_same_settings(listen: str, tmp_path: Path) -> None:
+def test_a_demand_does_not_serve_metrics(listen: str, tmp_path: Path) -> None:
     objective = tmp_path / "nothing.mcap"
     objective.write_bytes(b"")
     host, _, port = listen.rpartition(":")
@@ -160,7 +160,7 @@ def test_a_demand_leaves_metrics_to_the_servers_with_the_same_settings(listen: s
     refused(done, ConfigurationError, "password file")
 
 
-def test_who_does_not_answer_in_time_is_one_clear_line_and_code_1() -> None:
+def test_a_late_answer_is_one_clear_line_and_code_1() -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
         done = invoke("health", "--url", f"http://127.0.0.1:{silent.getsockname()[1]}", "--timeout", "0.2")
 
@@ -170,14 +170,14 @@ def test_who_does_not_answer_in_time_is_one_clear_line_and_code_1() -> None:
 @pytest.mark.parametrize(
     "answer", [b"HTTP/1.0 200 OK\r\n\r\n<html>", b'HTTP/1.0 200 OK\r\n\r\n{"ok": 1}', b"HTTP/1.0 404 No\r\n\r\n"]
 )
-def test_what_is_no_server_of_the_mesh_is_one_clear_line_and_code_1(answer: bytes) -> None:
+def test_another_http_server_is_one_clear_line_and_code_1(answer: bytes) -> None:
     with answering(answer) as url:
         done = invoke("health", "--url", url)
 
     refused(done, HealthUnavailable, url.removeprefix("http://"))
 
 
-def test_what_is_said_can_not_steer_the_terminal() -> None:
+def test_control_characters_of_an_answer_are_not_printed() -> None:
     with answering(b'HTTP/1.0 503 No\r\n\r\n{"ok": false, "parts": {"a\\u001b[2J": "b\\u001b[31m"}}') as url:
         done = invoke("health", "--url", url)
 
@@ -188,19 +188,19 @@ def test_what_is_said_can_not_steer_the_terminal() -> None:
 @pytest.mark.parametrize(
     "url", ["127.0.0.1:9464", "https://127.0.0.1:9464", "http://127.0.0.1", "http://[", "http://:x"]
 )
-def test_an_address_that_is_none_is_one_clear_line_and_code_2(url: str) -> None:
+def test_an_invalid_address_is_one_clear_line_and_code_2(url: str) -> None:
     done = invoke("health", "--url", url)
 
     refused(done, InvalidServerAddress, repr(url))
 
 
-def test_without_an_address_it_says_what_to_give() -> None:
+def test_a_missing_address_is_an_error_with_a_hint() -> None:
     done = invoke("health")
 
     assert "--url" in refused(done, InvalidServerAddress)
 
 
-def test_it_loads_little() -> None:
+def test_it_does_not_import_the_chain_or_the_network() -> None:
     program = """
 import sys
 sys.argv = ["aira", "health", "--url", "http://127.0.0.1:9"]

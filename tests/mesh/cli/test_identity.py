@@ -48,7 +48,7 @@ def made(folder: Path, site: Path, *more: str | Path, name: str = "arm") -> dict
     return found
 
 
-def test_a_member_s_files_make_an_identity_whose_common_name_is_the_address(tmp_path: Path, site: Path) -> None:
+def test_the_common_name_of_a_members_identity_is_its_address(tmp_path: Path, site: Path) -> None:
     folder = tmp_path / "arm"
 
     found = made(folder, site, "--address", ARM.upper().replace("X", "x"), "--role", "agent", "--role", "person")
@@ -60,7 +60,7 @@ def test_a_member_s_files_make_an_identity_whose_common_name_is_the_address(tmp_
     assert json.loads(invoke("identity", "show", folder, "--json").stdout) == found
 
 
-def test_show_tells_name_address_role_validity_and_fingerprint(tmp_path: Path, site: Path) -> None:
+def test_show_prints_name_address_role_validity_and_fingerprint(tmp_path: Path, site: Path) -> None:
     found = made(tmp_path / "arm", site, "--address", ARM, "--role", "agent", "--days", "30")
 
     lines = invoke("identity", "show", tmp_path / "arm").stdout.splitlines()
@@ -106,7 +106,7 @@ def test_nothing_is_overwritten(tmp_path: Path, site: Path) -> None:
     assert {path: path.read_bytes() for path in before} == before
 
 
-def test_the_roster_is_written_along_and_keeps_what_people_wrote(tmp_path: Path, site: Path) -> None:
+def test_a_new_identity_is_added_to_the_roster_without_changing_other_lines(tmp_path: Path, site: Path) -> None:
     roster = tmp_path / "roster.toml"
     roster.write_text("# our site\nlighthouses = []\n")
 
@@ -122,7 +122,7 @@ def test_the_roster_is_written_along_and_keeps_what_people_wrote(tmp_path: Path,
     assert shown.splitlines()[-1] == "roster       in the roster as agent"
 
 
-def test_who_can_t_be_in_the_roster_gets_no_certificate(tmp_path: Path, site: Path) -> None:
+def test_a_member_that_the_roster_can_not_hold_gets_no_certificate(tmp_path: Path, site: Path) -> None:
     roster = tmp_path / "roster.toml"
     made(tmp_path / "arm", site, "--address", ARM, "--role", "agent", "--roster", roster)
 
@@ -132,7 +132,7 @@ def test_who_can_t_be_in_the_roster_gets_no_certificate(tmp_path: Path, site: Pa
     assert not (tmp_path / "again").exists()
 
 
-def test_renewal_keeps_holder_and_key_and_tells_the_roster(tmp_path: Path, site: Path) -> None:
+def test_renewal_keeps_holder_and_key_and_updates_the_roster(tmp_path: Path, site: Path) -> None:
     folder, roster = tmp_path / "arm", tmp_path / "roster.toml"
     before = made(folder, site, "--address", ARM, "--role", "agent", "--days", "0.5", "--roster", roster)
     key = (folder / "identity.key").read_bytes()
@@ -149,7 +149,7 @@ def test_renewal_keeps_holder_and_key_and_tells_the_roster(tmp_path: Path, site:
     assert sorted(path.name for path in folder.iterdir()) == ["ca.pem", "identity.key", "identity.pem"]
 
 
-def test_show_says_what_the_roster_thinks(tmp_path: Path, site: Path) -> None:
+def test_show_compares_the_certificate_with_the_roster(tmp_path: Path, site: Path) -> None:
     folder, roster = tmp_path / "arm", tmp_path / "roster.toml"
     made(folder, site, "--address", ARM, "--role", "agent", "--roster", roster)
     text = roster.read_text()
@@ -165,7 +165,7 @@ def test_show_says_what_the_roster_thinks(tmp_path: Path, site: Path) -> None:
     assert standing() == "not in the roster"
 
 
-def test_a_router_is_made_without_an_account_but_for_a_host(tmp_path: Path, site: Path) -> None:
+def test_a_routers_identity_needs_a_host_and_no_account(tmp_path: Path, site: Path) -> None:
     found = made(tmp_path / "hub", site, "--role", "router", "--host", "127.0.0.1", "--host", "hub.example", name="hub")
 
     assert found["hosts"] == ["127.0.0.1", "hub.example"] or found["hosts"] == ["hub.example", "127.0.0.1"]
@@ -182,14 +182,14 @@ def test_a_router_is_made_without_an_account_but_for_a_host(tmp_path: Path, site
         (("--role", "router", "--address", ARM, "--host", "a host"), InputError, "a host"),
     ],
 )
-def test_a_member_who_can_t_be_is_refused_in_a_line(
+def test_an_invalid_member_is_one_clear_line(
     tmp_path: Path, site: Path, more: tuple[str, ...], error: type[AiraError], value: str
 ) -> None:
     refused(new(tmp_path / "arm", site, *more), error, value)
     assert not (tmp_path / "arm").exists()
 
 
-def test_an_unknown_role_names_those_that_there_are(tmp_path: Path, site: Path) -> None:
+def test_an_unknown_role_lists_the_roles(tmp_path: Path, site: Path) -> None:
     done = new(tmp_path / "arm", site, "--address", ARM, "--role", "king")
 
     assert done.returncode == 2
@@ -197,7 +197,7 @@ def test_an_unknown_role_names_those_that_there_are(tmp_path: Path, site: Path) 
     assert "'watcher'" in done.stderr
 
 
-def test_files_that_are_no_identity_are_named(tmp_path: Path, site: Path) -> None:
+def test_errors_name_files_that_are_no_identity(tmp_path: Path, site: Path) -> None:
     folder = tmp_path / "arm"
     made(folder, site, "--address", ARM, "--role", "agent")
     made(tmp_path / "other", site, "--address", OTHER, "--role", "agent", name="other")
@@ -221,7 +221,7 @@ def test_files_that_are_no_identity_are_named(tmp_path: Path, site: Path) -> Non
     assert certificate.read_bytes() == good
 
 
-def test_a_site_that_has_expired_signs_nothing(tmp_path: Path) -> None:
+def test_an_expired_site_signs_nothing(tmp_path: Path) -> None:
     invoke("identity", "site", tmp_path / "site", "--days", "0.000001")
 
     done = new(tmp_path / "arm", tmp_path / "site", "--address", ARM, "--role", "agent")
@@ -229,7 +229,7 @@ def test_a_site_that_has_expired_signs_nothing(tmp_path: Path) -> None:
     refused(done, IdentityError, f"{tmp_path}/site/ca.pem", "expired")
 
 
-def test_check_tells_who_is_let_in_and_heeded_from_who_is_not(tmp_path: Path) -> None:
+def test_check_distinguishes_admitted_members_from_refused_ones(tmp_path: Path) -> None:
     site = Site(tmp_path / "closed")
     board = Member(name="board", address=OTHER, roles=("edge",), agent=ARM, device="gripper")
     members = [
@@ -255,5 +255,5 @@ def test_check_tells_who_is_let_in_and_heeded_from_who_is_not(tmp_path: Path) ->
     assert (screen.returncode, edge.returncode) == (0, 0), (screen.stderr, edge.stderr)
 
 
-def test_check_without_an_identity_says_what_to_give() -> None:
+def test_check_without_an_identity_is_an_error_with_a_hint() -> None:
     refused(invoke("identity", "check"), IdentityMissing)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 __all__ = ["site"]
 
 
-def test_only_what_expires_soon_is_renewed_by_a_timer(tmp_path: Path, site: Path) -> None:
+def test_only_certificates_that_expire_soon_are_renewed(tmp_path: Path, site: Path) -> None:
     roster = tmp_path / "roster.toml"
     soon = made(tmp_path / "soon", site, "--address", ARM, "--role", "agent", "--days", "29", "--roster", roster)
     later = made(
@@ -36,7 +36,7 @@ def test_only_what_expires_soon_is_renewed_by_a_timer(tmp_path: Path, site: Path
     assert again.splitlines() == ["arm is valid for 89 more days", "leg is valid for 30 more days"]
 
 
-def test_one_that_can_t_be_renewed_does_not_hold_up_the_others(tmp_path: Path, site: Path) -> None:
+def test_a_failed_renewal_does_not_prevent_the_others(tmp_path: Path, site: Path) -> None:
     made(tmp_path / "arm", site, "--address", ARM, "--role", "agent", "--days", "1")
 
     done = invoke("identity", "renew", tmp_path / "nobody", tmp_path / "arm", "--site", site, "--within", "30")
@@ -46,7 +46,7 @@ def test_one_that_can_t_be_renewed_does_not_hold_up_the_others(tmp_path: Path, s
     assert "89 days left" in done.stdout
 
 
-def test_the_revoked_are_not_renewed_and_each_failure_is_told(tmp_path: Path, site: Path) -> None:
+def test_revoked_members_are_not_renewed_and_each_failure_is_printed(tmp_path: Path, site: Path) -> None:
     """The roster shuts an address out; a new certificate for it would outlive the day on which it is let in again."""
     roster = tmp_path / "roster.toml"
     for name, address in (("gone", ARM), ("leg", OTHER)):
@@ -67,7 +67,7 @@ def test_the_revoked_are_not_renewed_and_each_failure_is_told(tmp_path: Path, si
     assert [member.revoked for member in read_roster(roster).member] == [True, False]
 
 
-def test_a_certificate_is_renewed_where_its_key_is_not(tmp_path: Path, site: Path) -> None:
+def test_a_certificate_is_renewed_without_its_key(tmp_path: Path, site: Path) -> None:
     """The site's key stays with the site, and the member's with the member: only certificates travel."""
     folder = tmp_path / "arm"
     before = made(folder, site, "--address", ARM, "--role", "agent", "--days", "1")

@@ -53,7 +53,7 @@ def test_every_command_says_what_it_does(name: str) -> None:
     assert done.stdout.startswith(f"Usage: main {name} ")
 
 
-def test_the_version_is_the_packages() -> None:
+def test_the_version_is_that_of_the_package() -> None:
     assert CliRunner().invoke(main, ["--version"]).stdout == f"aira, version {mesh.__version__}\n"
 
 
@@ -65,13 +65,13 @@ def test_a_group_lists_its_commands_with_a_whole_line_each(group: str, names: tu
 
 
 @pytest.mark.parametrize(("typed", "meant"), [("dmeo", "demo"), ("demnd", "demand"), ("egde", "edge")])
-def test_a_typing_error_is_answered_with_the_nearest_command(typed: str, meant: str) -> None:
+def test_a_typing_error_suggests_the_nearest_command(typed: str, meant: str) -> None:
     done = CliRunner().invoke(main, [typed])
     assert done.exit_code == 2
     assert f"no such command {typed!r}; did you mean {meant!r}?" in done.stderr
 
 
-def test_what_is_near_to_nothing_is_only_unknown() -> None:
+def test_a_word_near_no_command_gets_no_suggestion() -> None:
     done = CliRunner().invoke(main, ["xyzzy"])
     assert done.exit_code == 2
     assert done.stderr.rstrip().endswith("no such command 'xyzzy'")
@@ -89,7 +89,7 @@ def test_an_interrupt_while_a_command_is_loaded_ends_with_130(monkeypatch: pytes
     assert done.output == ""
 
 
-def test_the_module_is_the_command_line_too() -> None:
+def test_the_module_runs_the_command_line() -> None:
     done = subprocess.run([sys.executable, "-m", "mesh", "--help"], capture_output=True, text=True, check=True)
     assert done.stdout.startswith("Usage: aira ")
 
@@ -152,7 +152,7 @@ def test_an_installed_command_that_can_not_be_imported_is_one_clear_line(root: c
 
 
 @pytest.mark.usefixtures("plugins")
-def test_a_broken_command_breaks_no_other(root: click.Group) -> None:
+def test_a_broken_command_does_not_break_others(root: click.Group) -> None:
     assert CliRunner().invoke(root, ["hello"]).exit_code == 0
     done = CliRunner().invoke(root, ["--help"])
     assert (done.exit_code, "module_that_is_absent" in done.stdout) == (0, True)

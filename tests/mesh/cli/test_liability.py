@@ -31,7 +31,9 @@ def signature_of(served: ServedChain, role: str, liability: str) -> str:
     return signature
 
 
-def test_an_open_one_is_shown_with_its_money_and_from_when_on_that_can_be_had_back(served: ServedChain) -> None:
+def test_an_open_liability_is_shown_with_its_cost_and_the_block_from_which_it_is_refundable(
+    served: ServedChain,
+) -> None:
     address = served.create_liability(cost=COST, lighthouse_fee=7)
     head = served.ask("person", lambda chain: chain.block_number())
     said = columns(served.aira("liability", "show", address).stdout)
@@ -45,7 +47,7 @@ def test_an_open_one_is_shown_with_its_money_and_from_when_on_that_can_be_had_ba
     assert "result" not in said
 
 
-def test_json_is_the_record_of_the_wire_and_a_state(served: ServedChain) -> None:
+def test_json_is_the_record_on_the_mesh_with_a_state(served: ServedChain) -> None:
     address = served.create_liability(cost=COST)
     told = served.run_json("liability", "show", address)
     assert (told.pop("state"), told.pop("refundableFrom") > 0) == ("open", True)
@@ -57,7 +59,7 @@ def test_json_is_the_record_of_the_wire_and_a_state(served: ServedChain) -> None
 
 
 @pytest.mark.parametrize(("success", "state"), [(True, "paid: "), (False, "failed: ")])
-def test_one_that_has_ended_is_shown_with_its_end(served: ServedChain, success: bool, state: str) -> None:
+def test_a_finalized_liability_is_shown_with_its_result(served: ServedChain, success: bool, state: str) -> None:
     address = served.create_liability(cost=COST)
     cid = served.finalize(address, success=success)
     said = columns(served.aira("liability", "show", address, by="stranger").stdout)
@@ -67,12 +69,12 @@ def test_one_that_has_ended_is_shown_with_its_end(served: ServedChain, success: 
     assert "refund" not in said
 
 
-def test_a_keyfile_is_not_needed_to_look(served: ServedChain) -> None:
+def test_showing_a_liability_needs_no_keyfile(served: ServedChain) -> None:
     address = served.create_liability()
     assert served.run_json("liability", "show", address, AIRA_KEYFILE="")["address"] == address
 
 
-def test_the_list_is_the_accounts_and_can_be_narrowed(served: ServedChain) -> None:
+def test_the_list_has_the_accounts_liabilities_and_can_be_filtered(served: ServedChain) -> None:
     start = served.ask("person", lambda chain: chain.block_number()) + 1
     ended, opened = served.create_liability(cost=COST), served.create_liability()
     served.finalize(ended)
@@ -95,19 +97,19 @@ def test_the_list_is_the_accounts_and_can_be_narrowed(served: ServedChain) -> No
     assert second[:4] == [opened, "open", "0", "XRT"]
 
 
-def test_without_an_account_all_are_listed(served: ServedChain) -> None:
+def test_without_an_account_all_liabilities_are_listed(served: ServedChain) -> None:
     address = served.create_liability()
     assert address in [liability["address"] for liability in served.run_json("liability", "list", AIRA_KEYFILE="")]
 
 
-def test_an_empty_list_says_so(served: ServedChain) -> None:
+def test_an_empty_list_is_printed_as_a_sentence(served: ServedChain) -> None:
     stranger = served.people["stranger"].address
     done = served.aira("liability", "list", "--state", "open", by="stranger")
     assert (done.exit_code, done.stdout) == (0, f"no open liabilities of {stranger}\n")
     assert served.run_json("liability", "list", by="stranger") == []
 
 
-def test_both_parties_call_the_work_off(served: ServedChain) -> None:
+def test_both_parties_cancel_a_liability(served: ServedChain) -> None:
     before = held(served, "person")
     address = served.create_liability(cost=COST)
     said = served.aira("liability", "cancel", address, by="robot").stdout
@@ -124,21 +126,21 @@ def test_both_parties_call_the_work_off(served: ServedChain) -> None:
     assert served.run_json("liability", "show", address)["state"] == "called-off"
 
 
-def test_anybody_can_bring_both_signatures(served: ServedChain) -> None:
+def test_anybody_can_cancel_with_both_signatures(served: ServedChain) -> None:
     address = served.create_liability(cost=COST)
     signatures = [word for role in ("robot", "person") for word in ("--signature", signature_of(served, role, address))]
     told = served.run_json("liability", "cancel", address, *signatures, by="stranger")
     assert (told["state"], told["tx"][:2], told["gasUsed"] > 0) == ("called-off", "0x", True)
 
 
-def test_a_signature_for_programs_says_whose_is_needed(served: ServedChain) -> None:
+def test_the_json_of_a_signature_names_the_other_signer(served: ServedChain) -> None:
     address = served.create_liability()
     told = served.run_json("liability", "cancel", address)
     assert (told["party"], told["signer"]) == ("promisee", served.people["person"].address)
     assert told["needed"] == served.people["robot"].address
 
 
-def test_a_signature_that_does_not_fit_is_one_clear_line(served: ServedChain) -> None:
+def test_a_wrong_signature_is_one_clear_line(served: ServedChain) -> None:
     address, other = served.create_liability(), served.create_liability()
     mine = signature_of(served, "person", address)
     wrong = signature_of(served, "robot", other)
@@ -150,18 +152,18 @@ def test_a_signature_that_does_not_fit_is_one_clear_line(served: ServedChain) ->
     assert served.run_json("liability", "show", address)["state"] == "open"
 
 
-def test_who_is_no_party_can_not_call_off(served: ServedChain) -> None:
+def test_only_a_party_can_cancel(served: ServedChain) -> None:
     refused(served.aira("liability", "cancel", served.create_liability(), by="stranger"), NotAParty)
 
 
-def test_what_has_ended_can_not_be_called_off(served: ServedChain) -> None:
+def test_a_finalized_liability_can_not_be_cancelled(served: ServedChain) -> None:
     address = served.create_liability()
     served.finalize(address)
     refused(served.aira("liability", "cancel", address), LiabilityEnded, address, "paid")
     refused(served.aira("liability", "cancel", address, "--refund"), LiabilityEnded, address, "paid")
 
 
-def test_the_money_of_a_promisor_who_vanished_can_be_had_back_after_the_delay(served: ServedChain) -> None:
+def test_the_cost_is_refunded_after_the_delay_when_the_promisor_disappeared(served: ServedChain) -> None:
     before = held(served, "person")
     address = served.create_liability(cost=COST)
     hint = refused(served.aira("liability", "cancel", address, "--refund"), NotRefundable, address)
@@ -178,7 +180,7 @@ def test_a_refund_needs_no_signature(served: ServedChain) -> None:
     assert (done.exit_code, "--refund needs no --signature" in done.stderr) == (2, True)
 
 
-def test_a_token_of_another_name_is_not_taken_for_xrt(served: ServedChain) -> None:
+def test_an_amount_of_another_token_is_not_printed_as_xrt(served: ServedChain) -> None:
     async def forge() -> str:
         async with served.chain("person") as chain:
             data = chain.node.creation_code("XRT", 1_000 * XRT)
@@ -196,12 +198,12 @@ def test_a_token_of_another_name_is_not_taken_for_xrt(served: ServedChain) -> No
 
 
 @pytest.mark.parametrize("command", ["show", "watch", "cancel"])
-def test_what_is_no_liability_is_one_clear_line(served: ServedChain, command: str) -> None:
+def test_an_address_without_a_liability_is_one_clear_line(served: ServedChain, command: str) -> None:
     refused(served.aira("liability", command, served.deployment.xrt), NotALiability, served.deployment.xrt)
     refused(served.aira("liability", command, "0x12"), InvalidAddress, "0x12")
 
 
-def test_watching_one_that_has_ended_shows_it_at_once(served: ServedChain) -> None:
+def test_watching_a_finalized_liability_prints_it_at_once(served: ServedChain) -> None:
     address = served.create_liability()
     served.finalize(address)
     assert served.run_json("liability", "watch", address)["state"] == "paid"
@@ -214,7 +216,7 @@ def watching(served: ServedChain) -> Iterator[Serving]:
         yield server
 
 
-def test_watching_all_tells_of_each_that_is_made_and_ends(served: ServedChain, watching: Serving) -> None:
+def test_watching_all_prints_each_creation_and_finalization(served: ServedChain, watching: Serving) -> None:
     address = served.create_liability(cost=COST)
     watching.wait_until_said(f"{address}  made ")
     served.finalize(address)
@@ -226,14 +228,14 @@ def test_watching_all_tells_of_each_that_is_made_and_ends(served: ServedChain, w
     assert "Traceback" not in watching.log()
 
 
-def test_watching_all_tells_what_a_reorganisation_takes_back(served: ServedChain, watching: Serving) -> None:
+def test_watching_all_prints_what_a_reorganisation_reverts(served: ServedChain, watching: Serving) -> None:
     address = served.create_liability(cost=COST)
     watching.wait_until_said(f"{address}  made ")
     served.replace_blocks(1)
     watching.wait_until_said(f"the chain was reorganised: {address} was not made after all")
 
 
-def test_watching_all_waits_for_a_node_that_is_lost(served: ServedChain, watching: Serving) -> None:
+def test_watching_all_waits_while_the_node_is_unreachable(served: ServedChain, watching: Serving) -> None:
     with served.unreachable():
         watching.wait_until_said("waiting for it")
     address = served.create_liability(cost=COST)
@@ -242,7 +244,7 @@ def test_watching_all_waits_for_a_node_that_is_lost(served: ServedChain, watchin
     assert "Traceback" not in watching.log()
 
 
-def test_watching_one_shows_it_once_it_has_ended(served: ServedChain) -> None:
+def test_watching_one_prints_it_when_it_is_finalized(served: ServedChain) -> None:
     address = served.create_liability(cost=COST)
     command = (*AIRA, "liability", "watch", address)
     with Serving(*command, says="waiting for its end", variables=served.variables()) as watcher:
@@ -250,7 +252,7 @@ def test_watching_one_shows_it_once_it_has_ended(served: ServedChain) -> None:
         watcher.wait_until_said("state       failed: ")
 
 
-def test_watching_all_for_programs_is_an_object_a_line(served: ServedChain) -> None:
+def test_watching_all_with_json_prints_one_object_per_line(served: ServedChain) -> None:
     block = served.ask("person", lambda chain: chain.block_number()) + 1
     address = served.create_liability()
     served.finalize(address)
@@ -260,7 +262,7 @@ def test_watching_all_for_programs_is_an_object_a_line(served: ServedChain) -> N
     assert [(line["event"], line["liability"]["address"]) for line in told] == [("made", address), ("ended", address)]
 
 
-def test_ctrl_c_ends_the_watching_of_one(served: ServedChain) -> None:
+def test_ctrl_c_stops_watching_one(served: ServedChain) -> None:
     interrupted = Interrupted(
         "liability",
         "watch",
@@ -272,6 +274,6 @@ def test_ctrl_c_ends_the_watching_of_one(served: ServedChain) -> None:
     assert (interrupted.code, interrupted.errors) == (130, "")
 
 
-def test_a_real_process_says_the_same(served: ServedChain) -> None:
+def test_a_separate_process_prints_the_same(served: ServedChain) -> None:
     done = aira("liability", "show", served.deployment.xrt, **served.variables())
     assert refused(done, NotALiability, served.deployment.xrt) == ""

@@ -32,7 +32,7 @@ def market(served: ServedChain) -> str:
     return name
 
 
-def test_a_new_lighthouse_is_told_of_and_listed(served: ServedChain) -> None:
+def test_a_new_lighthouse_is_announced_and_listed(served: ServedChain) -> None:
     made = served.run_json("lighthouse", "create", "brand-new", "--minimal-stake", "2.5", "--timeout-blocks", "7")
     assert (made["name"], made["timeoutBlocks"]) == ("brand-new.lighthouse.3.robonomics.eth", 7)
     listed = served.run_json("lighthouse", "list")
@@ -50,7 +50,7 @@ def test_a_new_lighthouse_is_told_of_and_listed(served: ServedChain) -> None:
     }
 
 
-def test_creating_says_what_was_made(served: ServedChain) -> None:
+def test_creating_prints_the_new_lighthouse(served: ServedChain) -> None:
     said = columns(served.aira("lighthouse", "create", "spoken", "--minimal-stake", "5wn").stdout)
     assert said["name"] == "spoken.lighthouse.3.robonomics.eth"
     assert (said["minimal stake"], said["timeout"]) == ("0.000000005 XRT", "25 blocks")
@@ -68,7 +68,7 @@ def test_the_list_has_a_line_for_each_since_a_block(served: ServedChain, market:
     assert done.stdout == f"no lighthouse was made here since block {block + 1:,}\n"
 
 
-def test_joining_approves_what_is_missing_and_leaving_gives_it_back(served: ServedChain, market: str) -> None:
+def test_joining_approves_the_missing_allowance_and_leaving_returns_the_stake(served: ServedChain, market: str) -> None:
     person = served.people["person"].address
     before = served.ask("person", lambda chain: chain.tokens.balance())
     said = columns(served.aira("lighthouse", "join", market, "5").stdout)
@@ -84,7 +84,7 @@ def test_joining_approves_what_is_missing_and_leaving_gives_it_back(served: Serv
     assert served.ask("person", lambda chain: chain.tokens.balance()) == before
 
 
-def test_taking_off_so_much_that_too_little_remains_takes_all(served: ServedChain, market: str) -> None:
+def test_a_withdrawal_that_leaves_less_than_the_minimum_takes_everything(served: ServedChain, market: str) -> None:
     served.run_json("lighthouse", "join", market, "3")
     told = served.run_json("lighthouse", "leave", market, "2")
     assert (told["stake"], told["isProvider"]) == ("0", False)
@@ -119,7 +119,7 @@ def test_info_is_by_default_of_the_settings_lighthouse(served: ServedChain) -> N
     assert said["minimal stake"] == "1 XRT"
 
 
-def test_info_of_an_empty_lighthouse_says_how_to_join(served: ServedChain, market: str) -> None:
+def test_info_of_an_empty_lighthouse_shows_how_to_join(served: ServedChain, market: str) -> None:
     assert "aira lighthouse join" in columns(served.aira("lighthouse", "info", market).stdout)["providers"]
 
 
@@ -129,12 +129,12 @@ def test_a_taken_name_is_one_clear_line(served: ServedChain) -> None:
 
 
 @pytest.mark.parametrize("name", ["Airalab", "a b", "a.b", "", "a" * 33])
-def test_a_name_that_can_not_be_is_one_clear_line(served: ServedChain, name: str) -> None:
+def test_an_invalid_name_is_one_clear_line(served: ServedChain, name: str) -> None:
     refused(served.aira("lighthouse", "create", name), InvalidLighthouse, repr(name))
 
 
 @pytest.mark.parametrize("stake", ["0", "0wn", str(2**128) + "wn"])
-def test_a_minimal_stake_that_can_not_be_is_one_clear_line(served: ServedChain, stake: str) -> None:
+def test_an_invalid_minimal_stake_is_one_clear_line(served: ServedChain, stake: str) -> None:
     refused(served.aira("lighthouse", "create", "staked", "--minimal-stake", stake), InvalidLighthouse)
 
 
@@ -144,7 +144,7 @@ def test_a_stake_below_the_minimum_is_one_clear_line(served: ServedChain, market
     refused(served.aira("lighthouse", "join", market, "0"), InvalidStake)
 
 
-def test_a_stake_that_the_account_does_not_have_is_one_clear_line(served: ServedChain, market: str) -> None:
+def test_a_stake_beyond_the_balance_is_one_clear_line(served: ServedChain, market: str) -> None:
     refused(served.aira("lighthouse", "join", market, "3", by="stranger"), BalanceTooLow, "0 XRT", "3 XRT")
 
 
@@ -152,7 +152,7 @@ def test_leaving_without_a_stake_is_one_clear_line(served: ServedChain, market: 
     refused(served.aira("lighthouse", "leave", market), NotAProvider, market)
 
 
-def test_taking_off_more_than_is_staked_is_one_clear_line(served: ServedChain, market: str) -> None:
+def test_a_withdrawal_of_more_than_the_stake_is_one_clear_line(served: ServedChain, market: str) -> None:
     served.run_json("lighthouse", "join", market, "3")
     refused(served.aira("lighthouse", "leave", market, "3.5"), InvalidStake, "3.5 XRT", "3 XRT")
 
@@ -162,20 +162,20 @@ def test_an_unknown_lighthouse_is_one_clear_line(served: ServedChain) -> None:
         refused(served.aira("lighthouse", *command), UnknownName, "nowhere.lighthouse.3.robonomics.eth")
 
 
-def test_what_is_no_lighthouse_is_one_clear_line(served: ServedChain) -> None:
+def test_an_address_without_a_lighthouse_is_one_clear_line(served: ServedChain) -> None:
     address = served.deployment.xrt
     for command in (("info", address), ("join", address, "1"), ("leave", address)):
         refused(served.aira("lighthouse", *command), NotALighthouse, address)
 
 
-def test_without_a_name_the_settings_lighthouse_is_joined_and_left(served: ServedChain, market: str) -> None:
+def test_the_default_lighthouse_to_join_and_leave_is_that_of_the_settings(served: ServedChain, market: str) -> None:
     at = ("--lighthouse-contract", market)
     assert served.run_json("lighthouse", "join", "4", *at)["name"] == market
     assert served.run_json("lighthouse", "leave", "2", *at)["stake"] == str(2 * XRT)
     assert served.run_json("lighthouse", "leave", *at)["stake"] == "0"
 
 
-def test_words_in_a_wrong_order_or_number_are_one_clear_line(served: ServedChain, market: str) -> None:
+def test_misplaced_arguments_are_one_clear_line(served: ServedChain, market: str) -> None:
     hint = refused(served.aira("lighthouse", "join", "20", market), InvalidAmount, market)
     assert hint == f"the lighthouse comes first: {market} 20"
     assert f"join {market} 20" in refused(served.aira("lighthouse", "join", market), InvalidOptions, "VALUE")

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from schemas import Signer
 
 
-def test_following_goes_on_over_a_restart_of_the_router(router: EmbeddedRouter) -> None:
+def test_following_continues_after_a_restart_of_the_router(router: EmbeddedRouter) -> None:
     with (
         pretender(router.endpoint, event("hello")),
         Follower(ROBOT.address, endpoint=router.endpoint) as follower,
@@ -43,7 +43,7 @@ def test_following_goes_on_over_a_restart_of_the_router(router: EmbeddedRouter) 
         assert follower.interrupt() == 130
 
 
-def test_what_a_hostile_agent_says_steers_no_terminal(router: EmbeddedRouter) -> None:
+def test_control_characters_of_a_hostile_agent_are_not_printed(router: EmbeddedRouter) -> None:
     wild = "\x1b[2J\x9b\r\u202e\x7f\x00\n"
     hostile = event(wild, time=wild, level=wild, logger=wild, liability=wild, error=wild, trace=f"a{wild}b{wild}")
     with pretender(router.endpoint, hostile):
@@ -57,7 +57,7 @@ def test_what_a_hostile_agent_says_steers_no_terminal(router: EmbeddedRouter) ->
             assert "\x1b" not in follower.until("    | ")
 
 
-def test_missed_events_are_told(router: EmbeddedRouter) -> None:
+def test_missed_events_are_reported(router: EmbeddedRouter) -> None:
     with (
         pretender(router.endpoint, event("hello"), missed=1_234),
         Follower(ROBOT.address, endpoint=router.endpoint) as follower,
@@ -65,7 +65,7 @@ def test_missed_events_are_told(router: EmbeddedRouter) -> None:
         follower.until("aira: missed 1,234 events, which came faster than they could be read")
 
 
-def test_an_answer_that_can_not_be_read_is_one_clear_line(router: EmbeddedRouter) -> None:
+def test_an_unreadable_answer_is_one_clear_line(router: EmbeddedRouter) -> None:
     key = str(RpcKey(ROBOT.address, "logs"))
     with zenoh.open(client_config(router.endpoint)) as session:
         queryable: Any = session.declare_queryable(key, lambda query: answer(query, key, b"\x1b[2J"))
@@ -76,7 +76,7 @@ def test_an_answer_that_can_not_be_read_is_one_clear_line(router: EmbeddedRouter
 
 
 @pytest.mark.parametrize("options", [(), ("--follow",), ("--device", "board")])
-def test_nobody_there_is_one_clear_line(router: EmbeddedRouter, options: tuple[str, ...]) -> None:
+def test_a_missing_agent_is_one_clear_line(router: EmbeddedRouter, options: tuple[str, ...]) -> None:
     done = invoke("logs", ROBOT.address, *options, AIRA_CONNECT=router.endpoint)
     assert refused(done, NoAnswer, "aira/agent/0x").startswith("is it running")
 
@@ -84,11 +84,11 @@ def test_nobody_there_is_one_clear_line(router: EmbeddedRouter, options: tuple[s
 @pytest.mark.parametrize(
     "wrong", [("0x12",), (ROBOT.address, "--liability", "0x12"), (ROBOT.address, "--level", "loud")]
 )
-def test_what_can_not_be_asked_is_refused_before(wrong: tuple[str, ...]) -> None:
+def test_invalid_arguments_are_refused_before_connecting(wrong: tuple[str, ...]) -> None:
     assert invoke("logs", *wrong).returncode == 2
 
 
-def test_ctrl_c_ends_the_waiting_for_an_answer(router: EmbeddedRouter) -> None:
+def test_ctrl_c_stops_waiting_for_an_answer(router: EmbeddedRouter) -> None:
     """Somebody who never answers."""
     queries: list[zenoh.Query] = []
     with zenoh.open(client_config(router.endpoint)) as session:
@@ -106,7 +106,7 @@ def test_ctrl_c_ends_the_waiting_for_an_answer(router: EmbeddedRouter) -> None:
         queries.clear()
 
 
-def test_on_a_closed_site_an_operator_may_look_and_an_agent_may_not(tmp_path: Path) -> None:
+def test_on_a_closed_site_an_operator_can_read_logs_and_an_agent_can_not(tmp_path: Path) -> None:
     site = Site(tmp_path)
     people: dict[str, tuple[Signer, Role]] = {
         "robot": (ROBOT, "agent"),

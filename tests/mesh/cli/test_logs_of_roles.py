@@ -142,7 +142,7 @@ def test_the_events_of_a_job_are_found_by_its_contract_with_agent_and_provider(m
         ]
 
 
-def test_people_read_the_same_as_in_the_roles_own_log_and_nothing_steers_their_terminal(market: JsonMarket) -> None:
+def test_plain_logs_equal_the_roles_own_log_without_control_characters(market: JsonMarket) -> None:
     liability = market.job
     done = invoke("logs", market.addresses["robot"], "--liability", liability, AIRA_CONNECT=market.endpoint)
     assert done.returncode == 0
@@ -153,7 +153,7 @@ def test_people_read_the_same_as_in_the_roles_own_log_and_nothing_steers_their_t
     assert all(re.match(rf"\d\d:\d\d:\d\d (INFO   |ERROR  ) {liability}: ", line) for line in events)
 
 
-def test_levels_and_lines_select(market: JsonMarket) -> None:
+def test_events_are_filtered_by_level_and_number_of_lines(market: JsonMarket) -> None:
     assert market.job
     assert {event["level"] for event in market.logs("robot", "--level", "error")} == {"error"}
     assert len(market.logs("robot", "--lines", "3")) == 3
@@ -162,7 +162,7 @@ def test_levels_and_lines_select(market: JsonMarket) -> None:
     assert newest == market.logs("robot")[-1:]
 
 
-def test_following_goes_on_over_restarts_of_the_agent(market: JsonMarket) -> None:
+def test_following_continues_after_restarts_of_the_agent(market: JsonMarket) -> None:
     robot = market.addresses["robot"]
     with Follower(robot, "--lines", "1", "--json", endpoint=market.endpoint) as follower:
         follower.until("{")
@@ -184,7 +184,7 @@ def test_following_goes_on_over_restarts_of_the_agent(market: JsonMarket) -> Non
             assert names.count(name) == 1, names
 
 
-def test_the_service_can_be_called_as_any_other(market: JsonMarket) -> None:
+def test_the_log_service_can_be_called_with_rpc(market: JsonMarket) -> None:
     done = invoke("rpc", market.addresses["robot"], "logs", "lines=1", "level=info", AIRA_CONNECT=market.endpoint)
     assert done.returncode == 0, done.stderr
     events = [line for line in done.stdout.splitlines() if not line.startswith("    | ")]
@@ -194,7 +194,7 @@ def test_the_service_can_be_called_as_any_other(market: JsonMarket) -> None:
     refused(wrong, InvalidArgument, "lines")
 
 
-def test_an_edge_agent_tells_its_log_by_its_device(router: EmbeddedRouter, tmp_path: Path) -> None:
+def test_the_log_of_an_edge_agent_is_read_by_its_device(router: EmbeddedRouter, tmp_path: Path) -> None:
     command = ("edge", tmp_path / "no-board", "--agent", ROBOT.address.lower(), "--connect", router.endpoint)
     with Serving(*AIRA, *command, says="edge of 0x", variables={"AIRA_LOG_FORMAT": "json"}) as edge:
         edge.wait_until_said("waiting")
@@ -207,7 +207,7 @@ def test_an_edge_agent_tells_its_log_by_its_device(router: EmbeddedRouter, tmp_p
     assert any(one["message"].startswith("edge of 0x") and one["device"] == "board" for one in told)
 
 
-def test_a_bridge_tells_its_log_by_its_address(router: EmbeddedRouter, tmp_path: Path) -> None:
+def test_the_log_of_a_bridge_is_read_by_its_address(router: EmbeddedRouter, tmp_path: Path) -> None:
     nowhere = f"http://127.0.0.1:{free_port()}"
     command = ("bridge", "ipfs", "--api", nowhere, "--web3-http-provider", "", "--web3-ws-provider", "")
     variables = {"AIRA_LOG_FORMAT": "json", "AIRA_CONNECT": router.endpoint, "AIRA_DATA_DIR": str(tmp_path)}
@@ -221,7 +221,7 @@ def test_a_bridge_tells_its_log_by_its_address(router: EmbeddedRouter, tmp_path:
     assert {(one["role"], one["address"].lower()) for one in told} == {("bridge", address)}
 
 
-def test_a_servers_last_word_is_an_event_too(tmp_path: Path) -> None:
+def test_the_error_that_ends_a_server_is_an_event(tmp_path: Path) -> None:
     nowhere = f"tcp/127.0.0.1:{free_port()}"
     for command in (("router", "--listen", "tcp/8.8.8.8:1"), ("edge", "/dev/none", "--agent", ROBOT.address)):
         done = aira(*command, AIRA_LOG_FORMAT="json", AIRA_CONNECT=nowhere, AIRA_CONNECT_TIMEOUT="0.2")

@@ -86,7 +86,7 @@ def test_a_bag_is_packed_without_losing_anything(tmp_path: Path) -> None:
     assert open_objective(tmp_path / "it.mcap").metadata["aira"]["source"] == cid_of_file(bag)
 
 
-def test_a_line_that_is_wrong_is_named_and_nothing_is_written(tmp_path: Path) -> None:
+def test_an_error_names_the_invalid_line_and_nothing_is_written(tmp_path: Path) -> None:
     done = call("pack", "-", "--out", tmp_path / "it.mcap", given=LINES + b'{"topic": "blink"}\n')
     refused(done, InvalidLine, "line 4", "blink")
     assert not (tmp_path / "it.mcap").exists()
@@ -110,7 +110,7 @@ def test_a_line_that_is_wrong_is_named_and_nothing_is_written(tmp_path: Path) ->
         (["get", "Qm", "--out", "new"], InvalidCid, "Qm"),
     ],
 )
-def test_what_can_not_be_is_one_clear_line(
+def test_invalid_arguments_are_one_clear_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], error: type[AiraError], value: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -118,7 +118,7 @@ def test_what_can_not_be_is_one_clear_line(
     assert {path.name for path in tmp_path.iterdir()} <= {"data"}
 
 
-def test_no_file_is_written_over(tmp_path: Path, sound: Path) -> None:
+def test_no_file_is_overwritten(tmp_path: Path, sound: Path) -> None:
     before = sound.read_bytes()
     for words in (["pack", "-", "--out"], ["get", cid_of_bytes(b"x"), "--out"], ["recover", sound, "--out"]):
         refused(call(*words, sound), FileExists, sound)
@@ -128,7 +128,7 @@ def test_no_file_is_written_over(tmp_path: Path, sound: Path) -> None:
     assert sound.read_bytes() == before
 
 
-def test_show_tells_what_is_in_a_file(sound: Path) -> None:
+def test_show_describes_a_file(sound: Path) -> None:
     done = call("show", sound)
     assert done.exit_code == 0, done.output
     lines = done.stdout.splitlines()
@@ -140,7 +140,7 @@ def test_show_tells_what_is_in_a_file(sound: Path) -> None:
     assert lines[8].split()[:3] == ["/stop", "raw", "1"]
 
 
-def test_show_tells_schemas_metadata_and_attachments(tmp_path: Path) -> None:
+def test_show_lists_schemas_metadata_and_attachments(tmp_path: Path) -> None:
     with Recorder(tmp_path / "it.mcap", RecordingAbout(liability="0x\x1b[2J1")) as recorder:
         recorder.record("/a", String("x").encode(), STRING)
     done = call("show", tmp_path / "it.mcap", "--schemas")
@@ -149,7 +149,7 @@ def test_show_tells_schemas_metadata_and_attachments(tmp_path: Path) -> None:
     assert any(line.split() == ["liability", "0x\N{REPLACEMENT CHARACTER}[2J1"] for line in done.stdout.splitlines())
 
 
-def test_show_for_programs(sound: Path) -> None:
+def test_show_prints_json(sound: Path) -> None:
     said = json.loads(call("show", sound, "--json").stdout)
     assert (said["cid"], said["messages"], said["format"]) == (cid_of_file(sound), 3, "mcap")
     assert said["topics"][0]["types"][1] == {
@@ -167,7 +167,9 @@ def test_show_draws_a_plot(tmp_path: Path, sound: Path) -> None:
     refused(call("show", sound, "--png", tmp_path / "nowhere" / "it.png"), FileUnwritable)
 
 
-def test_without_matplotlib_it_says_how_to_get_it(tmp_path: Path, sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_matplotlib_the_error_says_how_to_install_it(
+    tmp_path: Path, sound: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     done = call("show", sound, "--png", tmp_path / "it.png")
     refused(done, PackageMissing, "matplotlib")
@@ -179,7 +181,7 @@ def test_a_file_that_is_no_recording_can_not_be_shown(tmp_path: Path) -> None:
     refused(call("show", tmp_path / "text"), NotARecording, "text")
 
 
-def test_a_bag_is_converted_beside_itself(tmp_path: Path) -> None:
+def test_a_bag_is_converted_to_a_file_next_to_it(tmp_path: Path) -> None:
     bag = tmp_path / "it.bag"
     sent = [BagMessage("/blink", string(f"{n}"), T0 + n) for n in range(3)]
     bag.write_bytes(Bag(sent, "bz2").encode())
@@ -196,7 +198,7 @@ def test_a_bag_is_converted_beside_itself(tmp_path: Path) -> None:
     refused(call("convert", made, tmp_path / "other.mcap"), NotARecording, "it.mcap")
 
 
-def test_added_files_are_in_the_store_and_stay(tmp_path: Path, sound: Path) -> None:
+def test_added_files_are_stored_and_pinned(tmp_path: Path, sound: Path) -> None:
     other = tmp_path / "other.mcap"
     other.write_bytes(with_messages([T0]))
     assert call("add", sound).stdout == f"{cid_of_file(sound)}\n"
@@ -206,7 +208,7 @@ def test_added_files_are_in_the_store_and_stay(tmp_path: Path, sound: Path) -> N
         assert store.pins()[cid_of_file(sound)] == {"user"}
 
 
-def test_a_file_that_robots_would_refuse_is_added_with_a_warning(tmp_path: Path) -> None:
+def test_a_file_that_robots_refuse_is_added_with_a_warning(tmp_path: Path) -> None:
     (tmp_path / "text").write_bytes(b"hello")
     done = call("add", tmp_path / "text", "--json")
     assert done.exit_code == 0
@@ -216,7 +218,7 @@ def test_a_file_that_robots_would_refuse_is_added_with_a_warning(tmp_path: Path)
     assert json.loads(done.stdout)[0]["reason"] == "not-a-recording"
 
 
-def test_a_fit_objective_is_said_to_be_fit(sound: Path) -> None:
+def test_a_playable_objective_passes_verification(sound: Path) -> None:
     done = call("check", sound)
     assert (done.exit_code, done.stdout) == (0, f"{cid_of_file(sound)}  fit to be played: 3 messages, 0.04 s\n")
     call("add", sound)
@@ -227,7 +229,9 @@ def test_a_fit_objective_is_said_to_be_fit(sound: Path) -> None:
     ("options", "reason"),
     [(["--topics", "/go"], "unknown-topic"), (["--objective-size-limit", "10"], "too-large")],
 )
-def test_an_unfit_one_is_told_by_a_word_and_the_exit_code(sound: Path, options: list[str], reason: str) -> None:
+def test_an_unplayable_objective_fails_verification_with_an_exit_code(
+    sound: Path, options: list[str], reason: str
+) -> None:
     done = call("check", sound, "--json", *options)
     assert done.exit_code == 1
     said = json.loads(done.stdout)
@@ -235,7 +239,7 @@ def test_an_unfit_one_is_told_by_a_word_and_the_exit_code(sound: Path, options: 
     assert call("check", sound, *options).stdout.startswith(f"{cid_of_file(sound)}  {reason}: ")
 
 
-def test_a_store_with_a_rotten_file_is_told_of(tmp_path: Path, sound: Path) -> None:
+def test_a_damaged_file_in_the_store_is_reported(tmp_path: Path, sound: Path) -> None:
     call("add", sound)
     assert call("check").stdout.endswith(", 0 damaged\n")
     kept = tmp_path / "data" / "content" / cid_of_file(sound)
@@ -246,7 +250,7 @@ def test_a_store_with_a_rotten_file_is_told_of(tmp_path: Path, sound: Path) -> N
     assert json.loads(done.stdout)["damaged"] == [cid_of_file(sound)]
 
 
-def test_what_is_readable_of_a_cut_file_is_saved(tmp_path: Path) -> None:
+def test_the_readable_part_of_a_truncated_file_is_recovered(tmp_path: Path) -> None:
     (tmp_path / "it.mcap").write_bytes(with_messages([T0 + n for n in range(500)])[:3000])
     done = call("recover", tmp_path / "it.mcap", "--json")
     said = json.loads(done.stdout)
@@ -258,7 +262,7 @@ def test_what_is_readable_of_a_cut_file_is_saved(tmp_path: Path) -> None:
     refused(call("recover", tmp_path / "text"), RecordingError, "text")
 
 
-def test_looking_at_files_loads_no_chain(sound: Path) -> None:
+def test_reading_files_does_not_import_the_chain(sound: Path) -> None:
     program = (
         "import sys; from mesh.cli import main\n"
         f"main(['objective', 'show', {str(sound)!r}], standalone_mode=False)\n"

@@ -57,7 +57,7 @@ class Holder:
         await self._network.__aexit__(None, None, None)
 
 
-async def test_a_file_is_fetched_from_whoever_has_it(router: EmbeddedRouter, tmp_path: Path) -> None:
+async def test_a_file_is_fetched_from_a_peer(router: EmbeddedRouter, tmp_path: Path) -> None:
     import asyncio
 
     content = objective(("/go", "there"))
@@ -70,7 +70,7 @@ async def test_a_file_is_fetched_from_whoever_has_it(router: EmbeddedRouter, tmp
         assert done.stdout.splitlines()[0].split() == ["cid", cid]
 
 
-def test_what_nobody_has_and_no_router_are_one_clear_line(router: EmbeddedRouter, tmp_path: Path) -> None:
+def test_a_missing_file_and_a_missing_router_are_one_clear_line(router: EmbeddedRouter, tmp_path: Path) -> None:
     words: list[str | Path] = ["get", cid_of_bytes(b"nobody's"), "--out", tmp_path / "it", "--fetch-timeout", "0.2"]
     refused(call(*words, "--connect", router.endpoint), ContentUnavailable)
     nowhere = ["--connect", free_endpoint(), "--connect-timeout", "0.2"]
@@ -111,7 +111,7 @@ def speaker(router: EmbeddedRouter) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("speaker")
-def test_what_is_said_now_becomes_an_objective(router: EmbeddedRouter, tmp_path: Path) -> None:
+def test_live_messages_are_packed_into_an_objective(router: EmbeddedRouter, tmp_path: Path) -> None:
     out = tmp_path / "heard.mcap"
     words: list[str | Path] = ["--hear", f"{DEVICE}/**", "--hear", "elsewhere/*", "--seconds", "1.5", "--out", out]
     done = call("pack", *words, "--connect", router.endpoint, "--json")
@@ -124,7 +124,7 @@ def test_what_is_said_now_becomes_an_objective(router: EmbeddedRouter, tmp_path:
 
 
 @pytest.mark.usefixtures("speaker")
-def test_ctrl_c_ends_the_hearing_with_a_whole_file(router: EmbeddedRouter, tmp_path: Path) -> None:
+def test_ctrl_c_ends_the_capture_with_a_complete_file(router: EmbeddedRouter, tmp_path: Path) -> None:
     out = tmp_path / "heard.mcap"
     words: list[str | Path] = ["--hear", f"{DEVICE}/**", "--out", out, "--connect", router.endpoint]
     done = Interrupted("objective", "pack", *words, after=3.0)
@@ -132,7 +132,7 @@ def test_ctrl_c_ends_the_hearing_with_a_whole_file(router: EmbeddedRouter, tmp_p
     assert open_objective(out).count > 0
 
 
-def test_where_nobody_speaks_no_file_is_left(router: EmbeddedRouter, tmp_path: Path) -> None:
+def test_without_messages_no_file_is_left(router: EmbeddedRouter, tmp_path: Path) -> None:
     out = tmp_path / "it.mcap"
     words: list[str | Path] = ["--hear", "silence/**", "--seconds", "0.2", "--out", out, "--connect", router.endpoint]
     refused(call("pack", *words), NothingRecorded, "silence/**")

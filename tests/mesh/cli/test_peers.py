@@ -50,14 +50,14 @@ async def bridging(router: EmbeddedRouter, *told: BridgeStatus) -> AsyncIterator
         yield Settings(connect=(router.endpoint,), connect_timeout=5.0)
 
 
-async def test_nobody_is_told_in_a_line(router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_an_empty_channel_is_printed_as_a_line(
+    router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]
+) -> None:
     await show_peers(Settings(connect=(router.endpoint,)), as_json=False)
     assert capsys.readouterr().out == f"nobody on {MARKET}; on the IPFS side nobody knows: there is no bridge\n"
 
 
-async def test_everybody_is_told_by_role_and_address(
-    router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]
-) -> None:
+async def test_peers_are_listed_by_role_and_address(router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]) -> None:
     connected = msgspec.structs.replace(bridge_status(), ipfs_peers=NODES, state="connected")
     async with bridging(router, connected) as settings:
         await show_peers(settings, as_json=False)
@@ -78,7 +78,7 @@ async def test_everybody_is_told_by_role_and_address(
         }
 
 
-async def test_of_several_bridges_the_one_that_carries_is_believed(
+async def test_of_several_bridges_the_one_that_carries_is_used(
     router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]
 ) -> None:
     carries = msgspec.structs.replace(bridge_status(), ipfs_peers=NODES[:1], state="connected")

@@ -50,7 +50,7 @@ def call(folder: Path, words: str, stderr: int, monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize("words", COMMANDS)
-def test_long_work_shows_a_bar_on_a_terminal_only(
+def test_long_work_shows_a_progress_bar_on_a_terminal(
     folder: Path, words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     terminal, inside = pty.openpty()
@@ -67,7 +67,7 @@ def test_long_work_shows_a_bar_on_a_terminal_only(
 
 
 @pytest.mark.parametrize("words", COMMANDS)
-def test_where_nobody_watches_there_is_no_bar(
+def test_without_a_terminal_there_is_no_progress_bar(
     folder: Path, words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     silent = folder / "stderr"

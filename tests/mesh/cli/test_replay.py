@@ -67,7 +67,7 @@ def stage(router: EmbeddedRouter, tmp_path: Path) -> Stage:
     return Stage(router.endpoint, tmp_path)
 
 
-def test_a_file_is_said_on_the_topics_of_a_device_as_it_was(stage: Stage, listener: Listener) -> None:
+def test_a_file_is_published_on_the_topics_of_a_device(stage: Stage, listener: Listener) -> None:
     done = stage.play(stage.path, "--to", f"{ROBOT}/lamp")
     assert done.exit_code == 0, done.output
     assert done.stdout.startswith("3 messages in ")
@@ -79,12 +79,12 @@ def test_a_file_is_said_on_the_topics_of_a_device_as_it_was(stage: Stage, listen
     ]
 
 
-def test_or_on_keys_that_begin_as_one_likes(stage: Stage, listener: Listener) -> None:
+def test_a_file_is_published_under_a_given_key_prefix(stage: Stage, listener: Listener) -> None:
     assert stage.play(stage.path, "--to", "lab/stage").exit_code == 0
     assert listener.keys(3) == ["lab/stage/go", "lab/stage/move/left", "lab/stage/go"]
 
 
-def test_or_on_those_of_ones_own_device(stage: Stage, listener: Listener, tmp_path: Path) -> None:
+def test_a_file_is_published_on_the_topics_of_ones_own_device(stage: Stage, listener: Listener, tmp_path: Path) -> None:
     keyfile, password = tmp_path / "key.json", tmp_path / "password"
     made = CliRunner().invoke(main, ["account", "new", str(keyfile), "--password-file", str(password)])
     own = made.stdout.split()[-1].lower()
@@ -99,13 +99,13 @@ def test_a_cid_is_played_from_the_store(stage: Stage, listener: Listener) -> Non
     assert len(listener.keys(3)) == 3
 
 
-def test_only_what_is_wanted_is_said(stage: Stage, listener: Listener) -> None:
+def test_only_selected_topics_are_published(stage: Stage, listener: Listener) -> None:
     done = stage.play(stage.path, "--to", "lab/stage", "--topics", "/move/left", "--json")
     assert json.loads(done.stdout)["messages"] == 1
     assert listener.keys(1) == ["lab/stage/move/left"]
 
 
-def test_only_what_the_device_said(stage: Stage, listener: Listener, tmp_path: Path) -> None:
+def test_only_messages_of_the_device_are_published(stage: Stage, listener: Listener, tmp_path: Path) -> None:
     with Recorder(tmp_path / "job.mcap", RecordingAbout()) as recorder:
         recorder.record("/go", String("there").encode(), STRING, role="objective")
         recorder.record("/gone", String("there").encode(), STRING, role="device")
@@ -113,7 +113,7 @@ def test_only_what_the_device_said(stage: Stage, listener: Listener, tmp_path: P
     assert listener.keys(1) == ["lab/stage/gone"]
 
 
-def test_at_its_own_times(stage: Stage, listener: Listener) -> None:
+def test_messages_are_published_at_their_own_times(stage: Stage, listener: Listener) -> None:
     stage.path.write_bytes(timed([("/go", "one", 0), ("/go", "two", SECOND // 2), ("/go", "three", SECOND)]))
     assert stage.play(stage.path, "--to", "lab/stage").exit_code == 0
     heard = listener.heard(3)
@@ -126,7 +126,9 @@ def test_at_its_own_times(stage: Stage, listener: Listener) -> None:
     [(["--rate", "1200"], 3), (["--at-once"], 3), (["--from", "599.5"], 1)],
     ids=str,
 )
-def test_ten_minutes_in_a_moment(stage: Stage, listener: Listener, options: list[str], count: int) -> None:
+def test_a_high_rate_plays_ten_minutes_at_once(
+    stage: Stage, listener: Listener, options: list[str], count: int
+) -> None:
     stage.path.write_bytes(timed([("/go", "one", 0), ("/go", "two", SECOND), ("/go", "three", 600 * SECOND)]))
     with at_most(60):
         assert stage.play(stage.path, "--to", "lab/stage", *options).exit_code == 0
@@ -155,7 +157,7 @@ def test_ctrl_c_ends_it(stage: Stage, listener: Listener) -> None:
         (["odd.mcap", "--to", "a/b"], InvalidKey, "a b"),
     ],
 )
-def test_what_can_not_be_is_one_clear_line_and_nothing_is_said(
+def test_invalid_arguments_are_one_clear_line_and_nothing_is_published(
     stage: Stage,
     listener: Listener,
     monkeypatch: pytest.MonkeyPatch,
@@ -171,7 +173,7 @@ def test_what_can_not_be_is_one_clear_line_and_nothing_is_said(
     assert listener.heard(0) == []
 
 
-def test_no_router_nobody_who_has_it_and_no_chain_are_one_clear_line(stage: Stage) -> None:
+def test_a_missing_router_file_or_chain_is_one_clear_line(stage: Stage) -> None:
     nowhere = Stage(free_endpoint(), stage.path.parent)
     done = nowhere.play(stage.path, "--to", "a/b", "--connect-timeout", "0.2")
     refused(done, NetworkUnavailable)

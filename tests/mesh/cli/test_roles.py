@@ -109,7 +109,7 @@ def moving(robot: Agent) -> Agent:
     return robot
 
 
-async def test_a_router_and_a_provider_apart(tmp_path: Path, printed: Printed) -> None:
+async def test_a_router_and_a_provider_run_separately(tmp_path: Path, printed: Printed) -> None:
     endpoint = free_endpoint()
     router = start(serve_router(Settings(listen=(endpoint,))))
     await said(router, f"listens at {endpoint}\n", printed)
@@ -122,7 +122,7 @@ async def test_a_router_and_a_provider_apart(tmp_path: Path, printed: Printed) -
         await stopped(server)
 
 
-async def test_a_demand_that_comes_to_nothing_leaves_no_recording_behind(tmp_path: Path, printed: Printed) -> None:
+async def test_a_failed_demand_leaves_no_recording(tmp_path: Path, printed: Printed) -> None:
     up = start(serve_up(Settings(listen=(free_endpoint(),), data_dir=str(tmp_path)), port=0, block_time=60))
     await said(up, "provider    0x", printed)
     nowhere = settings_of("person", tmp_path, url=printed.value("chain"), endpoint=free_endpoint(), connect_timeout=1.0)
@@ -136,7 +136,7 @@ async def test_a_demand_that_comes_to_nothing_leaves_no_recording_behind(tmp_pat
     await stopped(up)
 
 
-async def test_what_can_not_listen_says_so_and_leaves_nothing_open(tmp_path: Path, printed: Printed) -> None:
+async def test_a_role_that_can_not_listen_is_an_error_and_leaves_nothing_open(tmp_path: Path, printed: Printed) -> None:
     endpoint = free_endpoint()
     router = start(serve_router(Settings(listen=(endpoint,))))
     await said(router, "listens at", printed)

@@ -40,7 +40,7 @@ def options(site: Site) -> tuple[str, ...]:
     return ("--listen", site.endpoint, *flags)
 
 
-def test_without_a_roster_it_says_that_only_this_machine_reaches_it() -> None:
+def test_without_a_roster_it_logs_that_only_this_machine_can_connect() -> None:
     says = "without a roster: only this machine reaches it, and everybody on it may do everything"
     with Serving(*AIRA, "router", "--listen", f"tcp/127.0.0.1:{free_port()}", says=says) as router:
         assert "listens at tcp/127.0.0.1:" in router.log()
@@ -48,7 +48,7 @@ def test_without_a_roster_it_says_that_only_this_machine_reaches_it() -> None:
 
 @pytest.mark.parametrize("command", ["router", "up"])
 @pytest.mark.parametrize("listen", ["tcp/0.0.0.0:{}", "tcp/[::]:{}", "tcp/example.org:{}", "udp/192.0.2.1:{}"])
-def test_without_a_roster_it_listens_nowhere_else(command: str, listen: str) -> None:
+def test_without_a_roster_it_listens_on_loopback_only(command: str, listen: str) -> None:
     locator = listen.format(free_port())
 
     done = invoke(command, "--listen", locator)
@@ -56,7 +56,7 @@ def test_without_a_roster_it_listens_nowhere_else(command: str, listen: str) -> 
     assert "--roster" in refused(done, ConfigurationError, locator)
 
 
-def test_with_a_roster_it_does_not_listen_where_nobody_shows_who_he_is(site: Site) -> None:
+def test_with_a_roster_it_does_not_listen_without_tls(site: Site) -> None:
     done = invoke("router", "--roster", site.roster, "--listen", "tcp/127.0.0.1:7447")
 
     assert "tls/HOST:PORT" in refused(done, ConfigurationError, "tcp/127.0.0.1:7447")
@@ -77,7 +77,7 @@ async def speak(speaker: Network, listener: Network, key: str) -> None:
         await until(lambda: heard, seconds=SECONDS)
 
 
-async def test_who_is_revoked_is_cut_off_while_the_others_go_on(site: Site) -> None:
+async def test_a_revoked_member_is_disconnected_and_the_others_are_not(site: Site) -> None:
     arm = site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
     thief = site.enlist(Member(name="thief", address=ANN, roles=("agent",)))
     screen = site.enlist(Member(name="screen", address="0x" + "03" * 20, roles=("watcher",)))
@@ -105,7 +105,7 @@ async def test_who_is_revoked_is_cut_off_while_the_others_go_on(site: Site) -> N
             hear.undeclare()  # type: ignore[no-untyped-call]
 
 
-async def test_a_roster_that_is_broken_meanwhile_changes_nothing(site: Site) -> None:
+async def test_a_roster_that_becomes_invalid_changes_nothing(site: Site) -> None:
     arm = site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
     good = site.roster.read_text()
     with Serving(*AIRA, "router", *options(site), says="let in: 1 of the roster") as router:
@@ -134,7 +134,7 @@ def revoke(site: Site, name: str) -> None:
     fresh.replace(site.roster)
 
 
-def test_acl_says_what_each_may_do_and_of_the_revoked_nothing(site: Site) -> None:
+def test_acl_lists_the_rights_of_each_member_and_none_of_revoked_ones(site: Site) -> None:
     site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
     site.enlist(Member(name="gone", address=ANN, roles=("agent",), revoked=True))
 
@@ -154,13 +154,13 @@ def test_acl_says_what_each_may_do_and_of_the_revoked_nothing(site: Site) -> Non
     assert [subject["id"] for subject in rules["subjects"]] == [ARM]
 
 
-def test_acl_without_a_roster_says_what_to_give() -> None:
+def test_acl_without_a_roster_is_an_error_with_a_hint() -> None:
     done = invoke("router", "acl", "--check")
 
     assert "--roster" in refused(done, RosterMissing)
 
 
-async def test_config_makes_the_same_router_of_zenohd(site: Site, tmp_path: Path) -> None:
+async def test_config_configures_zenohd_as_the_same_router(site: Site, tmp_path: Path) -> None:
     arm = site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
     screen = site.enlist(Member(name="screen", address=ANN, roles=("watcher",)))
     file = tmp_path / "zenohd.json5"
@@ -173,7 +173,7 @@ async def test_config_makes_the_same_router_of_zenohd(site: Site, tmp_path: Path
             await speak(arms, screens, f"aira/agent/{ARM}/device/arm/state")
 
 
-def test_config_writes_nothing_that_cannot_work(site: Site, tmp_path: Path) -> None:
+def test_config_refuses_settings_that_can_not_work(site: Site, tmp_path: Path) -> None:
     site.roster.write_text('[[member]]\nname="x"\naddress="0x12"\nroles=["agent"]\n')
 
     done = invoke("router", *options(site), "config", "--out", tmp_path / "zenohd.json5")

@@ -68,29 +68,27 @@ def test_a_signed_demand_is_sent_as_it_is() -> None:
         ),
     ],
 )
-def test_what_is_wrong_with_arguments_is_one_clear_line(
-    service: str, arguments: list[str], value: str, hint: str
-) -> None:
+def test_invalid_arguments_are_one_clear_line(service: str, arguments: list[str], value: str, hint: str) -> None:
     with pytest.raises(InvalidArgument) as caught:
         request_of(service, arguments)
     assert value in str(caught.value)
     assert caught.value.hint == hint
 
 
-def test_an_unknown_service_is_answered_with_the_nearest() -> None:
+def test_an_unknown_service_suggests_the_nearest() -> None:
     with pytest.raises(UnknownService, match="'strat'") as caught:
         request_of("strat", [])
     assert "did you mean start?" in caught.value.hint
 
 
-def test_a_number_that_no_contract_can_hold_is_refused() -> None:
+def test_a_number_beyond_256_bits_is_refused() -> None:
     for value in (str(MOST + 1), "9" * 5000):
         with pytest.raises(InputError, match=r"^eth/transfer: "):
             request_of("eth/transfer", ["to=x", f"value={value}"])
 
 
 @pytest.mark.parametrize("arguments", [[], [LIGHTHOUSE]])
-def test_without_a_service_it_says_what_is_needed(arguments: list[str]) -> None:
+def test_without_a_service_the_error_lists_what_is_needed(arguments: list[str]) -> None:
     done = CliRunner().invoke(main, ["rpc", *arguments])
     assert done.exit_code == 2
     assert "an ADDRESS and a SERVICE are needed; --list shows the services" in done.stderr
@@ -112,7 +110,7 @@ async def ask(place: Place, service: str, *arguments: str, as_json: bool = False
     await call_service(place.settings("watcher"), called, timeout=10.0, as_json=as_json)
 
 
-async def test_a_reply_is_facts_or_json(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_a_reply_is_printed_as_columns_or_json(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
     async with place.agent("robot"):
         await ask(place, "eth/accounts")
         assert capsys.readouterr().out == f"accounts  {place.address('robot')}\n"
@@ -145,7 +143,7 @@ async def test_a_job_is_driven_from_the_command_line(place: Place, capsys: pytes
         assert (shown["read"], shown["address"], shown["isSuccess"]) == ("yes", contract.address, "yes")
 
 
-async def test_what_was_not_done_is_an_error(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_a_failed_service_call_is_an_error(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
     async with place.agent("robot"):
         with pytest.raises(ServiceFailed, match=f"^start: can't start {LIGHTHOUSE}: it is not a job of this agent$"):
             await ask(place, "start", f"address={LIGHTHOUSE}")
@@ -159,7 +157,7 @@ async def test_what_was_not_done_is_an_error(place: Place, capsys: pytest.Captur
         assert json.loads(capsys.readouterr().out)["success"] is False
 
 
-async def test_nobody_there_is_an_error(place: Place) -> None:
+async def test_a_missing_agent_is_an_error(place: Place) -> None:
     with pytest.raises(ServiceFailed, match=r"^eth/accounts: no agent answers$"):
         await call_service(
             place.settings("watcher"), (STRANGER.address, "eth/accounts", ()), timeout=2.0, as_json=False

@@ -119,7 +119,7 @@ def test_a_job_is_done_and_paid_between_processes(development: Development, tmp_
         assert "Traceback" not in robot.log()
 
 
-def test_a_robot_that_is_killed_goes_on_where_it_was(development: Development, tmp_path: Path) -> None:
+def test_a_killed_robot_continues_its_job_after_a_restart(development: Development, tmp_path: Path) -> None:
     script, model, path = tmp_path / "robot.py", tmp_path / "model", tmp_path / "job.mcap"
     script.write_text(ROBOT)
     model.write_text("a slow robot")
@@ -153,7 +153,7 @@ def did(robot: Serving) -> list[str]:
     return re.findall(r"^did (\d+)$", robot.log(), re.MULTILINE)
 
 
-def test_the_parts_run_apart_as_well(tmp_path: Path) -> None:
+def test_the_servers_run_as_separate_processes(tmp_path: Path) -> None:
     endpoint, port = f"tcp/127.0.0.1:{free_port()}", free_port()
     router = Serving(*AIRA, "router", "--listen", endpoint, says="listens at")
     chain = Serving(*AIRA, "chain", "up", "--port", str(port), "--data-dir", tmp_path, says="password ")
@@ -167,7 +167,7 @@ def test_the_parts_run_apart_as_well(tmp_path: Path) -> None:
                 assert "Traceback" not in server.log()
 
 
-def test_up_ends_at_a_ctrl_c(tmp_path: Path) -> None:
+def test_ctrl_c_ends_up(tmp_path: Path) -> None:
     development = Development(tmp_path, block_time="0.05")
     with development.up as up:
         code, seconds = up.end(signal.SIGINT)
@@ -175,7 +175,7 @@ def test_up_ends_at_a_ctrl_c(tmp_path: Path) -> None:
         assert "Traceback" not in up.log()
 
 
-def test_ctrl_c_ends_the_waiting_for_a_contract(development: Development) -> None:
+def test_ctrl_c_stops_waiting_for_a_contract(development: Development) -> None:
     interrupted = Interrupted(
         "demand", *ORDER, SOME_CID, at="demand by 0x", after=0.3, variables=development.variables("person")
     )
@@ -198,15 +198,13 @@ def test_a_demand_without_keyfile_is_one_clear_line() -> None:
         ((*ORDER, SOME_CID, "--validator-fee", "1"), InvalidOptions, "--validator"),
     ],
 )
-def test_an_order_that_can_not_be_is_one_clear_line(
+def test_an_invalid_order_is_one_clear_line(
     development: Development, order: tuple[str, ...], error: type[AiraError], value: str
 ) -> None:
     development.refused(error, *order, value=value)
 
 
-def test_a_recording_that_can_not_be_written_is_found_before_anything_is_paid(
-    development: Development, tmp_path: Path
-) -> None:
+def test_an_unwritable_recording_is_an_error_before_anything_is_paid(development: Development, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     out = tmp_path / "file" / "result.mcap"
     development.refused(FileUnwritable, *ORDER, SOME_CID, "--out", out, value=out)
@@ -219,13 +217,13 @@ def test_a_wrong_password_is_one_clear_line(development: Development, tmp_path: 
         refused(invoke(*command, **variables), WrongPassword)
 
 
-def test_no_router_is_one_clear_line(development: Development) -> None:
+def test_an_unreachable_router_is_one_clear_line(development: Development) -> None:
     nowhere = f"tcp/127.0.0.1:{free_port()}"
     variables = development.variables("person") | {"AIRA_CONNECT": nowhere, "AIRA_CONNECT_TIMEOUT": "0.2"}
     refused(invoke("demand", *ORDER, SOME_CID, **variables), NetworkUnavailable, nowhere)
 
 
-def test_no_node_is_one_clear_line(development: Development) -> None:
+def test_an_unreachable_node_is_one_clear_line(development: Development) -> None:
     nowhere = f"http://127.0.0.1:{free_port()}"
     variables = development.variables("person") | {"AIRA_WEB3_HTTP_PROVIDER": nowhere}
     refused(invoke("provider", **variables), NodeUnreachable, nowhere)
@@ -237,11 +235,11 @@ def test_a_taken_port_is_one_clear_line(development: Development, tmp_path: Path
     refused(done, ConfigurationError, f"127.0.0.1:{development.port}")
 
 
-def test_what_is_no_endpoint_is_one_clear_line() -> None:
+def test_an_invalid_endpoint_is_one_clear_line() -> None:
     refused(invoke("router", "--listen", "localhost:7447"), ConfigurationError, "localhost:7447")
 
 
-def test_ctrl_c_while_a_router_is_waited_for_ends_the_waiting() -> None:
+def test_ctrl_c_stops_waiting_for_a_router() -> None:
     with socket.create_server(("127.0.0.1", 0)) as unfriendly:
         endpoint = f"tcp/127.0.0.1:{unfriendly.getsockname()[1]}"
         variables = {"AIRA_CONNECT": endpoint, "AIRA_CONNECT_TIMEOUT": "-1"}

@@ -72,12 +72,12 @@ def test_a_list_is_given_by_a_flag_for_each() -> None:
         (["--config", "/nowhere/aira.toml"], "/nowhere/aira.toml"),
     ],
 )
-def test_what_can_not_be_is_one_clear_line(arguments: list[str], value: str) -> None:
+def test_an_invalid_setting_is_one_clear_line(arguments: list[str], value: str) -> None:
     done = settings(*arguments)
     refused(done, ConfigurationError, value)
 
 
-def test_an_unknown_option_in_the_file_names_the_nearest(tmp_path: Path) -> None:
+def test_an_unknown_option_in_the_file_suggests_the_nearest(tmp_path: Path) -> None:
     file = tmp_path / "aira.toml"
     file.write_text('keyfle = "robot.json"\n')
     done = settings("--config", file)

@@ -25,7 +25,7 @@ def call(*words: str | Path) -> Result:
     return CliRunner().invoke(main, ["state", *map(str, words)])
 
 
-def test_show_tells_what_agents_remember(folder: Folder) -> None:
+def test_show_lists_the_state_of_agents(folder: Folder) -> None:
     done = call("show", "--data-dir", folder.path)
     assert done.exit_code == 0, done.output
     head, row, content, transactions = done.stdout.splitlines()
@@ -35,7 +35,7 @@ def test_show_tells_what_agents_remember(folder: Folder) -> None:
     assert transactions == "transactions under way  1"
 
 
-def test_show_prints_json_for_programs(folder: Folder) -> None:
+def test_show_prints_json(folder: Folder) -> None:
     found = json.loads(call("show", "--json", "--data-dir", folder.path).stdout)
     assert found["folder"] == str(folder.path)
     assert found["accounts"][0]["chains"] == [
@@ -43,7 +43,7 @@ def test_show_prints_json_for_programs(folder: Folder) -> None:
     ]
 
 
-def test_a_backup_is_made_shown_and_restored(folder: Folder, tmp_path: Path) -> None:
+def test_a_backup_is_created_shown_and_restored(folder: Folder, tmp_path: Path) -> None:
     made = call("backup", tmp_path / "it.tar.zst", "--data-dir", folder.path)
     assert made.exit_code == 0, made.output
     assert f"accounts        {ADDRESS}" in made.stdout
@@ -60,7 +60,7 @@ def test_a_backup_is_made_shown_and_restored(folder: Folder, tmp_path: Path) -> 
     assert call("show", "--data-dir", tmp_path / "new").stdout.splitlines()[1] == row
 
 
-def test_programs_are_told_the_same_in_json(folder: Folder, tmp_path: Path) -> None:
+def test_backup_and_restore_print_json(folder: Folder, tmp_path: Path) -> None:
     file = tmp_path / "it"
     made = json.loads(call("backup", file, "--json", "--content", "all", "--data-dir", folder.path).stdout)
     assert (made["file"], made["files"], made["jobs"], made["missing"]) == (str(file), 2, 1, [])
@@ -71,7 +71,7 @@ def test_programs_are_told_the_same_in_json(folder: Folder, tmp_path: Path) -> N
     assert restored["aside"] is None
 
 
-def test_an_existing_state_is_a_refusal_that_says_what_to_do(folder: Folder, tmp_path: Path) -> None:
+def test_an_existing_state_is_an_error_with_a_hint(folder: Folder, tmp_path: Path) -> None:
     call("backup", tmp_path / "it", "--data-dir", folder.path)
     done = call("restore", tmp_path / "it", "--data-dir", folder.path)
     assert "--existing set-aside" in refused(done, StateExists, folder.path)
@@ -80,7 +80,7 @@ def test_an_existing_state_is_a_refusal_that_says_what_to_do(folder: Folder, tmp
     assert f"before that     {folder.path}/.replaced-" in again.stdout
 
 
-async def test_a_state_in_use_is_refused_whatever_is_asked(folder: Folder, tmp_path: Path) -> None:
+async def test_a_state_in_use_is_refused_with_every_option(folder: Folder, tmp_path: Path) -> None:
     backup = ("state", "backup", tmp_path / "it", "--data-dir", folder.path)
     restore = ("state", "restore", tmp_path / "it", "--data-dir", folder.path, "--existing", "set-aside")
     async with Ledger(folder.ledger):

@@ -54,7 +54,7 @@ async def told(place: Place, role: str, capsys: pytest.CaptureFixture[str]) -> d
     return how
 
 
-async def test_an_agent_tells_its_parts_its_block_and_its_work(
+async def test_an_agent_reports_its_parts_its_block_and_its_work(
     place: Place, capsys: pytest.CaptureFixture[str]
 ) -> None:
     async with place.at_work(offering(place.agent("robot"))) as person:
@@ -76,23 +76,21 @@ async def test_an_agent_tells_its_parts_its_block_and_its_work(
     assert contract.liability.promisor == how["address"]
 
 
-async def test_an_order_that_waits_is_in_the_outbox(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_an_open_order_is_counted_in_the_outbox(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
     async with place.agent("robot") as robot:
         assert (await told(place, "robot", capsys))["work"]["outbox"] == 0
         await robot.offer(objective=OBJECTIVE)
         assert (await told(place, "robot", capsys))["work"]["outbox"] == 1
 
 
-async def test_an_executor_that_is_off_is_not_alive(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_a_disabled_executor_is_reported_as_off(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
     async with place.agent("robot", enable_executor=False):
         how = await told(place, "robot", capsys)
     assert how["parts"]["executor"] == "off"
     assert summarize_status(Status.decode(json.dumps(how).encode())).startswith("alive, block ")
 
 
-async def test_a_node_that_is_lost_is_said_by_those_who_wait_for_it(
-    place: Place, capsys: pytest.CaptureFixture[str]
-) -> None:
+async def test_a_part_that_waits_for_the_node_says_so(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
     async with JsonRpcServer(place.node.provider) as server:
         account = place.market.accounts["robot"]
         chain = Chain(server.url, account=account, ens=place.market.deployment.ens, timing=QUICK)
@@ -108,7 +106,7 @@ async def test_a_node_that_is_lost_is_said_by_those_who_wait_for_it(
             assert (await told(place, "robot", capsys))["parts"]["channel"] == "alive"
 
 
-async def test_a_provider_tells_its_orders_and_what_it_earned(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_a_provider_reports_its_orders_and_earnings(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
     async with place.at_work(offering_unseen(place.agent("robot"))) as person:
         await person.demand(place.save(objective(("/go", "x"))), cost=1)
         how = await told(place, "provider", capsys)
@@ -120,7 +118,7 @@ async def test_a_provider_tells_its_orders_and_what_it_earned(place: Place, caps
     assert (shown["provider"], shown["listener"]) == (place.address("provider"), "alive")
 
 
-async def test_everybody_on_the_lighthouse_is_a_line(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_each_peer_on_the_lighthouse_has_a_line(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
     async with place.at_work(place.agent("robot")):
 
         async def all_there() -> bool:
@@ -136,7 +134,7 @@ async def test_everybody_on_the_lighthouse_is_a_line(place: Place, capsys: pytes
     assert all("  alive, block " in row for row in rows)
 
 
-async def test_who_shows_itself_and_says_nothing_is_told_too(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_a_peer_that_does_not_answer_is_listed(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
     async with place.agent("robot") as robot:
         robot.channel.announce("person", STRANGER.address)
 
@@ -147,7 +145,7 @@ async def test_who_shows_itself_and_says_nothing_is_told_too(place: Place, capsy
         await until_found(is_there, what="the silent one", seconds=30)
 
 
-async def test_nobody_is_one_clear_line(router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_a_missing_peer_is_one_clear_line(router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]) -> None:
     settings = Settings(connect=(router.endpoint,))
     with pytest.raises(NoAnswer, match=STRANGER.address):
         await show_one(settings, STRANGER.address, timeout=1.0, as_json=False)
@@ -157,7 +155,7 @@ async def test_nobody_is_one_clear_line(router: EmbeddedRouter, capsys: pytest.C
     assert capsys.readouterr().out == f"nobody on {MARKET}\n"
 
 
-def test_work_in_words() -> None:
+def test_the_work_of_an_agent_is_described() -> None:
     shown = describe_status(msgspec.structs.replace(status(), work=WORK, uptime=75.5))
     assert shown["agent"] == ROBOT.address
     assert (shown["open jobs"], shown["done"]) == ("2 ready, 1 running", "12,345")
@@ -165,7 +163,7 @@ def test_work_in_words() -> None:
     assert (shown["block"], shown["runs for"]) == ("7 of chain 1", "75 s")
 
 
-def test_a_market_in_words() -> None:
+def test_the_market_of_a_provider_is_described() -> None:
     shown = describe_status(msgspec.structs.replace(status(role="provider"), market=MARKET_FACTS))
     assert shown["contracts"] == "3 made, 2 finalized"
     assert shown["rejected"] == "3 (1 WrongSigner, 2 expired)"
@@ -173,7 +171,7 @@ def test_a_market_in_words() -> None:
     assert shown["spent"] == "0.002 ETH on 343,444 gas"
 
 
-def test_a_bridge_in_words() -> None:
+def test_a_bridge_is_described() -> None:
     way = msgspec.structs.replace(WAY, carried=12, per_second=0.5, dropped={"no-room": 3}, waiting=4)
     shown = describe_status(msgspec.structs.replace(bridge_status(), to_ipfs=way, last_error="refused", losses=2))
     assert (shown["bridge"], shown["state"], shown["carries"]) == (STRANGER.address, "alone", "yes")
@@ -185,7 +183,7 @@ def test_a_bridge_in_words() -> None:
     assert content == "2 files fetched (2.0 KiB), 0 added (0 bytes), 0 blocks given, 1 false ones refused"
 
 
-def test_what_is_wrong_comes_first_in_the_line() -> None:
+def test_a_summary_begins_with_the_part_that_is_not_alive() -> None:
     ill = msgspec.structs.replace(status(), parts={"channel": "alive", "listener": "waits for the node"}, work=WORK)
     assert summarize_status(ill) == "listener waits for the node, block 7, 3 open jobs"
     assert summarize_status(msgspec.structs.replace(status(), market=MARKET_FACTS)) == (
@@ -194,7 +192,7 @@ def test_what_is_wrong_comes_first_in_the_line() -> None:
     assert summarize_status(bridge_status()) == "alone, carries, 0 nodes on the IPFS side"
 
 
-def test_what_somebody_says_does_not_steer_the_terminal() -> None:
+def test_control_characters_of_a_status_are_not_printed() -> None:
     evil = msgspec.structs.replace(status(), parts={"\x1b[2J": "\x1b[2J"}, version="\x1b]0;x\x07")
     shown = f"{describe_status(evil)} {summarize_status(evil)}"
     assert "\x1b" not in "".join(f"{name}{fact}" for name, fact in describe_status(evil).items()) + summarize_status(

@@ -35,7 +35,7 @@ def on_path(tmp_path: Path) -> dict[str, str]:
     return {"PATH": f"{folder}:{os.environ['PATH']}"}
 
 
-def test_anvil_is_taken_where_it_is_on_the_path(tmp_path: Path, on_path: dict[str, str]) -> None:
+def test_anvil_on_the_path_is_used(tmp_path: Path, on_path: dict[str, str]) -> None:
     with up(tmp_path, **on_path) as server:
         assert columns(server.log())["engine"] == f"anvil ({tmp_path}/programs/anvil)"
 
@@ -50,7 +50,7 @@ async def test_the_chain_is_kept_in_a_file(tmp_path: Path) -> None:
     assert first_blocks[0] == first_blocks[1]
 
 
-def test_a_chain_that_nothing_can_keep_is_one_clear_line(tmp_path: Path) -> None:
+def test_a_state_file_without_anvil_is_one_clear_line(tmp_path: Path) -> None:
     options = ["--engine", "embedded", "--state", str(tmp_path / "chain.json")]
     done = CliRunner().invoke(main, ["up", "--listen", f"tcp/127.0.0.1:{free_port()}", *options])
     refused(done, AnvilMissing, "--state")

@@ -64,7 +64,7 @@ def test_two_files_are_verified_without_chain_and_network(job: JobFiles) -> None
     assert lines[-1] == "0 things of 14 failed; 7 things stayed open"
 
 
-def test_what_fails_is_named_and_the_exit_code_is_1(job: JobFiles) -> None:
+def test_a_failed_check_is_named_and_the_exit_code_is_1(job: JobFiles) -> None:
     job.forge(lambda messages, metadata: messages[:4])
     done = verified(job)
     assert done.exit_code == 1
@@ -73,7 +73,7 @@ def test_what_fails_is_named_and_the_exit_code_is_1(job: JobFiles) -> None:
     assert done.stdout.splitlines()[-1].startswith("1 thing of 14 failed")
 
 
-def test_an_address_is_compared_with_what_the_recording_says(job: JobFiles) -> None:
+def test_an_address_is_compared_with_the_one_in_the_recording(job: JobFiles) -> None:
     assert verified(job, LIABILITY, "--offline").exit_code == 0
     done = verified(job, OTHER, "--offline")
     assert done.exit_code == 1
@@ -92,7 +92,7 @@ def test_with_the_message_the_signature_is_verified(job: JobFiles, tmp_path: Pat
     assert found["finalized"] is None
 
 
-def test_a_strangers_text_does_not_steer_the_terminal(job: JobFiles) -> None:
+def test_control_characters_of_untrusted_text_are_not_printed(job: JobFiles) -> None:
     def evil(messages: list[Any], metadata: dict[str, dict[str, str]]) -> list[Any]:
         metadata["aira"]["liability"] = "\x1b[2J" + LIABILITY
         return messages
@@ -114,7 +114,7 @@ def test_a_strangers_text_does_not_steer_the_terminal(job: JobFiles) -> None:
         (["verify", LIABILITY, "--web3-http-provider", "http://127.0.0.1:9"], NodeUnreachable, "http://127.0.0.1:9"),
     ],
 )
-def test_what_can_not_be_looked_at_is_one_clear_line_and_exit_code_2(
+def test_unreadable_input_is_one_clear_line_and_exit_code_2(
     tmp_path: Path, words: list[str], error: type[AiraError], value: str
 ) -> None:
     done = CliRunner().invoke(main, [*words, "--data-dir", str(tmp_path)])
@@ -128,7 +128,7 @@ def test_a_result_that_is_no_recording_fails(job: JobFiles) -> None:
     assert "it is neither an MCAP file nor a ROS 1 bag" in done.stdout
 
 
-def test_as_a_program(job: JobFiles) -> None:
+def test_it_runs_as_a_separate_process(job: JobFiles) -> None:
     done = aira("verify", "--objective", job.objective, "--result", job.result, AIRA_DATA_DIR=str(job.result.parent))
     assert (done.returncode, done.stderr) == (0, "")
 

@@ -32,7 +32,7 @@ def poor(served: ServedChain, tmp_path: Path) -> dict[str, str]:
     return {"AIRA_KEYFILE": str(keyfile)}
 
 
-def test_the_balance_is_that_of_the_settings_account_and_needs_no_password(served: ServedChain) -> None:
+def test_the_balance_of_the_settings_account_needs_no_password(served: ServedChain) -> None:
     address = served.people["robot"].address
     done = served.aira("xrt", "balance", by="robot", AIRA_KEYFILE_PASSWORD_FILE="")
     assert (done.exit_code, done.stdout) == (0, "1,000 XRT\n")
@@ -45,7 +45,7 @@ def test_the_balance_is_that_of_the_settings_account_and_needs_no_password(serve
     }
 
 
-def test_a_transfer_is_in_xrt_unless_its_ending_says_wn(served: ServedChain) -> None:
+def test_a_transfer_is_in_xrt_unless_the_amount_ends_with_wn(served: ServedChain) -> None:
     before = held(served, served.people["person"].address)
     done = columns(served.aira("xrt", "transfer", NOBODY, "1.5").stdout)
     assert (done["sent"], done["to"]) == ("1.5 XRT", NOBODY)
@@ -55,7 +55,7 @@ def test_a_transfer_is_in_xrt_unless_its_ending_says_wn(served: ServedChain) -> 
     assert held(served, NOBODY) == 1_500_000_007
 
 
-def test_an_allowance_is_by_default_the_factorys_and_can_be_given_and_taken_back(served: ServedChain) -> None:
+def test_an_allowance_is_by_default_the_factorys_and_can_be_granted_and_revoked(served: ServedChain) -> None:
     assert served.run_json("xrt", "allowance")["spender"] == served.deployment.factory
     done = columns(served.aira("xrt", "approve", "airalab", "2.5").stdout)
     assert (done["spender"], done["may take"]) == (served.deployment.lighthouse, "2.5 XRT")
@@ -67,7 +67,7 @@ def test_an_allowance_is_by_default_the_factorys_and_can_be_given_and_taken_back
     assert served.aira("xrt", "allowance", "airalab").stdout == "0 XRT\n"
 
 
-def test_another_token_counts_in_its_own_units(served: ServedChain) -> None:
+def test_amounts_of_another_token_are_in_its_units(served: ServedChain) -> None:
     token = served.run(_deploy_token(served))
     assert served.aira("xrt", "balance", "--token", token, by="provider").stdout == "123.45 XRT\n"
     assert served.run_json("xrt", "balance", NOBODY, "--token", token, by="provider")["token"] == token
@@ -83,19 +83,19 @@ async def _deploy_token(served: ServedChain) -> str:
         return receipt.contract
 
 
-def test_more_than_there_is_is_refused_before_anything_is_sent(served: ServedChain) -> None:
+def test_more_than_the_balance_is_refused_before_a_transaction_is_sent(served: ServedChain) -> None:
     done = served.aira("xrt", "transfer", NOBODY, "5000")
     hint = refused(done, BalanceTooLow, "5,000 XRT")
     assert "smaller amount" in hint
 
 
 @pytest.mark.parametrize("amount", ["1,5", "lots", "1.0000000001", "5 ETH"])
-def test_what_is_no_amount_is_one_clear_line(served: ServedChain, amount: str) -> None:
+def test_an_invalid_amount_is_one_clear_line(served: ServedChain, amount: str) -> None:
     assert "1.5" in refused(served.aira("xrt", "transfer", NOBODY, amount), InvalidAmount, repr(amount))
 
 
 @pytest.mark.parametrize("address", ["0x709", "robot", "0x70997970c51812dc3A010C7d01b50e0d17dc79C8"])
-def test_what_is_no_address_is_one_clear_line(served: ServedChain, address: str) -> None:
+def test_an_invalid_address_is_one_clear_line(served: ServedChain, address: str) -> None:
     refused(served.aira("xrt", "transfer", address, "1"), InputError, repr(address))
 
 
@@ -105,26 +105,26 @@ def test_an_unknown_name_is_one_clear_line(served: ServedChain) -> None:
 
 
 @pytest.mark.parametrize("what", ["lighthouse", "person"])
-def test_what_is_no_token_is_one_clear_line(served: ServedChain, what: str) -> None:
+def test_an_address_without_a_token_is_one_clear_line(served: ServedChain, what: str) -> None:
     address = served.deployment.lighthouse if what == "lighthouse" else served.people["person"].address
     refused(served.aira("xrt", "balance", "--token", address), NotAToken, address)
 
 
-def test_an_account_without_eth_is_told_so(served: ServedChain, poor: dict[str, str]) -> None:
+def test_an_account_without_eth_is_an_error(served: ServedChain, poor: dict[str, str]) -> None:
     hint = refused(served.aira("xrt", "approve", "factory", "1", **poor), InsufficientFunds, "has 0 ")
     assert "send ETH to the account" in hint
 
 
-def test_an_account_without_xrt_is_told_so(served: ServedChain, poor: dict[str, str]) -> None:
+def test_an_account_without_xrt_is_an_error(served: ServedChain, poor: dict[str, str]) -> None:
     refused(served.aira("xrt", "transfer", NOBODY, "1", **poor), BalanceTooLow, "0 XRT", "1 XRT")
 
 
-def test_no_account_is_one_clear_line(served: ServedChain) -> None:
+def test_a_missing_account_is_one_clear_line(served: ServedChain) -> None:
     assert "--keyfile" in refused(served.aira("xrt", "balance", AIRA_KEYFILE=""), AccountMissing)
     refused(served.aira("xrt", "transfer", NOBODY, "1", AIRA_KEYFILE=""), ConfigurationError, "account")
 
 
-def test_an_absent_keyfile_and_a_wrong_password_are_one_clear_line(served: ServedChain, tmp_path: Path) -> None:
+def test_a_missing_keyfile_and_a_wrong_password_are_one_clear_line(served: ServedChain, tmp_path: Path) -> None:
     absent = str(tmp_path / "absent.json")
     for command in (("balance",), ("transfer", NOBODY, "1")):
         hint = refused(served.aira("xrt", *command, AIRA_KEYFILE=absent), KeyfileError, absent)
@@ -135,7 +135,7 @@ def test_an_absent_keyfile_and_a_wrong_password_are_one_clear_line(served: Serve
     assert "guessed" not in done.output
 
 
-def test_no_node_is_one_clear_line(served: ServedChain) -> None:
+def test_an_unreachable_node_is_one_clear_line(served: ServedChain) -> None:
     nowhere = f"http://127.0.0.1:{free_port()}"
     refused(served.aira("xrt", "balance", AIRA_WEB3_HTTP_PROVIDER=nowhere), NodeUnreachable, nowhere)
 

@@ -47,7 +47,7 @@ async def test_a_keyfile_that_others_may_read_is_a_warning(machine: Machine) -> 
     assert result.hint == f"chmod 600 {machine.folder / 'password'}"
 
 
-async def test_a_keyfile_that_is_not_there_is_named(machine: Machine) -> None:
+async def test_a_missing_keyfile_is_named(machine: Machine) -> None:
     settings = machine.settings("robot", keyfile=str(machine.folder / "lost.json"))
 
     assert "lost.json" in (await examined(DoctorContext(settings=settings, requested_role="agent"))).cause("keyfile")
@@ -60,7 +60,7 @@ def poor(machine: Machine) -> dict[str, Any]:
     return {"keyfile": str(keyfile)}
 
 
-async def test_an_account_without_ether_is_named_where_it_has_to_pay_gas(machine: Machine) -> None:
+async def test_an_account_without_ether_is_reported_if_it_pays_gas(machine: Machine) -> None:
     person = await machine.examined("person", "robot", **poor(machine))
     agent = await machine.examined("agent", "robot", **poor(machine))
 
@@ -137,5 +137,5 @@ def test_a_requested_amount_is_never_less_than_needed(wei: int, asked: str) -> N
     assert at_least(wei, ETH) == asked
 
 
-def test_a_coin_with_few_decimals_is_asked_for_exactly() -> None:
+def test_a_requested_amount_of_a_coin_with_few_decimals_is_exact() -> None:
     assert at_least(1_500_000_001, Currency("XRT", 9)) == "1.500000001 XRT"

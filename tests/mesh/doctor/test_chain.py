@@ -47,7 +47,7 @@ async def test_only_a_requested_agent_role_needs_an_account(machine: Machine) ->
     assert "`aira account new`" in asked.cause("keyfile")
 
 
-async def test_a_node_that_is_not_there_is_named_once(machine: Machine) -> None:
+async def test_an_unreachable_node_is_named_once(machine: Machine) -> None:
     url = f"http://127.0.0.1:{free_port()}"
     found = await machine.examined("agent", "robot", web3_http_provider=url)
 
@@ -58,7 +58,7 @@ async def test_a_node_that_is_not_there_is_named_once(machine: Machine) -> None:
     assert found.one("data folder").ok
 
 
-async def test_a_chain_that_is_not_the_expected_one_is_named_by_both_numbers(machine: Machine) -> None:
+async def test_an_unexpected_chain_is_reported_with_both_chain_ids(machine: Machine) -> None:
     found = await machine.examined("agent", chain_id=1)
 
     cause = "; ".join(result.message for result in found["chain"])
@@ -85,7 +85,7 @@ async def test_a_chain_without_the_contracts_fails_once(machine: Machine, anvil:
     assert "lighthouse" not in found
 
 
-async def test_names_that_the_registry_does_not_know_are_named(machine: Machine) -> None:
+async def test_unregistered_names_are_reported(machine: Machine) -> None:
     factory = await machine.examined("agent", "robot", factory_contract="factory.7.robonomics.eth")
     market = await machine.examined("agent", "robot", lighthouse_contract="nowhere.lighthouse.3.robonomics.eth")
     token = await machine.examined("agent", "robot", erc20_token="gold.3.robonomics.eth")
@@ -109,7 +109,7 @@ async def test_the_wrong_kind_of_contracts_fails(machine: Machine) -> None:
     assert found.one("contracts").hint == "--contracts mesh"
 
 
-async def test_a_websocket_that_was_named_has_to_answer(machine: Machine) -> None:
+async def test_a_configured_websocket_must_answer(machine: Machine) -> None:
     dead = f"ws://127.0.0.1:{free_port()}"
     alive = machine.town.url.replace("http", "ws")
 

@@ -69,7 +69,7 @@ async def test_an_unexpected_error_is_raised() -> None:
         await made(failing("node", KeyError("a bug")))
 
 
-async def test_a_missing_package_is_named_with_the_extra_that_brings_it() -> None:
+async def test_a_missing_package_is_named_with_the_extra_that_installs_it() -> None:
     found = await made(failing("node", ModuleNotFoundError("no", name="web3.eth")))
 
     assert found["node"] == failed(
@@ -89,7 +89,7 @@ def node_finding() -> CheckResult:
     return failed("dead", hint="start it")
 
 
-async def test_of_a_group_one_is_enough_and_a_warning_is_no_failure() -> None:
+async def test_one_passed_check_of_a_group_is_enough_and_a_warning_is_no_failure() -> None:
     dead, alive = check("a", failed("dead", hint="start it")), check("b", warning("old", hint="renew it"))
 
     found = await made(dead, alive, check("session", passed("open"), [dead, alive]))
@@ -112,7 +112,7 @@ async def test_a_check_without_a_result_in_time_fails_and_delays_no_other() -> N
     assert found["quick"] == passed("there")
 
 
-async def test_a_call_that_blocks_for_ever_ends_with_the_time_too() -> None:
+async def test_a_call_that_blocks_for_ever_fails_at_the_timeout() -> None:
     released = threading.Event()
 
     async def blocked() -> CheckResult:

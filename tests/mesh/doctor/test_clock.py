@@ -10,7 +10,7 @@ NOW = 1_800_000_000.0
 
 
 @pytest.mark.parametrize("ahead", [-4.9, 0.0, 4.9])
-def test_some_seconds_are_tolerated(ahead: float) -> None:
+def test_a_difference_of_some_seconds_passes(ahead: float) -> None:
     assert compare_router_clock(NOW - ahead, NOW).ok
     assert compare_node_clock(NOW - ahead, NOW).ok
 
@@ -31,14 +31,14 @@ def test_a_block_from_the_future_means_a_clock_that_is_behind() -> None:
     assert compare_chain_clock(NOW + 29, NOW).ok
 
 
-def test_an_old_block_says_nothing() -> None:
+def test_an_old_block_is_no_evidence_about_the_clock() -> None:
     assert (
         compare_chain_clock(NOW - 7_200, NOW).message
         == "the newest block is 2 hours old, and says nothing about the clock"
     )
 
 
-def test_lengths_of_time_are_in_the_unit_that_says_them_best() -> None:
+def test_durations_are_printed_in_a_readable_unit() -> None:
     assert [duration(seconds) for seconds in (0.4, 90, 150, 7_300, 3 * 86_400)] == [
         "0 s",
         "90 s",

@@ -81,7 +81,7 @@ def test_a_failure_prints_a_hint_and_the_skipped_checks_and_exits_with_1(tmp_pat
     ]
 
 
-def test_json_is_an_object_a_check_with_four_names(town: ServedChain, router: EmbeddedRouter) -> None:
+def test_json_has_one_object_per_check_with_four_fields(town: ServedChain, router: EmbeddedRouter) -> None:
     variables = town.variables("robot") | {"AIRA_CONNECT": router.endpoint}
     done = aira("doctor", "--json", **variables)
     found = objects(done)
@@ -92,7 +92,7 @@ def test_json_is_an_object_a_check_with_four_names(town: ServedChain, router: Em
     assert {each["do"] for each in found} == {""}
 
 
-def test_json_of_a_failure_has_what_to_do(town: ServedChain, router: EmbeddedRouter) -> None:
+def test_json_of_a_failure_has_a_hint(town: ServedChain, router: EmbeddedRouter) -> None:
     done = aira("doctor", "--json", "--role", "provider", "--connect", router.endpoint, **town.variables("stranger"))
 
     assert done.returncode == 1
@@ -102,7 +102,7 @@ def test_json_of_a_failure_has_what_to_do(town: ServedChain, router: EmbeddedRou
     assert "aira lighthouse join" in failed["do"]
 
 
-def test_a_wrong_password_is_shown_neither_as_it_is_nor_as_it_should_be(town: ServedChain, tmp_path: Path) -> None:
+def test_neither_the_wrong_nor_the_right_password_is_printed(town: ServedChain, tmp_path: Path) -> None:
     (tmp_path / "password").write_text("open barley\n")
     variables = town.variables("robot") | {"AIRA_KEYFILE_PASSWORD_FILE": str(tmp_path / "password")}
     done = aira("doctor", "--json", "--role", "agent", **variables)
@@ -120,7 +120,7 @@ def test_a_key_in_the_address_of_a_node_is_not_shown() -> None:
     assert not any(word in done.stdout + done.stderr for word in ("sesame", "c0ffee"))
 
 
-def test_settings_that_can_t_be_read_end_with_2() -> None:
+def test_unreadable_settings_end_with_2() -> None:
     done = aira("doctor", "--generation", "4")
 
     assert done.returncode == 2
@@ -135,7 +135,7 @@ def test_a_device_without_its_agent_ends_with_2() -> None:
     assert "--agent" in done.stderr
 
 
-def test_a_server_that_takes_connections_and_says_nothing_ends_with_the_time() -> None:
+def test_a_server_that_accepts_and_never_answers_fails_at_the_timeout() -> None:
 
     with socket.create_server(("127.0.0.1", 0)) as silent, at_most(40):
         port = silent.getsockname()[1]
@@ -149,7 +149,7 @@ def test_a_server_that_takes_connections_and_says_nothing_ends_with_the_time() -
     assert failed == ["session", "node"]
 
 
-def test_the_certificate_s_role_is_taken_where_none_is_named(tmp_path: Path) -> None:
+def test_the_default_role_is_that_of_the_certificate(tmp_path: Path) -> None:
     site = Site(tmp_path)
     folder = site.enlist(Member(name="desk", address=ARM, roles=("operator",)))
     settings = settings_of(site.client(folder))
@@ -198,7 +198,7 @@ main()
 """The command line on an edge machine, which has none of these."""
 
 
-def test_an_edge_machine_is_examined_without_what_only_other_roles_need(tmp_path: Path) -> None:
+def test_an_edge_machine_is_checked_without_the_packages_of_other_roles(tmp_path: Path) -> None:
     site = Site(tmp_path)
     folder = site.enlist(Member(name="lamp", address=ARM, roles=("edge",)))
     settings = settings_of(site.client(folder))

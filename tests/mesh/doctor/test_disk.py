@@ -36,14 +36,14 @@ def test_a_writable_folder_passes_and_is_left_empty(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_that_is_yet_to_be_made_is_looked_at_where_it_will_be(tmp_path: Path) -> None:
+def test_for_a_missing_folder_its_nearest_parent_is_checked(tmp_path: Path) -> None:
     result = check_data_folder(tmp_path / "a" / "b", slow=60)
 
     assert result.message == f"{tmp_path / 'a' / 'b'} will be created at the start; {tmp_path} is writable"
     assert not (tmp_path / "a").exists()
 
 
-def test_a_folder_of_another_user_is_named_with_both_and_the_cure(tmp_path: Path) -> None:
+def test_a_folder_of_another_user_is_reported_with_both_users_and_a_hint(tmp_path: Path) -> None:
     tmp_path.chmod(0o555)
     for parent in tmp_path.parents:
         if parent.stat().st_uid == os.geteuid() and parent != parent.parent:
@@ -71,7 +71,7 @@ def test_the_hint_never_changes_the_owner_of_a_parent_folder(tmp_path: Path) -> 
         assert do.endswith(f" {folder}, or give another folder with --data-dir")
 
 
-def test_files_that_this_user_does_not_see_are_not_counted(tmp_path: Path) -> None:
+def test_files_that_this_user_can_not_read_are_not_counted(tmp_path: Path) -> None:
     store = tmp_path / "0xAb" / "content"
     store.mkdir(parents=True)
     (store / "Qm").write_bytes(bytes(16))

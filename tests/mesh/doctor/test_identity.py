@@ -48,7 +48,7 @@ async def test_every_role_passes_with_its_rights(site: Site, role: Role) -> None
     assert ("the space of another" in found.one("denied write").message) is (role in ("operator", "watcher"))
 
 
-async def test_an_edge_agent_is_tried_at_the_device_that_it_serves(site: Site) -> None:
+async def test_an_edge_agent_is_checked_with_the_device_that_it_serves(site: Site) -> None:
     folder = site.enlist(Member(name="board", address=ARM, roles=("edge",), agent=AGENT, device="lamp"))
     settings = settings_of(site.client(folder))
     with site.open_router("wheel"):
@@ -117,7 +117,7 @@ async def test_a_market_that_the_site_does_not_carry_is_named(site: Site) -> Non
     assert "lighthouses" in cause
 
 
-async def test_a_certificate_without_its_site_s_is_a_finding_and_no_crash(site: Site) -> None:
+async def test_a_certificate_without_its_authority_is_a_failed_check(site: Site) -> None:
     arm = site.certify("arm", ARM, "agent")
     settings = Settings(connect=(site.endpoint,), tls_certificate=str(arm.certificate), tls_key=str(arm.key))
 
@@ -126,7 +126,7 @@ async def test_a_certificate_without_its_site_s_is_a_finding_and_no_crash(site: 
     assert "tls_ca is not" in found.cause("certificate")
 
 
-async def test_a_router_s_own_case_is_its_roster_and_where_it_listens(site: Site) -> None:
+async def test_a_router_is_checked_for_its_roster_and_listen_addresses(site: Site) -> None:
     site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
     context = DoctorContext(settings=site.settings())
     idle = await examined(context)
@@ -140,7 +140,7 @@ async def test_a_router_s_own_case_is_its_roster_and_where_it_listens(site: Site
     assert list(running) == ["roster", "certificate", "router", "session"]
 
 
-async def test_a_roster_that_can_t_be_read_is_named(site: Site) -> None:
+async def test_an_unreadable_roster_is_named(site: Site) -> None:
     site.roster.write_text("[[member]]\nname = 1\n")
     with at_most(30):
         found = await examined(DoctorContext(settings=site.settings()))

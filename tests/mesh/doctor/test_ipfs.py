@@ -63,7 +63,7 @@ async def test_a_daemon_that_denies_access_fails(tmp_path: Path) -> None:
     assert allowed.one("ipfs daemon").ok
 
 
-async def test_a_daemon_that_is_not_there_is_named_once() -> None:
+async def test_an_unreachable_daemon_is_named_once() -> None:
     api = f"http://127.0.0.1:{free_port()}"
     found = await found_at(api)
 
@@ -87,7 +87,7 @@ def test_only_a_bridge_needs_a_daemon_unless_one_is_named() -> None:
     assert "bridge" in DoctorContext(settings=Settings(ipfs_http_provider="http://ipfs:5001")).roles
 
 
-async def test_a_bridge_without_a_daemon_hears_of_it_among_the_rest() -> None:
+async def test_a_bridge_without_a_daemon_gets_a_failed_check_among_the_others() -> None:
     settings = Settings(
         connect=(f"tcp/127.0.0.1:{free_port()}",),
         web3_http_provider=f"http://127.0.0.1:{free_port()}",

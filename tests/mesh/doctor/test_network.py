@@ -40,13 +40,13 @@ async def test_an_open_router_on_loopback_passes(router: EmbeddedRouter) -> None
     assert "open: everybody may write everything" in found.one("denied write").message
 
 
-async def test_the_stand_alone_router_is_as_good(zenohd: Zenohd) -> None:
+async def test_zenohd_passes(zenohd: Zenohd) -> None:
     found = await examined(DoctorContext(settings=Settings(connect=(zenohd.endpoint,)), requested_role="operator"))
 
     assert found.failed == []
 
 
-async def test_no_router_is_named_once_with_its_address_and_how_to_start_one() -> None:
+async def test_an_unreachable_router_is_reported_once_with_a_hint() -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with at_most(20):
         found = await examined(DoctorContext(settings=Settings(connect=(endpoint,)), requested_role="operator"))
@@ -57,7 +57,7 @@ async def test_no_router_is_named_once_with_its_address_and_how_to_start_one() -
     assert list(found) == ["router"]
 
 
-async def test_a_dead_router_beside_a_living_one_is_seen(router: EmbeddedRouter) -> None:
+async def test_one_unreachable_router_of_two_is_reported(router: EmbeddedRouter) -> None:
     dead = f"tcp/127.0.0.1:{free_port()}"
     found = await examined(DoctorContext(settings=Settings(connect=(dead, router.endpoint)), requested_role="operator"))
 
@@ -134,7 +134,7 @@ def leaky(site: Site) -> Iterator[str]:
         yield endpoint
 
 
-async def test_each_router_of_a_site_is_tried_and_the_one_that_forbids_nothing_is_named(site: Site, leaky: str) -> None:
+async def test_each_router_of_a_site_is_checked_and_an_open_one_is_named(site: Site, leaky: str) -> None:
     arm = site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
     settings = dataclasses.replace(settings_of(site.client(arm)), connect=(site.endpoint, leaky))
     with site.open_router("wheel"):

@@ -46,7 +46,7 @@ def test_a_port_that_opens_passes(silent: str) -> None:
     assert check.check_port(SerialSettings(port=silent)).message == f"{silent} opens at 57,600 baud"
 
 
-async def test_a_port_that_is_not_there_is_named(router: EmbeddedRouter) -> None:
+async def test_a_missing_port_is_named(router: EmbeddedRouter) -> None:
     context = DoctorContext(
         settings=Settings(connect=(router.endpoint,)), serial=SerialSettings(port="/dev/ttyNOTHING")
     )
@@ -60,7 +60,7 @@ async def test_a_port_that_is_not_there_is_named(router: EmbeddedRouter) -> None
     assert "serial board" not in found
 
 
-def test_a_port_without_permission_is_named_with_its_group_and_the_cure(silent: str) -> None:
+def test_a_port_without_permission_is_reported_with_its_group_and_a_hint(silent: str) -> None:
     os.chmod(silent, 0)
     if os.geteuid() == 0:
         os.chown(silent, -1, grp.getgrnam("dialout").gr_gid)

@@ -69,7 +69,7 @@ async def test_earlier_writes_do_not_count_for_the_round_trip(router: EmbeddedRo
     assert took >= FAR
 
 
-async def test_denied_writes_are_not_judged_if_allowed_ones_do_not_arrive(
+async def test_denied_writes_are_not_checked_if_allowed_ones_do_not_arrive(
     router: EmbeddedRouter,
 ) -> None:
     async with pair(router.endpoint, router.endpoint) as both:

@@ -36,7 +36,7 @@ def router(site: Site) -> Serving:
     return Serving(*AIRA, "router", *flags, *own, says="let in: ")
 
 
-async def test_a_running_job_is_done_and_paid_while_one_is_revoked_and_another_renewed(
+async def test_a_running_job_is_paid_while_one_member_is_revoked_and_another_renewed(
     anvil: Anvil, tmp_path: Path
 ) -> None:
     site = Site(tmp_path / "site")

@@ -69,7 +69,7 @@ def member_of_second(site: Site, folder: MemberFolder, port: int) -> Network:
 
 
 @pytest.mark.parametrize("kind", ["wheel", "zenohd"])
-async def test_linked_routers_carry_one_market_also_after_one_was_away(site: Site, kind: str) -> None:
+async def test_linked_routers_carry_one_market_also_after_one_restarted(site: Site, kind: str) -> None:
     arm = site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
     screen = site.enlist(Member(name="screen", address=SCREEN, roles=("watcher",)))
     second, port = site.enlist(Member(name="second", address=SECOND, roles=("router",))), free_port()
@@ -101,7 +101,7 @@ async def test_a_router_that_is_not_in_the_roster_links_nothing(site: Site) -> N
             assert b"false" not in heard
 
 
-def test_a_link_that_shows_no_certificate_is_refused(site: Site) -> None:
+def test_a_link_without_a_certificate_is_refused(site: Site) -> None:
     settings = dataclasses.replace(site.settings(), link=("tcp/192.0.2.1:7447",))
 
     with pytest.raises(ConfigurationError, match="it does not identify who connects"):

@@ -140,7 +140,7 @@ async def test_each_member_writes_only_what_it_may(
     assert await heard_by_witness(stage, kind, expected) == expected
 
 
-async def test_each_answers_where_it_serves_and_nowhere_else(stage: Stage) -> None:
+async def test_each_member_answers_only_on_its_own_keys(stage: Stage) -> None:
     for who in WHO:
         for key in KEYS[who].values():
 
@@ -167,7 +167,7 @@ async def test_each_answers_where_it_serves_and_nowhere_else(stage: Stage) -> No
 
 
 @pytest.mark.parametrize("who", WHO)
-async def test_each_shows_its_own_tokens_and_no_others(stage: Stage, who: str) -> None:
+async def test_each_member_declares_only_its_own_tokens(stage: Stage, who: str) -> None:
     def shown() -> set[str]:
         liveliness = stage.witness.liveliness()
         replies = [reply for selector in ALL_TOKENS for reply in liveliness.get(selector, timeout=SECONDS)]
@@ -183,7 +183,7 @@ async def test_each_shows_its_own_tokens_and_no_others(stage: Stage, who: str) -
     await until(lambda: not shown(), seconds=SECONDS)
 
 
-async def test_each_is_answered_where_it_may_ask(stage: Stage) -> None:
+async def test_each_member_gets_answers_only_where_it_may_query(stage: Stage) -> None:
     def answer(query: zenoh.Query) -> None:
         with query:
             query.reply(query.key_expr, b"")
@@ -239,7 +239,7 @@ WILD = ("aira/**", "aira/agent/**", "aira/agent/*/rpc/**", "aira/*/demand/*/*", 
 OTHERS_KEY = KEYS["arm"]["other rpc"]
 
 
-async def test_no_wildcard_reaches_further_than_its_writer_may(stage: Stage) -> None:
+async def test_a_wildcard_write_reaches_only_permitted_keys(stage: Stage) -> None:
     published, answered = set[str](), set[str]()
     for selector in ALL_TOKENS:
         stage.keep(stage.witness.declare_subscriber(selector, lambda sample: published.add(str(sample.key_expr))))
@@ -262,7 +262,7 @@ async def test_no_wildcard_reaches_further_than_its_writer_may(stage: Stage) -> 
     assert (published, answered, tokens) == (set(), set(), [])
 
 
-async def test_no_wildcard_reads_further_than_its_reader_may(stage: Stage) -> None:
+async def test_a_wildcard_read_reaches_only_permitted_keys(stage: Stage) -> None:
     heard, answered = set[str](), set[str]()
     for selector in ALL_TOKENS:
         stage.keep(stage.witness.declare_queryable(selector, lambda query: query.reply(OTHERS_KEY, b"")))

@@ -29,7 +29,7 @@ def test_an_empty_roster_has_both_markets_and_no_members() -> None:
     assert roster.lighthouses == ("airalab.lighthouse.3.robonomics.eth", "airalab.lighthouse.5.robonomics.eth")
 
 
-def test_texts_are_read_in_any_case_and_held_in_one() -> None:
+def test_addresses_and_fingerprints_are_normalised_to_lower_case() -> None:
     text = 'lighthouses = ["My.Lighthouse.3.Robonomics.ETH"]\n' + member(
         address=f'"{CHECKSUMMED}"', fingerprint='"' + ":".join(["AB"] * 32) + '"'
     )
@@ -95,7 +95,7 @@ def test_an_unknown_role_lists_the_roles() -> None:
     assert error.value.hint == "roles are agent, person, provider, operator, edge, bridge, watcher, router"
 
 
-def test_files_that_can_t_be_read_are_named(tmp_path: Path) -> None:
+def test_unreadable_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(RosterError, match="No such file or directory"):
         read_roster(tmp_path / "none.toml")
     (tmp_path / "bytes.toml").write_bytes(b"\xff")
@@ -125,7 +125,7 @@ def test_adding_a_member_keeps_the_rest_of_the_file(tmp_path: Path) -> None:
         with_fingerprint(file, ARM, old="ab" * 32, new="ef" * 32)
 
 
-def test_a_fingerprint_is_replaced_however_it_is_written(tmp_path: Path) -> None:
+def test_a_fingerprint_is_replaced_in_any_spelling(tmp_path: Path) -> None:
     file = tmp_path / "roster.toml"
     arm = Member(name="arm", address=ARM, roles=("agent",), fingerprint="ab" * 32)
     write_roster(file, entry_of(arm).replace("ab" * 32, ":".join(["AB"] * 32)))
@@ -148,7 +148,7 @@ def test_a_member_without_a_fingerprint_is_renewed_and_a_revoked_one_or_a_strang
         with_fingerprint(file, ARM, old="ab" * 32, new="cd" * 32)
 
 
-def test_the_revoked_are_not_admitted() -> None:
+def test_revoked_members_are_not_admitted() -> None:
     gone = Member(name="gone", address=OTHER, roles=("agent",), revoked=True)
     arm = Member(name="arm", address=ARM, roles=("agent",))
 

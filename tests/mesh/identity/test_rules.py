@@ -50,14 +50,14 @@ def test_every_family_of_keys_may_be_written_by_somebody() -> None:
         assert any(chunk in key for key in grants), chunk
 
 
-def test_only_the_own_space_may_be_deleted_in() -> None:
+def test_a_member_deletes_only_in_its_own_space() -> None:
     for role in ROLES:
         if role != "router":
             assert allowed((role,), Right.DELETE) <= {f"aira/agent/{ARM}/**"}
 
 
 @pytest.mark.parametrize("role", [role for role in ROLES if role != "router"])
-def test_no_member_writes_as_another(role: Role) -> None:
+def test_no_member_can_write_as_another(role: Role) -> None:
     for right in (Right.PUT, Right.DELETE, Right.TOKEN):
         for key in allowed((role,), right, agent=ARM, device="arm"):
             assert ARM in key or key.startswith(f"aira/{MARKET}/"), key
@@ -71,13 +71,13 @@ def test_an_edge_agent_writes_for_its_agent_and_nowhere_else() -> None:
     assert written == {f"aira/agent/{OTHER}/device/board/**", f"aira/agent/{OTHER}/liability/*/topic/**"}
 
 
-def test_roles_add_up() -> None:
+def test_the_rights_of_several_roles_are_combined() -> None:
     both = allowed(("agent", "person"), Right.PUT)
 
     assert both == allowed(("agent",), Right.PUT) | allowed(("person",), Right.PUT)
 
 
-def test_each_market_is_opened_and_no_other() -> None:
+def test_only_the_markets_of_the_roster_are_open() -> None:
     two = Roster(lighthouses=(MARKET, "b.eth"), member=(Member(name="ann", address=ARM, roles=("person",)),))
 
     puts = next(one.keys for one in access_of(two) if one.right is Right.PUT)
@@ -96,13 +96,13 @@ def test_zenoh_denies_by_default_and_knows_both_spellings_of_an_address() -> Non
     assert not any("put" in rule["messages"] and "ingress" in rule["flows"] for rule in rules["rules"])
 
 
-def test_a_roster_without_anybody_denies_all() -> None:
+def test_an_empty_roster_denies_everything() -> None:
     rules = access_control(Roster(lighthouses=(MARKET,)))
 
     assert (rules["enabled"], rules["default_permission"], rules["subjects"]) == (True, "deny", [])
 
 
-def test_the_revoked_may_do_nothing() -> None:
+def test_revoked_members_have_no_rights() -> None:
     gone = Roster(lighthouses=(MARKET,), member=(Member(name="arm", address=ARM, roles=("agent",), revoked=True),))
 
     assert access_of(gone) == ()

@@ -126,7 +126,7 @@ async def test_a_client_without_a_locator_is_rejected() -> None:
             pass
 
 
-async def test_a_port_that_is_taken_says_so() -> None:
+async def test_a_taken_port_is_reported() -> None:
     with closing(socket.create_server(("127.0.0.1", 0))) as taken:
         listen = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
         with pytest.raises(ConfigurationError) as error:
@@ -137,7 +137,7 @@ async def test_a_port_that_is_taken_says_so() -> None:
     assert "--listen" in error.value.hint
 
 
-async def test_a_router_is_there_at_once_and_is_its_own_network() -> None:
+async def test_a_router_is_usable_at_once_without_others() -> None:
     took = []
     # What else goes on on the machine may make one of them slow, and hardly all.
     for _ in range(3):
@@ -149,7 +149,7 @@ async def test_a_router_is_there_at_once_and_is_its_own_network() -> None:
     assert min(took) < 0.4
 
 
-async def test_the_session_is_there_only_inside_async_with(router: EmbeddedRouter) -> None:
+async def test_the_session_exists_only_inside_async_with(router: EmbeddedRouter) -> None:
     network = client(router.endpoint)
     with pytest.raises(ClosedError):
         network.session  # noqa: B018

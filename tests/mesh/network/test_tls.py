@@ -110,7 +110,7 @@ async def test_an_expired_certificate_is_reported(site: Site, kind: str) -> None
 
 
 @pytest.mark.parametrize("kind", ["wheel", "zenohd"])
-async def test_the_router_rejects_them_even_without_the_clients_checks(
+async def test_the_router_rejects_foreign_identities_without_the_clients_checks(
     site: Site, arm: MemberFolder, kind: str
 ) -> None:
     old, other = site.certify("old", ARM, "agent", days=-0.001), foreigner(site, ARM)

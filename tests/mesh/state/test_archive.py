@@ -63,7 +63,7 @@ NAMES = [
 
 
 @pytest.mark.parametrize("name", NAMES)
-async def test_a_name_that_no_state_has_is_refused(archive: Path, tmp_path: Path, name: str) -> None:
+async def test_an_unexpected_file_name_is_refused(archive: Path, tmp_path: Path, name: str) -> None:
     def change(members: Members) -> None:
         header = tarfile.TarInfo(name)
         header.size = 4
@@ -75,7 +75,7 @@ async def test_a_name_that_no_state_has_is_refused(archive: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize("kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.DIRTYPE, tarfile.CHRTYPE, tarfile.FIFOTYPE])
-async def test_only_plain_files_are_taken(archive: Path, tmp_path: Path, kind: bytes) -> None:
+async def test_only_plain_files_are_accepted(archive: Path, tmp_path: Path, kind: bytes) -> None:
     def change(members: Members) -> None:
         header = tarfile.TarInfo(f"{ADDRESS}/{CHAIN}/recordings/{ADDRESS}.mcap")
         header.type, header.linkname = kind, "/etc/passwd"
@@ -85,7 +85,7 @@ async def test_only_plain_files_are_taken(archive: Path, tmp_path: Path, kind: b
 
 
 @pytest.mark.parametrize("kind", [tarfile.GNUTYPE_LONGNAME, tarfile.XHDTYPE])
-async def test_a_header_can_t_ask_for_memory(archive: Path, tmp_path: Path, kind: bytes) -> None:
+async def test_a_huge_header_does_not_allocate_memory(archive: Path, tmp_path: Path, kind: bytes) -> None:
     def change(members: Members) -> None:
         header = tarfile.TarInfo("long")
         header.type, header.size = kind, 300 << 20
@@ -105,7 +105,7 @@ async def test_a_duplicate_file_is_refused(archive: Path, tmp_path: Path) -> Non
     assert "no part of a state" in await refused(forged, tmp_path)
 
 
-async def test_more_than_the_disk_has_is_refused_at_its_header(
+async def test_a_file_larger_than_the_free_space_is_refused_at_its_header(
     archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def change(members: Members) -> None:
@@ -115,7 +115,7 @@ async def test_more_than_the_disk_has_is_refused_at_its_header(
     assert "more space than the disk has" in await refused(forge(archive, tmp_path / "forged", change), tmp_path)
 
 
-async def test_more_files_than_the_checksums_could_list_are_refused_before_their_end(
+async def test_more_files_than_checksums_can_list_are_refused_early(
     archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Empty ones cost a forger a few bits each, and the disk a name."""
@@ -129,7 +129,7 @@ async def test_more_files_than_the_checksums_could_list_are_refused_before_their
     assert "more files than its checksums could list" in await refused(forged, tmp_path)
 
 
-async def test_a_backup_that_could_not_be_read_again_is_not_made(
+async def test_a_backup_with_too_many_files_to_restore_is_not_made(
     folder: Folder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(archives, "LARGEST_TEXT", 500)
@@ -138,7 +138,7 @@ async def test_a_backup_that_could_not_be_read_again_is_not_made(
     assert names_in(tmp_path) == ["data"]
 
 
-async def test_a_file_that_a_stranger_put_in_the_way_gets_nothing(folder: Folder, tmp_path: Path) -> None:
+async def test_a_prepared_temporary_file_gets_no_data(folder: Folder, tmp_path: Path) -> None:
     """In a folder of all, such as /tmp: under the name that the backup has until it is whole."""
     prepared = tmp_path / f".it.{os.getpid()}"
     prepared.touch(mode=0o666)
@@ -155,7 +155,7 @@ def changed(archive: Path, forged: Path, place: float) -> Path:
     return forged
 
 
-async def test_one_bit_that_is_wrong_is_found(archive: Path, tmp_path: Path) -> None:
+async def test_a_flipped_bit_is_detected(archive: Path, tmp_path: Path) -> None:
     """But for those that make no difference, as the window of a frame."""
     found = 0
     for place in range(40):
@@ -174,7 +174,7 @@ def still_the_same(archive: Path, forged: Path) -> bool:
         return False
 
 
-async def test_a_changed_file_is_found_by_its_checksum(archive: Path, tmp_path: Path) -> None:
+async def test_a_changed_file_is_detected_by_its_checksum(archive: Path, tmp_path: Path) -> None:
     def change(members: Members) -> None:
         header, data = members[2]
         members[2] = (header, data.replace(b"so far", b"sO far"))
@@ -184,7 +184,7 @@ async def test_a_changed_file_is_found_by_its_checksum(archive: Path, tmp_path: 
 
 
 @pytest.mark.parametrize("place", [1, 2, -2])
-async def test_a_file_that_is_missing_is_found(archive: Path, tmp_path: Path, place: int) -> None:
+async def test_a_missing_file_is_detected(archive: Path, tmp_path: Path, place: int) -> None:
     def change(members: Members) -> None:
         del members[place]
 
@@ -198,11 +198,11 @@ def cut(archive: Path, cut: Path, part: float) -> Path:
 
 
 @pytest.mark.parametrize("part", [0.0, 0.1, 0.5, 0.99])
-async def test_a_backup_that_was_cut_is_found(archive: Path, tmp_path: Path, part: float) -> None:
+async def test_a_truncated_backup_is_detected(archive: Path, tmp_path: Path, part: float) -> None:
     await refused(cut(archive, tmp_path / "cut", part), tmp_path)
 
 
-async def test_members_after_the_end_were_cut_with_their_checksums(archive: Path, tmp_path: Path) -> None:
+async def test_a_backup_without_checksums_is_damaged(archive: Path, tmp_path: Path) -> None:
     forged = forge(archive, tmp_path / "forged", lambda members: members.__delitem__(slice(-1, None)))
     assert "damaged" in await refused(forged, tmp_path)
 
@@ -216,18 +216,18 @@ def about(**changes: object) -> Callable[[Members], None]:
     return change
 
 
-async def test_a_newer_format_is_named(archive: Path, tmp_path: Path) -> None:
+async def test_a_newer_format_is_refused_with_both_versions(archive: Path, tmp_path: Path) -> None:
     forged = forge(archive, tmp_path / "forged", about(format=2, parts=5))
     said = await refused(forged, tmp_path)
     assert "written by another version (format 2, this one knows 1)" in said
 
 
 @pytest.mark.parametrize("changes", [{"parts": 5}, {"parts": [5]}, {"made": None}])
-async def test_nonsense_about_itself_is_refused(archive: Path, tmp_path: Path, changes: dict[str, object]) -> None:
+async def test_an_invalid_description_is_refused(archive: Path, tmp_path: Path, changes: dict[str, object]) -> None:
     assert "damaged" in await refused(forge(archive, tmp_path / "forged", about(**changes)), tmp_path)
 
 
-async def test_parts_that_lead_elsewhere_are_refused(archive: Path, tmp_path: Path, folder: Folder) -> None:
+async def test_parts_outside_the_folder_are_refused(archive: Path, tmp_path: Path, folder: Folder) -> None:
     """What a backup says that it has moves nothing that is not in it."""
     outside = tmp_path / "outside"
     outside.mkdir()
@@ -237,7 +237,7 @@ async def test_parts_that_lead_elsewhere_are_refused(archive: Path, tmp_path: Pa
     assert outside.is_dir()
 
 
-async def test_something_behind_the_end_is_refused(archive: Path, tmp_path: Path) -> None:
+async def test_data_after_the_end_is_refused(archive: Path, tmp_path: Path) -> None:
     (tmp_path / "longer").write_bytes(zstandard.compress(unpacked(archive) + b"more"))
     assert "something follows its end" in await refused(tmp_path / "longer", tmp_path)
 

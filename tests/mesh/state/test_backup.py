@@ -70,7 +70,7 @@ async def test_missing_content_of_jobs_is_reported(folder: Folder, tmp_path: Pat
     assert missing in (await back_up(folder.path, tmp_path / "it", content=ContentScope.NEEDED)).missing
 
 
-async def test_rotten_content_is_left_out_and_named(folder: Folder, tmp_path: Path) -> None:
+async def test_damaged_content_is_left_out_and_reported(folder: Folder, tmp_path: Path) -> None:
     held = folder.home / "content" / cid_of_bytes(OBJECTIVE)
     held.chmod(0o644)
     held.write_bytes(b"what is to be Done")
@@ -121,7 +121,7 @@ async def test_jobs_that_keep_changing_are_an_error_and_leave_no_file(
     assert names_in(tmp_path) == ["data"]
 
 
-async def test_a_ledger_that_is_written_meanwhile_is_whole_in_the_backup(folder: Folder, tmp_path: Path) -> None:
+async def test_a_ledger_written_during_the_backup_is_consistent_in_it(folder: Folder, tmp_path: Path) -> None:
     async with Ledger(folder.ledger) as ledger:
         writing = asyncio.create_task(write_without_end(ledger))
         try:
@@ -155,7 +155,7 @@ async def write_without_end(ledger: Ledger) -> None:
         await ledger.complete(job.address, success=True, result=signed.result, note="", outgoing=outgoing(signed))
 
 
-async def test_a_backup_replaces_an_earlier_one_only_when_it_is_whole(folder: Folder, tmp_path: Path) -> None:
+async def test_a_backup_replaces_an_earlier_one_only_when_it_is_complete(folder: Folder, tmp_path: Path) -> None:
     (tmp_path / "it").write_bytes(b"the earlier one")
     folder.ledger.write_bytes(b"no ledger at all")
     with pytest.raises(ConfigurationError):

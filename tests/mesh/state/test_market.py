@@ -133,7 +133,7 @@ async def test_jobs_paid_since_the_backup_are_not_repeated_even_if_the_chain_is_
     assert robot.said == [f"only {step}" for step in STEPS]
 
 
-async def test_a_job_that_ran_during_the_backup_goes_on_where_it_was(place: Place) -> None:
+async def test_a_job_that_ran_during_the_backup_continues(place: Place) -> None:
     """When nothing has happened since, a restored agent is one that was started again."""
     before = await place.balance("robot")
     robot, disk, archive = Robot(place), place.folder / "robot", place.folder / "backup"
@@ -153,7 +153,7 @@ async def test_a_job_that_ran_during_the_backup_goes_on_where_it_was(place: Plac
     assert await place.balance("robot") == before + COST
 
 
-async def test_a_signed_result_is_sent_by_the_restored_agent_as_it_was(place: Place) -> None:
+async def test_a_signed_result_is_sent_unchanged_by_the_restored_agent(place: Place) -> None:
     """The person is paid for by the Result that was signed before the backup, to the byte."""
     robot, disk, archive = Robot(place), place.folder / "robot", place.folder / "backup"
     async with place.agent("person") as person:

@@ -101,7 +101,7 @@ async def test_an_existing_state_is_not_touched(archive: Path, folder: Folder) -
     assert folder.contents() == before
 
 
-async def test_another_account_s_state_is_no_hindrance(archive: Path, tmp_path: Path) -> None:
+async def test_the_state_of_another_account_does_not_prevent_restoring(archive: Path, tmp_path: Path) -> None:
     other = tmp_path / "new" / ("0x" + "11" * 20) / "content"
     other.mkdir(parents=True)
     await restore(archive, tmp_path / "new")
@@ -145,7 +145,7 @@ async def test_a_store_that_is_open_is_in_use(archive: Path, folder: Folder) -> 
         await restore(archive, folder.path, existing=ExistingState.SET_ASIDE)
 
 
-async def test_a_transaction_that_somebody_waits_for_is_in_use(archive: Path, folder: Folder) -> None:
+async def test_a_locked_pending_transaction_is_in_use(archive: Path, folder: Folder) -> None:
     descriptor = lock_file(folder.path / NONCE, fcntl.LOCK_EX)
     assert descriptor is not None
     try:
@@ -155,7 +155,7 @@ async def test_a_transaction_that_somebody_waits_for_is_in_use(archive: Path, fo
         os.close(descriptor)
 
 
-async def test_no_agent_opens_a_state_while_it_is_exchanged(
+async def test_no_agent_can_open_a_state_while_it_is_replaced(
     archive: Path, folder: Folder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     exchange = restoring._exchange
@@ -171,7 +171,7 @@ async def test_no_agent_opens_a_state_while_it_is_exchanged(
     assert "database is locked" in refused[0]
 
 
-async def test_when_one_part_can_t_be_placed_all_is_as_it_was(
+async def test_if_one_part_can_not_be_moved_nothing_changes(
     archive: Path, folder: Folder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before, move, moves = folder.contents(), restoring._move, []
@@ -209,7 +209,7 @@ async def test_a_newer_ledger_is_not_backed_up(folder: Folder, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("data", [b"no ledger", b"SQLite format 3\x00" + bytes(4096)])
-async def test_a_file_that_is_no_ledger_is_refused(archive: Path, tmp_path: Path, data: bytes) -> None:
+async def test_an_invalid_ledger_is_refused(archive: Path, tmp_path: Path, data: bytes) -> None:
     with pytest.raises((LedgerUnusable, ArchiveUnusable)):
         await restore(forge_ledger(archive, tmp_path / "forged", data), tmp_path / "new")
     assert names_in(tmp_path / "new") == []
@@ -223,7 +223,7 @@ async def test_a_file_that_is_no_ledger_is_refused(archive: Path, tmp_path: Path
         ("CREATE VIRTUAL TABLE more USING fts5(words)", "virtual table"),
     ],
 )
-async def test_a_ledger_that_does_something_when_it_is_used_is_refused(
+async def test_a_ledger_with_views_triggers_or_virtual_tables_is_refused(
     archive: Path, tmp_path: Path, statement: str, kind: str
 ) -> None:
     ledger = tmp_path / "active.sqlite"
@@ -264,7 +264,7 @@ async def test_an_unwritable_folder_is_an_error(archive: Path, tmp_path: Path) -
         await restore(archive, tmp_path / "file")
 
 
-async def test_a_folder_where_only_its_inside_can_be_written_will_do(archive: Path, tmp_path: Path) -> None:
+async def test_a_mounted_folder_is_kept_and_filled(archive: Path, tmp_path: Path) -> None:
     """As the volume of a container, or a StateDirectory."""
     target = tmp_path / "volume"
     target.mkdir()
@@ -273,7 +273,7 @@ async def test_a_folder_where_only_its_inside_can_be_written_will_do(archive: Pa
     assert target.stat().st_ino == inode
 
 
-async def test_killed_at_any_moment_it_leaves_whole_parts_only(archive: Path, tmp_path: Path) -> None:
+async def test_a_killed_restore_leaves_only_complete_parts(archive: Path, tmp_path: Path) -> None:
     for number in range(8):
         target = Folder(tmp_path / f"new-{number}")
         with program(RESTORING, archive, target.path):

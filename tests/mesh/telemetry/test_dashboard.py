@@ -115,14 +115,14 @@ def expressions() -> Iterator[str]:
     yield from re.findall(r"^\s+expr: (.*)$", ALERTS.read_text(), flags=re.MULTILINE)
 
 
-async def test_every_expression_is_of_figures_that_are_served(served: Mapping[str, Known]) -> None:
+async def test_every_expression_uses_metrics_that_are_served(served: Mapping[str, Known]) -> None:
     asked = {name for expression in expressions() for name in NAME.findall(expression)}
 
     assert len(asked) > 40
     assert asked <= served.keys()
 
 
-async def test_every_label_of_an_expression_is_one_that_its_figures_have(served: Mapping[str, Known]) -> None:
+async def test_every_label_of_an_expression_exists_on_its_metric(served: Mapping[str, Known]) -> None:
     for expression in expressions():
         names = NAME.findall(expression)
         for found in SELECTED.finditer(expression):
@@ -133,7 +133,7 @@ async def test_every_label_of_an_expression_is_one_that_its_figures_have(served:
             assert labels <= set.union(ADDED, *(served[name].labels for name in names)), expression
 
 
-async def test_rates_are_of_counters_and_of_nothing_else(served: Mapping[str, Known]) -> None:
+async def test_rates_are_of_counters_only(served: Mapping[str, Known]) -> None:
     for expression in expressions():
         if expression.startswith("label_values("):
             continue
@@ -161,7 +161,7 @@ def panels() -> list[dict[str, Any]]:
     return found
 
 
-def test_the_dashboard_has_its_rows_and_no_two_panels_in_one_place() -> None:
+def test_the_dashboard_has_its_rows_and_panels_do_not_overlap() -> None:
     rows = [panel["title"] for panel in panels() if panel["type"] == "row"]
     assert rows == ["Health", "Market", "Jobs", "Money", "Network", "Devices", "Bridge"]
     assert len({panel["id"] for panel in panels()}) == len(panels())

@@ -88,7 +88,7 @@ def test_json_lines_keep_untrusted_text_unchanged() -> None:
     assert json.loads(json_line(event_of(record("%s", HOSTILE))))["message"] == HOSTILE
 
 
-def test_an_exception_is_a_part_of_the_one_json_line() -> None:
+def test_an_exception_is_part_of_the_json_line() -> None:
     line = json_line(event_of(record("the job failed", error=failed("by\nnothing"))))
     told = json.loads(line)
     assert len(line.splitlines()) == 1
@@ -136,7 +136,7 @@ def test_secrets_in_urls_are_removed(said: str, told: str) -> None:
         assert secret not in event.message + event.error + event.trace.replace(repr(said), "")
 
 
-def test_a_level_between_two_counts_as_the_lower() -> None:
+def test_a_level_between_two_is_mapped_to_the_lower() -> None:
     named = {level: event_of(record("x", level=level)).level for level in (0, 5, 10, 20, 25, 30, 40, 50, 99)}
     assert list(named.values()) == [
         "debug", "debug", "debug", "info", "info", "warning", "error", "critical", "critical",

@@ -89,7 +89,7 @@ def test_a_thread_that_fails_is_one_line() -> None:
     )
 
 
-def test_a_task_that_fails_unheard_is_one_line() -> None:
+def test_a_failed_task_that_nobody_awaits_is_one_line() -> None:
     body = """
 async def fail(): raise ZeroDivisionError
 task = asyncio.create_task(fail())
@@ -121,7 +121,7 @@ def test_a_warning_is_one_line() -> None:
     assert "old fashioned" in event["message"]
 
 
-def test_a_wrong_log_call_is_logged_and_stops_nothing() -> None:
+def test_an_invalid_log_call_is_logged_and_does_not_raise() -> None:
     first, second = told('log.info("%d messages", "many"); log.info("it goes on")')
     assert (first["event"], first["level"], "'%d messages'" in first["message"]) == ("record-malformed", "error", True)
     assert first["error"].startswith("TypeError")

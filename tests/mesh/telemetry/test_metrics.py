@@ -46,7 +46,7 @@ def test_a_scraper_that_asks_for_openmetrics_gets_it() -> None:
     assert found["aira_jobs_done"].samples[0].value == 3
 
 
-def test_the_process_tells_its_memory_its_start_and_the_version() -> None:
+def test_process_metrics_have_memory_start_and_version() -> None:
     figures = rendered()
 
     assert figures("process_resident_memory_bytes") > 1e6
@@ -63,7 +63,7 @@ def test_labels_are_added_to_all_samples_and_do_not_hide_their_own() -> None:
     assert second.samples == (MetricSample(2, {"lighthouse": "north", "kind": "demand"}),)
 
 
-def test_the_same_figure_of_two_lighthouses_is_one_family() -> None:
+def test_the_same_metric_of_two_lighthouses_is_one_family() -> None:
     both = [labelled([gauge("aira_a", "a", place)], lighthouse=name)[0] for place, name in enumerate(("n", "s"))]
 
     figures = rendered(*both)
@@ -71,7 +71,7 @@ def test_the_same_figure_of_two_lighthouses_is_one_family() -> None:
     assert (figures("aira_a", lighthouse="n"), figures("aira_a", lighthouse="s")) == (0, 1)
 
 
-def test_one_name_can_not_mean_two_things() -> None:
+def test_two_metrics_can_not_share_a_name() -> None:
     with pytest.raises(ValueError, match="two families named aira_a"):
         merged([gauge("aira_a", "a", 1), gauge("aira_a", "something else", 1)])
 

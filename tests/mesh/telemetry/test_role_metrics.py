@@ -150,7 +150,7 @@ async def _finalized(url: str, count: float) -> bool:
     return (await scraped(url))("aira_jobs", phase="finalized") == count
 
 
-async def test_a_job_that_is_under_way_stands_in_its_phase_for_longer_and_longer(place: Place) -> None:
+async def test_the_age_of_a_running_job_in_its_phase_grows(place: Place) -> None:
     robot, done = offering(place.agent("robot", metrics_listen=HERE)), asyncio.Event()
 
     @robot.on("/go")

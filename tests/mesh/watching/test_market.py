@@ -100,7 +100,7 @@ async def test_orders_and_results_come_as_they_are_published(market: Market) -> 
     assert market.watch.counters().received == 4
 
 
-async def test_a_message_with_another_ones_signature_is_counted_and_not_shown(market: Market) -> None:
+async def test_a_message_with_a_forged_signature_is_counted_and_not_shown(market: Market) -> None:
     forged = msgspec.structs.replace(demand(), signature="11" * 65)
     market.channel.put(market.key(forged), encode(forged))
     await market.refused("signature")
@@ -143,7 +143,7 @@ async def test_an_agents_events_are_shown_with_the_record_of_the_contract(market
     ],
     ids=repr,
 )
-async def test_an_event_that_can_not_be_is_refused(market: Market, changes: dict[str, str]) -> None:
+async def test_an_impossible_event_is_refused(market: Market, changes: dict[str, str]) -> None:
     market.channel.put(EVENT, msgspec.structs.replace(JOB, **changes).encode())
     await market.refused("event")
 
@@ -156,7 +156,7 @@ async def test_an_event_of_an_agent_of_another_lighthouse_is_not_shown(market: M
     assert (await market.next()).agent == ROBOT.address
 
 
-async def test_an_agent_that_comes_later_is_shown_too(market: Market) -> None:
+async def test_an_agent_that_starts_later_is_shown(market: Market) -> None:
     market.channel.announce("agent", STRANGER.address)
     await until(lambda: market.watch.knows(STRANGER.address), what="the new agent")
     theirs = msgspec.structs.replace(JOB, promisor=STRANGER.address)

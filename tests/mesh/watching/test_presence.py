@@ -149,7 +149,7 @@ async def test_an_address_reports_the_status_of_each_role(meeting: Meeting) -> N
         assert sorted(told, key=str) == sorted(both, key=str)
 
 
-async def test_a_bridge_answers_too(meeting: Meeting) -> None:
+async def test_a_bridge_reports_its_status(meeting: Meeting) -> None:
     key = bridge_status_key(STRANGER.address, MARKET)
     with answering(meeting.writer.session, key, bridge_status().encode()):
         await until_answered(meeting.session, key)
