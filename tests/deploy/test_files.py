@@ -133,9 +133,9 @@ def test_the_second_file_builds_on_services_of_the_first() -> None:
 
 def test_the_example_of_env_has_the_default_of_every_variable() -> None:
     used = dict(VARIABLE.findall(ONE_SITE.read_text()))
-    told = dict(re.findall(r"^#([A-Z]\w*)=(.*)$", (ROOT / ".env.example").read_text(), re.MULTILINE))
+    documented = dict(re.findall(r"^#([A-Z]\w*)=(.*)$", (ROOT / ".env.example").read_text(), re.MULTILINE))
     assert len(used) > 30
-    assert told == used
+    assert documented == used
 
 
 def test_every_variable_of_the_compose_file_is_in_the_example_of_env() -> None:

@@ -25,9 +25,7 @@ VOLTS = {"dust": 0.5, "CO": 1.0, "LPG": 1.5, "methane": 2.0, "smoke": 2.5, "hydr
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_a_person_gets_the_measurements_of_the_sensors(
-    protocol: str, market: dict[str, str], tmp_path: Path
-) -> None:
+def test_a_person_gets_the_measurements_of_the_sensors(protocol: str, market: dict[str, str], tmp_path: Path) -> None:
     out, png = tmp_path / "air.mcap", tmp_path / "air.png"
     watching = {"AIRA_CONNECT": market["AIRA_CONNECT"]}
     with (
@@ -45,10 +43,10 @@ def test_a_person_gets_the_measurements_of_the_sensors(
     assert "done, for 0x" in watched
     first = next(line.split(shown)[1] for line in watched.splitlines() if shown in line)
     assert [float(number) for number in first.split(",")[0].split()] == pytest.approx(list(VOLTS.values()), abs=0.02)
-    told = dict(line.rsplit(maxsplit=2)[:2] for line in done.stdout.splitlines() if line.endswith(" V"))
-    assert told.keys() == VOLTS.keys()
+    printed = dict(line.rsplit(maxsplit=2)[:2] for line in done.stdout.splitlines() if line.endswith(" V"))
+    assert printed.keys() == VOLTS.keys()
     for gas, volts in VOLTS.items():
-        assert float(told[gas]) == pytest.approx(volts, abs=0.02)
+        assert float(printed[gas]) == pytest.approx(volts, abs=0.02)
     assert [message.topic for message in open_objective(out).messages()] == ["/measurements"] * 2
     drawn = run(sys.executable, PLOT, out, "-o", png)
     assert drawn.stdout == f"{png}: 2 measurements\n", drawn.stderr

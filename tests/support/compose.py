@@ -1,4 +1,4 @@
-"""A compose project for tests: brought up, hurt and mended by the services' names, and gone at the end."""
+"""A compose project for tests: started, disturbed and repaired by the names of its services, and removed at the end."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Project:
             self.compose("up", "--detach", "--no-build", *services, seconds=UP_SECONDS)
 
     def down(self) -> None:
-        """Take all down with their volumes, as a user does. What that leaves, `leftovers` tells."""
+        """Remove all services with their volumes, as a user does. `leftovers` lists what remains."""
         self.compose("down", "--volumes", "--timeout", str(STOP_SECONDS), seconds=UP_SECONDS)
 
     def leftovers(self) -> list[str]:
@@ -113,11 +113,11 @@ class Project:
         self.engine("unpause", self.container(service))
 
     def disconnect(self, service: str, network: str = "default") -> None:
-        """Pull the service's plug out of a network: its packets go nowhere, nobody is told."""
+        """Disconnect the service from a network: its packets are lost without a notice."""
         self.engine("network", "disconnect", f"{self.name}_{network}", self.container(service))
 
     def connect(self, service: str, network: str = "default") -> None:
-        """Put the plug in again, by the service's name; the address may be another one."""
+        """Connect the service again under its name; its address can be another one."""
         with steady_bridges():
             self.engine("network", "connect", "--alias", service, f"{self.name}_{network}", self.container(service))
 

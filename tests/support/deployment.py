@@ -59,7 +59,7 @@ class Images:
 
     @property
     def variables(self) -> dict[str, str]:
-        """What the compose file is told of them."""
+        """The variables that name them in the compose file."""
         return {"MESH_IMAGE": self.prefix, "MESH_BASE_IMAGE": BASE_IMAGE, "MESH_FOUNDRY_IMAGE": FOUNDRY_IMAGE}
 
     def name(self, target: str) -> str:
@@ -67,7 +67,7 @@ class Images:
         return f"{self.prefix}-{target}:latest"
 
     def forget(self) -> None:
-        """Take the names away. What they named stays for a while, so that the next run builds what has changed."""
+        """Remove the names. The images stay for a while, so that the next run builds what has changed."""
         for target in ("edge", "server", "chain"):
             self.engine("untag", self.name(target))
 
@@ -84,7 +84,7 @@ class ComposeDeployment(Project):
         await self.until(
             lambda: self.exit_code("person") is not None, what="the first job's end", seconds=READY_SECONDS
         )
-        assert self.exit_code("person") == 0, self.told("the first job")
+        assert self.exit_code("person") == 0, self.report("the first job")
 
     def ask(self, seconds: int) -> Job:
         """A person asks for a job that plays for so long, a message a second, and waits for its end."""
@@ -98,47 +98,47 @@ class ComposeDeployment(Project):
         return Job(self, name, seconds=seconds, before=before, lamps=self.lamps())
 
     async def until(self, condition: Callable[[], object], *, what: str, seconds: float) -> None:
-        """Return when a condition is true; fail with all that was said if it isn't within `seconds`."""
+        """Return when a condition is true; fail with the logs if it isn't within `seconds`."""
         try:
             await until(condition, what=what, seconds=seconds, pause=PAUSE)
         except AssertionError as error:
-            raise AssertionError(self.told(str(error))) from None
+            raise AssertionError(self.report(str(error))) from None
 
     def lamps(self) -> int:
         """How often the robot's lamp went on so far."""
         return self.log("agent").count(LAMP)
 
     def account(self, role: str) -> str:
-        """The address of robot or person, as the chain says at its start."""
+        """The address of robot or person, as the chain logs at its start."""
         (line,) = {line for line in self.log("chain").splitlines() if line.startswith(f"{role} ")}
         return line.split()[-1]
 
     def happened(self, *kinds: type[ChainEvent]) -> list[Any]:
         """All events of these kinds on the chain."""
         node = Web3(HTTPProvider(f"http://{self.address('chain')}:8545", request_kwargs={"timeout": 10}))
-        told = [decode_log(log) for log in node.eth.get_logs({"fromBlock": 0, "toBlock": "latest"})]
-        return [event for event in told if isinstance(event, kinds)]
+        events = [decode_log(log) for log in node.eth.get_logs({"fromBlock": 0, "toBlock": "latest"})]
+        return [event for event in events if isinstance(event, kinds)]
 
-    def told(self, what: str) -> str:
-        """What is being waited for, and what everybody has said of late: for who reads of a failure."""
+    def report(self, what: str) -> str:
+        """The condition that was awaited and the end of every log, for the message of a failed test."""
         ends = [f"--- {name}\n{self.log_of(name)[-1500:]}" for name in self.containers()]
         return "\n".join([what, *ends])
 
     def log_of(self, container: str) -> str:
-        """All that a container has said."""
+        """The log of a container."""
         facts = self.engine.facts("inspect", "--format", "json", container)[0]
         return log_text(Path(facts["HostConfig"]["LogConfig"]["Path"]))
 
 
 async def passed(seconds: float) -> None:
-    """Return after so many seconds: for how long a trouble lasts is part of what is shown."""
+    """Return after so many seconds: how long a failure lasts is part of the test."""
     began = time.monotonic()
-    await until(lambda: time.monotonic() - began > seconds, what="the end of the trouble", seconds=2 * seconds)
+    await until(lambda: time.monotonic() - began > seconds, what="the end of the failure", seconds=2 * seconds)
 
 
 @dataclass(frozen=True)
 class Job:
-    """A person's container that waits for the end of a job. `before` and `lamps`: how things stood before it."""
+    """A person's container that waits for the end of a job. `before` and `lamps`: the state before it."""
 
     market: ComposeDeployment
     container: str
@@ -152,18 +152,18 @@ class Job:
         await self.market.until(lambda: self.market.lamps() >= played, what="its messages", seconds=JOB_SECONDS)
 
     def is_over(self) -> bool:
-        """Whether the person knows the end."""
+        """Whether the person's command has ended."""
         return self.market.engine("inspect", "--format", "{{.State.Status}}", self.container) == "exited\n"
 
     async def settled(self) -> dict[str, Any]:
-        """Wait for the end; what the person was told, after a look at the chain: it paid once, and whom it said."""
+        """Wait for the end, and check that the chain paid once and the right account; what the person printed."""
         await self.market.until(self.is_over, what="the job's end", seconds=self.seconds + JOB_SECONDS)
         said = self.market.log_of(self.container)
         code = self.market.engine("inspect", "--format", "{{.State.ExitCode}}", self.container)
-        assert code == "0\n", self.market.told(said)
-        told: dict[str, Any] = json.loads(said[said.index("{") :])
+        assert code == "0\n", self.market.report(said)
+        printed: dict[str, Any] = json.loads(said[said.index("{") :])
         (end,) = [event for event in self.market.happened(Finalized) if event not in self.before]
-        assert (end.liability, end.success) == (told["liability"], told["success"])
+        assert (end.liability, end.success) == (printed["liability"], printed["success"])
         made = [event.liability for event in self.market.happened(NewLiability)]
         assert made.count(end.liability) == 1
         assert len(made) == len(self.before) + 1
@@ -173,4 +173,4 @@ class Job:
         ]
         whose = self.market.account("robot" if end.success else "person")
         assert [(event.recipient, event.value) for event in paid] == [(whose, COST * 10**9)]
-        return told
+        return printed

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 FIRST: Final = 10_000
 BEYOND: Final = 32_700
-"""From here on the kernel gives ports to connections, and to whoever leaves the choice to it."""
+"""The first port that the kernel gives to connections and to servers that ask for port 0."""
 SHARE: Final = 200
 
 

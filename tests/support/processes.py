@@ -43,7 +43,7 @@ class Server(ABC):
 
     def __init__(self) -> None:
         self.folder = Path(tempfile.mkdtemp(prefix=f"aira-{self.name}-"))
-        # Whoever ends with `stop` instead of `close` leaves no folder behind either.
+        # A caller that uses `stop` instead of `close` leaves no folder either.
         self._remove_folder = weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
         self._log = self.folder / "server.log"
         self._process: subprocess.Popen[bytes] | None = None

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 SECONDS = 30.0
 FOREIGN = ("process_", "python_")
-"""How the names begin of what prometheus_client tells by itself."""
+"""The prefixes of the metrics that prometheus_client adds by itself."""
 
 
 class Page(NamedTuple):
@@ -29,7 +29,7 @@ class Page(NamedTuple):
 
 
 class Scrape:
-    """A scrape: `figures("aira_jobs", phase="ready")` is a sample's value."""
+    """A scrape: `metrics("aira_jobs", phase="ready")` is a sample's value."""
 
     def __init__(self, text: str) -> None:
         self.families: dict[str, Metric] = {}

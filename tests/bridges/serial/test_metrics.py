@@ -66,9 +66,9 @@ async def test_a_lost_board_is_reported(place: Place) -> None:
             await until_found(lambda: health_is(url, (200, WELL)), what="the board", seconds=LONG)
         gone = {**WELL, "line": "waits for the port", "board": "is absent"}
         await until_found(lambda: health_is(url, (503, gone)), what="the loss", seconds=LONG)
-        figures = await scraped(url)
-        assert (figures("aira_edge_board_present"), figures("aira_edge_board_losses_total")) == (0, 1)
-        assert figures("aira_part_up", part="board") == 0
+        metrics = await scraped(url)
+        assert (metrics("aira_edge_board_present"), metrics("aira_edge_board_losses_total")) == (0, 1)
+        assert metrics("aira_part_up", part="board") == 0
 
 
 async def test_an_edge_agent_that_waits_for_its_router_reports_that_it_starts(tmp_path: Path) -> None:

@@ -156,8 +156,8 @@ def assert_imported(folder: Path, done: Result) -> None:
 def test_new_and_show_print_json(made: tuple[Path, Path, Result], tmp_path: Path) -> None:
     address = made[2].stdout.strip()
     assert json.loads(account("show", made[0], "--json").stdout) == {"address": address, "keyfile": str(made[0])}
-    told = json.loads(account("new", tmp_path / "key.json", "--password-file", made[1], "--json").stdout)
-    assert told == {"address": account("show", told["keyfile"]).stdout.strip(), "keyfile": str(tmp_path / "key.json")}
+    shown = json.loads(account("new", tmp_path / "key.json", "--password-file", made[1], "--json").stdout)
+    assert shown == {"address": account("show", shown["keyfile"]).stdout.strip(), "keyfile": str(tmp_path / "key.json")}
 
 
 def test_show_uses_the_settings_account_unless_a_keyfile_is_given(made: tuple[Path, Path, Result]) -> None:
@@ -173,8 +173,8 @@ def test_show_reads_the_balances_from_the_chain(served: ServedChain) -> None:
     assert said["XRT"] == "1,000"
     assert said["ETH"].startswith("999,999.9")
     assert said["order nonce"] == "0"
-    told = served.run_json("account", "show", person.keyfile, "--balance", AIRA_KEYFILE="")
-    assert told == {
+    shown = served.run_json("account", "show", person.keyfile, "--balance", AIRA_KEYFILE="")
+    assert shown == {
         "address": person.address,
         "wei": str(served.ask("person", lambda chain: chain.tokens.eth_balance())),
         "wn": str(1_000 * XRT),

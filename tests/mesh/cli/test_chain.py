@@ -63,8 +63,8 @@ def test_a_second_deployment_needs_a_flag(bare: ServedChain) -> None:
     second = bare.run_json(*DEPLOY, "--again", by="provider")
     assert second["factory"] != first["factory"]
     assert second["settings"]["ens_contract"] == second["ens"] != first["ens"]
-    told = bare.run_json("chain", "status", AIRA_ENS_CONTRACT=second["ens"])
-    assert (told["factory"], told["isOurCode"]) == (second["factory"], True)
+    printed = bare.run_json("chain", "status", AIRA_ENS_CONTRACT=second["ens"])
+    assert (printed["factory"], printed["isOurCode"]) == (second["factory"], True)
 
 
 def test_an_account_that_can_not_pay_for_everything_deploys_nothing(bare: ServedChain, tmp_path: Path) -> None:
@@ -129,9 +129,9 @@ def test_status_shows_the_node_the_contracts_and_the_account(served: ServedChain
 
 
 def test_status_prints_json(served: ServedChain) -> None:
-    told = served.run_json("chain", "status")
-    assert (told["node"], told["isOurCode"], told["wn"]) == (served.url, True, str(1_000 * XRT))
-    assert told["chainId"] == served.ask("person", _chain_id)
+    printed = served.run_json("chain", "status")
+    assert (printed["node"], printed["isOurCode"], printed["wn"]) == (served.url, True, str(1_000 * XRT))
+    assert printed["chainId"] == served.ask("person", _chain_id)
     without = served.run_json("chain", "status", AIRA_KEYFILE="")
     assert (without["account"], without["wei"], without["wn"]) == (None, None, None)
 
@@ -147,8 +147,8 @@ def test_status_works_with_an_unknown_lighthouse(served: ServedChain) -> None:
 
 
 def test_contracts_with_other_code_are_not_reported_as_this_projects(served: ServedChain) -> None:
-    told = served.run_json("chain", "status", AIRA_FACTORY_CONTRACT=served.deployment.lighthouse)
-    assert told["isOurCode"] is False
+    printed = served.run_json("chain", "status", AIRA_FACTORY_CONTRACT=served.deployment.lighthouse)
+    assert printed["isOurCode"] is False
 
 
 def test_code_is_this_projects_if_only_immutables_differ(served: ServedChain) -> None:
@@ -179,8 +179,8 @@ def test_contracts_can_be_deployed_to_an_external_node(tmp_path: Path) -> None:
         }
         done = invoke(*DEPLOY, "--json", **variables)
         assert done.returncode == 0, done.stderr
-        told = json.loads(done.stdout)
-        status = invoke("chain", "status", "--json", **variables, AIRA_ENS_CONTRACT=told["ens"])
+        printed = json.loads(done.stdout)
+        status = invoke("chain", "status", "--json", **variables, AIRA_ENS_CONTRACT=printed["ens"])
         assert json.loads(status.stdout)["isOurCode"] is True
 
 

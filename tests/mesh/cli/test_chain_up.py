@@ -111,28 +111,28 @@ def is_running(pid: int) -> bool:
 
 def test_the_chain_is_kept_in_a_file(tmp_path: Path) -> None:
     options = ("--anvil", require("anvil"), "--state", tmp_path / "chain.json", "--json")
-    told = []
+    announced = []
     for _ in range(2):
         with up(tmp_path, *options, port=0, says="passwordFile") as server:
-            told.append(json.loads(server.log().splitlines()[0]))
-            status = invoke("chain", "status", "--json", AIRA_WEB3_HTTP_PROVIDER=told[-1]["chain"])
-            told[-1]["block"] = json.loads(status.stdout)["blockNumber"]
+            announced.append(json.loads(server.log().splitlines()[0]))
+            status = invoke("chain", "status", "--json", AIRA_WEB3_HTTP_PROVIDER=announced[-1]["chain"])
+            announced[-1]["block"] = json.loads(status.stdout)["blockNumber"]
             code, _ = server.end(signal.SIGTERM)
             assert code == 0
     where = ("chain", "webSocket")
-    first, second = ({name: fact for name, fact in facts.items() if name not in where} for facts in told)
+    first, second = ({name: fact for name, fact in facts.items() if name not in where} for facts in announced)
     assert first == second
 
 
 def test_the_embedded_chain_is_used_without_anvil(tmp_path: Path) -> None:
     with up(tmp_path, "--json", port=0, says="passwordFile", PATH="/nowhere:/usr/bin:/bin") as server:
-        told = json.loads(server.log().splitlines()[0])
-        assert told["engine"] == "embedded"
-        assert set(told["accounts"]) == {"provider", "robot", "person"}
-        keyfile = Path(told["accounts"]["robot"]["keyfile"])
+        announced = json.loads(server.log().splitlines()[0])
+        assert announced["engine"] == "embedded"
+        assert set(announced["accounts"]) == {"provider", "robot", "person"}
+        keyfile = Path(announced["accounts"]["robot"]["keyfile"])
         assert keyfile.is_file()
-        status = invoke("chain", "status", "--json", AIRA_WEB3_HTTP_PROVIDER=told["chain"])
-        assert json.loads(status.stdout)["factory"] == told["factory"]
+        status = invoke("chain", "status", "--json", AIRA_WEB3_HTTP_PROVIDER=announced["chain"])
+        assert json.loads(status.stdout)["factory"] == announced["factory"]
 
 
 def test_the_embedded_chain_can_be_selected(tmp_path: Path, on_path: dict[str, str]) -> None:

@@ -33,7 +33,7 @@ FIFTH = Settings(generation=5).lighthouse_contract
 
 @pytest.fixture
 def listen() -> str:
-    """Where a server of the test tells its metrics."""
+    """The address on which a server of the test serves metrics."""
     return f"127.0.0.1:{free_port()}"
 
 
@@ -78,9 +78,9 @@ async def test_aira_up_has_metrics_of_both_generations(listen: str, tmp_path: Pa
             "channel",
             *(f"{part} of {lighthouse}" for part in ("transactions", "listener") for lighthouse in (THIRD, FIFTH)),
         }
-        figures = await scraped(url)
-        assert figures.of_label("aira_orders_open", "lighthouse") == {THIRD, FIFTH}
-        assert figures("aira_account_eth_wei") > 0
+        metrics = await scraped(url)
+        assert metrics.of_label("aira_orders_open", "lighthouse") == {THIRD, FIFTH}
+        assert metrics("aira_account_eth_wei") > 0
         assert invoke("health", "--url", url).returncode == 0
 
 
@@ -200,7 +200,7 @@ def test_a_missing_address_is_an_error_with_a_hint() -> None:
     assert "--url" in refused(done, InvalidServerAddress)
 
 
-def test_it_does_not_import_the_chain_or_the_network() -> None:
+def test_it_imports_no_heavy_modules() -> None:
     program = """
 import sys
 sys.argv = ["aira", "health", "--url", "http://127.0.0.1:9"]

@@ -49,13 +49,13 @@ def test_an_open_liability_is_shown_with_its_cost_and_the_block_from_which_it_is
 
 def test_json_is_the_record_on_the_mesh_with_a_state(served: ServedChain) -> None:
     address = served.create_liability(cost=COST)
-    told = served.run_json("liability", "show", address)
-    assert (told.pop("state"), told.pop("refundableFrom") > 0) == ("open", True)
-    record = Liability.decode(json.dumps(told).encode())
+    shown = served.run_json("liability", "show", address)
+    assert (shown.pop("state"), shown.pop("refundableFrom") > 0) == ("open", True)
+    record = Liability.decode(json.dumps(shown).encode())
     assert record == served.ask("robot", lambda chain: chain.liabilities.get(address))
     cid = served.finalize(address)
-    told = served.run_json("liability", "show", address)
-    assert (told["state"], told["result"], told["refundableFrom"]) == ("paid", cid, None)
+    shown = served.run_json("liability", "show", address)
+    assert (shown["state"], shown["result"], shown["refundableFrom"]) == ("paid", cid, None)
 
 
 @pytest.mark.parametrize(("success", "state"), [(True, "paid: "), (False, "failed: ")])
@@ -129,15 +129,15 @@ def test_both_parties_cancel_a_liability(served: ServedChain) -> None:
 def test_anybody_can_cancel_with_both_signatures(served: ServedChain) -> None:
     address = served.create_liability(cost=COST)
     signatures = [word for role in ("robot", "person") for word in ("--signature", signature_of(served, role, address))]
-    told = served.run_json("liability", "cancel", address, *signatures, by="stranger")
-    assert (told["state"], told["tx"][:2], told["gasUsed"] > 0) == ("called-off", "0x", True)
+    shown = served.run_json("liability", "cancel", address, *signatures, by="stranger")
+    assert (shown["state"], shown["tx"][:2], shown["gasUsed"] > 0) == ("called-off", "0x", True)
 
 
 def test_the_json_of_a_signature_names_the_other_signer(served: ServedChain) -> None:
     address = served.create_liability()
-    told = served.run_json("liability", "cancel", address)
-    assert (told["party"], told["signer"]) == ("promisee", served.people["person"].address)
-    assert told["needed"] == served.people["robot"].address
+    shown = served.run_json("liability", "cancel", address)
+    assert (shown["party"], shown["signer"]) == ("promisee", served.people["person"].address)
+    assert shown["needed"] == served.people["robot"].address
 
 
 def test_a_wrong_signature_is_one_clear_line(served: ServedChain) -> None:
@@ -258,8 +258,8 @@ def test_watching_all_with_json_prints_one_object_per_line(served: ServedChain) 
     served.finalize(address)
     command = (*AIRA, "liability", "watch", "--json", "--from-block", str(block))
     with Serving(*command, says='"ended"', variables=served.variables()) as watcher:
-        told = [json.loads(line) for line in watcher.log().splitlines()]
-    assert [(line["event"], line["liability"]["address"]) for line in told] == [("made", address), ("ended", address)]
+        shown = [json.loads(line) for line in watcher.log().splitlines()]
+    assert [(line["event"], line["liability"]["address"]) for line in shown] == [("made", address), ("ended", address)]
 
 
 def test_ctrl_c_stops_watching_one(served: ServedChain) -> None:

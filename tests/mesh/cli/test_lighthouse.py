@@ -86,19 +86,19 @@ def test_joining_approves_the_missing_allowance_and_leaving_returns_the_stake(se
 
 def test_a_withdrawal_that_leaves_less_than_the_minimum_takes_everything(served: ServedChain, market: str) -> None:
     served.run_json("lighthouse", "join", market, "3")
-    told = served.run_json("lighthouse", "leave", market, "2")
-    assert (told["stake"], told["isProvider"]) == ("0", False)
+    printed = served.run_json("lighthouse", "leave", market, "2")
+    assert (printed["stake"], printed["isProvider"]) == ("0", False)
 
 
 def test_info_shows_providers_and_whose_turn_it_is(served: ServedChain, market: str) -> None:
     people = [served.people[role].address for role in ("robot", "person")]
     for role, stake in (("robot", "4"), ("person", "10")):
         served.run_json("lighthouse", "join", market, stake, by=role)
-    told = served.run_json("lighthouse", "info", market)
-    assert [provider["provider"] for provider in told["providers"]] == people
-    assert [provider["quota"] for provider in told["providers"]] == [2, 5]
-    assert (told["current"], told["marker"], told["quota"]) == (people[0], 1, 2)
-    assert [provider["maySend"] for provider in told["providers"]] == [True, False]
+    printed = served.run_json("lighthouse", "info", market)
+    assert [provider["provider"] for provider in printed["providers"]] == people
+    assert [provider["quota"] for provider in printed["providers"]] == [2, 5]
+    assert (printed["current"], printed["marker"], printed["quota"]) == (people[0], 1, 2)
+    assert [provider["maySend"] for provider in printed["providers"]] == [True, False]
     said = served.aira("lighthouse", "info", market).stdout
     assert columns(said)["turn"] == f"{people[0]}  (1 of 2), 2 transactions left"
     lines = [line.split() for line in said.splitlines()[-2:]]

@@ -136,8 +136,8 @@ def test_the_events_of_a_job_are_found_by_its_contract_with_agent_and_provider(m
     for server in (market.up, market.robot):
         lines = [json.loads(line) for line in server.log().splitlines()]
         assert all({"time", "level", "logger", "message", "role"} <= line.keys() for line in lines)
-        told = [line for line in lines if line.get("liability") == liability]
-        assert [line["message"] for line in told] == [
+        received = [line for line in lines if line.get("liability") == liability]
+        assert [line["message"] for line in received] == [
             event["message"] for event in (worked if server is market.robot else provided)
         ]
 
@@ -200,11 +200,11 @@ def test_the_log_of_an_edge_agent_is_read_by_its_device(router: EmbeddedRouter, 
         edge.wait_until_said("waiting")
         done = invoke("logs", ROBOT.address, "--device", "board", "--json", AIRA_CONNECT=router.endpoint)
         assert done.returncode == 0, done.stderr
-        told = [json.loads(line) for line in done.stdout.splitlines()]
+        received = [json.loads(line) for line in done.stdout.splitlines()]
         written = [json.loads(line) for line in edge.log().splitlines()]
-    assert [{**one, "sequence": 0} for one in told] == [{**one, "sequence": 0} for one in written[: len(told)]]
-    assert {(one["role"], one["address"]) for one in told} == {("edge", ROBOT.address)}
-    assert any(one["message"].startswith("edge of 0x") and one["device"] == "board" for one in told)
+    assert [{**one, "sequence": 0} for one in received] == [{**one, "sequence": 0} for one in written[: len(received)]]
+    assert {(one["role"], one["address"]) for one in received} == {("edge", ROBOT.address)}
+    assert any(one["message"].startswith("edge of 0x") and one["device"] == "board" for one in received)
 
 
 def test_the_log_of_a_bridge_is_read_by_its_address(router: EmbeddedRouter, tmp_path: Path) -> None:
@@ -216,9 +216,9 @@ def test_the_log_of_a_bridge_is_read_by_its_address(router: EmbeddedRouter, tmp_
         written = [json.loads(line) for line in bridge.log().splitlines()]
         address = next(one["bridge"] for one in written if "bridge" in one)
         done = invoke("logs", address, "--json", AIRA_CONNECT=router.endpoint)
-    told = [json.loads(line) for line in done.stdout.splitlines()]
-    assert [one["message"] for one in told][: len(written)] == [one["message"] for one in written]
-    assert {(one["role"], one["address"].lower()) for one in told} == {("bridge", address)}
+    received = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [one["message"] for one in received][: len(written)] == [one["message"] for one in written]
+    assert {(one["role"], one["address"].lower()) for one in received} == {("bridge", address)}
 
 
 def test_the_error_that_ends_a_server_is_an_event(tmp_path: Path) -> None:
@@ -226,5 +226,5 @@ def test_the_error_that_ends_a_server_is_an_event(tmp_path: Path) -> None:
     for command in (("router", "--listen", "tcp/8.8.8.8:1"), ("edge", "/dev/none", "--agent", ROBOT.address)):
         done = aira(*command, AIRA_LOG_FORMAT="json", AIRA_CONNECT=nowhere, AIRA_CONNECT_TIMEOUT="0.2")
         assert done.returncode in (1, 2)
-        told = [json.loads(line) for line in (done.stdout + done.stderr).splitlines()]
-        assert told[-1]["level"] == "error"
+        received = [json.loads(line) for line in (done.stdout + done.stderr).splitlines()]
+        assert received[-1]["level"] == "error"

@@ -1,4 +1,4 @@
-"""`aira peers`: who is on the channel, and how many are on the IPFS side."""
+"""`aira peers`: who is on the channel, and status many are on the IPFS side."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ NODES = ("QmA", "QmB", "QmC")
 
 
 @asynccontextmanager
-async def bridging(router: EmbeddedRouter, *told: BridgeStatus) -> AsyncIterator[Settings]:
-    """A channel with an agent and these bridges, for who has the settings."""
+async def bridging(router: EmbeddedRouter, *bridges: BridgeStatus) -> AsyncIterator[Settings]:
+    """A channel with an agent and bridges with these statuses; gives the settings of a client."""
     async with (
         Network(Endpoints(connect=(router.endpoint,))) as network,
         Channel(network.session, MARKET) as channel,
         AsyncExitStack() as stack,
     ):
         channel.announce("agent", ROBOT.address)
-        for how in told:
-            channel.announce("bridge", how.bridge)
-            stack.enter_context(answering(network.session, bridge_status_key(how.bridge, MARKET), how.encode()))
+        for status in bridges:
+            channel.announce("bridge", status.bridge)
+            stack.enter_context(answering(network.session, bridge_status_key(status.bridge, MARKET), status.encode()))
         async with Network(Endpoints(connect=(router.endpoint,))) as reader, Channel(reader.session, MARKET) as seen:
-            for how in told:
-                await until_answered(reader.session, bridge_status_key(how.bridge, MARKET))
+            for status in bridges:
+                await until_answered(reader.session, bridge_status_key(status.bridge, MARKET))
 
             async def all_there() -> bool:
-                return len(await present(seen)) == 1 + len(told)
+                return len(await present(seen)) == 1 + len(bridges)
 
             await until_found(all_there, what="everybody", seconds=30)
         yield Settings(connect=(router.endpoint,), connect_timeout=5.0)

@@ -95,9 +95,9 @@ async def test_a_job_from_up_to_the_recording(tmp_path: Path, printed: Printed) 
         with pytest.raises(OutputFailed, match="/dev/full") as caught:
             await demand(person, objective=cid_of_file(path), out=full, as_json=True, **order)
         assert "}\n" in printed
-        told = json.loads(printed.text)
-        assert (told["success"], told["recording"], told["error"]) == (True, None, str(caught.value))
-        assert cid_of_file(Path(caught.value.hint.split()[-1])) == told["result"]
+        summary = json.loads(printed.text)
+        assert (summary["success"], summary["recording"], summary["error"]) == (True, None, str(caught.value))
+        assert cid_of_file(Path(caught.value.hint.split()[-1])) == summary["result"]
     await stopped(up)
 
 

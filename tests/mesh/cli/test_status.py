@@ -46,12 +46,12 @@ MARKET_FACTS = MarketStatus(
 )
 
 
-async def told(place: Place, role: str, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
-    """What the status of a role is, for programs."""
+async def read_status(place: Place, role: str, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    """The status of a role as `aira status --json` prints it."""
     await show_one(place.settings("watcher"), place.address(role), timeout=5.0, as_json=True)
-    (how,) = json.loads(capsys.readouterr().out)
-    assert isinstance(how, dict)
-    return how
+    (found,) = json.loads(capsys.readouterr().out)
+    assert isinstance(found, dict)
+    return found
 
 
 async def test_an_agent_reports_its_parts_its_block_and_its_work(
@@ -61,33 +61,33 @@ async def test_an_agent_reports_its_parts_its_block_and_its_work(
         contract = await person.demand(place.save(objective(("/go", "x"))), cost=1)
 
         async def is_ready() -> bool:
-            jobs: dict[str, int] = (await told(place, "robot", capsys))["work"]["jobs"]
+            jobs: dict[str, int] = (await read_status(place, "robot", capsys))["work"]["jobs"]
             return jobs == {"ready": 1}
 
         await until_found(is_ready, what="the job", seconds=30)
-        how = await told(place, "robot", capsys)
+        found = await read_status(place, "robot", capsys)
         head = await place.chains["person"].block_number()
-    assert how["parts"] == dict.fromkeys(("executor", "channel", "signer", "listener"), "alive")
-    assert (how["role"], how["address"], how["version"]) == ("agent", place.address("robot"), mesh.__version__)
-    assert how["lighthouse"] == place.market.deployment.lighthouse_name
-    assert how["xrt"] == place.market.deployment.xrt
-    assert 0 < how["head"] <= head
-    assert how["work"]["store"]["files"] == 1
-    assert contract.liability.promisor == how["address"]
+    assert found["parts"] == dict.fromkeys(("executor", "channel", "signer", "listener"), "alive")
+    assert (found["role"], found["address"], found["version"]) == ("agent", place.address("robot"), mesh.__version__)
+    assert found["lighthouse"] == place.market.deployment.lighthouse_name
+    assert found["xrt"] == place.market.deployment.xrt
+    assert 0 < found["head"] <= head
+    assert found["work"]["store"]["files"] == 1
+    assert contract.liability.promisor == found["address"]
 
 
 async def test_an_open_order_is_counted_in_the_outbox(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
     async with place.agent("robot") as robot:
-        assert (await told(place, "robot", capsys))["work"]["outbox"] == 0
+        assert (await read_status(place, "robot", capsys))["work"]["outbox"] == 0
         await robot.offer(objective=OBJECTIVE)
-        assert (await told(place, "robot", capsys))["work"]["outbox"] == 1
+        assert (await read_status(place, "robot", capsys))["work"]["outbox"] == 1
 
 
 async def test_a_disabled_executor_is_reported_as_off(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
     async with place.agent("robot", enable_executor=False):
-        how = await told(place, "robot", capsys)
-    assert how["parts"]["executor"] == "off"
-    assert summarize_status(Status.decode(json.dumps(how).encode())).startswith("alive, block ")
+        found = await read_status(place, "robot", capsys)
+    assert found["parts"]["executor"] == "off"
+    assert summarize_status(Status.decode(json.dumps(found).encode())).startswith("alive, block ")
 
 
 async def test_a_part_that_waits_for_the_node_says_so(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
@@ -95,25 +95,25 @@ async def test_a_part_that_waits_for_the_node_says_so(place: Place, capsys: pyte
         account = place.market.accounts["robot"]
         chain = Chain(server.url, account=account, ens=place.market.deployment.ens, timing=QUICK)
         async with chain, Agent(MODEL, settings=place.settings("robot"), account=account, chain=chain):
-            assert (await told(place, "robot", capsys))["parts"]["listener"] == "alive"
+            assert (await read_status(place, "robot", capsys))["parts"]["listener"] == "alive"
             await server.__aexit__(None, None, None)
 
             async def waits() -> bool:
-                state: str = (await told(place, "robot", capsys))["parts"]["listener"]
+                state: str = (await read_status(place, "robot", capsys))["parts"]["listener"]
                 return state == "waits for the node"
 
             await until_found(waits, what="the loss", seconds=60)
-            assert (await told(place, "robot", capsys))["parts"]["channel"] == "alive"
+            assert (await read_status(place, "robot", capsys))["parts"]["channel"] == "alive"
 
 
 async def test_a_provider_reports_its_orders_and_earnings(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
     async with place.at_work(offering_unseen(place.agent("robot"))) as person:
         await person.demand(place.save(objective(("/go", "x"))), cost=1)
-        how = await told(place, "provider", capsys)
+        found = await read_status(place, "provider", capsys)
         await show_one(place.settings("watcher"), place.address("provider"), timeout=5.0, as_json=False)
         shown = columns(capsys.readouterr().out)
-    assert (how["role"], how["market"]["created"], how["market"]["openOrders"]) == ("provider", 1, 0)
-    assert int(how["market"]["spent"]) > 0
+    assert (found["role"], found["market"]["created"], found["market"]["openOrders"]) == ("provider", 1, 0)
+    assert int(found["market"]["spent"]) > 0
     assert shown["contracts"].startswith("1 made")
     assert (shown["provider"], shown["listener"]) == (place.address("provider"), "alive")
 
@@ -178,8 +178,8 @@ def test_a_bridge_is_described() -> None:
     assert shown["to IPFS"] == "12 carried (0.5/s), 4 waiting, 3 (3 no-room) dropped"
     assert (shown["losses"], shown["last error"]) == ("2 of the daemon", "refused")
     assert "content" not in shown
-    figures = dict.fromkeys(ContentMetrics.__struct_fields__, 0) | {"fetched": 2, "fetched_bytes": 2048, "lies": 1}
-    content = describe_status(msgspec.structs.replace(bridge_status(), content=ContentMetrics(**figures)))["content"]
+    counters = dict.fromkeys(ContentMetrics.__struct_fields__, 0) | {"fetched": 2, "fetched_bytes": 2048, "lies": 1}
+    content = describe_status(msgspec.structs.replace(bridge_status(), content=ContentMetrics(**counters)))["content"]
     assert content == "2 files fetched (2.0 KiB), 0 added (0 bytes), 0 blocks given, 1 false ones refused"
 
 

@@ -152,7 +152,7 @@ async def served_market(folder: Path, capsys: pytest.CaptureFixture[str]) -> Asy
 
 
 def moving(robot: Settings) -> Agent:
-    """A robot that goes where it is told to."""
+    """A robot that goes where a message says."""
     agent = offering(Agent(MODEL, settings=robot, account=load_account(robot)))
 
     @agent.on("/go")

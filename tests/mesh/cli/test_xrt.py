@@ -50,8 +50,8 @@ def test_a_transfer_is_in_xrt_unless_the_amount_ends_with_wn(served: ServedChain
     done = columns(served.aira("xrt", "transfer", NOBODY, "1.5").stdout)
     assert (done["sent"], done["to"]) == ("1.5 XRT", NOBODY)
     assert done["transaction"].startswith("0x")
-    told = served.run_json("xrt", "transfer", NOBODY, "7wn")
-    assert (told["amount"], told["balance"]) == ("7", str(before - 1_500_000_007))
+    printed = served.run_json("xrt", "transfer", NOBODY, "7wn")
+    assert (printed["amount"], printed["balance"]) == ("7", str(before - 1_500_000_007))
     assert held(served, NOBODY) == 1_500_000_007
 
 
@@ -61,8 +61,8 @@ def test_an_allowance_is_by_default_the_factorys_and_can_be_granted_and_revoked(
     assert (done["spender"], done["may take"]) == (served.deployment.lighthouse, "2.5 XRT")
     assert served.aira("xrt", "allowance", "airalab").stdout == "2.5 XRT\n"
     person = served.people["person"].address
-    told = served.run_json("xrt", "allowance", "airalab.lighthouse.5.robonomics.eth", "--owner", person, by="robot")
-    assert (told["owner"], told["allowance"]) == (person, str(5 * XRT // 2))
+    printed = served.run_json("xrt", "allowance", "airalab.lighthouse.5.robonomics.eth", "--owner", person, by="robot")
+    assert (printed["owner"], printed["allowance"]) == (person, str(5 * XRT // 2))
     assert served.run_json("xrt", "approve", "airalab", "0")["allowance"] == "0"
     assert served.aira("xrt", "allowance", "airalab").stdout == "0 XRT\n"
 

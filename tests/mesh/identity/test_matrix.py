@@ -128,7 +128,7 @@ async def heard_by_witness(stage: Stage, kind: zenoh.SampleKind, expected: dict[
 
 
 def known(stage: Stage, who: str) -> bool:
-    """Whether an identity that may publish is told of the witness's subscriber."""
+    """Whether an identity that may publish sees the witness's subscriber."""
     with stage.sessions[who].declare_publisher(next(iter(KEYS[who].values()))) as publisher:
         return bool(publisher.matching_status.matching)  # type: ignore[attr-defined]
 

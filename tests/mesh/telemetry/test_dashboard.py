@@ -34,7 +34,7 @@ ALERTS: Final = ROOT / "deploy" / "prometheus" / "alerts.yml"
 ADDED: Final = {"job", "instance"}
 """Labels that Prometheus itself gives to every figure."""
 ROLE: Final = {"role"}
-"""A label by which figures of several roles are told apart in this test alone."""
+"""A label of this test only: it distinguishes metrics of several roles."""
 NAME: Final = re.compile(r"\b(?:aira|process)_[a-z0-9_]+\b")
 SELECTED: Final = re.compile(r"(?P<name>\b(?:aira|process)_[a-z0-9_]+)(?:\{(?P<labels>[^}]*)\})?(?P<range>\[[^]]*\])?")
 GROUPED: Final = re.compile(r"\bby \((?P<labels>[^)]*)\)")

@@ -37,9 +37,9 @@ def failed(words: str) -> ZeroDivisionError:
 def test_an_event_has_its_source_and_its_liability() -> None:
     with source_context(ARM), liability_context(LIABILITY.lower()):
         event = event_of(record("ready, %d messages to play", 3))
-    told = json.loads(json_line(event))
-    assert told.pop("time").endswith("Z")
-    assert told == {
+    fields = json.loads(json_line(event))
+    assert fields.pop("time").endswith("Z")
+    assert fields == {
         "level": "info",
         "logger": "mesh.work.executor",
         "message": "ready, 3 messages to play",
@@ -72,9 +72,9 @@ def test_events_without_a_context_have_the_default_source() -> None:
 def test_facts_are_members_of_the_json_object_and_never_replace_a_field() -> None:
     event = record("rejected")
     vars(event).update(log_event("order-rejected", order="ab" * 32, gas=7, level="none", message="forged"))
-    told = json.loads(json_line(event_of(event)))
-    assert (told["event"], told["order"], told["gas"]) == ("order-rejected", "ab" * 32, "7")
-    assert (told["level"], told["message"]) == ("info", "rejected")
+    fields = json.loads(json_line(event_of(event)))
+    assert (fields["event"], fields["order"], fields["gas"]) == ("order-rejected", "ab" * 32, "7")
+    assert (fields["level"], fields["message"]) == ("info", "rejected")
 
 
 @pytest.mark.parametrize("write", [human_line, json_line])
@@ -90,11 +90,11 @@ def test_json_lines_keep_untrusted_text_unchanged() -> None:
 
 def test_an_exception_is_part_of_the_json_line() -> None:
     line = json_line(event_of(record("the job failed", error=failed("by\nnothing"))))
-    told = json.loads(line)
+    fields = json.loads(line)
     assert len(line.splitlines()) == 1
-    assert told["error"] == "ZeroDivisionError: by\nnothing"
-    assert told["trace"].startswith("Traceback (most recent call last):\n")
-    assert "in failed\n" in told["trace"]
+    assert fields["error"] == "ZeroDivisionError: by\nnothing"
+    assert fields["trace"].startswith("Traceback (most recent call last):\n")
+    assert "in failed\n" in fields["trace"]
 
 
 def test_a_line_of_a_traceback_can_not_pass_for_an_event() -> None:
@@ -120,7 +120,7 @@ def test_undecodable_file_names_can_be_logged() -> None:
 
 
 @pytest.mark.parametrize(
-    ("said", "told"),
+    ("text", "expected"),
     [
         ("wss://user:pass@node.example:8546/x fails", "wss://node.example:8546/x fails"),
         ("(https://node.example/v3/0123456789abcdef0123) fails", "(https://node.example/v3/… fails"),
@@ -129,11 +129,11 @@ def test_undecodable_file_names_can_be_logged() -> None:
         (f"http://gateway/ipfs/Qm{'a' * 44}", f"http://gateway/ipfs/Qm{'a' * 44}"),
     ],
 )
-def test_secrets_in_urls_are_removed(said: str, told: str) -> None:
-    assert without_secrets(said).replace(")", "") == told
-    event = event_of(record("%s", said, error=failed(said)))
+def test_secrets_in_urls_are_removed(text: str, expected: str) -> None:
+    assert without_secrets(text).replace(")", "") == expected
+    event = event_of(record("%s", text, error=failed(text)))
     for secret in ("pass@", "0123456789abcdef", "apikey"):
-        assert secret not in event.message + event.error + event.trace.replace(repr(said), "")
+        assert secret not in event.message + event.error + event.trace.replace(repr(text), "")
 
 
 def test_a_level_between_two_is_mapped_to_the_lower() -> None:

@@ -1,4 +1,4 @@
-"""The service `logs` of roles, over real routers: whose events are told, and who may ask."""
+"""The service `logs` of roles, over real routers: whose events they return, and who has the right to read them."""
 
 from __future__ import annotations
 
@@ -77,26 +77,26 @@ async def test_agent_and_provider_serve_the_events_of_a_liability(place: Place, 
         assert (await contract.outcome()).success
 
         async def is_told() -> bool:
-            told = await logs(place, "robot", liability=contract.address)
-            return told.entries[-1].message == "it is finalized"
+            reply = await logs(place, "robot", liability=contract.address)
+            return reply.entries[-1].message == "it is finalized"
 
         await until_found(is_told, what="the end of the job", seconds=30)
-        told = await logs(place, "robot", liability=contract.address)
+        reply = await logs(place, "robot", liability=contract.address)
         provided = await logs(place, "provider", liability=contract.address)
         asked = await logs(place, "person", liability=contract.address)
-    words = [entry.message for entry in told.entries]
+    words = [entry.message for entry in reply.entries]
     assert {"the lamp is on", "the lamp is off"} <= set(words)
-    events = [entry.event for entry in told.entries if entry.event]
+    events = [entry.event for entry in reply.entries if entry.event]
     assert events == ["job-accepted", "job-ready", "job-started", "job-finished", "job-finalized"]
     assert [one for one in words if one.startswith("it is")] == [
         f"it is {phase}" for phase in ("incoming", "ready", "running", "complete", "finalized")
     ]
-    assert {(entry.role, entry.address, entry.liability) for entry in told.entries} == {
+    assert {(entry.role, entry.address, entry.liability) for entry in reply.entries} == {
         ("agent", place.address("robot"), contract.address)
     }
     assert [entry.event for entry in provided.entries] == ["contract-created", "contract-finalized"]
     assert {(entry.role, entry.address) for entry in provided.entries} == {("provider", place.address("provider"))}
-    assert {entry.lighthouse for entry in (*told.entries, *provided.entries)} == {
+    assert {entry.lighthouse for entry in (*reply.entries, *provided.entries)} == {
         place.market.deployment.lighthouse_name
     }
     created, ended = asked.entries
@@ -110,8 +110,8 @@ async def test_a_rejected_order_is_logged_with_its_hash(place: Place, kept: LogH
         await until(lambda: len(provider.book), what="the order in the book")
         (message,) = provider.book.orders()
         provider.settlement.reject(message, "expired", "too late")
-        (told,) = (await logs(place, "provider", level="warning")).entries
-    assert (told.facts["order"], told.facts["reason"]) == (order, "expired")
+        (event,) = (await logs(place, "provider", level="warning")).entries
+    assert (event.facts["order"], event.facts["reason"]) == (order, "expired")
 
 
 async def test_a_program_that_keeps_no_log_says_so(place: Place) -> None:

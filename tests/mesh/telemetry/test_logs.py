@@ -31,12 +31,12 @@ def said(body: str, *, code: int = 0, **variables: str) -> list[str]:
     return [*done.stdout.splitlines(), *done.stderr.splitlines()]
 
 
-def told(body: str, *, code: int = 0, **variables: str) -> list[dict[str, Any]]:
+def logged(body: str, *, code: int = 0, **variables: str) -> list[dict[str, Any]]:
     return [json.loads(line) for line in said(body, code=code, AIRA_LOG_FORMAT="json", **variables)]
 
 
 def test_messages_of_the_users_program_are_events() -> None:
-    (event,) = told('log.info("the lamp %s", "is on")')
+    (event,) = logged('log.info("the lamp %s", "is on")')
     assert (event["level"], event["logger"], event["message"]) == ("info", "my.robot", "the lamp is on")
     assert event["role"] == "robot"
 
@@ -52,18 +52,18 @@ def test_the_human_format_is_time_level_message() -> None:
 )
 def test_the_level_decides_what_is_logged(level: str, words: str) -> None:
     body = 'log.debug("d"); log.info("b"); log.info("i"); log.warning("w"); log.error("e")'
-    events = told(body, AIRA_LOG_LEVEL=level)
+    events = logged(body, AIRA_LOG_LEVEL=level)
     assert "".join(event["message"] for event in events if event["logger"] == "my.robot") == words
 
 
 def test_libraries_log_only_warnings_unless_the_level_is_debug() -> None:
     body = 'web3 = logging.getLogger("web3.providers"); web3.info("chatter"); web3.warning("trouble")'
-    assert [event["message"] for event in told(body)] == ["trouble"]
-    assert "chatter" in [event["message"] for event in told(body, AIRA_LOG_LEVEL="debug")]
+    assert [event["message"] for event in logged(body)] == ["trouble"]
+    assert "chatter" in [event["message"] for event in logged(body, AIRA_LOG_LEVEL="debug")]
 
 
 def test_an_error_that_ends_a_server_is_an_event_with_its_hint() -> None:
-    (event,) = told('raise RemoteError("the node is gone", hint="start it")', code=1)
+    (event,) = logged('raise RemoteError("the node is gone", hint="start it")', code=1)
     assert (event["level"], event["message"], event["hint"]) == ("error", "the node is gone", "start it")
     assert (event["event"], event["code"]) == ("program-failed", "remote-error")
     assert said('raise RemoteError("the node is gone", hint="start it")', code=1) == [
@@ -73,7 +73,7 @@ def test_an_error_that_ends_a_server_is_an_event_with_its_hint() -> None:
 
 
 def test_an_unexpected_error_that_ends_a_server_is_one_line_with_its_traceback() -> None:
-    event = told('raise ZeroDivisionError("so\\nwhat")', code=1)[-1]
+    event = logged('raise ZeroDivisionError("so\\nwhat")', code=1)[-1]
     assert (event["event"], event["level"]) == ("program-failed", "critical")
     assert event["error"] == "ZeroDivisionError: so\nwhat"
     assert "in main\n" in event["trace"]
@@ -81,7 +81,7 @@ def test_an_unexpected_error_that_ends_a_server_is_one_line_with_its_traceback()
 
 def test_a_thread_that_fails_is_one_line() -> None:
     body = 'thread = threading.Thread(target=lambda: 1 / 0, name="pump"); thread.start(); thread.join()'
-    (event,) = told(body)
+    (event,) = logged(body)
     assert (event["event"], event["thread"], event["error"]) == (
         "thread-failed",
         "pump",
@@ -97,7 +97,7 @@ await asyncio.sleep(0)
 await asyncio.sleep(0)
 del task
 """
-    (event,) = told(body)
+    (event,) = logged(body)
     assert (event["logger"], event["level"]) == ("asyncio", "error")
     assert "ZeroDivisionError" in event["error"]
 
@@ -109,20 +109,20 @@ class Fragile:
         raise ZeroDivisionError("in the end")
 Fragile()
 """
-    (event,) = told(body)
+    (event,) = logged(body)
     assert (event["event"], event["level"]) == ("finalizer-failed", "error")
     assert event["error"] == "ZeroDivisionError: in the end"
     assert "Fragile" in event["message"]
 
 
 def test_a_warning_is_one_line() -> None:
-    (event,) = told('warnings.warn("old fashioned", DeprecationWarning, stacklevel=1)', PYTHONWARNINGS="always")
+    (event,) = logged('warnings.warn("old fashioned", DeprecationWarning, stacklevel=1)', PYTHONWARNINGS="always")
     assert event["logger"] == "py.warnings"
     assert "old fashioned" in event["message"]
 
 
 def test_an_invalid_log_call_is_logged_and_does_not_raise() -> None:
-    first, second = told('log.info("%d messages", "many"); log.info("it goes on")')
+    first, second = logged('log.info("%d messages", "many"); log.info("it goes on")')
     assert (first["event"], first["level"], "'%d messages'" in first["message"]) == ("record-malformed", "error", True)
     assert first["error"].startswith("TypeError")
     assert second["message"] == "it goes on"

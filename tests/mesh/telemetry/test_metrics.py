@@ -18,22 +18,22 @@ def rendered(*families: MetricFamily) -> Scrape:
 
 
 def test_a_counter_and_a_gauge_are_rendered_with_type_and_help() -> None:
-    figures = rendered(counter("aira_jobs_done_total", "Jobs done", 3), gauge("aira_queue", "What waits", 1.5))
+    metrics = rendered(counter("aira_jobs_done_total", "Jobs done", 3), gauge("aira_queue", "What waits", 1.5))
 
-    assert (figures("aira_jobs_done_total"), figures("aira_queue")) == (3, 1.5)
-    assert (figures.families["aira_jobs_done"].type, figures.families["aira_jobs_done"].documentation) == (
+    assert (metrics("aira_jobs_done_total"), metrics("aira_queue")) == (3, 1.5)
+    assert (metrics.families["aira_jobs_done"].type, metrics.families["aira_jobs_done"].documentation) == (
         "counter",
         "Jobs done",
     )
-    assert figures.families["aira_queue"].type == "gauge"
+    assert metrics.families["aira_queue"].type == "gauge"
 
 
 def test_labels_may_hold_any_text() -> None:
     strange = 'a "quoted"\nline \\ and ☃'
 
-    figures = rendered(by_label("aira_x", "gauge", "x", "reason", {strange: 1, "plain": 2}))
+    metrics = rendered(by_label("aira_x", "gauge", "x", "reason", {strange: 1, "plain": 2}))
 
-    assert (figures("aira_x", reason=strange), figures("aira_x", reason="plain")) == (1, 2)
+    assert (metrics("aira_x", reason=strange), metrics("aira_x", reason="plain")) == (1, 2)
 
 
 def test_a_scraper_that_asks_for_openmetrics_gets_it() -> None:
@@ -47,11 +47,11 @@ def test_a_scraper_that_asks_for_openmetrics_gets_it() -> None:
 
 
 def test_process_metrics_have_memory_start_and_version() -> None:
-    figures = rendered()
+    metrics = rendered()
 
-    assert figures("process_resident_memory_bytes") > 1e6
-    assert figures("process_start_time_seconds") > 1e9
-    assert figures.of_label("aira_info", "version")
+    assert metrics("process_resident_memory_bytes") > 1e6
+    assert metrics("process_start_time_seconds") > 1e9
+    assert metrics.of_label("aira_info", "version")
 
 
 def test_labels_are_added_to_all_samples_and_do_not_hide_their_own() -> None:
@@ -66,9 +66,9 @@ def test_labels_are_added_to_all_samples_and_do_not_hide_their_own() -> None:
 def test_the_same_metric_of_two_lighthouses_is_one_family() -> None:
     both = [labelled([gauge("aira_a", "a", place)], lighthouse=name)[0] for place, name in enumerate(("n", "s"))]
 
-    figures = rendered(*both)
+    metrics = rendered(*both)
 
-    assert (figures("aira_a", lighthouse="n"), figures("aira_a", lighthouse="s")) == (0, 1)
+    assert (metrics("aira_a", lighthouse="n"), metrics("aira_a", lighthouse="s")) == (0, 1)
 
 
 def test_two_metrics_can_not_share_a_name() -> None:

@@ -1,4 +1,4 @@
-"""Metrics of a provider and an agent that do a job: each figure moves by what the job did, and by nothing else."""
+"""Metrics of a provider and an agent that do a job: each metric changes by what the job did, and by nothing else."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from mesh.agent import JobFailed
 from mesh.background import Background
 from mesh.chain import NodeUnreachable
-from mesh.chain import metrics as chain_figures
+from mesh.chain import metrics as chain_metrics
 from mesh.market.provider import Provider, ProviderProcess
 from mesh.network import Endpoints, Network
 from mesh.telemetry.serving import Telemetry
@@ -40,7 +40,7 @@ AGENT_WELL = {"executor": ALIVE, "channel": ALIVE, "signer": ALIVE, "listener": 
 
 @asynccontextmanager
 async def provider_at(place: Place) -> AsyncIterator[str]:
-    """The lighthouse's provider at work; gives where its metrics are."""
+    """The lighthouse's provider at work; gives the URL of its metrics."""
     async with (
         asyncio.timeout(LONG),
         Telemetry(HERE) as telemetry,
@@ -55,12 +55,12 @@ async def provider_at(place: Place) -> AsyncIterator[str]:
 
 
 def url_of(agent: Agent) -> str:
-    """Where an agent's metrics are, which runs."""
+    """The URL of a running agent's metrics."""
     return agent.telemetry.url
 
 
 def blinking(place: Place) -> Agent:
-    """A robot that does what it is asked for, and says something of it; its metrics are told."""
+    """A robot that does its jobs and publishes messages; its metrics are served."""
     robot = offering(place.agent("robot", metrics_listen=HERE))
 
     @robot.on("/go")
@@ -76,11 +76,11 @@ def blinking(place: Place) -> Agent:
 
 
 async def settled(url: str, **expected: float) -> Scrape:
-    """The figures, when those named (without labels) have come to their values."""
+    """The metrics, when those named (without labels) have reached their values."""
 
     async def as_expected() -> bool:
-        figures = await scraped(url)
-        return all(figures(name) == value for name, value in expected.items())
+        metrics = await scraped(url)
+        return all(metrics(name) == value for name, value in expected.items())
 
     await until_found(as_expected, what=f"{expected}", seconds=LONG)
     return await scraped(url)
@@ -89,7 +89,7 @@ async def settled(url: str, **expected: float) -> Scrape:
 async def test_a_job_changes_exactly_these_metrics_of_its_provider(
     place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(chain_figures, "MAX_AGE", 0.0)
+    monkeypatch.setattr(chain_metrics, "MAX_AGE", 0.0)
     lighthouse = place.market.deployment.lighthouse_name
     async with provider_at(place) as url, blinking(place), place.agent("person") as person:
         before, eth = await scraped(url), await place.chains["provider"].tokens.eth_balance()
@@ -161,8 +161,8 @@ async def test_the_age_of_a_running_job_in_its_phase_grows(place: Place) -> None
         contract = await person.demand(place.save(objective(("/go", Empty()))), model=MODEL, cost=COST)
 
         async def standing() -> float:
-            figures = await scraped(url_of(robot))
-            return figures("aira_job_standing_seconds", phase="running")
+            metrics = await scraped(url_of(robot))
+            return metrics("aira_job_standing_seconds", phase="running")
 
         await until_found(standing, what="a job under way", seconds=LONG)
         first = await standing()
@@ -202,9 +202,9 @@ async def test_the_loss_and_return_of_a_router_are_reported(place: Place, router
         for where, well in ((url, WELL), (own, AGENT_WELL)):
             lost = (503, {**well, "channel": "waits for a router"})
             await until_found(partial(_is, where, lost), what="the loss", seconds=LONG)
-            figures = await scraped(where)
-            assert (figures("aira_network_losses_total"), figures("aira_network_links")) == (1, 0)
-            assert (figures("aira_part_up", part="channel"), figures("aira_part_up", part="listener")) == (0, 1)
+            metrics = await scraped(where)
+            assert (metrics("aira_network_losses_total"), metrics("aira_network_links")) == (1, 0)
+            assert (metrics("aira_part_up", part="channel"), metrics("aira_part_up", part="listener")) == (0, 1)
         await asyncio.to_thread(router.start)
         for where, well in ((url, WELL), (own, AGENT_WELL)):
             await until_found(partial(_is, where, (200, well)), what="the return", seconds=LONG)
@@ -228,14 +228,14 @@ async def test_an_agent_without_an_account_reports_what_it_receives(place: Place
         assert await health(url_of(watcher)) == (200, {"channel": ALIVE})
         await robot.offer(objective=cid_of_bytes(b"x"), cost=COST)
         await until(lambda: heard, seconds=LONG)
-        figures = await scraped(url_of(watcher))
-        assert figures("aira_messages_total", kind="offer", verdict="accepted") == 1
-        assert figures("aira_messages_dropped_total", kind="offer") == 0
-        assert figures("aira_network_links") == 1
+        metrics = await scraped(url_of(watcher))
+        assert metrics("aira_messages_total", kind="offer", verdict="accepted") == 1
+        assert metrics("aira_messages_dropped_total", kind="offer") == 0
+        assert metrics("aira_network_links") == 1
 
 
 async def test_rejected_orders_are_counted_by_reason(place: Place) -> None:
-    """The person has taken back the allowance that the demand needs."""
+    """The person revoked the allowance that the demand needs."""
     async with provider_at(place) as url, place.agent("robot") as robot, place.agent("person") as person:
         before = await scraped(url)
         terms = await person.runtime.trader.terms(
@@ -259,7 +259,7 @@ async def test_rejected_orders_are_counted_by_reason(place: Place) -> None:
 async def test_a_balance_that_the_node_does_not_return_is_left_out(
     place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(chain_figures, "MAX_AGE", 0.0)
+    monkeypatch.setattr(chain_metrics, "MAX_AGE", 0.0)
     chain = place.chains["robot"]
 
     async def unreachable(address: str | None = None) -> int:
@@ -268,6 +268,6 @@ async def test_a_balance_that_the_node_does_not_return_is_left_out(
     async with provider_at(place), blinking(place) as robot:
         assert "aira_account_eth_wei" in (await scraped(url_of(robot))).names()
         monkeypatch.setattr(chain.node, "eth_balance", unreachable)
-        figures = await scraped(url_of(robot))
-        assert "aira_account_eth_wei" not in figures.names()
-        assert figures.of_label("aira_jobs", "phase")
+        metrics = await scraped(url_of(robot))
+        assert "aira_account_eth_wei" not in metrics.names()
+        assert metrics.of_label("aira_jobs", "phase")

@@ -97,16 +97,16 @@ class Meeting:
         await until_found(all_there, what=f"{peers}", seconds=30)
 
     @asynccontextmanager
-    async def telling(self, *told: Status) -> AsyncIterator[None]:
-        """Meanwhile each of these statuses is answered where its address says."""
-        async with Services(self.writer.session, told[0].address) as services:
-            for one in told:
+    async def answering_with(self, *answers: Status) -> AsyncIterator[None]:
+        """Meanwhile the service `status` of the address answers each of these."""
+        async with Services(self.writer.session, answers[0].address) as services:
+            for one in answers:
 
                 async def answer(_request: Nothing, one: Status = one) -> Status:
                     return one
 
                 services.offer("status", answer)
-            await until_answered(self.session, str(RpcKey(told[0].address, "status")))
+            await until_answered(self.session, str(RpcKey(answers[0].address, "status")))
             yield
 
 
@@ -139,14 +139,14 @@ async def test_the_turn_token_of_a_bridge_is_no_peer(meeting: Meeting) -> None:
 
 async def test_an_address_reports_the_status_of_each_role(meeting: Meeting) -> None:
     both = status(), status(lighthouse="other.lighthouse.3.robonomics.eth", role="provider")
-    async with meeting.telling(*both):
+    async with meeting.answering_with(*both):
 
-        async def all_told() -> bool:
+        async def all_answered() -> bool:
             return len(await status_of(meeting.session, ROBOT.address, MARKET)) == len(both)
 
-        await until_found(all_told, what="both answers", seconds=30)
-        told = await status_of(meeting.session, ROBOT.address.lower(), MARKET)
-        assert sorted(told, key=str) == sorted(both, key=str)
+        await until_found(all_answered, what="both answers", seconds=30)
+        found = await status_of(meeting.session, ROBOT.address.lower(), MARKET)
+        assert sorted(found, key=str) == sorted(both, key=str)
 
 
 async def test_a_bridge_reports_its_status(meeting: Meeting) -> None:
@@ -181,8 +181,8 @@ async def test_statuses_of_other_addresses_and_lighthouses_are_ignored(meeting: 
             stack.enter_context(answering(meeting.writer.session, key, lie))
         await until_answered(meeting.session, key)
         assert await statuses(meeting.session, meeting.seen, [peer]) == {peer: None}
-        told = await status_of(meeting.session, ROBOT.address, MARKET)
-        assert {found.lighthouse for found in told} <= {"another.eth"}
+        found = await status_of(meeting.session, ROBOT.address, MARKET)
+        assert {one.lighthouse for one in found} <= {"another.eth"}
 
 
 def test_unknown_fields_of_newer_versions_are_ignored() -> None:

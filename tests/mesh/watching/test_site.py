@@ -52,14 +52,14 @@ async def test_what_each_role_sees(tmp_path: Path, role: str, may_ask: int, sees
             async def is_seen() -> bool:
                 return await present(seen) == [PresentPeer("agent", ROBOT.address)]
 
-            async def told() -> list[RoleStatus]:
+            async def answers() -> list[RoleStatus]:
                 return await status_of(others.session, ROBOT.address, MARKET, timeout=QUICK)
 
             async with MarketWatch(others.session, seen) as watch:
                 await until_found(is_seen, what="the agent", seconds=SECONDS)
                 if may_ask:
-                    await until_found(told, what="the agent's answer", seconds=SECONDS)
-                assert len(await told()) == may_ask
+                    await until_found(answers, what="the agent's answer", seconds=SECONDS)
+                assert len(await answers()) == may_ask
 
                 def events() -> int:
                     shown.put(EVENT, JOB.encode())
@@ -70,5 +70,5 @@ async def test_what_each_role_sees(tmp_path: Path, role: str, may_ask: int, sees
                 else:
                     for _ in range(3):
                         events()
-                        await told()
+                        await answers()
                     assert watch.counters().received == 0
