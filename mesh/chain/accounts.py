@@ -33,6 +33,18 @@ class KeyfileError(ConfigurationError):
         self.path = str(path)
 
 
+class KeyfileExists(KeyfileError):
+    """A keyfile of that name exists; none is ever overwritten."""
+
+    code = "keyfile-exists"
+
+
+class NotAKeyfile(KeyfileError):
+    """The content of a file is not Web3 secret storage."""
+
+    code = "not-a-keyfile"
+
+
 class WrongPassword(KeyfileError):
     """The password does not open the keyfile."""
 
@@ -103,7 +115,9 @@ def write_keyfile(path: Path | str, private_key: bytes, password: str) -> str:
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     except FileExistsError:
-        raise KeyfileError(path, "exists already", hint="keyfiles are never overwritten; choose another name") from None
+        raise KeyfileExists(
+            path, "exists already", hint="keyfiles are never overwritten; choose another name"
+        ) from None
     except OSError as error:
         raise KeyfileError(path, f"can't be written: {error.strerror}") from None
     with os.fdopen(descriptor, "w", encoding="utf-8") as file:
@@ -140,9 +154,9 @@ def _open_keyfile(keyfile: Path, password: bytes, *, password_from: object) -> b
     except ValueError as error:
         if "MAC" in str(error):
             raise WrongPassword(keyfile, password_from) from None
-        raise KeyfileError(keyfile, f"is not a keyfile: {error}") from None
+        raise NotAKeyfile(keyfile, f"is not a keyfile: {error}") from None
     except (KeyError, TypeError, AttributeError, NotImplementedError) as error:
-        raise KeyfileError(keyfile, f"is not a keyfile that can be read here ({error})") from None
+        raise NotAKeyfile(keyfile, f"is not a keyfile that can be read here ({error})") from None
     return bytes(key)
 
 
@@ -153,9 +167,9 @@ def _read_keyfile(path: Path) -> dict[str, Any]:
         hint = "make one with `aira account new`" if isinstance(error, FileNotFoundError) else ""
         raise KeyfileError(path, f"can't read the keyfile: {error.strerror}", hint=hint) from None
     except ValueError:
-        raise KeyfileError(path, "is not a keyfile: not JSON") from None
+        raise NotAKeyfile(path, "is not a keyfile: not JSON") from None
     if not isinstance(content, dict):
-        raise KeyfileError(path, "is not a keyfile: not a JSON object")
+        raise NotAKeyfile(path, "is not a keyfile: not a JSON object")
     return content
 
 

@@ -9,6 +9,7 @@ from mesh.errors import ChainError, ConfigurationError, InputError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from pathlib import Path
 
 METHOD_NOT_FOUND: Final = -32601
 """The JSON-RPC code of a method that the node does not have."""
@@ -50,6 +51,19 @@ class NodeUnreachable(ChainError):
         )
         self.endpoint = endpoint
         self.why = why
+
+
+class InvalidEndpoint(ConfigurationError):
+    """A text is not the address of an Ethereum node."""
+
+    code = "invalid-endpoint"
+
+    def __init__(self, endpoint: str) -> None:
+        super().__init__(
+            f"{endpoint!r} is not the address of a node",
+            hint="an address begins with http://, https://, ws:// or wss://; several are separated by commas",
+        )
+        self.endpoint = endpoint
 
 
 class WrongChain(ConfigurationError):
@@ -262,6 +276,36 @@ class NoAccount(ConfigurationError):
 
     def __init__(self) -> None:
         super().__init__("this needs an account", hint="set keyfile and keyfile_password_file")
+
+
+class TransactionsNotKept(ConfigurationError):
+    """The disk refuses the sent transactions in `folder`."""
+
+    code = "transactions-not-kept"
+
+    def __init__(self, folder: Path, why: str) -> None:
+        super().__init__(
+            f"can't keep sent transactions in {folder}: {why}",
+            hint="make room on that disk, let this user write there, or name another folder with --data-dir",
+        )
+        self.folder = folder
+        self.why = why
+
+
+class TransactionDamaged(ConfigurationError):
+    """The file of a sent transaction is damaged."""
+
+    code = "transaction-damaged"
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(f"{path} holds no sent transaction", hint="it is damaged; move it away")
+        self.path = path
+
+
+class UnknownContracts(ConfigurationError):
+    """The settings name contracts, or a generation of them, that do not exist."""
+
+    code = "unknown-contracts"
 
 
 class InvalidName(InputError):

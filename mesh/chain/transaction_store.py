@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from mesh.chain.accounts import SignedTransaction
-from mesh.errors import ConfigurationError
+from mesh.chain.errors import TransactionDamaged, TransactionsNotKept
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -103,7 +103,7 @@ class LockedEntry:
 
 
 class TransactionStore:
-    """The folder with an account's sent transactions on one chain. Raises `ConfigurationError` if it can't be written.
+    """The folder with an account's sent transactions on one chain. Raises `TransactionsNotKept` if it can't be written.
 
     Not for network file systems, whose locks other machines may not see.
     """
@@ -191,14 +191,11 @@ def lock_file(path: Path, operation: int) -> int | None:
 
 @contextmanager
 def _on_disk(path: Path) -> Iterator[None]:
-    """Work on the file at `path`. Raises `ConfigurationError` if the disk refuses."""
+    """Work on the file at `path`. Raises `TransactionsNotKept` if the disk refuses."""
     try:
         yield
     except OSError as error:
-        raise ConfigurationError(
-            f"can't keep sent transactions in {path.parent}: {error.strerror}",
-            hint="make room on that disk, let this user write there, or name another folder with --data-dir",
-        ) from None
+        raise TransactionsNotKept(path.parent, error.strerror or str(error)) from None
 
 
 def _linked(unfinished: str, path: Path) -> bool:
@@ -223,7 +220,7 @@ def _parse(nonce: int, path: Path) -> PendingTransaction:
         for line in path.read_text(encoding="utf-8").splitlines():
             lines.append(json.loads(line))
     if not lines:
-        raise ConfigurationError(f"{path} holds no sent transaction", hint="it is damaged; move it away")
+        raise TransactionDamaged(path)
     fields = lines[-1]["fields"] | {"to": lines[-1]["fields"]["to"] or b""}
     versions = [SignedTransaction(raw=bytes.fromhex(line["raw"]), hash=line["hash"]) for line in lines]
     return PendingTransaction(

@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
-from mesh.chain.errors import NotOffered
-from mesh.errors import ConfigurationError, InvalidMessage
+from mesh.chain.errors import NotOffered, UnknownContracts
+from mesh.errors import InvalidMessage
 from schemas.address import ZERO_ADDRESS, parse_address
 from schemas.cid import parse_cid
 
@@ -197,9 +197,9 @@ class OriginalContracts(ContractVersion):
 
 
 def contract_version(kind: ContractKind, node: Node, factory: str, generation: int) -> ContractVersion:
-    """The version for a kind and a generation. Raises `ConfigurationError` if there is none."""
+    """The version for a kind and a generation. Raises `UnknownContracts` if there is none."""
     if generation not in GETTERS or kind not in ("mesh", "original"):
-        raise ConfigurationError(
+        raise UnknownContracts(
             f"there are no {kind} contracts of generation {generation}",
             hint='contracts are "mesh" or "original", generations 3 or 5',
         )

@@ -13,11 +13,11 @@ from aiohttp import ClientError, ClientResponseError
 from web3.exceptions import Web3Exception
 from web3.providers.async_base import AsyncBaseProvider
 
-from mesh.chain.errors import NodeUnreachable, RequestRefused, WrongChain
+from mesh.chain.errors import InvalidEndpoint, NodeUnreachable, RequestRefused, WrongChain
 from mesh.chain.node_metrics import NodeMetrics
 from mesh.chain.reverts import decode_revert
 from mesh.chain.transports import HttpTransport, WebSocketTransport
-from mesh.errors import AiraError, ClosedError, ConfigurationError
+from mesh.errors import AiraError, ClosedError
 from mesh.log_context import log_event
 from mesh.retry import Backoff
 
@@ -187,7 +187,7 @@ def open_provider(endpoint: Endpoint, timing: Timing, metrics: NodeMetrics | Non
     """The provider of an endpoint: `http(s)://…`, `ws(s)://…`, several of them, or a provider object.
 
     Several are a sequence, or one text with commas. Nothing is connected yet. `metrics` counts whether they answer.
-    Raises `ConfigurationError` for any other text.
+    Raises `InvalidEndpoint` for any other text.
     """
     metrics = metrics or NodeMetrics()
     if isinstance(endpoint, AsyncBaseProvider):
@@ -204,10 +204,7 @@ def _upstream(url: str) -> Upstream:
     elif url.startswith(("ws://", "wss://")):
         transport = WebSocketTransport(url)
     else:
-        raise ConfigurationError(
-            f"{url!r} is not the address of a node",
-            hint="an address begins with http://, https://, ws:// or wss://; several are separated by commas",
-        )
+        raise InvalidEndpoint(url)
     return Upstream(transport, endpoint=url, owned=transport)
 
 

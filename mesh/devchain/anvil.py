@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Final, NoReturn
 
 from mesh.background import Background
 from mesh.devchain.anvil_state import STATE_SECONDS, copy_states, prepare_state, settle_state
+from mesh.devchain.errors import NotAProgram, PortUnavailable
 from mesh.errors import ConfigurationError, RemoteError
 
 if TYPE_CHECKING:
@@ -50,11 +51,11 @@ class NodeEnded(RemoteError):
 def find_anvil(program: Path | None) -> Path | None:
     """Where anvil is: the named program, else the one on the path; None if there is none.
 
-    Raises `ConfigurationError` when the named one is no program.
+    Raises `NotAProgram` when the named one is not a program.
     """
     found = shutil.which(program or "anvil")
     if found is None and program is not None:
-        raise ConfigurationError(f"{program} is not a program that can be run", hint="--anvil names the file `anvil`")
+        raise NotAProgram(program)
     return Path(found) if found else None
 
 
@@ -186,7 +187,7 @@ def _keys_in(facts: Path) -> tuple[bytes, ...]:
 
 
 def _bindable(host: str, port: int) -> int:
-    """The port, or a free one for 0. Raises `ConfigurationError` when it is taken."""
+    """The port, or a free one for 0. Raises `PortUnavailable` when it is taken."""
     try:
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -194,6 +195,4 @@ def _bindable(host: str, port: int) -> int:
             taken: int = probe.getsockname()[1]
             return taken
     except OSError as error:
-        raise ConfigurationError(
-            f"can't listen on {host}:{port}: {error.strerror}", hint="another node may run there; choose another port"
-        ) from None
+        raise PortUnavailable(host, port, str(error.strerror)) from None

@@ -14,6 +14,7 @@ import os
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final, NoReturn
 
+from mesh.devchain.errors import InvalidChainState
 from mesh.errors import ConfigurationError
 from mesh.log_context import log_event
 
@@ -47,7 +48,7 @@ def prepare_state(state: Path) -> None:
             return
         whole = state_copy(state).read_bytes() if state_copy(state).exists() else b""
         if not _is_chain(whole):
-            raise ConfigurationError(f"{state} holds no chain of anvil", hint="name another file, or remove it")
+            raise InvalidChainState(state)
         _replace(state, whole)
     except OSError as error:
         raise ConfigurationError(f"can't keep the chain in {state}: {error.strerror}") from None

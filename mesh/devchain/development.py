@@ -24,7 +24,7 @@ from mesh.chain import (
 from mesh.devchain.anvil import serve_anvil
 from mesh.devchain.anvil_state import deploying
 from mesh.devchain.embedded import serve_embedded
-from mesh.errors import ConfigurationError
+from mesh.devchain.errors import KeyfilesNotWritable, MarketMissing
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
@@ -179,9 +179,7 @@ async def serve_chain(
         try:
             await asyncio.to_thread(_write_keyfiles, keys, funded)
         except OSError as error:
-            raise ConfigurationError(
-                f"can't write keyfiles to {keys}: {error.strerror}", hint="name another folder with --data-dir"
-            ) from None
+            raise KeyfilesNotWritable(keys, str(error.strerror)) from None
         yield DevelopmentChain(url=url, engine=engine, market=market, keys=keys)
 
 
@@ -190,9 +188,7 @@ async def _load_or_deploy(url: str, keys: tuple[bytes, ...], state: Path | None)
     try:
         market = await load_market(url, keys)
     except NoContracts:
-        raise ConfigurationError(
-            f"the chain in {state} is not new, but has no market", hint="name another file, or remove it"
-        ) from None
+        raise MarketMissing(state) from None
     if market is not None:
         return market
     with deploying(state):

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from aiohttp import WSMsgType, web
 
+from mesh.devchain.errors import PortUnavailable
 from mesh.devchain.jsonrpc import INVALID_PARAMS, Dispatcher, RpcError
 from mesh.devchain.subscriptions import Subscriptions
-from mesh.errors import ConfigurationError
 from mesh.log_context import log_event
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class JsonRpcServer:
     It listens on loopback by default. A web page may call it only from one of `allowed_origins` (`"*"` for any); a
     loopback server also refuses requests that name another host, as after DNS rebinding.
 
-    Used with `async with`; leaving it finishes the requests in progress. Entering raises `ConfigurationError` when the
+    Used with `async with`; leaving it finishes the requests in progress. Entering raises `PortUnavailable` when the
     port is taken.
     """
 
@@ -90,10 +90,8 @@ class JsonRpcServer:
             await web.TCPSite(self._runner, self._host, self._port).start()
         except OSError as error:
             await self._runner.cleanup()
-            raise ConfigurationError(
-                f"can't listen on {self._host}:{self._port}: {os.strerror(error.errno) if error.errno else error}",
-                hint="another node may run there; choose another port",
-            ) from None
+            why = os.strerror(error.errno) if error.errno else str(error)
+            raise PortUnavailable(self._host, self._port, why) from None
         self._port = self._runner.addresses[0][1]
         return self
 

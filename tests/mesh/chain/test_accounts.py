@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.chain import Account, KeyfileError, WrongPassword, keyfile_address, new_private_key, write_keyfile
+from mesh.chain.accounts import KeyfileExists, NotAKeyfile
 from mesh.errors import ConfigurationError, InputError
 from schemas.signing import recover
 
@@ -91,8 +92,9 @@ def test_only_the_owner_can_read_a_keyfile(keyfile: Path) -> None:
 
 def test_a_keyfile_is_never_overwritten(keyfile: Path) -> None:
     before = keyfile.read_bytes()
-    with pytest.raises(KeyfileError, match="exists already"):
+    with pytest.raises(KeyfileExists) as caught:
         write_keyfile(keyfile, new_private_key(), "other")
+    assert (caught.value.code, caught.value.path) == ("keyfile-exists", str(keyfile))
     assert keyfile.read_bytes() == before
 
 
@@ -101,30 +103,36 @@ def test_a_keyfiles_address_is_read_without_the_password(keyfile: Path) -> None:
 
 
 def test_a_wrong_password_is_one_clear_error(keyfile: Path, tmp_path: Path) -> None:
-    with pytest.raises(WrongPassword, match="does not open it") as caught:
-        Account.from_keyfile(keyfile, _password_file(tmp_path, "mellon"))
+    password_file = _password_file(tmp_path, "mellon")
+    with pytest.raises(WrongPassword) as caught:
+        Account.from_keyfile(keyfile, password_file)
+    assert (caught.value.code, caught.value.path) == ("wrong-password", str(keyfile))
+    assert str(password_file) in str(caught.value)
     assert isinstance(caught.value, ConfigurationError)
     assert caught.value.hint
     assert "mellon" not in str(caught.value)
 
 
 def test_a_missing_keyfile_says_how_to_make_one(tmp_path: Path) -> None:
-    with pytest.raises(KeyfileError, match=r"no\.json") as caught:
+    with pytest.raises(KeyfileError) as caught:
         Account.from_keyfile(tmp_path / "no.json", _password_file(tmp_path, "x"))
-    assert "account new" in caught.value.hint
+    assert caught.value.path == str(tmp_path / "no.json")
+    assert "`aira account new`" in caught.value.hint
 
 
 def test_a_missing_password_file_is_named(keyfile: Path, tmp_path: Path) -> None:
-    with pytest.raises(KeyfileError, match="password file"):
+    with pytest.raises(KeyfileError) as caught:
         Account.from_keyfile(keyfile, tmp_path / "none")
+    assert (caught.value.code, caught.value.path) == ("keyfile-error", str(tmp_path / "none"))
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '"text"', '{"version": 3, "crypto": {}}', '{"version": 9}'])
 def test_a_file_that_is_not_a_keyfile_is_refused(tmp_path: Path, content: str) -> None:
     path = tmp_path / "key.json"
     path.write_text(content)
-    with pytest.raises(KeyfileError, match="is not a keyfile"):
+    with pytest.raises(NotAKeyfile) as caught:
         Account.from_keyfile(path, _password_file(tmp_path, "x"))
+    assert (caught.value.code, caught.value.path) == ("not-a-keyfile", str(path))
 
 
 def test_neither_key_nor_password_is_shown_or_logged(

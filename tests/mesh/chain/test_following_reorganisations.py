@@ -270,9 +270,10 @@ async def test_a_chain_that_was_restarted_from_nothing_is_an_error() -> None:
         await node.request("evm_mine")
         await deploy(node, account)
         async with Chain(node) as chain:
-            with pytest.raises(ReorganisedTooDeep, match="no block 4") as caught:
+            with pytest.raises(ReorganisedTooDeep) as caught:
                 await anext(chain.follow(head + 1, history=history))
-    assert "fresh data_dir" in caught.value.hint
+    assert caught.value.cursor == 4
+    assert "data_dir" in caught.value.hint
 
 
 def test_a_history_is_encoded_and_decoded_and_invalid_ones_are_refused() -> None:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.chain import GWEI, Account, Node, TransactionSender, TransactionTimeout
-from mesh.errors import ConfigurationError
-from tests.mesh.chain.conftest import QUICK
+from mesh.chain.errors import TransactionsNotKept
+from tests.mesh.chain.conftest import QUICK, raises_with
 from tests.mesh.chain.senders import NO_MINING, SHORT, anvil, open_sender, pending_hashes, until_pending, unused_address
 from tests.support.nodes import Anvil
 
@@ -173,5 +173,5 @@ async def test_processes_that_share_a_folder_never_use_the_same_nonce(tmp_path: 
 async def test_a_folder_that_can_not_be_written_is_an_error(anvil: Anvil, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     async with open_sender(anvil, transactions=tmp_path / "file") as (_, sender):
-        with pytest.raises(ConfigurationError, match="can't keep sent transactions"):
+        with raises_with(TransactionsNotKept, code="transactions-not-kept"):
             await sender.send(to=unused_address(), data=b"", value=1)

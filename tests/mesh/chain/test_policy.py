@@ -12,7 +12,7 @@ from mesh.chain import GWEI, Account, FeePolicy, FeeTooHigh, Node, TransactionSe
 from mesh.chain.policy import Fees
 from mesh.chain.transports import HttpTransport
 from mesh.errors import ConfigurationError
-from tests.mesh.chain.conftest import QUICK
+from tests.mesh.chain.conftest import QUICK, raises_with
 from tests.mesh.chain.senders import unused_address
 from tests.support.nodes import Anvil
 
@@ -104,5 +104,5 @@ async def test_without_a_suggested_priority_fee_the_gas_price_is_used(anvil: Anv
 
 @pytest.mark.parametrize("wrong", [{"ceiling": 0}, {"patience": -1}, {"bump_percent": 9}])
 def test_invalid_policies_are_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(ConfigurationError, match="ceiling above zero"):
+    with raises_with(ConfigurationError, code="configuration-error"):
         FeePolicy(**wrong)

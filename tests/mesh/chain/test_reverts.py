@@ -30,7 +30,7 @@ def test_custom_errors_are_found_wherever_nodes_put_them(error: dict[str, Any]) 
     assert reverted is not None
     assert (reverted.reason, reverted.arguments) == ("NotAProvider", (ADDRESS,))
     assert str(reverted) == f"the contract refused: NotAProvider ({ADDRESS})"
-    assert reverted.hint.startswith("stake on the lighthouse first")
+    assert reverted.hint == REVERT_HINTS["NotAProvider"]
 
 
 def test_every_hint_is_for_an_error_of_the_contracts() -> None:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 from typing import TYPE_CHECKING
 
 import pytest
 
 from mesh.chain.accounts import SignedTransaction
+from mesh.chain.errors import TransactionDamaged, TransactionsNotKept
 from mesh.chain.pending import PendingTransactions
 from mesh.chain.transaction_store import PendingTransaction, TransactionStore
-from mesh.errors import ConfigurationError
+from tests.mesh.chain.conftest import raises_with
 from tests.support.disks import file_size_limit
 
 if TYPE_CHECKING:
@@ -99,10 +102,11 @@ def test_a_version_after_an_incomplete_line_is_read(
 def test_a_full_disk_is_an_error_and_leaves_nothing_behind(one: TransactionStore, tmp_path: Path) -> None:
     with (
         file_size_limit(16),
-        pytest.raises(ConfigurationError, match=f"^can't keep sent transactions in {tmp_path}: ") as caught,
+        raises_with(TransactionsNotKept, code="transactions-not-kept", folder=tmp_path) as caught,
     ):
         one.add(_entry(7))
-    assert "make room" in caught.value.hint
+    assert caught.value.why
+    assert caught.value.hint
     assert list(tmp_path.iterdir()) == []
     assert one.add(_entry(7)) is not None
 
@@ -113,7 +117,7 @@ def test_a_version_that_does_not_fit_leaves_the_others(one: TransactionStore, tm
     assert hold is not None
     (path,) = tmp_path.iterdir()
     entry.versions.append(SignedTransaction(b"\x02", "0x02"))
-    with file_size_limit(path.stat().st_size + 16), pytest.raises(ConfigurationError):
+    with file_size_limit(path.stat().st_size + 16), pytest.raises(TransactionsNotKept):
         hold.append(entry)
     hold.append(entry)
     hold.release()
@@ -126,12 +130,12 @@ async def test_a_missing_folder_is_an_error(one: TransactionStore, tmp_path: Pat
     entry = _entry(7)
     assert await outbox.add(entry)
     shutil.rmtree(tmp_path)
-    with pytest.raises(ConfigurationError, match="No such file or directory"):
+    with raises_with(TransactionsNotKept, folder=tmp_path, why=os.strerror(errno.ENOENT)):
         await outbox.add(_entry(8))
     outbox.abandon(entry)
 
 
 def test_a_damaged_entry_is_an_error(one: TransactionStore, tmp_path: Path) -> None:
     (tmp_path / "000000000007.jsonl").write_text("garbage")
-    with pytest.raises(ConfigurationError, match="holds no sent transaction"):
+    with raises_with(TransactionDamaged, path=tmp_path / "000000000007.jsonl"):
         one.read(())

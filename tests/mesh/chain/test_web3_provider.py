@@ -13,9 +13,10 @@ import pytest
 from aiohttp import web
 
 from mesh.chain import Chain, Node, NodeUnreachable, RequestRefused, WrongChain
+from mesh.chain.errors import InvalidEndpoint
 from mesh.devchain import EmbeddedChain, JsonRpcServer
 from mesh.errors import ClosedError, ConfigurationError, RemoteError
-from tests.mesh.chain.conftest import QUICK, unreachable
+from tests.mesh.chain.conftest import QUICK, raises_with, unreachable
 from tests.support.nodes import Anvil
 from tests.support.ports import free_port
 
@@ -38,11 +39,12 @@ async def _server(handler: Callable[[web.Request], Awaitable[web.StreamResponse]
 @pytest.mark.parametrize("scheme", ["http", "ws"])
 async def test_a_missing_node_is_an_error(scheme: str) -> None:
     endpoint = f"{scheme}://127.0.0.1:{free_port()}"
-    with pytest.raises(NodeUnreachable, match=endpoint) as caught:
+    with pytest.raises(NodeUnreachable) as caught:
         async with Chain(endpoint, timing=QUICK):
             pass
     assert isinstance(caught.value, RemoteError)
     assert caught.value.endpoint == endpoint
+    assert endpoint in str(caught.value)
     assert "\n" not in str(caught.value)
     assert caught.value.hint
 
@@ -122,16 +124,16 @@ async def test_a_json_rpc_error_with_an_http_status_is_reported() -> None:
         return web.json_response({"jsonrpc": "2.0", "id": 1, "error": error}, status=400)
 
     async with _server(rude) as url:
-        with pytest.raises(RequestRefused, match="limit exceeded") as caught:
+        with raises_with(RequestRefused, rpc_code=-32005, detail="limit exceeded"):
             async with Node(url, timing=QUICK):
                 pass
-    assert caught.value.rpc_code == -32005
 
 
 @pytest.mark.parametrize("endpoint", ["", "127.0.0.1:8545", "ftp://127.0.0.1"])
 def test_invalid_endpoints_are_refused(endpoint: str) -> None:
-    with pytest.raises(ConfigurationError, match="not the address of a node"):
+    with pytest.raises(InvalidEndpoint) as caught:
         Node(endpoint)
+    assert caught.value.endpoint == endpoint
 
 
 @pytest.mark.parametrize("scheme", ["http", "ws"])
@@ -227,9 +229,7 @@ async def test_a_node_that_is_missing_at_the_start_is_skipped() -> None:
 async def test_nodes_of_different_chains_are_refused(scheme: str) -> None:
     async with Anvil() as anvil, Anvil(arguments=("--chain-id", "4")) as other:
         urls = [one.url if scheme == "http" else one.ws_url for one in (anvil, other)]
-        with pytest.raises(
-            WrongChain, match=f"{urls[1]} is on the chain 4, the others are on the chain 31337"
-        ) as caught:
+        with raises_with(WrongChain, endpoint=urls[1], found=4, expected=31337) as caught:
             async with Node(urls, timing=QUICK):
                 pass
     assert isinstance(caught.value, ConfigurationError)
@@ -240,7 +240,7 @@ async def test_a_node_of_another_chain_that_starts_later_is_skipped() -> None:
     other = Anvil(arguments=("--chain-id", "4"))
     async with Anvil() as anvil, Node((anvil.url, other.url), timing=replace(QUICK, attempts=1)) as node, other:
         await asyncio.to_thread(anvil.kill)
-        with pytest.raises(NodeUnreachable, match=f"{other.url}: it is on the chain 0x4, the others are on 0x7a69"):
+        with unreachable(f"{other.url}: .* 0x4, .* 0x7a69"):
             await node.block_number()
 
 
@@ -279,11 +279,11 @@ async def test_too_many_requests_are_retried() -> None:
     [{"attempts": 0}, {"request_timeout": 0}, {"receipt_timeout": 0}, {"retry_delay": -1}, {"repeat_within": -1}],
 )
 def test_invalid_timings_are_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(ConfigurationError, match="above zero"):
+    with raises_with(ConfigurationError, code="configuration-error"):
         replace(QUICK, **wrong)
 
 
 @pytest.mark.parametrize("endpoint", [(), "http://127.0.0.1:1,", ["http://127.0.0.1:1", "ftp://x"]])
 def test_each_of_several_endpoints_is_validated(endpoint: Any) -> None:
-    with pytest.raises(ConfigurationError, match="not the address of a node"):
+    with pytest.raises(InvalidEndpoint):
         Node(endpoint)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import os
 import signal
 import stat
@@ -15,7 +16,7 @@ from mesh.chain import XRT, Account, Chain, Node, TransactionSender
 from mesh.devchain import EmbeddedChain
 from mesh.devchain.anvil import STOP_SECONDS, NodeEnded, find_anvil, serve_anvil
 from mesh.devchain.development import ALLOWANCE, serve_chain
-from mesh.errors import ConfigurationError
+from mesh.devchain.errors import InvalidChainState, MarketMissing, NotAProgram, PortUnavailable
 from mesh.settings import Settings
 from tests.support.peers import require
 from tests.support.ports import answers, free_port
@@ -70,19 +71,19 @@ async def test_an_anvil_that_ends_by_itself_ends_the_body_with_its_output(progra
             os.kill(node.pid, signal.SIGKILL)
             await asyncio.Event().wait()
 
-    with pytest.raises(NodeEnded, match=r"^anvil ended by itself, by signal 9$") as ended:
+    with pytest.raises(NodeEnded) as ended:
         await asyncio.wait_for(serve(), 30)
-    assert ended.value.exit_code == -9
+    assert (ended.value.code, ended.value.exit_code) == ("node-ended", -9)
 
 
 async def test_a_failed_start_has_its_reason(tmp_path: Path) -> None:
     broken = tmp_path / "anvil"
     broken.write_text("#!/bin/sh\necho 'the disk is on fire'\nexit 3\n")
     broken.chmod(stat.S_IRWXU)
-    with pytest.raises(NodeEnded, match=r"^anvil ended by itself, with exit code 3$") as ended:
+    with pytest.raises(NodeEnded) as ended:
         async with serve_anvil(broken, host="127.0.0.1", port=0, block_time=None, state=None):
             pytest.fail("it serves")
-    assert ended.value.hint == "the disk is on fire"
+    assert (ended.value.exit_code, ended.value.hint) == (3, "the disk is on fire")
 
 
 async def test_cancelling_the_start_leaves_no_process(tmp_path: Path) -> None:
@@ -113,18 +114,21 @@ def _pid_in(path: Path) -> int:
 async def test_a_taken_port_is_an_error(program: Path) -> None:
     async with serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=None) as node:
         port = int(node.url.rpartition(":")[2])
-        with pytest.raises(ConfigurationError, match=rf"^can't listen on 127.0.0.1:{port}: Address already in use$"):
+        with pytest.raises(PortUnavailable) as caught:
             async with serve_anvil(program, host="127.0.0.1", port=port, block_time=None, state=None):
                 pytest.fail("it serves")
+    assert (caught.value.code, caught.value.host, caught.value.port) == ("port-unavailable", "127.0.0.1", port)
+    assert caught.value.why == os.strerror(errno.EADDRINUSE)
 
 
 @pytest.mark.parametrize("content", [b"garbage", b"[]", b"{}", b"\xff"])
 async def test_an_invalid_state_is_an_error_and_is_not_changed(program: Path, tmp_path: Path, content: bytes) -> None:
     state = tmp_path / "state.json"
     state.write_bytes(content)
-    with pytest.raises(ConfigurationError, match="holds no chain of anvil"):
+    with pytest.raises(InvalidChainState) as caught:
         async with serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=state):
             pytest.fail("it serves")
+    assert (caught.value.code, caught.value.state) == ("invalid-chain-state", state)
     assert state.read_bytes() == content
 
 
@@ -154,11 +158,12 @@ async def test_a_kept_chain_without_a_market_is_an_error(program: Path, tmp_path
         Node(node.url) as client,
     ):
         await TransactionSender(client, Account.from_key(node.funded_keys[0])).send(to=NOBODY, data=b"", value=1)
-    with pytest.raises(ConfigurationError, match=r"state\.json is not new, but has no market$"):
+    with pytest.raises(MarketMissing) as caught:
         async with serve_chain(
             Settings(data_dir=str(tmp_path)), host="127.0.0.1", port=0, block_time=None, anvil=program, state=state
         ):
             pytest.fail("it serves")
+    assert (caught.value.code, caught.value.state) == ("market-missing", state)
 
 
 def test_anvil_is_found_on_the_path_or_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -166,7 +171,8 @@ def test_anvil_is_found_on_the_path_or_by_its_name(tmp_path: Path, monkeypatch: 
     assert find_anvil(None) is None
     program = tmp_path / "anvil"
     program.write_text("#!/bin/sh\n")
-    with pytest.raises(ConfigurationError, match="is not a program that can be run"):
+    with pytest.raises(NotAProgram) as caught:
         find_anvil(program)
+    assert (caught.value.code, caught.value.program) == ("not-a-program", program)
     program.chmod(stat.S_IRWXU)
     assert find_anvil(None) == find_anvil(program) == program

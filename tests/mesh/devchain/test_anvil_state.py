@@ -10,7 +10,7 @@ from mesh.chain import Account, Node, TransactionSender
 from mesh.devchain.anvil import serve_anvil
 from mesh.devchain.anvil_state import deploying, deployment_mark, prepare_state, state_copy
 from mesh.devchain.development import serve_chain
-from mesh.errors import ConfigurationError
+from mesh.devchain.errors import InvalidChainState
 from mesh.settings import Settings
 from tests.support.log_events import logged_events
 from tests.support.peers import require
@@ -70,8 +70,9 @@ def test_without_a_copy_a_damaged_state_is_an_error_and_is_not_changed(tmp_path:
     state = tmp_path / "state.json"
     for file in (state, state_copy(state)):
         file.write_bytes(b'{"accounts": {')
-    with pytest.raises(ConfigurationError, match=r"state\.json holds no chain of anvil"):
+    with pytest.raises(InvalidChainState) as caught:
         prepare_state(state)
+    assert (caught.value.code, caught.value.state) == ("invalid-chain-state", state)
     assert state.read_bytes() == state_copy(state).read_bytes() == b'{"accounts": {'
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import stat
 from typing import TYPE_CHECKING
 
@@ -9,7 +11,7 @@ import pytest
 
 from mesh.chain import Account, Chain
 from mesh.devchain.development import ALLOWANCE, ROLES, DevelopmentChain, serve_chain
-from mesh.errors import ConfigurationError
+from mesh.devchain.errors import KeyfilesNotWritable
 from mesh.settings import Settings
 from tests.support.ports import answers
 
@@ -45,6 +47,8 @@ def assert_described(served: DevelopmentChain) -> None:
 async def test_a_data_folder_that_is_a_file_is_an_error(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_text("")
-    with pytest.raises(ConfigurationError, match=f"^can't write keyfiles to {file}/development: Not a directory$"):
+    with pytest.raises(KeyfilesNotWritable) as caught:
         async with serve_chain(Settings(data_dir=str(file)), host="127.0.0.1", port=0, block_time=None):
             pytest.fail("it serves")
+    assert (caught.value.code, caught.value.folder) == ("keyfiles-not-writable", file / "development")
+    assert caught.value.why == os.strerror(errno.ENOTDIR)

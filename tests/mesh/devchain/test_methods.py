@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from web3 import AsyncWeb3
+from web3.exceptions import Web3RPCError
 
 from mesh.chain import Account, Chain, deploy
 from mesh.devchain import EmbeddedChain
-from mesh.devchain.jsonrpc import RpcError
+from mesh.devchain.jsonrpc import INVALID_PARAMS, SERVER_ERROR, RpcError
 from mesh.devchain.methods import MAX_FILTERS
 from tests.mesh.chain.conftest import QUICK
 
@@ -55,7 +56,7 @@ async def test_web3_filters_return_new_logs_and_blocks(node: EmbeddedChain, chai
         await chain.block_number() - back for back in (2, 1, 0)
     ]
     assert await web3.eth.uninstall_filter(logs.filter_id)
-    with pytest.raises(Exception, match="not found"):
+    with pytest.raises(Web3RPCError, match="filter not found"):
         await logs.get_new_entries()
 
 
@@ -94,8 +95,9 @@ async def test_the_least_recently_used_filter_is_removed(node: EmbeddedChain) ->
     for _ in range(MAX_FILTERS - 1):
         await node.request("eth_newBlockFilter", [])
     assert await node.request("eth_getFilterChanges", [first]) == []
-    with pytest.raises(RpcError, match="not found"):
+    with pytest.raises(RpcError) as caught:
         await node.request("eth_getFilterChanges", [second])
+    assert (caught.value.code, caught.value.message) == (SERVER_ERROR, "filter not found")
 
 
 @pytest.mark.parametrize(
@@ -115,5 +117,6 @@ async def test_invalid_filters_are_refused(node: EmbeddedChain, method: str, par
 
 async def test_a_block_filter_has_no_logs(node: EmbeddedChain) -> None:
     name = await node.request("eth_newBlockFilter", [])
-    with pytest.raises(RpcError, match="of blocks"):
+    with pytest.raises(RpcError) as caught:
         await node.request("eth_getFilterLogs", [name])
+    assert caught.value.code == INVALID_PARAMS

@@ -8,7 +8,7 @@ import aiohttp
 import pytest
 
 from mesh.devchain import EmbeddedChain, JsonRpcServer, serve_embedded
-from mesh.errors import ConfigurationError
+from mesh.devchain.errors import PortUnavailable
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -102,6 +102,7 @@ async def test_a_loopback_server_refuses_other_host_names(url: str) -> None:
 
 async def test_a_taken_port_is_an_error(url: str) -> None:
     port = int(url.rpartition(":")[2])
-    with pytest.raises(ConfigurationError, match=str(port)):
+    with pytest.raises(PortUnavailable) as caught:
         async with serve_embedded(port=port):
             pass
+    assert (caught.value.code, caught.value.port) == ("port-unavailable", port)
