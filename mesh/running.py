@@ -81,7 +81,7 @@ def _run(main: Callable[[], Coroutine[Any, Any, object]]) -> bool:
     except AiraError as error:
         fail(error)
     except BaseExceptionGroup as group:
-        cause = _cause(group)
+        cause = cause_of(group)
         if cause is None:
             raise
         fail(cause)
@@ -121,10 +121,10 @@ async def _until_signal(main: Callable[[], Coroutine[Any, Any, object]]) -> bool
     return not stopped
 
 
-def _cause(group: BaseExceptionGroup[BaseException]) -> AiraError | None:
+def cause_of(group: BaseExceptionGroup[BaseException]) -> AiraError | None:
     """The first error of a group that holds only `AiraError`s (they mostly have one cause); None for other groups."""
     matching, rest = group.split(AiraError)
     if matching is None or rest is not None:
         return None
     first = matching.exceptions[0]
-    return _cause(first) if isinstance(first, BaseExceptionGroup) else first
+    return cause_of(first) if isinstance(first, BaseExceptionGroup) else first

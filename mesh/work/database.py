@@ -55,6 +55,21 @@ class LedgerUnusable(ConfigurationError):
         hint = "free space on the disk, let this user write there, or give another folder with --data-dir"
         super().__init__(f"can't use the ledger {path}: {why}", hint=hint)
         self.path = path
+        self.why = str(why)
+
+
+class LedgerTooNew(ConfigurationError):
+    """A newer version wrote the ledger. `found` and `known` are versions of its format."""
+
+    code = "ledger-too-new"
+
+    def __init__(self, path: Path, *, found: int, known: int) -> None:
+        super().__init__(
+            f"the ledger {path} was written by a newer version (format {found}, this one knows {known})",
+            hint="upgrade aira-mesh",
+        )
+        self.found = found
+        self.known = known
 
 
 class Database:
@@ -69,7 +84,7 @@ class Database:
         self._writing = asyncio.Lock()
 
     async def open(self) -> None:
-        """Open the file, or create it. Raises `ConfigurationError` if a newer version wrote it."""
+        """Open the file, or create it. Raises `LedgerTooNew` if a newer version wrote it."""
         if self._connection is not None:
             raise ClosedError("this ledger is open already")
         try:
@@ -123,10 +138,7 @@ class Database:
         await self.run("PRAGMA synchronous = FULL")
         version = (await self.rows("PRAGMA user_version"))[0][0]
         if version > VERSION:
-            raise ConfigurationError(
-                f"the ledger {self._path} was written by a newer version (format {version}, this one knows {VERSION})",
-                hint="upgrade aira-mesh",
-            )
+            raise LedgerTooNew(self._path, found=version, known=VERSION)
         await self._opened().executescript(SCHEMA)
         await self.run(f"PRAGMA user_version = {VERSION}")
 

@@ -28,6 +28,16 @@ class JobFailed(AiraError):
     code = "job-failed"
 
 
+class DuplicateHandler(ConfigurationError):
+    """A topic has two handlers."""
+
+    code = "duplicate-handler"
+
+    def __init__(self, topic: str) -> None:
+        super().__init__(f"two handlers for topic {topic}", hint="give each topic one handler")
+        self.topic = topic
+
+
 class HandlerCancelled(AiraError):
     """A handler ended because something that it waited for was cancelled, so it has not done its work."""
 
@@ -82,10 +92,10 @@ class TopicHandlers:
     def add(self, topic: str, handler: TopicHandler, kind: type | None = None) -> None:
         """Register the handler of a topic (`*`: of all others). Its messages are converted to `kind`.
 
-        Raises `ConfigurationError` for a second handler of the same topic.
+        Raises `DuplicateHandler` for a second handler of the same topic.
         """
         if topic in self._handlers:
-            raise ConfigurationError(f"two handlers for topic {topic}", hint="give each topic one handler")
+            raise DuplicateHandler(topic)
         self._handlers[topic] = (handler, kind)
 
     def __bool__(self) -> bool:

@@ -53,10 +53,12 @@ class Ledger:
     """The ledger in the file at `path`, created if missing: `async with Ledger(path) as ledger`.
 
     A file belongs to one agent. Calls run in order, in a thread of their own. Every call raises `LedgerUnusable`.
+    `spent_kept` is how many spent orders it remembers, for contracts that a reorganisation takes back.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, spent_kept: int = SPENT_KEPT) -> None:
         self._database = Database(path)
+        self._spent_kept = spent_kept
 
     async def __aenter__(self) -> Self:
         await self._database.open()
@@ -134,7 +136,7 @@ class Ledger:
         await self._database.run_together(
             ("INSERT OR REPLACE INTO spent SELECT *, ? FROM outbox WHERE identity = ?", (liability, identity)),
             ("DELETE FROM outbox WHERE identity = ?", (identity,)),
-            ("DELETE FROM spent WHERE rowid <= (SELECT MAX(rowid) FROM spent) - ?", (SPENT_KEPT,)),
+            ("DELETE FROM spent WHERE rowid <= (SELECT MAX(rowid) FROM spent) - ?", (self._spent_kept,)),
         )
 
     async def spent_until(self, liability: str) -> int | None:

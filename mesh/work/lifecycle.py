@@ -50,6 +50,7 @@ class WrongPhase(AiraError):
         where = f"is {phase.value}" if phase else "is not a job of this agent"
         super().__init__(f"can't {asked} {liability}: it {where}")
         self.liability = liability
+        self.asked = asked
         self.phase = phase
 
 

@@ -1,17 +1,19 @@
-"""Jobs that fail: what is refused, what breaks, and what is said of it."""
+"""Jobs that fail: refused objectives, failing handlers, an unusable ledger, and what is reported."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 import os
+import sqlite3
+from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 import pytest
 
 from mesh.agent import JobFailed, Phase
-from mesh.running import _cause
+from mesh.running import cause_of
 from mesh.work.database import LedgerUnusable
 from mesh.work.run import NOTE_TOPIC
 from schemas import Empty, String, cid_of_bytes
@@ -20,6 +22,8 @@ from tests.support.market import Place, offering, offering_unseen
 from tests.support.objectives import objective
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from mesh.agent import Agent
     from mesh.recording import Objective
     from mesh.work.job import Job
@@ -147,14 +151,27 @@ async def test_a_failure_that_was_meant_is_logged_without_a_traceback(
     with caplog.at_level(logging.WARNING, "mesh.work"):
         async with place.at_work(robot) as person:
             await (await person.demand(place.save(objective(("/go", Empty()))))).outcome()
-    (line,) = [record for record in caplog.records if "the battery is empty" in record.message]
-    assert not line.exc_info
+    (record,) = [record for record in caplog.records if vars(record).get("event") == "job-failed"]
+    assert vars(record)["facts"] == {"code": "job-failed"}
+    assert "the battery is empty" in record.getMessage()
+    assert not record.exc_info
+
+
+def refuse_changes_of_jobs(ledger: Path) -> None:
+    """Have every change of a job fail as on a full disk: its trigger needs a table that does not exist."""
+    with closing(sqlite3.connect(ledger)) as database:
+        database.execute("CREATE TRIGGER full_disk BEFORE UPDATE ON jobs BEGIN INSERT INTO room VALUES (1); END")
+
+
+def accept_changes_of_jobs(ledger: Path) -> None:
+    with closing(sqlite3.connect(ledger)) as database:
+        database.execute("DROP TRIGGER full_disk")
 
 
 async def test_a_ledger_that_can_not_be_written_ends_the_agent_and_fails_no_job(place: Place) -> None:
     """As on a full disk: when there is room again, the restarted agent goes on with the job."""
-    writable = [False]
     done: list[str] = []
+    ledgers: list[Path] = []
     before = await place.chains["person"].block_number()
 
     def robot() -> Agent:
@@ -162,8 +179,9 @@ async def test_a_ledger_that_can_not_be_written_ends_the_agent_and_fails_no_job(
 
         @made.on("/go")
         async def go(job: Job, message: Any) -> None:
-            if not writable[0]:
-                await made.parts.ledger._database.run("PRAGMA query_only = ON")
+            if not done:
+                ledgers.append(made.parts.directory / "ledger.sqlite")
+                refuse_changes_of_jobs(*ledgers)
             done.append(message.data)
 
         return made
@@ -176,8 +194,8 @@ async def test_a_ledger_that_can_not_be_written_ends_the_agent_and_fails_no_job(
 
         with pytest.raises(ExceptionGroup) as caught:
             await asyncio.wait_for(asked(robot()), 30)
-        assert isinstance(_cause(caught.value), LedgerUnusable), "one line, and no traceback"
-        writable[0] = True
+        assert isinstance(cause_of(caught.value), LedgerUnusable), "one line, and no traceback"
+        accept_changes_of_jobs(*ledgers)
         (made,) = await place.chains["person"].liabilities.list(promisee=place.address("person"), from_block=before)
         async with robot():
             assert (await asyncio.wait_for((await person.contract(made.address)).outcome(), 30)).success

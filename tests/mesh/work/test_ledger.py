@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.work import Ledger, Phase
-from mesh.work import ledger as ledger_module
 from mesh.work.outbox import outgoing
 from tests.mesh.work.ledgers import RESULT, ledger, path
 from tests.mesh.work.samples import liability, message
@@ -200,13 +199,13 @@ async def test_an_order_that_became_a_contract_is_kept_for_when_it_did_not(ledge
     assert await ledger.outbox(head=50) == [other], "and it has its deadline as before"
 
 
-async def test_only_the_latest_orders_are_kept(ledger: Ledger, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ledger_module, "SPENT_KEPT", 2)
+async def test_only_the_latest_spent_orders_are_kept(path: Path) -> None:
     orders = [outgoing(demand()) for _ in range(4)]
-    for number, order in enumerate(orders):
-        await ledger.post(order)
-        await ledger.spend(order.identity, f"0x{number}")
-    assert [await ledger.unspend(f"0x{number}") for number in range(4)] == [False, False, True, True]
+    async with Ledger(path, spent_kept=2) as ledger:
+        for number, order in enumerate(orders):
+            await ledger.post(order)
+            await ledger.spend(order.identity, f"0x{number}")
+        assert [await ledger.unspend(f"0x{number}") for number in range(4)] == [False, False, True, True]
 
 
 async def test_what_is_not_in_the_outbox_is_not_spent(ledger: Ledger) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from mesh.errors import ClosedError, ConfigurationError
 from mesh.work import Ledger, Phase
-from mesh.work.database import VERSION, LedgerUnusable
+from mesh.work.database import VERSION, LedgerTooNew, LedgerUnusable
 from tests.mesh.work.ledgers import RESULT, ledger, mark_as_version, path
 from tests.mesh.work.samples import liability, message
 from tests.support.disks import file_size_limit
@@ -79,8 +79,9 @@ async def test_a_ledger_of_a_newer_version_is_refused_and_not_touched(path: Path
         pass
     mark_as_version(path, VERSION + 1)
     error = await refused(path)
-    assert "was written by a newer version (format 2, this one knows 1)" in str(error)
-    assert error.hint == "upgrade aira-mesh"
+    assert isinstance(error, LedgerTooNew)
+    assert (error.code, error.found, error.known) == ("ledger-too-new", VERSION + 1, VERSION)
+    assert error.hint
     assert version_of(path) == VERSION + 1
 
 
@@ -110,16 +111,23 @@ def no_file(path: Path) -> Path:
 
 async def test_a_file_that_is_no_database_is_one_clear_line(no_database: Path) -> None:
     error = await refused(no_database)
-    assert str(error) == f"can't use the ledger {no_database}: file is not a database"
+    assert isinstance(error, LedgerUnusable)
+    assert (error.code, error.path, error.why) == ("ledger-unusable", no_database, "file is not a database")
+    assert str(no_database) in str(error)
     assert error.hint
 
 
 async def test_a_folder_in_the_files_place_is_one_clear_line(no_file: Path) -> None:
-    assert str(await refused(no_file)) == f"can't use the ledger {no_file}: unable to open database file"
+    error = await refused(no_file)
+    assert isinstance(error, LedgerUnusable)
+    assert (error.code, error.path, error.why) == ("ledger-unusable", no_file, "unable to open database file")
 
 
 async def test_a_folder_that_can_not_be_made_is_one_clear_line(no_database: Path) -> None:
-    assert str(no_database) in str(await refused(no_database / "ledger.sqlite"))
+    error = await refused(no_database / "ledger.sqlite")
+    assert isinstance(error, LedgerUnusable)
+    assert (error.code, error.path) == ("ledger-unusable", no_database / "ledger.sqlite")
+    assert str(no_database) in str(error)
 
 
 async def test_a_closed_ledger_says_so(path: Path) -> None:

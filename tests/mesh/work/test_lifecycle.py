@@ -32,7 +32,7 @@ def test_the_chain_can_end_a_job_in_any_phase(phase: Phase) -> None:
 def test_no_job_goes_back_or_skips_its_objective(phase: Phase, to: Phase) -> None:
     with pytest.raises(WrongPhase) as caught:
         advance(LIABILITY, phase, to)
-    assert (caught.value.phase, caught.value.liability) == (phase, LIABILITY)
+    assert (caught.value.code, caught.value.phase, caught.value.liability) == ("wrong-phase", phase, LIABILITY)
 
 
 def test_every_phase_has_its_next_ones_and_only_the_last_has_none() -> None:
@@ -42,4 +42,6 @@ def test_every_phase_has_its_next_ones_and_only_the_last_has_none() -> None:
 
 def test_a_job_of_somebody_else_has_no_phase() -> None:
     error = WrongPhase(LIABILITY, asked="start", phase=None)
-    assert str(error) == f"can't start {LIABILITY}: it is not a job of this agent"
+    assert (error.code, error.liability, error.asked, error.phase) == ("wrong-phase", LIABILITY, "start", None)
+    assert LIABILITY in str(error)
+    assert "None" not in str(error)

@@ -141,8 +141,8 @@ async def check_sending_on_return(router: EmbeddedRouter, post: Post) -> None:
         await until(lambda: not post.network.connected)
         await post.outbox.post(ours)
         await asyncio.to_thread(router.start)
-        assert router._session is not None
-        router._session.declare_subscriber("aira/**", lambda sample: arrived.append(sample.payload.to_bytes()))
+        assert router.session is not None
+        router.session.declare_subscriber("aira/**", lambda sample: arrived.append(sample.payload.to_bytes()))
         await until(lambda: post.network.connected)
         with suppress(AssertionError):
             await until(lambda: encode(ours) in arrived, seconds=2)
