@@ -68,7 +68,7 @@ async def serve(settings: Settings) -> None:
         words = f"provider {provider.address} serves {lighthouse}, Zenoh id {network.id}"
         announce(log, "provider-started", words, provider=provider.address, zenoh=network.id)
         tasks = await stack.enter_async_context(Background())
-        tasks.start(_report(provider.earnings), "earnings")
+        tasks.start(report_earnings(provider.earnings), "earnings")
         await provider.run()
 
 
@@ -93,12 +93,12 @@ async def _open_provider(
                 yield network, provider
 
 
-async def _report(earnings: Callable[[], Earnings]) -> None:
-    """Log earnings and costs at intervals, if they have changed, and at the end."""
+async def report_earnings(earnings: Callable[[], Earnings], *, interval: float = REPORT_INTERVAL) -> None:
+    """Log earnings and costs at intervals (seconds), if they have changed, and at the end."""
     reported = None
     try:
         while True:
-            await asyncio.sleep(REPORT_INTERVAL)
+            await asyncio.sleep(interval)
             if (now := earnings()) != reported:
                 _log_earnings(now)
                 reported = now

@@ -15,9 +15,19 @@ from tests.support.waiting import until_heard
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    import zenoh
+
     from tests.support.routers import EmbeddedRouter
 
 SOON = 0.02
+
+
+class OpenChannel(Channel):
+    """A channel whose session is public, so that a test can see who listens."""
+
+    def __init__(self, session: zenoh.Session, lighthouse: str, *, address: str) -> None:
+        super().__init__(session, lighthouse, address=address)
+        self.session = session
 
 
 @pytest.fixture
@@ -27,15 +37,15 @@ def settings(router: EmbeddedRouter) -> Settings:
 
 
 @pytest.fixture
-async def channel(router: EmbeddedRouter) -> AsyncIterator[Channel]:
+async def channel(router: EmbeddedRouter) -> AsyncIterator[OpenChannel]:
     """The market's channel, of somebody else."""
     async with (
         Network(Endpoints(connect=(router.endpoint,))) as network,
-        Channel(network.session, MARKET, address=LIGHTHOUSE) as channel,
+        OpenChannel(network.session, MARKET, address=LIGHTHOUSE) as channel,
     ):
         yield channel
 
 
-async def heard_on(channel: Channel, kind: str) -> None:
+async def heard_on(channel: OpenChannel, kind: str) -> None:
     """Wait until somebody listens to a kind of message."""
-    await until_heard(channel._session, f"aira/{MARKET}/{kind}/{MODEL}/x")
+    await until_heard(channel.session, f"aira/{MARKET}/{kind}/{MODEL}/x")

@@ -14,6 +14,7 @@ from mesh import Agent, Settings
 from mesh.chain import WrongPassword, write_keyfile
 from mesh.devchain import JsonRpcServer
 from mesh.errors import ConfigurationError
+from mesh.work.job import DuplicateHandler
 from schemas import Demand, Offer, Result, Verified, cid_of_bytes
 from tests.mesh.agent.agents import SOON, channel, heard_on, settings
 from tests.support.log_events import logged_facts
@@ -24,8 +25,8 @@ from tests.support.waiting import until, until_found
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from mesh.network import Channel
     from mesh.work.job import Job
+    from tests.mesh.agent.agents import OpenChannel
 from tests.support.market import Place
 
 __all__ = ["channel", "settings"]
@@ -33,7 +34,7 @@ __all__ = ["channel", "settings"]
 Order = Verified[Demand] | Verified[Offer]
 
 
-async def test_an_agent_without_account_hears_the_market(settings: Settings, channel: Channel) -> None:
+async def test_an_agent_without_account_hears_the_market(settings: Settings, channel: OpenChannel) -> None:
     agent = Agent(settings=settings)
     heard: list[object] = []
 
@@ -59,7 +60,7 @@ async def test_an_agent_without_account_hears_the_market(settings: Settings, cha
         assert sorted(map(repr, heard)) == sorted(map(repr, messages))
 
 
-async def test_an_agent_hears_the_orders_of_its_model_only(settings: Settings, channel: Channel) -> None:
+async def test_an_agent_hears_the_orders_of_its_model_only(settings: Settings, channel: OpenChannel) -> None:
     agent = Agent(MODEL, settings=settings)
     heard: list[Demand] = []
 
@@ -77,7 +78,7 @@ async def test_an_agent_hears_the_orders_of_its_model_only(settings: Settings, c
 
 
 async def test_all_handlers_of_a_kind_are_called_and_a_failing_one_stops_nothing(
-    settings: Settings, channel: Channel, caplog: pytest.LogCaptureFixture
+    settings: Settings, channel: OpenChannel, caplog: pytest.LogCaptureFixture
 ) -> None:
     agent = Agent(settings=settings)
     heard: list[Demand] = []
@@ -193,8 +194,9 @@ async def test_two_handlers_for_one_topic_are_refused() -> None:
         pass
 
     agent.on("/go")(handler)
-    with pytest.raises(ConfigurationError, match="two handlers for topic /go"):
+    with pytest.raises(DuplicateHandler) as caught:
         agent.on("/go")(handler)
+    assert (caught.value.code, caught.value.topic) == ("duplicate-handler", "/go")
 
 
 async def test_a_working_agent_shows_that_it_is_there(place: Place) -> None:

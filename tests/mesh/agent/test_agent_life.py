@@ -1,4 +1,4 @@
-"""An agent's beginning and end, and what it bears in between."""
+"""How an agent starts and ends, and which failures it survives."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import pytest
 from mesh import Agent, Settings
 from mesh.agent import Phase
 from mesh.errors import ClosedError, NetworkUnavailable
-from mesh.network import Channel, Endpoints, Network
-from tests.mesh.agent.agents import SOON, channel, heard_on, settings
+from mesh.network import Endpoints, Network
+from tests.mesh.agent.agents import SOON, OpenChannel, channel, heard_on, settings
 from tests.support.market import offering
 from tests.support.objectives import objective
 from tests.support.orders import LIGHTHOUSE, MARKET, demand
@@ -106,7 +106,7 @@ async def test_an_error_of_the_body_comes_out_as_it_is(settings: Settings) -> No
             raise ZeroDivisionError
 
 
-async def test_agents_of_one_loop_are_independent(settings: Settings, channel: Channel) -> None:
+async def test_agents_of_one_loop_are_independent(settings: Settings, channel: OpenChannel) -> None:
     heard: dict[str, list[Demand]] = {"one": [], "two": []}
     agents = [listening(Agent(settings=settings), heard[name]) for name in heard]
     async with agents[0]:
@@ -157,7 +157,7 @@ async def test_a_lost_router_does_not_end_an_agent(settings: Settings, router: E
         await asyncio.to_thread(router.start)
         async with (
             Network(Endpoints(connect=(router.endpoint,))) as network,
-            Channel(network.session, MARKET, address=LIGHTHOUSE) as channel,
+            OpenChannel(network.session, MARKET, address=LIGHTHOUSE) as channel,
         ):
             await heard_on(channel, "demand")
             channel.publish(demand())
@@ -166,6 +166,7 @@ async def test_a_lost_router_does_not_end_an_agent(settings: Settings, router: E
 
 async def test_a_missing_router_raises_with_its_endpoint() -> None:
     endpoint = free_endpoint()
-    with pytest.raises(NetworkUnavailable, match=endpoint):
+    with pytest.raises(NetworkUnavailable) as caught:
         async with Agent(settings=Settings(connect=(endpoint,), connect_timeout=0.1)):
             pass
+    assert (caught.value.code, caught.value.endpoints) == ("network-unavailable", (endpoint,))

@@ -93,8 +93,10 @@ async def test_a_file_that_can_not_be_kept_is_an_error(temporary: Path, tmp_path
     path.write_bytes(objective(("/blink", Empty())))
     taken = out / f"{cid_of_file(path)}.mcap"
     taken.mkdir(parents=True)
-    with pytest.raises(OutputNotWritable, match=str(taken)):
+    with pytest.raises(OutputNotWritable) as caught:
         await demo(Recorder(), objective=path, out=out).run()
+    assert caught.value.code == "output-not-writable"
+    assert str(taken) in str(caught.value)
 
 
 async def test_an_unfit_objective_ends_it_before_anything_is_opened(temporary: Path, tmp_path: Path) -> None:

@@ -6,6 +6,8 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING
 
+from msgspec.structs import asdict
+
 from mesh.cli import provider as command
 from mesh.market.earnings import Earnings, EarningsLedger
 from tests.mesh.operations.site import FEE, Site
@@ -51,7 +53,7 @@ async def test_logged_earnings_are_what_the_account_gained_and_spent(
         created=2, finalized=2, rejected={}, gas_used=gas, spent=spent, fees=2 * FEE, minted=gained - 2 * FEE
     )
     assert earned.minted > 2 * 200_000
-    assert logged(caplog) == [str(earned)]
+    assert reports(caplog) == [fields_of(earned)]
 
 
 async def gas_used(chain: Chain, start: int) -> int:
@@ -67,23 +69,28 @@ def finalized(caplog: pytest.LogCaptureFixture) -> int:
     return sum(record.facts["success"] == "True" for record in records)  # type: ignore[attr-defined]
 
 
-def logged(caplog: pytest.LogCaptureFixture) -> list[str]:
-    """The messages that the command has logged."""
-    return [record.getMessage() for record in caplog.records if record.name == command.__name__]
+def reports(caplog: pytest.LogCaptureFixture) -> list[dict[str, str]]:
+    """The fields of the reports that the command has logged; it logs nothing else here."""
+    records = [vars(record) for record in caplog.records if record.name == command.__name__]
+    assert all(record["event"] == "earnings-reported" for record in records)
+    return [record["facts"] for record in records]
 
 
-async def test_changed_earnings_are_logged_regularly(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setattr(command, "REPORT_INTERVAL", 0.01)
+def fields_of(earnings: Earnings) -> dict[str, str]:
+    """The fields of a report; `rejected` is the number of all rejections."""
+    fields = asdict(earnings) | {"rejected": sum(earnings.rejected.values())}
+    return {name: str(value) for name, value in fields.items()}
+
+
+async def test_changed_earnings_are_logged_regularly(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, command.__name__)
     ledger = EarningsLedger()
-    reporting = asyncio.create_task(command._report(ledger.earnings))
-    await until(lambda: len(logged(caplog)) == 1)
+    reporting = asyncio.create_task(command.report_earnings(ledger.earnings, interval=0.01))
+    await until(lambda: len(reports(caplog)) == 1)
     await asyncio.sleep(0.2)
-    assert len(logged(caplog)) == 1, "nothing has changed"
+    assert len(reports(caplog)) == 1, "nothing has changed"
     ledger.rejected("full")
-    await until(lambda: len(logged(caplog)) == 2)
+    await until(lambda: len(reports(caplog)) == 2)
     reporting.cancel()
     await asyncio.wait([reporting])
-    assert logged(caplog)[2:] == [str(ledger.earnings())]
+    assert reports(caplog)[2:] == [fields_of(ledger.earnings())]
