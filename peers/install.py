@@ -18,15 +18,15 @@ from peers.recipes import cache_folder
 from peers.running import InstallFailed, Runner
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from peers.recipes import Recipe
 
 
-def main() -> int:
+def main(recipes: Sequence[Recipe] = RECIPES) -> int:
     """Install what is missing, print the table, and return the exit code."""
     with _alone():
-        failures = {recipe.name: reason for recipe in RECIPES if (reason := _install(recipe))}
+        failures = {recipe.name: reason for recipe in recipes if (reason := _install(recipe))}
     missing = _print_table(failures)
     if os.environ.get("AIRA_REQUIRE_PEERS") == "1" and missing:
         print(f"\nAIRA_REQUIRE_PEERS=1, but missing: {', '.join(missing)}", file=sys.stderr)

@@ -168,34 +168,38 @@ class DebianRecipe:
     release: str
     packages: tuple[str, ...]
     environment: Mapping[str, str] = field(default_factory=lambda: {"DEBIAN_FRONTEND": "noninteractive"})
+    certificates: Path = CERTIFICATES
 
     @property
     def folder(self) -> Path:
         return cache_folder() / f"debian-{self.release}"
 
     def is_complete(self) -> bool:
-        return _is_marked(self.folder, self._made_from())
+        return _is_marked(self.folder, self.made_from())
 
     def install(self, run: Runner) -> None:
         if os.geteuid() != 0:
             raise InstallFailed("needs root, as debootstrap does")
-        made_from = self._made_from()
+        made_from = self.made_from()
         _make_empty(self.folder)
         root = self.folder / "root"
         run(
             ["debootstrap", "--variant=minbase", f"--include={','.join(self.packages)}", self.release, root],
             timeout=900,
         )
-        if CERTIFICATES.exists():
-            shutil.copy(CERTIFICATES, root / CERTIFICATES.relative_to("/"))
+        if self.certificates.exists():
+            shutil.copy(self.certificates, root / self.certificates.relative_to("/"))
         left_out = [f"--exclude=./{path}/*" for path in ("dev", "var/cache/apt", "var/lib/apt/lists")]
         run(["tar", "--numeric-owner", *left_out, "-C", root, "-cf", self.folder / "root.tar", "."], timeout=300)
         shutil.rmtree(root)
         _mark(self.folder, made_from)
 
-    def _made_from(self) -> str:
+    def made_from(self) -> str:
+        """The hash of the release, the packages and this machine's certificates."""
         words = " ".join((self.release, *self.packages)).encode()
-        return hashlib.sha256(words + (CERTIFICATES.read_bytes() if CERTIFICATES.exists() else b"")).hexdigest()
+        return hashlib.sha256(
+            words + (self.certificates.read_bytes() if self.certificates.exists() else b"")
+        ).hexdigest()
 
 
 def _fingerprint(files: list[Path]) -> str:

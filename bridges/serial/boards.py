@@ -59,14 +59,14 @@ class PinChange:
     at: float
 
 
-def simulator() -> Path:
+def simulator(header: Path = HEADER) -> Path:
     """The simulator's program, compiled if necessary. Raises `ConfigurationError` where libsimavr or gcc is missing."""
     source = SOURCE.read_bytes()
     program = _cache() / f"board-{hashlib.sha256(source).hexdigest()[:12]}"
     if program.exists():
         return program
     hint = "on Debian: apt-get install libsimavr-dev gcc; `make peers` does it"
-    if not HEADER.exists():
+    if not header.exists():
         raise ConfigurationError("libsimavr is not installed", hint=hint)
     program.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=program.parent) as folder:

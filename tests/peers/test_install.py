@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -8,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from peers import install, recipes, where
+from peers import install, where
 from peers.catalog import BASE, CHAIN, PEERS, ROUTER, PeerMissing, locate
-from peers.recipes import CargoRecipe, DebianRecipe
+from peers.recipes import CargoRecipe
 
 ROOT = Path(__file__).parents[2]
 
@@ -47,9 +48,8 @@ def test_installing_continues_when_a_recipe_fails_and_reports_it_at_the_end(cach
 def test_missing_peers_are_an_error_only_if_all_are_required(
     cache: Path, monkeypatch: pytest.MonkeyPatch, required: str, code: int
 ) -> None:
-    monkeypatch.setattr(install, "RECIPES", ())
     monkeypatch.setenv("AIRA_REQUIRE_PEERS", required)
-    assert install.main() == code
+    assert install.main(recipes=()) == code
 
 
 def test_a_partly_installed_folder_is_not_complete(cache: Path) -> None:
@@ -74,17 +74,15 @@ def test_another_version_of_a_crate_is_not_complete(cache: Path) -> None:
     assert not CargoRecipe(crate=ROUTER.crate, version="1.10.0").is_complete()
 
 
-def test_a_base_image_is_rebuilt_for_other_packages_or_certificates(
-    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_base_image_is_rebuilt_for_other_packages_or_certificates(cache: Path, tmp_path: Path) -> None:
     certificates = tmp_path / "certificates"
-    monkeypatch.setattr(recipes, "CERTIFICATES", certificates)
-    BASE.folder.mkdir(parents=True)
-    (BASE.folder / ".complete").write_text(BASE._made_from())
-    assert BASE.is_complete()
-    assert not DebianRecipe(name=BASE.name, release=BASE.release, packages=("python3",)).is_complete()
-    certificates.write_text("what this machine trusts since today")
-    assert not BASE.is_complete()
+    base = dataclasses.replace(BASE, certificates=certificates)
+    base.folder.mkdir(parents=True)
+    (base.folder / ".complete").write_text(base.made_from())
+    assert base.is_complete()
+    assert not dataclasses.replace(base, packages=("python3",)).is_complete()
+    certificates.write_text("another certificate authority")
+    assert not base.is_complete()
 
 
 def test_lock_files_name_no_registry() -> None:

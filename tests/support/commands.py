@@ -137,6 +137,11 @@ class Serving(Server):
         except AssertionError as late:
             raise AssertionError(f"{late}:\n{self.log()}") from None
 
+    def wait(self) -> int:
+        """Wait until the command ends by itself; its exit code."""
+        process, self._process = self._running(), None
+        return process.wait(SECONDS)
+
     def end(self, how: signal.Signals) -> tuple[int, float]:
         """Send a signal and wait for the end; its exit code, and the seconds that it took."""
         process, self._process = self._running(), None

@@ -41,7 +41,9 @@ class Server(ABC):
 
     name: str
 
-    def __init__(self) -> None:
+    def __init__(self, *, start_seconds: float = START_SECONDS, stop_seconds: float = STOP_SECONDS) -> None:
+        self.start_seconds = start_seconds
+        self.stop_seconds = stop_seconds
         self.folder = Path(tempfile.mkdtemp(prefix=f"aira-{self.name}-"))
         # A caller that uses `stop` instead of `close` leaves no folder either.
         self._remove_folder = weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
@@ -131,18 +133,18 @@ class Server(ABC):
         # A paused process takes no signal but SIGKILL until it goes on.
         process.send_signal(signal.SIGCONT)
         try:
-            process.wait(STOP_SECONDS)
+            process.wait(self.stop_seconds)
         except subprocess.TimeoutExpired:
             process.kill()
-            process.wait(STOP_SECONDS)
+            process.wait(self.stop_seconds)
 
     def _wait_until_ready(self, process: subprocess.Popen[bytes]) -> None:
-        deadline = time.monotonic() + START_SECONDS
+        deadline = time.monotonic() + self.start_seconds
         while not self.is_ready():
             if process.poll() is not None:
                 raise ServerFailed(self.name, f"ended with {process.returncode}", self._log_tail())
             if time.monotonic() > deadline:
-                raise ServerFailed(self.name, f"was not ready within {START_SECONDS:.0f} s", self._log_tail())
+                raise ServerFailed(self.name, f"was not ready within {self.start_seconds:g} s", self._log_tail())
             time.sleep(POLL_SECONDS)
 
     def _log_tail(self) -> str:

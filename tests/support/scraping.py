@@ -33,19 +33,19 @@ class Scrape:
 
     def __init__(self, text: str) -> None:
         self.families: dict[str, Metric] = {}
-        self._samples: dict[tuple[str, frozenset[tuple[str, str]]], float] = {}
+        self.samples: dict[tuple[str, frozenset[tuple[str, str]]], float] = {}
         for family in text_string_to_metric_families(text):
             assert family.name not in self.families, f"{family.name} is there twice"
             self.families[family.name] = family
             for sample in family.samples:
                 place = sample.name, frozenset(sample.labels.items())
-                assert place not in self._samples, f"{place} is there twice"
-                self._samples[place] = sample.value
+                assert place not in self.samples, f"{place} is there twice"
+                self.samples[place] = sample.value
 
     def __call__(self, name: str, **labels: str) -> float:
         """The value of the one sample of that name with these labels among its own; 0 if there is none."""
         wanted = labels.items()
-        found = [value for (known, given), value in self._samples.items() if known == name and wanted <= given]
+        found = [value for (known, given), value in self.samples.items() if known == name and wanted <= given]
         assert len(found) <= 1, f"{len(found)} samples of {name} with {labels}"
         return found[0] if found else 0.0
 
@@ -53,8 +53,8 @@ class Scrape:
         """What has changed since, as `name{label,…}`: counters of the mesh only, without their lighthouse."""
         counters = {name for name in self.names() if name.endswith("_total")}
         found: dict[str, float] = {}
-        for (name, labels), value in self._samples.items():
-            difference = value - before._samples.get((name, labels), 0.0)
+        for (name, labels), value in self.samples.items():
+            difference = value - before.samples.get((name, labels), 0.0)
             if difference and name in counters:
                 kinds = ",".join(text for label, text in sorted(labels) if label != "lighthouse")
                 found[f"{name}{{{kinds}}}" if kinds else name] = difference
@@ -62,11 +62,11 @@ class Scrape:
 
     def names(self) -> set[str]:
         """The names of the mesh's samples."""
-        return {name for name, _ in self._samples if not name.startswith(FOREIGN)}
+        return {name for name, _ in self.samples if not name.startswith(FOREIGN)}
 
     def of_label(self, name: str, label: str) -> set[str]:
         """The values that a label of a family has."""
-        return {dict(labels)[label] for known, labels in self._samples if known == name and label in dict(labels)}
+        return {dict(labels)[label] for known, labels in self.samples if known == name and label in dict(labels)}
 
 
 def get(url: str, path: str, *, method: str = "GET", headers: Mapping[str, str] | None = None) -> Page:

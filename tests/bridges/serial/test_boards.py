@@ -79,9 +79,8 @@ def test_without_the_simulators_library_the_hint_says_how_to_install_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("AIRA_PEERS_CACHE", str(tmp_path))
-    monkeypatch.setattr("bridges.serial.boards.HEADER", tmp_path / "sim_avr.h")
     with pytest.raises(ConfigurationError) as raised:
-        simulator()
+        simulator(header=tmp_path / "sim_avr.h")
     assert "libsimavr-dev" in raised.value.hint
 
 

@@ -270,6 +270,9 @@ class Typing:
     def type(self, text: str) -> None:
         os.write(self._terminal, text.encode())
 
+    def interrupt(self) -> None:
+        self._process.send_signal(signal.SIGINT)
+
     def end(self) -> int:
         self.until("the end of the terminal")
         os.close(self._terminal)
@@ -288,7 +291,7 @@ def test_a_typed_key_is_not_echoed(tmp_path: Path) -> None:
 def test_ctrl_c_at_the_prompt_ends_the_command(tmp_path: Path) -> None:
     typing = Typing(tmp_path)
     typing.until("private key: ")
-    typing._process.send_signal(signal.SIGINT)
+    typing.interrupt()
     assert typing.end() == 130
     assert "Traceback" not in typing.shown
     assert list(tmp_path.iterdir()) == []

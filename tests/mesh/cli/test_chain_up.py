@@ -98,7 +98,7 @@ def test_a_crash_of_anvil_is_logged_and_ends_the_command(tmp_path: Path) -> None
         wait_until(lambda: not is_running(server.pid), what="the end of the command")
         assert "signal 9 [node-ended]\n" in server.log()
         assert "Traceback" not in server.log()
-        assert server._running().wait(30) == 1
+        assert server.wait() == 1
 
 
 def is_running(pid: int) -> bool:

@@ -14,7 +14,7 @@ import pytest
 import zstandard
 
 from mesh.errors import ConfigurationError
-from mesh.state import ArchiveUnusable, ContentScope, back_up, examine_archive, restore, restoring
+from mesh.state import ArchiveUnusable, ContentScope, back_up, examine_archive, restore
 from mesh.state import archive as archives
 from tests.mesh.state.conftest import ADDRESS, CHAIN, Folder, forge, members, names_in, unpacked
 
@@ -111,7 +111,8 @@ async def test_a_file_larger_than_the_free_space_is_refused_at_its_header(
     def change(members: Members) -> None:
         members[1][0].size = 8**11 - 1
 
-    monkeypatch.setattr(restoring, "SPARE", shutil.disk_usage(tmp_path).free - (4 << 30))
+    usage = shutil.disk_usage(tmp_path)._replace(free=4 << 30)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _path: usage)
     assert "more space than the disk has" in await refused(forge(archive, tmp_path / "forged", change), tmp_path)
 
 

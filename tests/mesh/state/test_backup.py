@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
+import itertools
 import json
 import os
 import sqlite3
@@ -14,6 +16,7 @@ from mesh.content import Store
 from mesh.errors import ConfigurationError
 from mesh.state import ContentScope, NoState, StateChanging, back_up, examine_archive, take_inventory
 from mesh.state import backup as backup_module
+from mesh.state.inventory import read_ledger
 from mesh.work import Ledger, Phase
 from mesh.work.outbox import outgoing
 from schemas import cid_of_bytes
@@ -84,16 +87,15 @@ async def test_a_job_that_ends_during_the_backup_is_in_it_either_running_or_ende
 ) -> None:
     """Never running without its recording."""
     ended = asyncio.Event()
-    copied = backup_module._copied
 
-    async def copied_and_then_ended(ledger: Path, copy: Path) -> LedgerFacts:
-        facts = await copied(ledger, copy)
+    async def read_and_then_end(copy: Path) -> LedgerFacts:
+        facts = await read_ledger(copy)
         if not ended.is_set():
             ended.set()
             await end_the_job(folder)
         return facts
 
-    monkeypatch.setattr(backup_module, "_copied", copied_and_then_ended)
+    monkeypatch.setattr(backup_module, "read_ledger", read_and_then_end)
     await back_up(folder.path, tmp_path / "it", content=ContentScope.NEEDED)
 
     (tmp_path / "ledger").write_bytes(members(tmp_path / "it")[f"{ADDRESS}/{CHAIN}/ledger.sqlite"])
@@ -115,7 +117,13 @@ async def end_the_job(folder: Folder) -> None:
 async def test_jobs_that_keep_changing_are_an_error_and_leave_no_file(
     folder: Folder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(backup_module, "_still_running", lambda *_: False)
+    reads = itertools.count()
+
+    async def read_without_jobs_every_second_time(copy: Path) -> LedgerFacts:
+        facts = await read_ledger(copy)
+        return dataclasses.replace(facts, jobs={}) if next(reads) % 2 else facts
+
+    monkeypatch.setattr(backup_module, "read_ledger", read_without_jobs_every_second_time)
     with pytest.raises(StateChanging):
         await back_up(folder.path, tmp_path / "it", content=ContentScope.NEEDED)
     assert names_in(tmp_path) == ["data"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import fcntl
 import hashlib
 import json
@@ -11,6 +12,7 @@ import sqlite3
 import subprocess
 import sys
 from contextlib import closing, contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -26,7 +28,6 @@ from mesh.state import (
     StateInUse,
     back_up,
     restore,
-    restoring,
 )
 from mesh.work import Ledger, Phase
 from mesh.work.database import VERSION, LedgerUnusable
@@ -37,7 +38,6 @@ from tests.support.disks import file_size_limit
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
 AGENT = """
 import sqlite3, sys, time
@@ -158,15 +158,16 @@ async def test_a_locked_pending_transaction_is_in_use(archive: Path, folder: Fol
 async def test_no_agent_can_open_a_state_while_it_is_replaced(
     archive: Path, folder: Folder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    exchange = restoring._exchange
+    rename = Path.rename
     refused: list[str] = []
 
-    def tried(*arguments: Path) -> Path | None:
-        done = subprocess.run([sys.executable, "-c", AGENT, str(folder.ledger)], capture_output=True, text=True)
-        refused.append(done.stderr)
-        return exchange(*arguments)  # type: ignore[arg-type]
+    def open_ledger_and_rename(source: Path, target: Path) -> Path:
+        if not refused:
+            done = subprocess.run([sys.executable, "-c", AGENT, str(folder.ledger)], capture_output=True, text=True)
+            refused.append(done.stderr)
+        return rename(source, target)
 
-    monkeypatch.setattr(restoring, "_exchange", tried)
+    monkeypatch.setattr(Path, "rename", open_ledger_and_rename)
     await restore(archive, folder.path, existing=ExistingState.SET_ASIDE)
     assert "database is locked" in refused[0]
 
@@ -174,17 +175,20 @@ async def test_no_agent_can_open_a_state_while_it_is_replaced(
 async def test_if_one_part_can_not_be_moved_nothing_changes(
     archive: Path, folder: Folder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    before, move, moves = folder.contents(), restoring._move, []
+    before, rename = folder.contents(), Path.rename
+    targets: list[Path] = []
 
-    def refuse_the_last(source: Path, target: Path, moved: list[tuple[Path, Path]]) -> None:
-        moves.append(target)
-        if len(moves) == 4:
-            raise ConfigurationError("the disk is gone")
-        move(source, target, moved)
+    def refuse_the_last(source: Path, target: Path) -> Path:
+        targets.append(target)
+        if len(targets) == 4:
+            raise OSError(errno.EIO, "the disk is gone")
+        return rename(source, target)
 
-    monkeypatch.setattr(restoring, "_move", refuse_the_last)
-    with pytest.raises(ConfigurationError, match="the disk is gone"):
+    monkeypatch.setattr(Path, "rename", refuse_the_last)
+    with pytest.raises(ConfigurationError) as caught:
         await restore(archive, folder.path, existing=ExistingState.SET_ASIDE)
+    assert str(targets[3]) in str(caught.value)
+    assert "the disk is gone" in str(caught.value)
     assert folder.contents() == before
 
 

@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from mesh.agent import JobFailed
+from mesh.agent import Agent, JobFailed
 from mesh.background import Background
 from mesh.chain import NodeUnreachable
 from mesh.chain import metrics as chain_metrics
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
     import pytest
 
-    from mesh.agent import Agent
     from tests.support.market import Place
     from tests.support.routers import EmbeddedRouter
 
@@ -216,8 +215,7 @@ async def _is(url: str, expected: tuple[int, dict[str, str]]) -> bool:
 
 
 async def test_an_agent_without_an_account_reports_what_it_receives(place: Place) -> None:
-    watcher = place.agent("person", metrics_listen=HERE)
-    watcher._account = None
+    watcher = Agent(MODEL, settings=place.settings("person", metrics_listen=HERE))
     heard: list[object] = []
 
     @watcher.on_offer
