@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from contextlib import AsyncExitStack
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import ClassVar, Self
 
 from mesh.errors import ClosedError
-
-if TYPE_CHECKING:
-    from types import TracebackType
 
 
 class Lifecycle(ABC):
@@ -30,9 +27,7 @@ class Lifecycle(ABC):
             self._stack = stack.pop_all()
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc_info: object) -> None:
         stack, self._stack = self._stack, None
         if stack is not None:
             await stack.aclose()

@@ -24,7 +24,6 @@ from schemas.status import ContentMetrics
 if TYPE_CHECKING:
     from collections.abc import Coroutine
     from pathlib import Path
-    from types import TracebackType
 
     from bridges.ipfs.daemon import Daemon
     from bridges.ipfs.transfers import ContentSources
@@ -100,9 +99,7 @@ class ContentBridge:
         )
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc_info: object) -> None:
         self._open = False
         if not self._session.is_closed():
             self._queryable.undeclare()

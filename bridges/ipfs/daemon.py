@@ -25,7 +25,6 @@ from mesh.errors import ClosedError
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterator
     from pathlib import Path
-    from types import TracebackType
 
 T = TypeVar("T")
 
@@ -106,9 +105,7 @@ class Daemon:
         self._http = aiohttp.ClientSession(headers=self._headers)
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc_info: object) -> None:
         http, self._http = self._http, None
         if http is not None:
             await http.close()

@@ -18,7 +18,6 @@ from mesh.errors import ConfigurationError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
-    from types import TracebackType
 
 DEDUPLICATION_WINDOW: Final = 600.0
 """Seconds for which a message that is on both sides is not relayed again. After that a repeated message is relayed: its
@@ -95,9 +94,7 @@ class RelayJournal:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc_info: object) -> None:
         self._database.close()
         os.close(self._lock)
 

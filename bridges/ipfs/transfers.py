@@ -22,7 +22,6 @@ from schemas.unixfs import MAX_BLOCK_SIZE
 
 if TYPE_CHECKING:
     from pathlib import Path
-    from types import TracebackType
 
     from bridges.ipfs.daemon import Daemon
     from mesh.content import Assembly, BlockRef, Store
@@ -57,9 +56,7 @@ class Gateway:
         self._http = aiohttp.ClientSession()
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc_info: object) -> None:
         http, self._http = self._http, None
         if http is not None:
             await http.close()

@@ -20,7 +20,6 @@ from mesh.errors import ConfigurationError, InputError, RemoteError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from types import TracebackType
 
 SOURCE: Final = Path(__file__).parent / "board" / "board.c"
 HEADER: Final = Path("/usr/include/simavr/sim_avr.h")
@@ -135,9 +134,7 @@ class SimulatedBoard:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc_info: object) -> None:
         process, self._process = self._process, None
         if process is not None:
             process.terminate()

@@ -23,7 +23,6 @@ from mesh.errors import ClosedError
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Awaitable, Callable, Iterable
     from pathlib import Path
-    from types import TracebackType
     from typing import Self
 
     from mesh.chain.accounts import Account
@@ -93,9 +92,7 @@ class Chain:
             self._stack = stack.pop_all()
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc_info: object) -> None:
         self._contracts = None
         await self._stack.aclose()
 

@@ -17,7 +17,6 @@ from schemas.cid import parse_cid
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
-    from types import TracebackType
 
     from mesh.content.files import TemporaryFile
     from mesh.content.index import BlockSpan
@@ -70,9 +69,7 @@ class StoreDirectory:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc_info: object) -> None:
         self.close()
 
     def close(self) -> None:

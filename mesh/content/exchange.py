@@ -21,7 +21,6 @@ from schemas.keys import CidKey, parse_key
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
-    from types import TracebackType
 
     from mesh.content.files import Progress
     from mesh.content.store import Store
@@ -81,9 +80,7 @@ class Exchange:
         await asyncio.to_thread(self._server.start)
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc_info: object) -> None:
         running = dict(self._running)
         for download in running:
             download.stop()

@@ -14,7 +14,6 @@ from mesh.content.errors import StoreFull
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
-    from types import TracebackType
 
 Progress: TypeAlias = "Callable[[int, int | None], None]"
 """Is called with how far a long operation is: bytes done, and bytes in all or None if that is not known."""
@@ -74,9 +73,7 @@ class TemporaryFile:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc_info: object) -> None:
         if self._delete_on_exit:
             with suppress(FileNotFoundError):
                 self.path.unlink()

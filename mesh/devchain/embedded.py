@@ -16,7 +16,6 @@ from mesh.errors import ClosedError, ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
-    from types import TracebackType
     from typing import Self
 
     from web3.types import RPCEndpoint, RPCResponse
@@ -56,9 +55,7 @@ class EmbeddedChain:
             self._clock = asyncio.create_task(self._mine_by_time(self._block_time), name="aira-embedded-chain-clock")
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc_info: object) -> None:
         if self._clock is not None:
             self._clock.cancel()
             with suppress(asyncio.CancelledError):

@@ -18,7 +18,6 @@ from mesh.log_context import log_event
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable
-    from types import TracebackType
     from typing import Self
 
     from web3.providers.async_base import AsyncBaseProvider
@@ -95,9 +94,7 @@ class JsonRpcServer:
         self._port = self._runner.addresses[0][1]
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc_info: object) -> None:
         if self._runner is not None:
             await self._runner.cleanup()
             self._runner = None

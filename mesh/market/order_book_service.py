@@ -13,7 +13,6 @@ from schemas import encode, lighthouse_selector
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
-    from types import TracebackType
 
     from mesh.market.book import Order, OrderBook
     from schemas import Verified
@@ -59,9 +58,7 @@ class OrderBookService:
         )
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc_info: object) -> None:
         self._open = False
         if not self._session.is_closed():
             self._queryable.undeclare()

@@ -30,7 +30,6 @@ from schemas.keys import PresenceKey, parse_key
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from types import TracebackType
 
     from mesh.network.subscription import Resolver
 
@@ -70,9 +69,7 @@ class Channel:
         self._open = True
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc_info: object) -> None:
         self._open = False
         declarations, self._declarations = self._declarations, []
         if not self._session.is_closed():

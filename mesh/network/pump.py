@@ -23,7 +23,6 @@ from mesh.log_context import log_event
 if TYPE_CHECKING:
     from collections.abc import Callable
     from contextvars import Context
-    from types import TracebackType
 
 log = logging.getLogger(__name__)
 
@@ -107,9 +106,7 @@ class Pump(Generic[T]):
         self._thread.start()
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc_info: object) -> None:
         self._stopping = True
         self._ready.set()
         await asyncio.to_thread(self._end)

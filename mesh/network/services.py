@@ -23,7 +23,6 @@ from schemas.rpc import SERVICES, SPENDING
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
-    from types import TracebackType
 
     from schemas.rpc import Service
 
@@ -77,9 +76,7 @@ class Services:
         self._open = True
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc_info: object) -> None:
         self._open = False
         queryables, self._queryables = self._queryables, []
         if not self._session.is_closed():

@@ -21,7 +21,6 @@ from mesh.network.pump import call_in_loop
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
-    from types import TracebackType
 
     from mesh.network.endpoints import Endpoints
 
@@ -89,9 +88,7 @@ class Network:
         self._session = session
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc_info: object) -> None:
         session, self._session = self._session, None
         self._linked.clear()
         if session is not None:

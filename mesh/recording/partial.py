@@ -27,7 +27,6 @@ from schemas.payloads import EMPTY, PayloadType
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
     from pathlib import Path
-    from types import TracebackType
 
     from mesh.content import Progress
     from mesh.recording.mcap_writer import WriterChannel
@@ -100,9 +99,7 @@ class PartialFile:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc_info: object) -> None:
         self._stream.close()
 
     def begin(self, about: Mapping[str, str]) -> None:

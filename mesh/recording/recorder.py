@@ -21,7 +21,6 @@ from mesh.recording.partial import PartialFile, PendingMessage
 
 if TYPE_CHECKING:
     from pathlib import Path
-    from types import TracebackType
 
     from mesh.recording.partial import MessageRole
     from schemas.payloads import PayloadType
@@ -127,9 +126,7 @@ class Recorder:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc_info: object) -> None:
         self.close()
 
     @property

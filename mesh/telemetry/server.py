@@ -25,7 +25,6 @@ from mesh.telemetry.metrics import merged
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
-    from types import TracebackType
 
     from prometheus_client.core import Metric
 
@@ -137,9 +136,7 @@ class TelemetryServer:
         )
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc_info: object) -> None:
         if self._http is not None:
             self._http.shutdown()
             self._http.server_close()

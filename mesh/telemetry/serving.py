@@ -12,7 +12,6 @@ from mesh.telemetry.health import STARTING, Health, health_metrics, listen_addre
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator, Mapping
-    from types import TracebackType
     from typing import Any
 
     from mesh.telemetry.metrics import MetricFamily
@@ -83,9 +82,7 @@ class Telemetry:
             self._server = self._stack.enter_context(server)
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc_info: object) -> None:
         if self._server is not None:
             self._server = None
             await asyncio.to_thread(self._stack.close)

@@ -18,7 +18,6 @@ from schemas import Liability
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
-    from types import TracebackType
 
 POST: Final = "INSERT OR IGNORE INTO outbox (identity, kind, payload, deadline, posted) VALUES (?, ?, ?, ?, ?)"
 SPENT_KEPT: Final = 4096
@@ -64,9 +63,7 @@ class Ledger:
         await self._database.open()
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc_info: object) -> None:
         await self._database.close()
 
     async def add_job(self, liability: Liability) -> bool:
