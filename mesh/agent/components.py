@@ -35,12 +35,12 @@ class ChainHead:
 
     def __init__(self, head: int) -> None:
         self._advanced = asyncio.Event()
-        self.pass_to(head)
+        self.advance_to(head)
 
-    def pass_to(self, block: int) -> None:
+    def advance_to(self, block: int) -> None:
         """All of `block` has been handled."""
         self.head = block
-        self.passed_at = time.monotonic()
+        self.advanced_at = time.monotonic()
         self._advanced.set()
         self._advanced = asyncio.Event()
 
@@ -64,7 +64,7 @@ class AgentComponents:
     store: Store
     exchange: Exchange
     services: Services
-    clock: ChainHead
+    chain_head: ChainHead
     outages: OutageLog
     """Outages of the node, for everything that waits for it."""
     directory: Path
@@ -99,10 +99,10 @@ async def working(
             chain = await stack.enter_async_context(chain_of(settings, account))
         home = settings.state_directory / account.address
         directory = home / await _chain_folder(chain)
-        clock = ChainHead(await chain.block_number())
+        chain_head = ChainHead(await chain.block_number())
         network = await stack.enter_async_context(Network(endpoints_of(settings)))
         channel = await stack.enter_async_context(
-            await _channel_of(settings.lighthouse_contract, network, chain=chain, clock=clock)
+            await _channel_of(settings.lighthouse_contract, network, chain=chain, head=chain_head)
         )
         ledger = await stack.enter_async_context(Ledger(directory / "ledger.sqlite"))
         store = await asyncio.to_thread(
@@ -116,11 +116,11 @@ async def working(
             channel=channel,
             signer=account.signer,
             ledger=ledger,
-            outbox=Outbox(ledger, channel, network, head=lambda: clock.head, policy=resend),
+            outbox=Outbox(ledger, channel, network, head=lambda: chain_head.head, policy=resend),
             store=store,
             exchange=await stack.enter_async_context(Exchange(network.session, store)),
             services=await stack.enter_async_context(Services(network.session, account.address)),
-            clock=clock,
+            chain_head=chain_head,
             outages=OutageLog(log, "chain"),
             directory=directory,
         )
@@ -128,10 +128,10 @@ async def working(
         yield parts
 
 
-async def _channel_of(lighthouse: str, network: Network, *, chain: Chain, clock: ChainHead) -> Channel:
+async def _channel_of(lighthouse: str, network: Network, *, chain: Chain, head: ChainHead) -> Channel:
     """The channel of a lighthouse, not yet open, which resolves names and knows the head by the chain."""
     address = await chain.names.address(lighthouse)
-    return Channel(network.session, lighthouse, address=address, resolver=chain.names.address, head=lambda: clock.head)
+    return Channel(network.session, lighthouse, address=address, resolver=chain.names.address, head=lambda: head.head)
 
 
 async def _chain_folder(chain: Chain) -> str:

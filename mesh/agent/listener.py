@@ -159,7 +159,7 @@ class ChainListener:
         await self._trader.matched(liability, demand_hash=demand_hash, offer_hash=offer_hash)
         if liability.promisor != self._account or not self._parts.settings.enable_executor:
             return
-        await self._executor.opened()
+        await self._executor.wait_until_open()
         if liability.is_finalized or not await self._ledger.add_job(liability):
             return
         job = await self._ledger.job(liability.address)
@@ -217,7 +217,7 @@ class ChainListener:
 
     async def new_head(self, block: int) -> None:
         """All of `block` has been handled. After a reorganisation it may be lower than before."""
-        self._parts.clock.pass_to(block)
+        self._parts.chain_head.advance_to(block)
         self._trader.new_head(block)
         await self._parts.outbox.expire(block)
 

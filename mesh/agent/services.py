@@ -249,7 +249,7 @@ class MessageServices:
     def _check(self, message: SignedMessage) -> None:
         if isinstance(message, Result):
             return
-        channel, head = self._parts.channel, self._parts.clock.head
+        channel, head = self._parts.channel, self._parts.chain_head.head
         if message.lighthouse != channel.address:
             raise InputError(
                 f"this agent trades on {channel.address} ({channel.lighthouse}), the order is for {message.lighthouse}",

@@ -62,7 +62,7 @@ class AgentStatus:
             zenoh_id=parts.network.id,
             lighthouse=parts.channel.lighthouse,
             parts=self.health(),
-            head=parts.clock.head,
+            head=parts.chain_head.head,
             chain_id=parts.chain.chain_id,
             xrt=parts.chain.xrt,
             uptime=round(time.monotonic() - self._started, 3),
@@ -96,7 +96,7 @@ class AgentStatus:
             *await self._outbox(),
             *self._recording(),
             *await self._content(),
-            *reading_families(head=self._parts.clock.head, read_at=self._parts.clock.passed_at),
+            *reading_families(head=self._parts.chain_head.head, read_at=self._parts.chain_head.advanced_at),
         )
         own = labelled(families, lighthouse=self._parts.channel.lighthouse)
         return (*own, *network_families(self._parts.network), *await self._chain.measure())

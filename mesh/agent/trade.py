@@ -287,7 +287,7 @@ class Trader(Lifecycle):
         if order is None:
             return
         is_overtaken = order.nonce is not None and order.nonce < await self._chain.liabilities.next_nonce(self._address)
-        await self._parts.clock.reached(await self._chain.block_number())
+        await self._parts.chain_head.reached(await self._chain.block_number())
         if identity in self._orders:
             _fail(order.created, _Overtaken() if is_overtaken else OrderRejected(rejection))
 

@@ -93,6 +93,16 @@ class Provider(Role):
         self._demands = await stack.enter_async_context(self.channel.subscribe(Demand))
         self._offers = await stack.enter_async_context(self.channel.subscribe(Offer))
         self.results = await stack.enter_async_context(self.channel.subscribe(Result))
+        self._wire(head)
+        await stack.enter_async_context(OrderBookService(self._session, self._lighthouse, self.book))
+        services = await stack.enter_async_context(Services(self._session, self.address))
+        with source_context(self._source):
+            services.offer("status", self._status.status)
+            services.offer("logs", LogService("provider", self.address).logs)
+        self.channel.announce("provider", self.address)
+
+    def _wire(self, head: int) -> None:
+        """Connect book, queue, channel and chain, which has been read up to block `head`."""
         self.settlement = Settlement(
             self._chain,
             self.channel,
@@ -114,12 +124,6 @@ class Provider(Role):
             settlement=self.settlement,
             earnings=self.ledger,
         )
-        await stack.enter_async_context(OrderBookService(self._session, self._lighthouse, self.book))
-        services = await stack.enter_async_context(Services(self._session, self.address))
-        with source_context(self._source):
-            services.offer("status", self._status.status)
-            services.offer("logs", LogService("provider", self.address).logs)
-        self.channel.announce("provider", self.address)
 
     async def _work(self) -> None:
         with source_context(self._source):

@@ -62,12 +62,12 @@ class Executor:
         self._outbox = outbox
         self._store = store
         self._signer = signer
-        self._source = objectives
+        self._objectives = objectives
         self._playbacks = playbacks
         self._handlers = handlers
         self._on_phase = on_phase
         self._preparing: dict[str, asyncio.Task[None]] = {}
-        self._objectives: dict[str, Objective] = {}
+        self._fetched: dict[str, Objective] = {}
         self._ready: asyncio.Queue[str] = asyncio.Queue()
         self._tasks: asyncio.TaskGroup | None = None
         self._opened = asyncio.Event()
@@ -92,14 +92,16 @@ class Executor:
         """Whether `run` serves."""
         return self._tasks is not None
 
-    async def opened(self) -> None:
+    async def wait_until_open(self) -> None:
         """Return when `run` has taken up the jobs of the ledger."""
         await self._opened.wait()
 
     def prepare(self, liability: Liability) -> None:
         """Fetch and check a job's objective in a task. Then the job is ready, or complete without success."""
         address = liability.address
-        task = self._preparing[address] = self._running().create_task(self._fetch(liability), name=f"prepare {address}")
+        task = self._preparing[address] = self._task_group().create_task(
+            self._fetch(liability), name=f"prepare {address}"
+        )
         task.add_done_callback(partial(self._drop_task, address))
 
     @asynccontextmanager
@@ -112,20 +114,21 @@ class Executor:
             job = await self._ledger.job(address)
             if job is not None:
                 await self._playbacks.suspend(address)
-                self._objectives.pop(address, None)
+                self._fetched.pop(address, None)
             yield job
             if job is not None:
                 await self._release(address)
 
     async def owe_result(self, address: str, *, success: bool, result: str, note: str) -> None:
         """Complete a job in the ledger, together with its signed Result, which is sent until the chain has it."""
+        await asyncio.to_thread(self._store.pin, result, address)  # released if a reorganisation reverted the job
         signed = self._signer.sign(Result(liability=address, result=result, success=success))
         await self._ledger.complete(address, success=success, result=result, note=note, outgoing=outgoing(signed))
 
     @with_liability_context
     async def start(self, address: str) -> None:
         """Play the objective of a ready job. Returns when the playback has begun. Raises `WrongPhase`."""
-        await self._prepared(address)
+        await self._wait_until_prepared(address)
         async with self._changing:
             job = await self._startable(address, asked="start")
             if job.phase is not Phase.READY:
@@ -135,7 +138,7 @@ class Executor:
     @with_liability_context
     async def restart(self, address: str) -> None:
         """Play the objective of a running or ready job from its first message, with a new recording."""
-        await self._prepared(address)
+        await self._wait_until_prepared(address)
         async with self._changing:
             job = await self._startable(address, asked="restart")
             await self._playbacks.suspend(address)
@@ -147,7 +150,7 @@ class Executor:
     @with_liability_context
     async def resume(self, address: str) -> None:
         """Continue an interrupted job at the position in the ledger, and its recording."""
-        await self._prepared(address)
+        await self._wait_until_prepared(address)
         async with self._changing:
             job = await self._startable(address, asked="resume")
             if self._playbacks.run(address) is not None:
@@ -176,7 +179,7 @@ class Executor:
             cid = await asyncio.to_thread(self._store.put_file, summary.path, pin=address)
             await self.owe_result(address, success=success, result=cid, note=note)
             await asyncio.to_thread(summary.path.unlink, missing_ok=True)
-            self._objectives.pop(address, None)
+            self._fetched.pop(address, None)
         facts = log_event("job-finished", success=success, result=cid, messages=summary.messages)
         log.info("complete, success %s, result %s, %d messages", success, cid, summary.messages, extra=facts)
         await self._on_phase(Phase.COMPLETE, replace(job.liability, result=cid, is_success=success))
@@ -189,7 +192,7 @@ class Executor:
         address = liability.address
         try:
             await asyncio.to_thread(self._store.pin, liability.objective, address)
-            objective = await self._source.examine(liability.objective)
+            objective = await self._objectives.examine(liability.objective)
         except (ContentError, InputError) as error:
             log.warning("the objective is refused: %s", error, extra=log_event("objective-refused", code=error.code))
             await self._unless_ended(self.finish(address, success=False, note=str(error)))
@@ -200,7 +203,7 @@ class Executor:
                 return
             if job.phase is Phase.INCOMING:
                 await self._ledger.set_phase(address, Phase.READY)
-            self._objectives[address] = objective
+            self._fetched[address] = objective
         if job.phase is Phase.INCOMING:
             log.info("ready, %d messages to play", objective.count, extra=log_event("job-ready", count=objective.count))
             await self._on_phase(Phase.READY, liability)
@@ -225,17 +228,19 @@ class Executor:
             return self._playbacks.task(address)
 
     async def _begin(self, job: JobRecord, position: int) -> None:
-        liability, objective = job.liability, self._objectives[job.liability.address]
+        liability, objective = job.liability, self._fetched[job.liability.address]
         facts = log_event("job-started", position=position, count=objective.count)
         log.info("running, from message %d of %d", position, objective.count, extra=facts)
-        await self._playbacks.begin(liability, objective, position=position, play=self._play, tasks=self._running())
+        await self._playbacks.begin(
+            liability, objective, position=position, play=self._run_job, tasks=self._task_group()
+        )
 
-    async def _play(self, run: JobRun) -> None:
+    async def _run_job(self, run: JobRun) -> None:
         """Play a run. With handlers, or when it fails, the job then finishes; else the run stays open."""
         address, success, note = run.liability.address, True, ""
         try:
             await self._on_phase(Phase.RUNNING, run.liability)
-            await self._playbacks.play(run, None if self._handlers is None else self._handlers.handle)
+            await self._playbacks.play_and_save(run, None if self._handlers is None else self._handlers.handle)
         except LedgerUnusable:  # not the job's fault: it is resumed when the ledger is usable
             raise
         except Exception as error:
@@ -267,22 +272,22 @@ class Executor:
 
     async def _startable(self, address: str, *, asked: str) -> JobRecord:
         job = await self._job(address, asked=asked)
-        if job.phase not in STARTABLE or address not in self._objectives:
+        if job.phase not in STARTABLE or address not in self._fetched:
             raise WrongPhase(address, asked=asked, phase=job.phase)
         return job
 
-    async def _prepared(self, address: str) -> None:
+    async def _wait_until_prepared(self, address: str) -> None:
         """Wait until the objective of a startable job is there: after a restart it is checked again first."""
-        await self.opened()
+        await self.wait_until_open()
         job, preparing = await self._ledger.job(address), self._preparing.get(address)
-        if job is not None and job.phase in STARTABLE and address not in self._objectives and preparing is not None:
+        if job is not None and job.phase in STARTABLE and address not in self._fetched and preparing is not None:
             await asyncio.wait([preparing])
 
     def _drop_task(self, address: str, task: asyncio.Task[None]) -> None:
         if self._preparing.get(address) is task:
             del self._preparing[address]
 
-    def _running(self) -> asyncio.TaskGroup:
+    def _task_group(self) -> asyncio.TaskGroup:
         if self._tasks is None:
             raise ClosedError("the executor is not running")
         return self._tasks

@@ -93,7 +93,7 @@ class Playbacks:
         task = self._tasks[address] = tasks.create_task(play(run), name=f"play {address}", context=context)
         task.add_done_callback(partial(self._drop_task, address))
 
-    async def play(self, run: JobRun, handle: Handle | None) -> None:
+    async def play_and_save(self, run: JobRun, handle: Handle | None) -> None:
         """Play a run to its end, and keep its position in the ledger. Raises what `handle` raises."""
         address, saved = run.liability.address, time.monotonic()
 

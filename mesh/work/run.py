@@ -93,7 +93,7 @@ class JobRun(Job):
         try:
             async with asyncio.TaskGroup() as tasks:
                 if not self._closing:
-                    self._player = tasks.create_task(self._play(), name=f"player {self.liability.address}")
+                    self._player = tasks.create_task(self._publish_messages(), name=f"player {self.liability.address}")
                 tasks.create_task(self._handle_all(handle, progress), name=f"handlers {self.liability.address}")
         except ExceptionGroup as group:
             failed = group.exceptions[0]
@@ -113,7 +113,7 @@ class JobRun(Job):
             self._recorder.record(NOTE_TOPIC, String(note).encode(), STRING, role="agent")
         return await asyncio.to_thread(self._recorder.close)
 
-    async def _play(self) -> None:
+    async def _publish_messages(self) -> None:
         assert self._objective is not None, "a run without an objective only records"
         async for step in play(self._objective, pace=self.pace, start_index=self.position):
             message = step.message

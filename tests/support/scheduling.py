@@ -10,20 +10,23 @@ if TYPE_CHECKING:
     from xdist.workermanage import WorkerController  # type: ignore[import-untyped]
 
 SECONDS: Final[dict[str, int]] = {
+    "tests/examples/test_blink.py": 120,
     "tests/mesh/cli/test_serving.py": 100,
     "tests/bridges/ipfs/test_resilience.py": 80,
+    "tests/mesh/operations/test_two_providers.py": 70,
     "tests/bridges/ipfs/test_channel.py": 55,
+    "tests/contracts/test_money.py": 50,
+    "tests/examples/test_air_pollution.py": 45,
     "tests/mesh/operations/test_unfit_at_the_start.py": 55,
     "tests/bridges/serial/test_firmware.py": 50,
     "tests/mesh/cli/test_chain_up.py": 50,
-    "tests/mesh/operations/test_two_providers.py": 45,
     "tests/mesh/cli/test_status.py": 35,
     "tests/mesh/cli/test_verify.py": 35,
     "tests/bridges/ipfs/test_content.py": 30,
     "tests/mesh/demo/test_demo.py": 30,
     "tests/bridges/ipfs/test_cli.py": 25,
     "tests/bridges/ipfs/test_jobs.py": 25,
-    "tests/mesh/chain/test_reorganisation.py": 25,
+    "tests/mesh/chain/test_following_reorganisations.py": 25,
 }
 """Roughly how long the longest files take on a busy machine. All others are short."""
 

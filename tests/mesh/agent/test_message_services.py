@@ -46,7 +46,7 @@ def terms(place: Place, agent: Agent, **changed: Any) -> dict[str, Any]:
         "cost": 0,
         "lighthouse": lighthouse,
         "validator": ZERO_ADDRESS,
-        "deadline": agent.parts.clock.head + 1000,
+        "deadline": agent.parts.chain_head.head + 1000,
     } | changed
 
 

@@ -47,7 +47,7 @@ async def heard(place: Place, agent: Agent) -> AsyncIterator[list[Any]]:
 async def until_handled(place: Place, agent: Agent) -> None:
     """Wait until the agent has handled all that is on the chain."""
     head = await place.chains["provider"].block_number()
-    await until(lambda: agent.parts.clock.head >= head, what=f"block {head}", seconds=30)
+    await until(lambda: agent.parts.chain_head.head >= head, what=f"block {head}", seconds=30)
 
 
 async def test_what_comes_goes_and_is_allowed_is_told_as_the_legacy_stack_did(place: Place) -> None:

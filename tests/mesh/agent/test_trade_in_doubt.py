@@ -26,7 +26,7 @@ async def test_a_demand_that_nobody_takes_expires_at_its_deadline(place: Place) 
         await posted(person)
         await place.node.mine(4)
         head = deadline - 1
-        await until(lambda: person.parts.clock.head >= head)
+        await until(lambda: person.parts.chain_head.head >= head)
         assert not demand.done()
         await place.node.mine(1)
         with pytest.raises(OrderExpired) as caught:
@@ -178,7 +178,7 @@ async def test_a_contract_that_is_created_again_does_not_fail_at_the_deadline(pl
             await until_found(lambda: all_posted(person, 0))
         await place.node.mine(60)
         head = await place.chains["person"].block_number()
-        await until(lambda: person.parts.clock.head >= head)
+        await until(lambda: person.parts.chain_head.head >= head)
         assert not outcome.done()
         outcome.cancel()
 
@@ -202,7 +202,7 @@ async def test_a_contract_on_our_terms_that_a_stranger_has_signed_leaves_our_dem
         assert (await chain.liabilities.order_hashes(made.liability))[0] == message_hash(ours)
 
         head = await chain.block_number()
-        await until(lambda: person.parts.clock.head >= head)
+        await until(lambda: person.parts.chain_head.head >= head)
         assert not demanding.done()
         assert await waiting(person) == ["demand"]
         demanding.cancel()

@@ -129,7 +129,7 @@ async def test_jobs_paid_since_the_backup_are_not_repeated_even_if_the_chain_is_
     monkeypatch.setattr(ChainListener, "run", never)
     async with robot.life() as life:
         await in_phase(life, contract, Phase.FINALIZED)
-        await life.runtime.executor.opened()
+        await life.runtime.executor.wait_until_open()
     assert robot.said == [f"only {step}" for step in STEPS]
 
 

@@ -180,7 +180,7 @@ async def test_an_agent_without_executor_ignores_liabilities(place: Place) -> No
     async with place.at_work(robot) as person:
         contract = await person.demand(place.save(objective(("/go", Empty()))))
         head = await place.chains["robot"].block_number()
-        await until(lambda: robot.parts.clock.head >= head)
+        await until(lambda: robot.parts.chain_head.head >= head)
         assert await robot.parts.ledger.jobs() == []
         assert not (await place.chains["person"].liabilities.get(contract.address)).is_finalized
 

@@ -109,7 +109,7 @@ async def test_a_liability_that_has_ended_before_the_agent_heard_of_it_is_no_job
     async with place.provider(), place.agent("person") as person:
         async with offering(place.agent("robot", enable_executor=False)) as robot:
             await reading(robot)
-            head, robot_memory = robot.parts.clock.head, robot.parts.directory
+            head, robot_memory = robot.parts.chain_head.head, robot.parts.directory
             contract = await person.demand(words(place))
         failed = result(signer=place.market.accounts["robot"].signer, liability=contract.address, success=False)
         await place.chains["provider"].liabilities.finalize(place.market.deployment.lighthouse_name, failed)
