@@ -107,6 +107,9 @@ async def test_the_result_of_a_reverted_payment_is_sent_again(place: Place, paid
         await place.forget_blocks(1)
         assert not await paid.once()
         await in_phase(robot, contract, Phase.COMPLETE)
+        job = await robot.parts.ledger.job(contract.address)
+        assert job is not None
+        assert contract.address in robot.parts.store.pins().get(job.result or "", ()), "its recording may be evicted"
         async with place.provider():
             await in_phase(robot, contract, Phase.FINALIZED)
         assert await robot.parts.ledger.outbox(head=0) == []
