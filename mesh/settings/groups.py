@@ -34,6 +34,18 @@ def option(default: T, meaning: str) -> T:
     return field(default=default, metadata={"meaning": meaning})
 
 
+class NodeNotSet(ConfigurationError):
+    """The settings name no EVM node."""
+
+    code = "node-not-set"
+
+
+class AccountNotSet(ConfigurationError):
+    """The settings name no keyfile, or no password file."""
+
+    code = "account-not-set"
+
+
 @dataclass(frozen=True, kw_only=True)
 class NetworkSettings:
     """How a client joins the Zenoh network."""
@@ -109,10 +121,10 @@ class ChainSettings(StorageSettings):
 
     @property
     def node(self) -> str:
-        """The node's URL, or several split by commas. Raises `ConfigurationError` when there is none."""
+        """The node's URL, or several split by commas. Raises `NodeNotSet`."""
         found = self.web3_http_provider.strip() or self.web3_ws_provider.strip()
         if not found:
-            raise ConfigurationError(
+            raise NodeNotSet(
                 "no EVM node is configured: web3_http_provider and web3_ws_provider are both empty",
                 hint="pass --web3-http-provider http://HOST:8545",
             )
@@ -127,9 +139,9 @@ class AccountSettings:
     keyfile_password_file: str = option("", "file with the keyfile's password")
 
     def keyfile_and_password(self) -> tuple[Path, Path]:
-        """The keyfile and its password file. Raises `ConfigurationError` when either is not set."""
+        """The keyfile and its password file. Raises `AccountNotSet`."""
         if not self.keyfile or not self.keyfile_password_file:
-            raise ConfigurationError(
+            raise AccountNotSet(
                 "this needs an account, and keyfile or keyfile_password_file is not set",
                 hint="create one with `aira account new`, then pass --keyfile and --keyfile-password-file",
             )

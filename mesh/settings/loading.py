@@ -30,13 +30,55 @@ NOT_OPTIONS: Final = frozenset({"AIRA_CONFIG", "AIRA_REQUIRE_PEERS", "AIRA_KUBO"
 """`AIRA_*` variables that belong to the command line or to the tests, not to the settings."""
 
 
+class UnknownOption(ConfigurationError):
+    """A file, the environment or the flags (`where`) set an option that does not exist; `nearest` is a similar one."""
+
+    code = "unknown-option"
+
+    def __init__(self, name: str, where: str, nearest: str) -> None:
+        super().__init__(f"unknown option {name!r} in {where}", hint=f"did you mean {nearest!r}?")
+        self.name = name
+        self.where = where
+        self.nearest = nearest
+
+
+class InvalidOption(ConfigurationError):
+    """The value of the option `name` has the wrong type or is out of range."""
+
+    code = "invalid-option"
+
+    def __init__(self, name: str, why: str) -> None:
+        super().__init__(f"the setting {name} is invalid: {why}", hint=f"{name}: {MEANING[name]}")
+        self.name = name
+
+
+class SettingsUnreadable(ConfigurationError):
+    """The settings file at `path` can't be read."""
+
+    code = "settings-unreadable"
+
+    def __init__(self, path: Path, why: str | None) -> None:
+        super().__init__(f"can't read the settings {path}: {why}")
+        self.path = path
+
+
+class SettingsNotToml(ConfigurationError):
+    """The settings file at `path` is not TOML."""
+
+    code = "settings-not-toml"
+
+    def __init__(self, path: Path, why: object) -> None:
+        super().__init__(f"{path} is not TOML: {why}")
+        self.path = path
+
+
 def load(
     *, path: Path | None = None, environ: Mapping[str, str] | None = None, flags: Mapping[str, Any] | None = None
 ) -> Settings:
     """The settings from the file at `path`, the `AIRA_*` variables of `environ` and `flags`.
 
     Without a path, `AIRA_CONFIG` names the file, if it is set. A flag whose value is None was not given.
-    Raises `ConfigurationError` for an unreadable file, an unknown option or an invalid value.
+    Raises `SettingsUnreadable`, `SettingsNotToml`, `UnknownOption` or `InvalidOption`.
     """
     variables = os.environ if environ is None else environ
     if path is None and variables.get("AIRA_CONFIG"):
@@ -57,9 +99,9 @@ def _read_toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ConfigurationError(f"can't read the settings {path}: {error.strerror}") from None
+        raise SettingsUnreadable(path, error.strerror) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"{path} is not TOML: {error}") from None
+        raise SettingsNotToml(path, error) from None
 
 
 def _from_environment(environ: Mapping[str, str]) -> dict[str, Any]:
@@ -77,7 +119,7 @@ def _split(text: str) -> tuple[str, ...]:
 
 
 def _checked(options: dict[str, Any], *, where: str) -> dict[str, Any]:
-    """The options without the retired ones. Raises `ConfigurationError` for an unknown one."""
+    """The options without the retired ones. Raises `UnknownOption`."""
     kept: dict[str, Any] = {}
     for name, value in options.items():
         if name in RETIRED:
@@ -88,12 +130,12 @@ def _checked(options: dict[str, Any], *, where: str) -> dict[str, Any]:
             kept[name] = value
         else:
             nearest = difflib.get_close_matches(name, OPTIONS, n=1, cutoff=0)[0]
-            raise ConfigurationError(f"unknown option {name!r} in {where}", hint=f"did you mean {nearest!r}?")
+            raise UnknownOption(name, where, nearest)
     return kept
 
 
-def _invalid(error: msgspec.ValidationError) -> ConfigurationError:
+def _invalid(error: msgspec.ValidationError) -> InvalidOption:
     """The error with the option's name in front, which msgspec puts as a path at the end."""
     why, _, path = str(error).partition(" - at `$.")
     name = path.rstrip("`").partition("[")[0]
-    return ConfigurationError(f"the setting {name} is invalid: {why}", hint=f"{name}: {MEANING[name]}")
+    return InvalidOption(name, why)

@@ -18,6 +18,12 @@ STARTING: Final = "still waits"
 """The state of a role's part `start` until the role has started."""
 
 
+class InvalidListenAddress(ConfigurationError):
+    """The setting `metrics_listen` is not HOST:PORT."""
+
+    code = "invalid-listen-address"
+
+
 class Health(msgspec.Struct, frozen=True):
     """The state of each part of a role. `ok` if every part is `ALIVE`, or `OFF` by its settings."""
 
@@ -57,11 +63,11 @@ def health_metrics(parts: Mapping[str, str]) -> MetricFamily:
 
 
 def listen_address(listen: str) -> tuple[str, int]:
-    """Parse HOST:PORT; an IPv6 address is in brackets. Raises `ConfigurationError`."""
+    """Parse HOST:PORT; an IPv6 address is in brackets. Raises `InvalidListenAddress`."""
     host, _, port = listen.rpartition(":")
     bare = host.removeprefix("[").removesuffix("]")
     if not bare or (":" in bare) == (bare == host) or not (port.isascii() and port.isdigit()) or int(port) > 65_535:
-        raise ConfigurationError(
+        raise InvalidListenAddress(
             f"metrics_listen is {listen!r}, not HOST:PORT",
             hint="give --metrics-listen 127.0.0.1:9464, or 0.0.0.0:9464 for other machines; empty serves no metrics",
         )

@@ -39,6 +39,19 @@ TEXT: Final = "text/plain; charset=utf-8"
 PROMETHEUS_TYPES: Final = {"counter": CounterMetricFamily, "gauge": GaugeMetricFamily}
 
 
+class MetricsNotServed(ConfigurationError):
+    """The address of metrics and health can't be used; `where` is its HOST:PORT."""
+
+    code = "metrics-not-served"
+
+    def __init__(self, where: str, why: object) -> None:
+        super().__init__(
+            f"can't serve metrics and health at {where}: {why}",
+            hint="is the port taken? each server on a machine needs its own: --metrics-listen HOST:PORT",
+        )
+        self.where = where
+
+
 class ServerLimits(NamedTuple):
     """What clients may use of the server."""
 
@@ -123,10 +136,7 @@ class TelemetryServer:
         except (OSError, OverflowError, UnicodeError) as error:
             where = f"{self._address[0]}:{self._address[1]}"
             why = getattr(error, "strerror", None) or error
-            raise ConfigurationError(
-                f"can't serve metrics and health at {where}: {why}",
-                hint="is the port taken? each server on a machine needs its own: --metrics-listen HOST:PORT",
-            ) from None
+            raise MetricsNotServed(where, why) from None
         threading.Thread(target=self._http.serve_forever, args=(POLL,), name="aira-metrics", daemon=True).start()
         log.info(
             "metrics at %s/metrics, health at %s/health",

@@ -14,6 +14,7 @@ from mesh.chain.errors import InsufficientFunds, NoContracts, NodeUnreachable
 from mesh.cli.chain import DEPLOYMENT_GAS
 from mesh.cli.errors import AlreadyDeployed, InvalidAmount, InvalidLighthouse
 from mesh.errors import ConfigurationError, InvalidAddress
+from mesh.settings import AccountNotSet
 from tests.mesh.cli.served_chain import ServedChain, columns, write_quick_keyfile
 from tests.support.commands import invoke, refused
 from tests.support.nodes import Anvil
@@ -98,7 +99,7 @@ def test_values_that_the_factory_would_refuse_are_refused_before_the_first_trans
 
 
 def test_a_deployment_needs_an_account_and_a_node(bare: ServedChain) -> None:
-    refused(bare.aira(*DEPLOY, AIRA_KEYFILE=""), ConfigurationError, "account")
+    refused(bare.aira(*DEPLOY, AIRA_KEYFILE=""), AccountNotSet)
     nowhere = f"http://127.0.0.1:{free_port()}"
     refused(bare.aira(*DEPLOY, AIRA_WEB3_HTTP_PROVIDER=nowhere), NodeUnreachable, nowhere)
 

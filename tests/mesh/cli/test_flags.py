@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from mesh.cli import main
-from mesh.errors import ConfigurationError
+from mesh.settings import InvalidOption, UnknownOption
 from tests.support.commands import refused
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def test_an_error_of_an_invalid_number_names_its_flag(arguments: tuple[str, ...]
 @pytest.mark.parametrize("value", ["inf", "nan"])
 def test_seconds_are_finite(option: str, value: str) -> None:
     done = aira("settings", option, value)
-    refused(done, ConfigurationError, option[2:].replace("-", "_"))
+    refused(done, InvalidOption, option[2:].replace("-", "_"))
 
 
 def test_an_unknown_flag_suggests_similar_ones() -> None:
@@ -66,4 +66,4 @@ def test_an_unknown_flag_suggests_similar_ones() -> None:
 def test_an_invalid_variable_is_one_clear_line_in_every_command_with_settings(command: str) -> None:
     needed = ("--model", CID, "--objective", CID) if command == "demand" else ()
     done = aira(command, *needed, AIRA_KEYFILL="x")
-    refused(done, ConfigurationError, "'keyfill'", "environment")
+    refused(done, UnknownOption, "'keyfill'", "environment")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -15,6 +17,8 @@ import pytest
 from mesh.cli.errors import HealthUnavailable, InvalidServerAddress
 from mesh.errors import ConfigurationError
 from mesh.settings import Settings
+from mesh.telemetry.health import InvalidListenAddress
+from mesh.telemetry.server import MetricsNotServed
 from schemas.status import ALIVE
 from tests.mesh.cli.served_chain import columns
 from tests.support.commands import AIRA, Serving, invoke, refused
@@ -127,13 +131,13 @@ def test_a_taken_port_is_one_clear_line(command: tuple[str, ...], tmp_path: Path
             AIRA_DATA_DIR=str(tmp_path),
             AIRA_LISTEN=f"tcp/127.0.0.1:{free_port()}",
         )
-    assert refused(done, ConfigurationError, place, "Address already in use")
+    assert refused(done, MetricsNotServed, place, os.strerror(errno.EADDRINUSE))
 
 
 def test_an_invalid_listen_address_is_one_clear_line() -> None:
     done = invoke("router", "--metrics-listen", "9464", AIRA_LISTEN=f"tcp/127.0.0.1:{free_port()}")
 
-    refused(done, ConfigurationError, "'9464'")
+    refused(done, InvalidListenAddress, "'9464'")
 
 
 def test_a_closed_port_is_one_clear_line_and_code_1(listen: str) -> None:

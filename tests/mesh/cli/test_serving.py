@@ -18,6 +18,7 @@ from mesh.chain.errors import NodeUnreachable, UnknownName
 from mesh.cli.errors import BalanceTooLow, FileUnwritable, InvalidAmount, InvalidOptions, NotAFileOrCid
 from mesh.errors import AiraError, ConfigurationError, InputError, NetworkUnavailable
 from mesh.recording import open_objective
+from mesh.settings import AccountNotSet
 from schemas import cid_of_file
 from tests.support.commands import AIRA, SOON, Interrupted, Serving, aira, invoke, refused
 from tests.support.development import variables_of
@@ -184,7 +185,7 @@ def test_ctrl_c_stops_waiting_for_a_contract(development: Development) -> None:
 
 
 def test_a_demand_without_keyfile_is_one_clear_line() -> None:
-    refused(invoke("demand", *ORDER, SOME_CID), ConfigurationError, "account")
+    refused(invoke("demand", *ORDER, SOME_CID), AccountNotSet)
 
 
 @pytest.mark.parametrize(

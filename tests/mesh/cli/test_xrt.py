@@ -10,7 +10,8 @@ from mesh.chain import XRT, Account, TransactionSender, new_private_key
 from mesh.chain.accounts import KeyfileError, WrongPassword
 from mesh.chain.errors import InsufficientFunds, NodeUnreachable, UnknownName
 from mesh.cli.errors import AccountMissing, BalanceTooLow, InvalidAmount, NotAToken
-from mesh.errors import ConfigurationError, InputError
+from mesh.errors import InputError
+from mesh.settings import AccountNotSet
 from tests.mesh.cli.served_chain import MONEY, ServedChain, columns, write_quick_keyfile
 from tests.support.commands import refused
 from tests.support.ports import free_port
@@ -121,7 +122,7 @@ def test_an_account_without_xrt_is_an_error(served: ServedChain, poor: dict[str,
 
 def test_a_missing_account_is_one_clear_line(served: ServedChain) -> None:
     assert "--keyfile" in refused(served.aira("xrt", "balance", AIRA_KEYFILE=""), AccountMissing)
-    refused(served.aira("xrt", "transfer", NOBODY, "1", AIRA_KEYFILE=""), ConfigurationError, "account")
+    refused(served.aira("xrt", "transfer", NOBODY, "1", AIRA_KEYFILE=""), AccountNotSet)
 
 
 def test_a_missing_keyfile_and_a_wrong_password_are_one_clear_line(served: ServedChain, tmp_path: Path) -> None:

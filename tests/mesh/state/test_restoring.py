@@ -30,7 +30,7 @@ from mesh.state import (
     restore,
 )
 from mesh.work import Ledger, Phase
-from mesh.work.database import VERSION, LedgerUnusable
+from mesh.work.database import VERSION, LedgerTooNew, LedgerUnusable
 from schemas import cid_of_bytes
 from tests.mesh.state.conftest import ADDRESS, CHAIN, JOB, NONCE, OBJECTIVE, Folder, forge, members, names_in
 from tests.mesh.work.ledgers import mark_as_version
@@ -199,14 +199,15 @@ async def test_a_newer_ledger_in_a_backup_is_named_and_nothing_changed(
     newer.write_bytes(folder.ledger.read_bytes())
     mark_as_version(newer, VERSION + 1)
     forged = forge_ledger(archive, tmp_path / "forged", newer.read_bytes())
-    with pytest.raises(ConfigurationError, match=rf"newer version \(format {VERSION + 1}, this one knows {VERSION}\)"):
+    with pytest.raises(LedgerTooNew) as caught:
         await restore(forged, tmp_path / "new")
+    assert (caught.value.found, caught.value.known) == (VERSION + 1, VERSION)
     assert names_in(tmp_path / "new") == []
 
 
 async def test_a_newer_ledger_is_not_backed_up(folder: Folder, tmp_path: Path) -> None:
     mark_as_version(folder.ledger, VERSION + 1)
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(LedgerTooNew) as caught:
         await back_up(folder.path, tmp_path / "it", content=ContentScope.NONE)
     assert caught.value.hint == "upgrade aira-mesh"
     assert str(folder.ledger) in str(caught.value)
