@@ -37,6 +37,7 @@ class InvalidAddress(InputError):
     def __init__(self, text: str, why: str) -> None:
         super().__init__(f"{text[:80]!r} is not an address: {why}")
         self.text = text
+        self.why = why
 
 
 class InvalidCid(InputError):
@@ -57,6 +58,7 @@ class InvalidKey(InputError):
     def __init__(self, text: str, why: str) -> None:
         super().__init__(f"{text[:160]!r} is not a key of the mesh: {why}")
         self.text = text
+        self.why = why
 
 
 class InvalidMessage(InputError):
@@ -82,6 +84,7 @@ class InvalidRecord(InputError):
     def __init__(self, kind: str, why: str) -> None:
         super().__init__(f"not a {kind}: {why}")
         self.kind = kind
+        self.why = why
 
 
 class InvalidPayload(InputError):

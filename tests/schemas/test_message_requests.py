@@ -60,8 +60,9 @@ def test_a_request_to_sign_becomes_the_unsigned_message() -> None:
 
 @pytest.mark.parametrize("nonce", ["", "0x12", "1 2", "-1", "1.0", "٣", "9" * 79])
 def test_a_counted_nonce_is_decimal_digits(nonce: str) -> None:
-    with pytest.raises(InvalidMessage, match="nonce"):
+    with pytest.raises(InvalidMessage) as caught:
         replace(SendDemand.of(DEMAND_5), nonce=nonce).message()
+    assert caught.value.reason == "nonce"
 
 
 def test_a_request_with_missing_or_unknown_fields_is_refused() -> None:
@@ -72,8 +73,9 @@ def test_a_request_with_missing_or_unknown_fields_is_refused() -> None:
 
 
 def test_an_invalid_message_is_refused_when_it_is_built() -> None:
-    with pytest.raises(InvalidMessage, match="objective"):
+    with pytest.raises(InvalidMessage) as caught:
         replace(SendDemand.of(DEMAND), objective="the kitchen").message()
+    assert "objective" in caught.value.detail
 
 
 def test_guarded_services_exist() -> None:

@@ -100,8 +100,10 @@ def test_a_named_sender_or_liability_must_be_resolved_first() -> None:
         msgspec.structs.replace(DEMAND_5, sender="robot.eth"),
         msgspec.structs.replace(RESULT, liability="robot.eth"),
     ):
-        with pytest.raises(InvalidMessage, match=r"robot\.eth"):
+        with pytest.raises(InvalidMessage) as caught:
             message_hash(named)
+        assert "robot.eth" in caught.value.detail
+        assert caught.value.reason == "unresolved-name"
 
 
 def test_feedback_has_no_hash() -> None:

@@ -64,15 +64,17 @@ def test_a_bag_cut_within_a_record_is_corrupt(tmp_path: Path, indexed: bool) -> 
 
 def test_a_closed_bag_without_an_index_is_corrupt_and_an_unclosed_one_is_not(tmp_path: Path) -> None:
     closed, unclosed = (Bag(MESSAGES, per_chunk=250, indexed=indexed).encode() for indexed in (True, False))
-    with pytest.raises(CorruptRecording, match="before its index"):
+    with pytest.raises(CorruptRecording) as caught:
         open_objective(kept(tmp_path, closed[: len(unclosed) - 200]))
+    assert "before its index" in caught.value.why
     assert open_objective(kept(tmp_path, unclosed)).count == 250
 
 
 def test_an_encrypted_bag_is_not_a_recording(tmp_path: Path) -> None:
     header = {"op": b"\x03", "index_pos": bytes(8), "encryptor": b"rosbag/AesCbcEncryptor"}
-    with pytest.raises(NotARecording, match="encrypted"):
+    with pytest.raises(NotARecording) as caught:
         open_objective(kept(tmp_path, MAGIC + record(header, b"")))
+    assert "encrypted" in caught.value.why
 
 
 BAG = record({"op": b"\x03", "index_pos": bytes(8)}, b"")
@@ -109,8 +111,9 @@ def chunk(data: bytes, *, compression: bytes = b"none", size: int | None = None)
     ],
 )
 def test_malformed_records_are_corrupt(tmp_path: Path, content: bytes, why: str) -> None:
-    with pytest.raises(CorruptRecording, match=why):
+    with pytest.raises(CorruptRecording) as caught:
         open_objective(kept(tmp_path, MAGIC + content))
+    assert why in caught.value.why
 
 
 @pytest.mark.parametrize(

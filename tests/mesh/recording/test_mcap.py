@@ -138,15 +138,17 @@ def test_a_flipped_bit_in_the_data_fails_its_checksum(tmp_path: Path, options: d
     times = [T0 + n for n in range(50)]
     whole = bytearray(with_messages(times, compression=CompressionType.NONE, **options))
     whole[whole.index(b'{"n":7}') + 5] ^= 1
-    with pytest.raises(CorruptRecording, match="checksum"):
+    with pytest.raises(CorruptRecording) as caught:
         open_objective(kept(tmp_path, bytes(whole)))
+    assert "checksum" in caught.value.why
 
 
 def test_a_flipped_bit_in_the_index_fails_its_checksum(tmp_path: Path) -> None:
     whole = bytearray(with_messages([T0]))
     whole[whole.rindex(b"/b")] ^= 1
-    with pytest.raises(CorruptRecording, match="checksum"):
+    with pytest.raises(CorruptRecording) as caught:
         open_objective(kept(tmp_path, bytes(whole)))
+    assert "checksum" in caught.value.why
 
 
 def test_a_file_over_the_size_limit_is_not_read(tmp_path: Path) -> None:
@@ -240,8 +242,9 @@ def test_every_limit_is_enforced(tmp_path: Path, limits: Limits, limit: str) -> 
     ],
 )
 def test_malformed_records_are_corrupt(tmp_path: Path, content: bytes, why: str) -> None:
-    with pytest.raises(CorruptRecording, match=why) as caught:
+    with pytest.raises(CorruptRecording) as caught:
         open_objective(kept(tmp_path, content))
+    assert why in caught.value.why
     assert caught.value.reason == "corrupt"
     assert caught.value.hint
 

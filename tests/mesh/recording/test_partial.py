@@ -195,5 +195,6 @@ def test_a_damaged_attachment_is_corrupt(tmp_path: Path) -> None:
     whole = bytearray(mcap_file(with_attachment))
     whole[whole.index(b"image/png") + 1000] ^= 1
     (tmp_path / "it.mcap").write_bytes(whole)
-    with pytest.raises(CorruptRecording, match="checksum"):
+    with pytest.raises(CorruptRecording) as caught:
         open_objective(tmp_path / "it.mcap")
+    assert "checksum" in caught.value.why
