@@ -66,7 +66,7 @@ class Books:
     gas: int = 0
 
     def create(self, terms: Terms, provider: str) -> str | None:
-        """Take what a liability costs; if somebody can't pay, nothing is taken and the answer is the refusal."""
+        """Take the costs of a liability; if an account can't pay, take nothing and return the refusal."""
         return self._transfer(
             [
                 Payment(self.xrt, terms.promisor, provider, terms.lighthouse_fee),
@@ -87,7 +87,7 @@ class Books:
             self.balances[self.xrt, provider] += minted
 
     def give_back(self, terms: Terms) -> None:
-        """Pay the promisee back, who also keeps the validator's fee."""
+        """Return the cost and the validator's fee to the promisee."""
         self._give(terms.token, self.factory, terms.promisee, terms.cost)
         self._give(self.xrt, self.factory, terms.promisee, terms.judging)
         self.gas += terms.gas

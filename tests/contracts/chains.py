@@ -23,7 +23,7 @@ FUNDS_WEI: Final = 10**24
 
 
 class Chain:
-    """A chain whose accounts are unlocked, with the ways of a development node: mining at will and snapshots."""
+    """A chain whose accounts are unlocked, with the methods of a development node: mining on demand and snapshots."""
 
     def __init__(self, web3: Web3, keys: Sequence[bytes]) -> None:
         self.web3 = web3

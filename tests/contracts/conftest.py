@@ -35,7 +35,7 @@ def markets(chain: Chain) -> dict[int, Market]:
 
 @pytest.fixture
 def undone(chain: Chain) -> Iterator[None]:
-    """Whatever the test does to the chain is undone."""
+    """Every change that the test makes to the chain is undone."""
     before = chain.snapshot()
     yield
     chain.revert(before)

@@ -50,7 +50,7 @@ class Market:
         return person.signer.sign(Offer(**fields))
 
     def pair(self, **changes: Any) -> tuple[Demand, Offer]:
-        """A demand and an offer that match, both with these changes; fees go to whose they are."""
+        """A demand and an offer that match, both with these changes; each gets the fee that it has a field for."""
         validator_fee, lighthouse_fee = changes.pop("validator_fee", 0), changes.pop("lighthouse_fee", 0)
         return self.demand(validator_fee=validator_fee, **changes), self.offer(lighthouse_fee=lighthouse_fee, **changes)
 
@@ -69,7 +69,7 @@ class Market:
         return self.suite.contract("Liability", event["args"]["liability"])
 
     def result(self, liability: Contract, *, success: bool = True, by: Person | None = None) -> Result:
-        """A signed result, the promisor's unless said otherwise."""
+        """A signed result, by default the promisor's."""
         message = Result(liability=liability.address, result=RESULT, success=success)
         return (by or self.promisor).signer.sign(message)
 

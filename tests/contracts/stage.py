@@ -80,11 +80,11 @@ class Stage:
         return Books(self.xrt, self.factory, self.lighthouse, XRT, balances, SUPPLY, allowances)
 
     def balance(self, token: str, holder: str) -> int:
-        """What the token says that somebody holds."""
+        """The balance of an account, as the token returns it."""
         return self.ask(token, "balanceOf(address)", holder)
 
     def allowance(self, owner: str) -> int:
-        """What XRT says that the factory may take from somebody."""
+        """The allowance that an account gave the factory, as XRT returns it."""
         return self.ask(self.xrt, "allowance(address,address)", owner, self.factory)
 
     def stored_balance(self, token: str, holder: str) -> int:
@@ -92,7 +92,7 @@ class Stage:
         return self.evm.stored(token, self._places[token, holder])
 
     def current_provider(self) -> str:
-        """Whose turn it is; the first provider to be where there is none."""
+        """The current provider; without any, the first account that may become one."""
         current = self.evm.call(self.lighthouse, "current()", sender=self.keeper).output[12:]
         return checksum_address(current) if any(current) else self.people[2]
 
@@ -155,7 +155,7 @@ class Stage:
         return self.evm.call(self.lighthouse, function, value, sender=provider)
 
     def approve(self, value: int, owner: str) -> Answer:
-        """Let the factory take so much of somebody's XRT."""
+        """Approve the factory for an amount of an account's XRT."""
         return self.evm.call(self.xrt, "approve(address,uint256)", self.factory, value, sender=owner)
 
     def collect_fees(self) -> Answer:

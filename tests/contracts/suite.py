@@ -1,4 +1,4 @@
-"""The contracts, deployed on a test chain, and the people who use them."""
+"""The contracts, deployed on a test chain, and the accounts that use them."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def namehash(name: str) -> bytes:
 
 @dataclass(frozen=True)
 class Person:
-    """One with an account on the chain, whose key signs messages."""
+    """A person with an account on the chain; its key signs messages."""
 
     address: str
     signer: Signer
@@ -82,13 +82,13 @@ class Suite:
         return self.web3.eth.contract(address, abi=artifact(name)["abi"])  # type: ignore[call-overload, no-any-return]
 
     def send(self, call: Any, sender: Person | None = None) -> TxReceipt:
-        """Send a transaction that is to succeed (by the deployer unless said otherwise)."""
+        """Send a transaction that must succeed, from the deployer by default."""
         receipt = self.attempt(call, sender)
         assert receipt["status"] == 1, f"reverted: {self.chain.refusal(call, (sender or self.deployer).address)}"
         return receipt
 
     def attempt(self, call: Any, sender: Person | None = None) -> TxReceipt:
-        """Send a transaction, whatever becomes of it."""
+        """Send a transaction, which may revert."""
         fields = {"from": (sender or self.deployer).address, "gas": 8_000_000}
         return self.web3.eth.wait_for_transaction_receipt(call.transact(fields), poll_latency=0.005)
 

@@ -1,4 +1,4 @@
-"""Two who agree to end their work before there is a result."""
+"""Promisee and promisor agree to end a liability before there is a result."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def liability(market: Market) -> Contract:
 
 
 def signed(person: Person, liability: Contract, word: bytes = b"cancel") -> bytes:
-    """Somebody's agreement to cancel, or to another word."""
+    """An account's signature under the cancellation of a liability, or under another word."""
     return person.signer.sign_hash(keccak256(address_bytes(liability.address) + word))
 
 
@@ -67,7 +67,7 @@ def test_the_validator_who_was_not_asked_is_not_paid(market: Market) -> None:
     assert suite.balance(jury) == 0
 
 
-def test_it_takes_both_of_them(market: Market, liability: Contract) -> None:
+def test_cancellation_needs_both_parties(market: Market, liability: Contract) -> None:
     cancel = market.suite.factory.functions.cancel
     promisee, promisor = signed(market.promisee, liability), signed(market.promisor, liability)
     other = signed(market.outsider, liability)

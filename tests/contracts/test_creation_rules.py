@@ -100,8 +100,8 @@ def test_used_hashes_are_kept_for_generation_3(market: Market) -> None:
         assert known == (market.generation == 3)
 
 
-def test_a_stranger_does_not_use_up_anothers_order(third: Market) -> None:
-    """Who signs another's terms himself, nonce and all, and an offer to himself, uses an order of his own."""
+def test_another_account_can_not_use_up_an_order(third: Market) -> None:
+    """An account that signs copied terms with their nonce, and an offer for them, uses up only its own order."""
     victim, offer = third.pair()
     copied = third.outsider.signer.sign(replace(victim, signature=""))
     assert message_hash(copied) == message_hash(victim)
@@ -122,7 +122,7 @@ def test_a_stranger_does_not_use_up_anothers_order(third: Market) -> None:
 
 
 def test_lighthouses_of_two_chains_never_have_one_address(market: Market) -> None:
-    """Orders name no chain, but their lighthouse, whose address has the number of its chain in it."""
+    """Orders do not name a chain; the address of their lighthouse depends on the number of its chain."""
     suite, address = market.suite, market.lighthouse.address
     code = bytes(suite.web3.eth.get_code(address))
     creation = bytes.fromhex(f"61{len(code):04x}3d81600a3d39f3") + code
@@ -200,7 +200,7 @@ def test_only_one_signature_of_an_order_counts(market: Market, forge: Callable[[
     ],
 )
 @pytest.mark.parametrize("spoiled", [0, 1])
-def test_bytes_that_are_no_order_are_refused(market: Market, spoil: Callable[[bytes], bytes], spoiled: int) -> None:
+def test_bytes_that_are_not_an_order_are_refused(market: Market, spoil: Callable[[bytes], bytes], spoiled: int) -> None:
     orders = [order_abi(order) for order in market.pair()]
     orders[spoiled] = spoil(orders[spoiled])
     demand, offer = orders

@@ -56,7 +56,7 @@ def test_failure_earns_nothing_as_no_money_changed_hands(market: Market) -> None
 
 
 @pytest.mark.parametrize("dealer", ["promisee is promisor", "provider is promisee", "provider is promisor"])
-def test_dealing_with_oneself_earns_nothing(market: Market, dealer: str) -> None:
+def test_trading_with_oneself_earns_nothing(market: Market, dealer: str) -> None:
     suite = market.suite
     suite.fund(market.provider, COST, suite.factory.address)
     promisee, promisor = {
@@ -94,7 +94,7 @@ def test_gas_is_counted_once_at_the_end(market: Market) -> None:
     assert functions.gasConsumedOf(market.outsider.address).call() == 0
 
 
-def test_gas_is_counted_for_a_refund_too_but_pays_nobody(market: Market) -> None:
+def test_gas_of_a_refund_is_counted_but_not_paid(market: Market) -> None:
     suite = market.suite
     liability = market.create(cost=COST)
     suite.chain.mine(REFUND_DELAY)
@@ -105,7 +105,7 @@ def test_gas_is_counted_for_a_refund_too_but_pays_nobody(market: Market) -> None
 
 
 @pytest.mark.parametrize("terms", [{}, {"cost": COST}, {"cost": COST, "lighthouse_fee": XRT}])
-def test_the_schedule_is_what_a_liability_takes(market: Market, terms: dict[str, Any]) -> None:
+def test_the_gas_schedule_matches_the_gas_of_a_liability(market: Market, terms: dict[str, Any]) -> None:
     suite = market.suite
     # The first of everything pays for new storage; a liability that stays keeps the factory's balance above zero.
     market.finalize(market.create(**{"cost": COST, **terms}))

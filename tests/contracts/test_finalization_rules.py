@@ -74,7 +74,7 @@ def test_a_refunded_liability_stays_refunded(market: Market, liability: Contract
     assert market.refusal(market.finalization(market.result(liability))) == ("AlreadyFinalized", liability.address)
 
 
-def test_a_refund_comes_not_too_early(market: Market, liability: Contract) -> None:
+def test_an_early_refund_is_refused(market: Market, liability: Contract) -> None:
     created = liability.functions.createdAt().call()
     refund = market.suite.factory.functions.refund(liability.address)
     assert market.refusal(refund) == ("RefundTooEarly", created + REFUND_DELAY)
@@ -127,14 +127,14 @@ def test_the_factory_and_the_liability_take_no_results_from_outsiders(market: Ma
         (parse_cid(OTHER), bytes(66), "InvalidSignature"),
     ],
 )
-def test_bytes_that_are_no_result_are_refused(
+def test_bytes_that_are_not_a_result_are_refused(
     market: Market, liability: Contract, result: bytes, signature: bytes, reason: str
 ) -> None:
     call = market.lighthouse.functions.finalizeLiability(liability.address, result, True, signature)
     assert market.refusal(call) == (reason,)
 
 
-def test_to_carries_finalize_and_nothing_else(market: Market, liability: Contract) -> None:
+def test_to_forwards_only_finalize(market: Market, liability: Contract) -> None:
     suite, to = market.suite, market.lighthouse.functions.to
     theft = suite.xrt.encode_abi("transfer", [market.provider.address, XRT])
     for target, data in ((suite.xrt.address, theft), (liability.address, b""), (liability.address, b"\xc5\x21\x3e")):

@@ -55,7 +55,7 @@ def test_legacy_events_keep_their_shape(contract: str, event: str) -> None:
     assert event in {signature(entry) for entry in entries(contract, "event")}
 
 
-def test_each_contract_decodes_what_the_others_refuse() -> None:
+def test_the_factory_interface_includes_errors_of_lighthouse_and_liability() -> None:
     errors = [{signature(entry) for entry in entries(name, "error")} for name in ("Factory", "Lighthouse", "Liability")]
     assert errors[1] <= errors[0]
     assert errors[2] <= errors[0]

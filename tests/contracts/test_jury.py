@@ -42,14 +42,14 @@ def test_a_jurors_word_ends_the_work_and_earns_the_fee(fifth: Market, jury: Cont
     assert liability.functions.isSuccess().call() == success
 
 
-def test_nobody_judges_without_being_a_juror(fifth: Market, jury: Contract) -> None:
+def test_only_a_juror_can_judge(fifth: Market, jury: Contract) -> None:
     liability = fifth.create(cost=COST, validator=jury.address)
     for person in (fifth.promisor, fifth.promisee, fifth.suite.deployer):
         refused = fifth.finalization(fifth.result(liability, by=person))
         assert fifth.refusal(refused) == ("RefusedByValidator", person.address)
 
 
-def test_a_juror_who_was_dismissed_judges_no_more(fifth: Market, jury: Contract) -> None:
+def test_a_dismissed_juror_can_not_judge(fifth: Market, jury: Contract) -> None:
     liability = fifth.create(cost=COST, validator=jury.address)
     receipt = fifth.suite.send(jury.functions.name(fifth.outsider.address, False))
     (event,) = jury.events.Named().process_receipt(receipt, errors=DISCARD)

@@ -1,4 +1,4 @@
-"""From a demand and an offer to the end of the liability, and who holds what on the way."""
+"""From a demand and an offer to the end of the liability, with the balances at each step."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def test_the_other_generations_call_ends_a_liability_too(market: Market) -> None
     assert liability.functions.isSuccess().call()
 
 
-def test_refund_comes_when_the_promisor_stays_silent(market: Market) -> None:
+def test_the_promisee_is_refunded_when_the_promisor_stays_silent(market: Market) -> None:
     suite = market.suite
     before = suite.balance(market.promisee)
     liability = market.create(cost=COST)
@@ -159,7 +159,7 @@ def test_refund_comes_when_the_promisor_stays_silent(market: Market) -> None:
     assert dict(event["args"]) == {"success": False, "result": b""}
 
 
-def test_a_late_result_still_counts_until_somebody_refunds(market: Market) -> None:
+def test_a_late_result_counts_until_the_refund(market: Market) -> None:
     liability = market.create(cost=COST)
     market.suite.chain.mine(REFUND_DELAY + 5)
     market.finalize(liability)

@@ -1,4 +1,4 @@
-"""What holds of the money whatever people do: none is lost, none is paid twice, and all of it can be had in the end.
+"""Invariants of the money under random actions: none is lost or paid twice, and all can be withdrawn in the end.
 
 Histories are made up by Hypothesis: orders of both generations, paid in XRT and in another token, that are taken,
 finished well or badly, judged, refunded, cancelled and sent again, while providers come and go. Each call must be
@@ -39,10 +39,10 @@ if TYPE_CHECKING:
 
 HISTORIES: Final = int(os.environ.get("AIRA_MONEY_HISTORIES", "100"))
 AT_A_TIME: Final = 250
-"""Histories in one test, so that it stays far below the time that a test may take."""
+"""Histories in one test: few enough to stay far below the time limit of a test."""
 
 STEPS: Final = 15
-NEXT: Final = "whose turn it is"
+NEXT: Final = "the current provider"
 
 COSTS: Final = st.sampled_from((0, 1, 200_000, 300_000, 5 * XRT, 5 * XRT, 30 * XRT))
 FEES: Final = st.sampled_from((0, 0, 1, 2 * XRT, 2 * XRT, 30 * XRT))
@@ -63,7 +63,7 @@ def anybody() -> SearchStrategy[str]:
 
 
 def provider() -> SearchStrategy[str]:
-    """One who may have staked, the first of whom is a party at times; mostly it is nobody but whose turn it is."""
+    """An account that may have a stake (the first is sometimes a party); mostly the current provider."""
     return st.sampled_from((NEXT, NEXT, NEXT, NEXT, *stage().people[2:]))
 
 
@@ -121,7 +121,7 @@ class Histories(RuleBasedStateMachine):
         return self.agree(terms, provider, flaw) or multiple()
 
     def agree(self, terms: Terms, provider: str, flaw: str | None) -> Work | None:
-        """A liability that somebody makes, or tries to."""
+        """A provider creates a liability, or tries to."""
         provider = self.sender(provider)
         deadline = self.stage.evm.block if flaw == "late" else FOREVER
         orders = self.stage.orders(terms, deadline=deadline, offered=terms.cost + (flaw == "cost"))
@@ -227,7 +227,7 @@ class Histories(RuleBasedStateMachine):
         assert self.stage.stored_balance(self.stage.xrt, self.stage.lighthouse) == sum(self.books.stakes.values())
 
     def teardown(self) -> None:
-        """Everything can be had: what is still open is finished or refunded, and stakes and fees are taken out."""
+        """Everything can be withdrawn: open liabilities are finalized or refunded, stakes and fees are withdrawn."""
         if sys.exc_info()[0] is not None:
             return
         self.stage.evm.advance(REFUND_DELAY)
@@ -269,13 +269,13 @@ class Histories(RuleBasedStateMachine):
         return refusal is None
 
     def not_the_turn_of(self, person: str) -> str | None:
-        """Why a provider can't send now; whose turn it is the tests of turns see to."""
+        """Why a provider can't send now. The order of turns is tested in the tests of turns."""
         if not self.books.stakes.get(person):
             return "NotAProvider"
         return None if self.stage.ask(self.stage.lighthouse, "isTurnOf(address)", person) else "NotYourTurn"
 
     def sender(self, provider: str) -> str:
-        """Who it is, if it is whose turn it is."""
+        """The account of a chosen provider; `NEXT` is the current one."""
         return self.stage.current_provider() if provider == NEXT else provider
 
     def somebody_but(self, person: str) -> str:

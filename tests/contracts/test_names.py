@@ -48,7 +48,7 @@ def test_a_new_lighthouse_is_announced_and_known(suite: Suite) -> None:
     assert functions.xrt().call() == suite.xrt.address
 
 
-def test_neither_implementations_nor_strangers_are_lighthouses(suite: Suite) -> None:
+def test_implementations_and_other_addresses_are_not_lighthouses(suite: Suite) -> None:
     factory = suite.factory.functions
     for address in (factory.lighthouseCode().call(), suite.xrt.address, suite.deployer.address, ZERO):
         assert not factory.isLighthouse(address).call()
@@ -85,7 +85,7 @@ def test_stake_and_timeout_have_bounds(suite: Suite, stake: int, timeout: int, r
     assert suite.chain.refusal(call, suite.deployer.address) == refusal
 
 
-def test_nobody_can_point_a_lighthouses_name_elsewhere(suite: Suite) -> None:
+def test_the_name_of_a_lighthouse_can_not_be_pointed_elsewhere(suite: Suite) -> None:
     suite.create_lighthouse(name="mine")
     node = namehash("mine.lighthouse.5.robonomics.eth")
     thief = suite.people[1].address
@@ -94,7 +94,7 @@ def test_nobody_can_point_a_lighthouses_name_elsewhere(suite: Suite) -> None:
             assert suite.chain.refusal(call, person) == ("NotTheOwner", node, person)
 
 
-def test_owners_of_names_may_do_what_ens_allows(suite: Suite) -> None:
+def test_owners_of_names_have_the_rights_of_ens(suite: Suite) -> None:
     registry, owner = suite.ens.functions, suite.people[1]
     root, node = namehash("robonomics.eth"), namehash("sub.robonomics.eth")
     suite.send(registry.setSubnodeOwner(root, keccak256(b"sub"), owner.address))
@@ -122,5 +122,5 @@ def test_a_name_can_stand_for_a_model(suite: Suite) -> None:
 @pytest.mark.parametrize(
     ("interface", "known"), [("01ffc9a7", True), ("3b3b57de", True), ("e89401a1", True), ("ffffffff", False)]
 )
-def test_the_resolver_says_what_it_can(suite: Suite, interface: str, known: bool) -> None:
+def test_the_resolver_reports_its_interfaces(suite: Suite, interface: str, known: bool) -> None:
     assert suite.resolver.functions.supportsInterface(bytes.fromhex(interface)).call() == known

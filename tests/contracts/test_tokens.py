@@ -35,13 +35,13 @@ def test_a_token_that_keeps_a_part_is_refused_before_it_can_lock_anything(market
     assert refusal == ("TokenAmountMismatch", token.address, COST, COST - COST // 100)
 
 
-def test_a_token_that_says_no_is_taken_at_its_word(market: Market) -> None:
+def test_a_transfer_that_returns_false_is_a_failure(market: Market) -> None:
     token = funded(market, "RefusingToken")
     refusal = market.refusal(market.creation(*market.pair(token=token.address, cost=COST)))
     assert refusal == ("TokenTransferFailed", token.address)
 
 
-def test_an_account_is_no_token(market: Market) -> None:
+def test_an_account_is_not_a_token(market: Market) -> None:
     token = market.outsider.address
     assert market.refusal(market.creation(*market.pair(token=token, cost=COST))) == ("TokenTransferFailed", token)
 

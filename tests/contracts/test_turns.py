@@ -21,7 +21,7 @@ TIMEOUT = 10
 
 
 class Round:
-    """A lighthouse whose transactions are the cheapest that there are: attempts to end what is no liability."""
+    """A lighthouse with the cheapest transactions: attempts to finalize an address that is not a liability."""
 
     def __init__(self, market: Market, stakes: Iterable[int]) -> None:
         self.market = market
@@ -37,7 +37,7 @@ class Round:
         self.suite.send(self.market.creation(*orders, lighthouse=self.lighthouse), provider)
 
     def may_send(self, *providers: Person) -> list[bool]:
-        """Who of these may send the next transaction."""
+        """Which of these may send the next transaction."""
         call = self.market.creation(*self.market.pair(lighthouse=self.lighthouse.address), lighthouse=self.lighthouse)
         allowed = []
         for provider in providers:
@@ -83,7 +83,7 @@ def test_getters_tell_the_turn_under_both_generations_names(market: Market) -> N
         assert market.refusal(turns.lighthouse.functions[name](2)) == ("NoSuchProvider", 2)
 
 
-def test_who_has_not_staked_is_no_provider(market: Market) -> None:
+def test_an_account_without_a_stake_is_not_a_provider(market: Market) -> None:
     call = market.creation(*market.pair())
     assert market.refusal(call, market.outsider) == ("NotAProvider", market.outsider.address)
     nobodys = Round(market, [])
@@ -92,7 +92,7 @@ def test_who_has_not_staked_is_no_provider(market: Market) -> None:
     assert refusal == ("NotAProvider", market.provider.address)
 
 
-def test_out_of_turn_the_refusal_names_whose_turn_it_is(market: Market) -> None:
+def test_the_refusal_out_of_turn_names_the_current_provider(market: Market) -> None:
     turns = Round(market, [2, 1])
     call = market.creation(*market.pair(lighthouse=turns.lighthouse.address), lighthouse=turns.lighthouse)
     assert market.refusal(call, turns.providers[1]) == ("NotYourTurn", turns.providers[0].address, 2)
@@ -113,7 +113,7 @@ def test_silence_passes_the_turn_on_one_provider_a_timeout(market: Market) -> No
 
 
 def test_a_provider_cannot_keep_the_turn_by_waiting(market: Market) -> None:
-    """It may use what is left of its quota whenever it likes, but it gets no other before the next one had a chance."""
+    """It may use the rest of its quota at any time, but gets no new one before the next provider had a turn."""
     turns = Round(market, [2, 1])
     first, second = turns.providers[:2]
     turns.send(first)
@@ -124,7 +124,7 @@ def test_a_provider_cannot_keep_the_turn_by_waiting(market: Market) -> None:
     assert turns.may_send(first, second) == [False, True]
 
 
-def test_a_silent_provider_stops_nobody(market: Market) -> None:
+def test_a_silent_provider_does_not_stop_others(market: Market) -> None:
     turns = Round(market, [1, 1])
     first = turns.providers[0]
     for _ in range(3):
@@ -132,7 +132,7 @@ def test_a_silent_provider_stops_nobody(market: Market) -> None:
         turns.suite.chain.mine(TIMEOUT)
 
 
-def test_is_turn_of_agrees_with_what_is_allowed(market: Market) -> None:
+def test_is_turn_of_agrees_with_the_transactions_that_are_allowed(market: Market) -> None:
     turns = Round(market, [1, 1, 1])
     people = turns.providers[:3]
     assert [turns.read("isTurnOf", person.address) for person in people] == [True, False, False]
@@ -141,7 +141,7 @@ def test_is_turn_of_agrees_with_what_is_allowed(market: Market) -> None:
     assert [turns.read("isTurnOf", person.address) for person in people] == turns.may_send(*people)
 
 
-def test_stakes_come_back(market: Market) -> None:
+def test_stakes_can_be_withdrawn(market: Market) -> None:
     suite = market.suite
     turns = Round(market, [5])
     provider = turns.providers[0]
@@ -182,7 +182,7 @@ def test_a_lighthouse_goes_on_when_a_provider_leaves(market: Market, leaver: int
 
 
 @pytest.mark.parametrize("passed", [0, 1, 2])
-def test_who_comes_waits_until_each_of_the_others_has_had_a_turn(market: Market, passed: int) -> None:
+def test_a_new_provider_waits_until_each_of_the_others_has_had_a_turn(market: Market, passed: int) -> None:
     turns = Round(market, [1, 1, 1])
     people = list(turns.providers[:3])
     for person in people[:passed]:
@@ -197,7 +197,7 @@ def test_who_comes_waits_until_each_of_the_others_has_had_a_turn(market: Market,
 
 @pytest.mark.parametrize("leaver", [0, 1, 2, 3])
 @pytest.mark.parametrize("passed", [0, 1, 2, 3])
-def test_nobody_jumps_the_queue_when_a_provider_leaves(market: Market, leaver: int, passed: int) -> None:
+def test_no_provider_skips_the_queue_when_another_leaves(market: Market, leaver: int, passed: int) -> None:
     turns = Round(market, [1, 1, 1, 1])
     people = list(turns.providers[:4])
     for person in people[:passed]:
@@ -210,7 +210,7 @@ def test_nobody_jumps_the_queue_when_a_provider_leaves(market: Market, leaver: i
         turns.send(person)
 
 
-def test_leaving_in_ones_turn_is_no_sign_of_life(market: Market) -> None:
+def test_leaving_in_its_turn_does_not_update_the_keep_alive_block(market: Market) -> None:
     turns = Round(market, [1, 1, 1])
     first, second, third = turns.providers[:3]
     alive = turns.read("keepAliveBlock")
@@ -221,7 +221,7 @@ def test_leaving_in_ones_turn_is_no_sign_of_life(market: Market) -> None:
 
 
 @pytest.mark.parametrize("working", [False, True], ids=["silent", "working"])
-def test_two_who_leave_and_come_back_do_not_keep_another_from_its_turn(market: Market, working: bool) -> None:
+def test_two_providers_that_leave_and_return_do_not_keep_a_third_from_its_turn(market: Market, working: bool) -> None:
     turns = Round(market, [1, 1, 1])
     one, honest, two = turns.providers[:3]
     for leaver in [one, two] * 3:

@@ -1,4 +1,4 @@
-"""What holds of a lighthouse whatever its providers do."""
+"""Invariants of a lighthouse under random actions of its providers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STEPS = 30
 
 
 class Walk:
-    """Providers who come, go, send and stay silent as chance will have it."""
+    """Providers that join, leave, send and stay silent at random."""
 
     def __init__(self, market: Market, chance: Random) -> None:
         self.market = market
@@ -32,7 +32,7 @@ class Walk:
             self.suite.fund(person, 50 * XRT, self.lighthouse.address)
 
     def step(self) -> None:
-        """One act of somebody's."""
+        """One action of an account."""
         person = self.chance.choice(self.people)
         stake = self.lighthouse.functions.stakes(person.address).call()
         match self.chance.choice(("send", "send", "send", "refill", "withdraw", "silence")):
@@ -46,7 +46,7 @@ class Walk:
                 self.send(self.providers())
 
     def send(self, providers: list[Person]) -> None:
-        """A transaction of one of those who may send; there always is one."""
+        """A transaction of one of the providers that may send; there always is one."""
         if not providers:
             return
         orders = self.market.pair(lighthouse=self.lighthouse.address)
@@ -56,7 +56,7 @@ class Walk:
         self.suite.send(call, self.chance.choice(allowed))
 
     def providers(self) -> list[Person]:
-        """Those who have staked."""
+        """The accounts with a stake."""
         return [person for person in self.people if self.lighthouse.functions.indexOf(person.address).call()]
 
     def check(self) -> None:

@@ -61,7 +61,7 @@ def test_in_generation_3_the_validator_cannot_alter_the_result(third: Market) ->
     assert third.refusal(verdict, third.outsider) == ("WrongSigner", third.promisor.address, third.outsider.address)
 
 
-def test_in_generation_3_a_judgement_comes_once(third: Market) -> None:
+def test_in_generation_3_a_liability_is_judged_once(third: Market) -> None:
     liability = third.create(cost=COST, validator=third.outsider.address)
     judge(third, liability, success=True, agree=True)
     signature = bytes.fromhex(third.result(liability).signature)
@@ -69,7 +69,7 @@ def test_in_generation_3_a_judgement_comes_once(third: Market) -> None:
     assert third.refusal(verdict, third.outsider) == ("AlreadyFinalized", liability.address)
 
 
-def test_in_generation_5_the_validator_contract_says_whose_result_counts(fifth: Market) -> None:
+def test_in_generation_5_the_validator_contract_decides_which_result_counts(fifth: Market) -> None:
     suite = fifth.suite
     validator = suite.deploy("OneSigner", fifth.outsider.address)
     liability = fifth.create(cost=COST, validator=validator.address, validator_fee=FEE)

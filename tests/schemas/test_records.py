@@ -189,7 +189,7 @@ def test_any_bytes_decode_or_raise_invalid_record(kind: type[Record], data: byte
         kind.decode(data)
 
 
-def test_every_legacy_service_is_there() -> None:
+def test_every_legacy_service_exists() -> None:
     assert {
         "start",
         "finish",

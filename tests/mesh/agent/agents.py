@@ -1,4 +1,4 @@
-"""Agents for tests of what they hear and how they end."""
+"""Agents for tests of the messages they receive and of their end."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def settings(router: EmbeddedRouter) -> Settings:
 
 @pytest.fixture
 async def channel(router: EmbeddedRouter) -> AsyncIterator[OpenChannel]:
-    """The market's channel, of somebody else."""
+    """Another participant's channel of the market."""
     async with (
         Network(Endpoints(connect=(router.endpoint,))) as network,
         OpenChannel(network.session, MARKET, address=LIGHTHOUSE) as channel,
@@ -47,5 +47,5 @@ async def channel(router: EmbeddedRouter) -> AsyncIterator[OpenChannel]:
 
 
 async def heard_on(channel: OpenChannel, kind: str) -> None:
-    """Wait until somebody listens to a kind of message."""
+    """Wait until a subscriber receives a kind of message."""
     await until_heard(channel.session, f"aira/{MARKET}/{kind}/{MODEL}/x")

@@ -1,4 +1,4 @@
-"""A robot that is driven over Zenoh, and who drives it."""
+"""A robot that is driven over Zenoh, and the session that drives it."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Control:
 
 @pytest.fixture
 async def control(place: Place) -> AsyncIterator[Control]:
-    """A robot without handlers, a provider, and whoever drives the robot."""
+    """A robot without handlers, a provider, and a session that drives the robot."""
     async with controlled(place, offering(place.agent("robot"))) as control:
         yield control
 

@@ -53,7 +53,7 @@ async def closed(place: Place) -> AsyncIterator[Asker]:
         yield asker
 
 
-async def test_all_may_read_what_accounts_have(place: Place, closed: Asker) -> None:
+async def test_everyone_may_read_balances(place: Place, closed: Asker) -> None:
     robot, person, chain = place.address("robot"), place.address("person"), place.chains["person"]
     assert await closed.ask("eth/accounts") == Accounts((robot,))
     assert await closed.ask("eth/current_block") == BlockNumber(await chain.block_number())
@@ -70,7 +70,7 @@ async def test_all_may_read_what_accounts_have(place: Place, closed: Asker) -> N
     assert (await closed.ask("eth/account_xrt_balance", factory)).balance == await chain.tokens.balance(chain.factory)
 
 
-async def test_all_may_read_who_may_take_how_much(place: Place, closed: Asker) -> None:
+async def test_everyone_may_read_allowances(place: Place, closed: Asker) -> None:
     chain = place.chains["person"]
     await chain.tokens.approve(place.address("robot"), 123)
     asked = AccountToAddressAllowance(place.address("person"), place.address("robot"))
@@ -103,7 +103,7 @@ REQUESTS: dict[str, Record] = {
 
 
 @pytest.mark.parametrize("service", sorted(REQUESTS))
-async def test_nobody_spends_or_signs_with_an_agents_key_unless_it_lets_them(closed: Asker, service: str) -> None:
+async def test_spending_and_signing_services_are_closed_by_default(closed: Asker, service: str) -> None:
     line = await closed.refused(service, REQUESTS[service])
     assert line.startswith(f"this agent does not offer {service} to others / ")
     assert "open_services" in line
@@ -113,7 +113,7 @@ def test_all_that_is_guarded_is_tried() -> None:
     assert GUARDED - REQUESTS.keys() == {"send/demand", "send/offer"}, "which are tried with the other messages"
 
 
-async def test_tokens_are_sent_for_who_may_ask_for_it(place: Place, opened: Asker) -> None:
+async def test_tokens_are_sent_when_the_service_is_open(place: Place, opened: Asker) -> None:
     before = await place.balance("robot"), await place.balance("person")
     done = await opened.ask("eth/transfer", TransferRequest(place.address("person"), 250))
     assert (await place.balance("robot"), await place.balance("person")) == (before[0] - 250, before[1] + 250)
@@ -122,7 +122,7 @@ async def test_tokens_are_sent_for_who_may_ask_for_it(place: Place, opened: Aske
     assert receipt["status"] == 1
 
 
-async def test_who_asks_for_many_transfers_at_once_gets_each_of_them(place: Place, opened: Asker) -> None:
+async def test_concurrent_transfers_are_all_sent(place: Place, opened: Asker) -> None:
     before = await place.balance("person")
     request = TransferRequest(place.address("person"), 3)
     done = await asyncio.gather(*(opened.ask("eth/transfer", request) for _ in range(10)))
@@ -158,7 +158,7 @@ async def test_a_refused_transaction_is_one_line(opened: Asker, request_: Transf
     assert (await opened.refused("eth/transfer", request_)).startswith(said)
 
 
-async def test_an_account_without_ether_says_what_it_lacks(place: Place) -> None:
+async def test_the_error_of_an_account_without_ether_names_the_missing_amount(place: Place) -> None:
     poor = Account.from_key(new_private_key())
     chain = Chain(place.node.provider, account=poor, ens=place.market.deployment.ens, timing=QUICK)
     async with chain:
@@ -179,8 +179,8 @@ async def test_a_chain_that_was_opened_for_reading_sends_nothing(place: Place) -
     assert line.startswith("this needs an account")
 
 
-async def test_who_works_by_itself_is_not_driven_by_others(place: Place) -> None:
-    """Its own code starts and ends its jobs; without any, there is nobody else to do it."""
+async def test_services_that_drive_jobs_are_closed_by_default_for_handlers(place: Place) -> None:
+    """Its handlers start and end its jobs; without handlers, only a program that drives it can."""
     robot = offering(place.agent("robot"))
 
     @robot.on("/say")

@@ -1,4 +1,4 @@
-"""The agent as its user sees it: what its handlers hear, and what it says of itself."""
+"""The agent as its user sees it: the messages its handlers receive, and the errors and logs it gives."""
 
 from __future__ import annotations
 
@@ -34,7 +34,9 @@ __all__ = ["channel", "settings"]
 Order = Verified[Demand] | Verified[Offer]
 
 
-async def test_an_agent_without_account_hears_the_market(settings: Settings, channel: OpenChannel) -> None:
+async def test_an_agent_without_account_receives_messages_of_the_market(
+    settings: Settings, channel: OpenChannel
+) -> None:
     agent = Agent(settings=settings)
     heard: list[object] = []
 
@@ -60,7 +62,7 @@ async def test_an_agent_without_account_hears_the_market(settings: Settings, cha
         assert sorted(map(repr, heard)) == sorted(map(repr, messages))
 
 
-async def test_an_agent_hears_the_orders_of_its_model_only(settings: Settings, channel: OpenChannel) -> None:
+async def test_an_agent_receives_only_orders_of_its_model(settings: Settings, channel: OpenChannel) -> None:
     agent = Agent(MODEL, settings=settings)
     heard: list[Demand] = []
 
@@ -154,7 +156,7 @@ async def test_a_late_agent_receives_all_of_many_open_orders(place: Place) -> No
             await until(lambda: len(heard) == len(orders), seconds=30)
 
 
-async def test_every_calls_at_the_start_and_again_in_spite_of_failures(settings: Settings) -> None:
+async def test_a_periodic_handler_is_called_at_the_start_and_again_after_failures(settings: Settings) -> None:
     agent = Agent(settings=settings)
     calls = 0
 
@@ -172,7 +174,7 @@ async def test_every_calls_at_the_start_and_again_in_spite_of_failures(settings:
     assert calls == ended
 
 
-async def test_trading_without_account_is_one_clear_error(settings: Settings) -> None:
+async def test_trading_without_account_raises(settings: Settings) -> None:
     async with Agent(settings=settings) as agent:
         for attempt in (
             agent.demand(cid_of_bytes(b"job")),
@@ -199,7 +201,7 @@ async def test_two_handlers_for_one_topic_are_refused() -> None:
     assert (caught.value.code, caught.value.topic) == ("duplicate-handler", "/go")
 
 
-async def test_a_working_agent_shows_that_it_is_there(place: Place) -> None:
+async def test_a_working_agent_is_present_on_its_channel(place: Place) -> None:
     async with place.agent("person") as person, place.agent("robot"):
 
         async def both() -> bool:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["channel", "settings"]
 
 
-async def test_an_agent_that_does_not_run_says_so(settings: Settings) -> None:
+async def test_an_agent_that_is_not_running_raises(settings: Settings) -> None:
     agent = Agent(settings=settings)
     for use in ("channel", "parts", "address"):
         with pytest.raises(ClosedError):
@@ -128,7 +128,7 @@ def listening(agent: Agent, heard: list[Demand]) -> Agent:
 
 
 async def test_a_job_handler_that_uses_the_agent_while_it_ends_does_not_fail_its_job(place: Place) -> None:
-    """A refund because of a Ctrl-C would be a job lost: it is to be resumed."""
+    """Ctrl-C must not fail and refund a job: the restarted agent resumes it."""
     robot = offering(place.agent("robot"))
     begun = asyncio.Event()
 

@@ -1,4 +1,4 @@
-"""Allowances: the factory may take what open orders cost, whatever happens while the allowance is approved."""
+"""Allowances: the factory may take the cost of open orders, also when they change during an approval."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ async def test_a_released_order_no_longer_counts(chain: Chain, allowances: Allow
 async def test_an_allowance_used_up_meanwhile_is_approved_again(
     place: Place, road: Overtaken, chain: Chain, allowances: Allowances
 ) -> None:
-    """Gas is estimated for changing an allowance; to set one anew costs more."""
+    """Gas is estimated for changing an allowance; setting one that is used up costs more."""
     await chain.tokens.approve(chain.factory, 100)
     spent: list[int] = []
 

@@ -1,4 +1,4 @@
-"""The chain that settings name: every option of theirs reaches it, and what is sent is written down."""
+"""The chain that the settings describe: each option reaches it, and sent transactions are written to disk."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ async def test_the_next_run_continues_an_unconfirmed_transaction(served: ServedC
         assert await chain.tokens.balance(friend) == 14
 
 
-async def test_programs_of_one_account_get_not_in_each_others_way(served: ServedChain, tmp_path: Path) -> None:
+async def test_programs_of_one_account_do_not_disturb_each_other(served: ServedChain, tmp_path: Path) -> None:
     friend = Account.from_key(new_private_key()).address
     key = served.node.funded_keys[0].hex()
     variables = {"AIRA_WEB3_HTTP_PROVIDER": served.url, "AIRA_DATA_DIR": str(tmp_path), "AIRA_POLL_INTERVAL": "0.05"}

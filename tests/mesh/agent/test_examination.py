@@ -1,4 +1,4 @@
-"""A look at the objective before anything is offered for it."""
+"""Objectives are examined before anything is offered for them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def refused_offers(caplog: pytest.LogCaptureFixture) -> list[dict[str, str]]:
 
 
 class Speed(Struct):
-    """What a robot is told that can drive."""
+    """The messages of a robot that drives."""
 
     metres_per_second: float
 
@@ -86,7 +86,7 @@ async def test_no_offer_is_made_for_a_message_that_its_handler_can_not_take(
         unfit.cancel()
 
 
-async def test_demands_with_objectives_that_nobody_has_hold_up_no_other(place: Place) -> None:
+async def test_demands_with_unavailable_objectives_do_not_delay_others(place: Place) -> None:
     robot = going(offering(place.agent("robot", fetch_timeout=60.0)))
     async with place.at_work(robot) as person, asyncio.timeout(50):
         missing = [

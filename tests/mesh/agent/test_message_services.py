@@ -31,7 +31,7 @@ RECORDING = cid_of_bytes(b"a recording")
 
 @pytest.fixture
 async def ear(place: Place) -> AsyncIterator[Agent]:
-    """Somebody who hears what is said on the market."""
+    """An agent that receives the messages of the market."""
     async with place.agent("person") as ear:
         yield ear
 
@@ -63,7 +63,7 @@ def demand_of(place: Place, agent: Agent, *, generation: int = 3, **changed: Any
 async def hearing(
     speaker: Agent, kind: type[Any], ear: Agent, subject: str = MODEL
 ) -> AsyncIterator[Subscription[Any]]:
-    """What is published of a kind, once what the speaker puts on keys of the subject reaches the ear."""
+    """The messages of a kind that `ear` receives; entered when those of `speaker` on the subject's keys reach it."""
     async with ear.channel.subscribe(kind) as messages:
         key = f"aira/{ear.channel.lighthouse}/{kind.__name__.lower()}/{subject}/{'0' * 64}"
         await until_heard(speaker.parts.network.session, key)
@@ -111,7 +111,7 @@ async def test_orders_that_two_agents_signed_become_a_contract(place: Place, gen
 
 
 async def test_a_result_that_the_agent_signed_ends_the_contract_and_is_sent_until_then(place: Place) -> None:
-    """The robot's own executor is off: who drives it makes the results."""
+    """The executor of the robot is off: the program that drives it makes the results."""
     robot = offering(place.agent("robot", open_services=True, enable_executor=False))
     async with asking(place, robot) as asker, place.agent("person") as person:
         async with place.provider():
@@ -124,11 +124,11 @@ async def test_a_result_that_the_agent_signed_ends_the_contract_and_is_sent_unti
         await until_settled(robot)
         again = SignResult(liability=contract.address, result=RECORDING, success=True)
         assert isinstance(await asker.ask("sign/result", again), Published)
-        assert await waiting(robot) == [], "what has ended is not waited for"
+        assert await waiting(robot) == [], "the result of an ended contract is not kept"
 
 
-async def test_a_result_that_answers_no_contract_goes_out_once(place: Place, opened: Asker, ear: Agent) -> None:
-    """As that of a sensor that answers a demand without a price: nothing on the chain tells that it was heard."""
+async def test_a_result_without_a_contract_is_published_once(place: Place, opened: Asker, ear: Agent) -> None:
+    """As a sensor answers a demand without a price: nothing on the chain confirms that it arrived."""
     request = SignResult(liability=ear.address, result=RECORDING, success=True)
     async with hearing(opened.agent, Result, ear, ear.address.lower()) as results:
         published = await opened.ask("sign/result", request)
@@ -139,7 +139,7 @@ async def test_a_result_that_answers_no_contract_goes_out_once(place: Place, ope
 
 
 @GENERATIONS
-async def test_a_signed_order_is_published_as_it_is(place: Place, opened: Asker, ear: Agent, generation: int) -> None:
+async def test_a_signed_order_is_published_unchanged(place: Place, opened: Asker, ear: Agent, generation: int) -> None:
     demand = demand_of(place, ear, generation=generation)
     async with hearing(opened.agent, Demand, ear) as demands:
         published = await opened.ask("send/demand", SendDemand.of(demand))
@@ -172,11 +172,11 @@ async def test_names_in_a_signed_order_are_looked_up(place: Place, opened: Asker
 
 
 def forged(message: SignedMessage) -> Any:
-    """The same with a signature of nobody's."""
+    """The same message with an invalid signature."""
     return msgspec.structs.replace(message, signature="00" * 65)
 
 
-async def test_only_what_is_rightly_signed_is_published(place: Place, opened: Asker, ear: Agent) -> None:
+async def test_only_messages_with_valid_signatures_are_published(place: Place, opened: Asker, ear: Agent) -> None:
     demand = demand_of(place, ear, generation=5)
     line = await opened.refused("send/demand", SendDemand.of(forged(demand)))
     assert "signature" in line
@@ -186,7 +186,9 @@ async def test_only_what_is_rightly_signed_is_published(place: Place, opened: As
     assert "decimal digits" in await opened.refused("send/demand", nonce)
 
 
-async def test_orders_are_for_the_agents_lighthouse_and_not_too_late(place: Place, opened: Asker, ear: Agent) -> None:
+async def test_orders_of_other_lighthouses_and_expired_orders_are_refused(
+    place: Place, opened: Asker, ear: Agent
+) -> None:
     elsewhere = demand_of(place, ear, lighthouse=place.market.deployment.xrt)
     line = await opened.refused("send/demand", SendDemand.of(elsewhere))
     assert line.startswith(f"this agent trades on {ear.channel.address}")
@@ -198,7 +200,7 @@ async def test_orders_are_for_the_agents_lighthouse_and_not_too_late(place: Plac
     assert await waiting(opened.agent) == []
 
 
-async def test_what_can_not_be_an_order_is_told_by_its_field(place: Place, opened: Asker, ear: Agent) -> None:
+async def test_the_refusal_of_an_invalid_order_names_its_field(place: Place, opened: Asker, ear: Agent) -> None:
     asked = SignDemand(**terms(place, ear, objective="the kitchen"), validator_fee=0)
     assert "objective" in await opened.refused("sign/demand", asked)
     asked = SignDemand(**terms(place, ear, model="dance.model.3.robonomics.eth"), validator_fee=0)

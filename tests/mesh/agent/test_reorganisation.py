@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["ledger"]
 
 
-async def test_a_chain_that_is_shorter_than_what_was_read_is_refused(place: Place, ledger: Ledger) -> None:
+async def test_a_chain_shorter_than_the_cursor_is_refused(place: Place, ledger: Ledger) -> None:
     await ledger.set_cursor(ChainListener.CURSOR, 10**6)
     async with opened(place, ledger) as listener:
         with pytest.raises(ChainWentBack):

@@ -1,4 +1,4 @@
-"""An agent without handlers: driven over Zenoh by somebody else, who also is its device."""
+"""An agent without handlers: another program drives it over Zenoh, and is its device too."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ async def test_a_ready_job_may_be_restarted_too(place: Place, control: Control, 
     assert (await contract.outcome()).success
 
 
-async def test_resume_goes_on_after_the_agent_was_down(place: Place) -> None:
+async def test_resume_continues_a_job_after_a_restart_of_the_agent(place: Place) -> None:
     async with place.agent("person") as person:
         async with controlled(place, offering(place.agent("robot"))) as control:
             contract = await ready(control, person, place)
@@ -131,7 +131,7 @@ async def test_a_ready_job_can_be_started_right_after_the_agent_has_come_back(pl
             assert (await contract.outcome()).success
 
 
-async def test_read_tells_a_job_as_the_ledger_has_it(place: Place, control: Control, person: Agent) -> None:
+async def test_read_returns_the_job_of_the_ledger(place: Place, control: Control, person: Agent) -> None:
     contract = await ready(control, person, place, cost=7)
     assert await control.read(contract.address) == LiabilityRead(True, contract.liability)
     await control.finish(contract.address, success=True)
@@ -156,25 +156,27 @@ async def test_addresses_may_be_asked_for_in_lower_case(place: Place, control: C
 
 
 async def test_events_are_on_the_agents_keys_with_the_record(place: Place, control: Control, person: Agent) -> None:
-    told: list[tuple[str, Liability]] = []
+    records: list[tuple[str, Liability]] = []
     subscriber: Any = control.session.declare_subscriber(
         f"aira/agent/{control.robot.address.lower()}/liability/*/*",
-        lambda sample: told.append((str(sample.key_expr), Liability.decode(sample.payload.to_bytes()))),
+        lambda sample: records.append((str(sample.key_expr), Liability.decode(sample.payload.to_bytes()))),
     )
     contract = await ready(control, person, place)
     await control.start(contract.address)
     await control.finish(contract.address)
     outcome = await contract.outcome()
-    await until(lambda: len(told) == 4)
+    await until(lambda: len(records) == 4)
     subscriber.undeclare()
     events = f"aira/agent/{control.robot.address.lower()}/liability/{contract.address.lower()}"
-    assert [key for key, _ in told] == [f"{events}/{event}" for event in ("incoming", "ready", "complete", "finalized")]
-    assert [record.address for _, record in told] == [contract.address] * 4
-    assert [record.result for _, record in told] == ["", "", outcome.result, outcome.result]
-    assert [record.is_finalized for _, record in told] == [False, False, False, True]
+    assert [key for key, _ in records] == [
+        f"{events}/{event}" for event in ("incoming", "ready", "complete", "finalized")
+    ]
+    assert [record.address for _, record in records] == [contract.address] * 4
+    assert [record.result for _, record in records] == ["", "", outcome.result, outcome.result]
+    assert [record.is_finalized for _, record in records] == [False, False, False, True]
 
 
-async def test_a_device_hears_the_objective_and_answers_within_the_job(
+async def test_a_device_receives_the_objective_and_answers_within_the_job(
     place: Place, control: Control, person: Agent
 ) -> None:
     contract = await ready(control, person, place)

@@ -1,4 +1,4 @@
-"""What an agent's services refuse, and why."""
+"""Requests that the services of an agent refuse, and the reasons."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def not_done(address: str, asked: str, phase: Phase | None) -> Done:
     return Done(False, str(WrongPhase(address, asked=asked, phase=phase)))
 
 
-async def test_what_the_phase_does_not_allow_is_answered_with_the_reason(
+async def test_a_request_that_the_phase_does_not_allow_is_answered_with_the_reason(
     place: Place, control: Control, person: Agent
 ) -> None:
     contract = await ready(control, person, place)
@@ -52,7 +52,7 @@ async def test_what_the_phase_does_not_allow_is_answered_with_the_reason(
         assert done.msg.startswith(f"can't {service} {address}: it is ")
 
 
-async def test_a_job_whose_objective_has_not_come_can_not_be_started(place: Place) -> None:
+async def test_a_job_whose_objective_was_not_fetched_can_not_be_started(place: Place) -> None:
     robot = offering_unseen(place.agent("robot", fetch_timeout=30.0))
     async with controlled(place, robot) as control, place.agent("person") as person:
         contract = await person.demand(cid_of_bytes(b"nobody's"))
@@ -63,7 +63,7 @@ async def test_a_job_whose_objective_has_not_come_can_not_be_started(place: Plac
         assert not (await contract.outcome()).success
 
 
-async def test_unknown_liabilities_are_no_jobs(control: Control) -> None:
+async def test_an_unknown_liability_is_not_a_job(control: Control) -> None:
     done = await control.start(ZERO_ADDRESS)
     assert done == not_done(ZERO_ADDRESS, "start", None)
     assert await control.read(ZERO_ADDRESS) == LiabilityRead(False)
@@ -74,7 +74,7 @@ async def test_unknown_liabilities_are_no_jobs(control: Control) -> None:
 
 
 @pytest.mark.parametrize("service", ["start", "restart", "resume", "finish", "read"])
-async def test_what_is_no_address_is_an_error_reply(control: Control, service: str) -> None:
+async def test_an_invalid_address_is_an_error_reply(control: Control, service: str) -> None:
     requests = {"finish": FinishLiability("the kitchen", True), "read": ReadLiability("the kitchen")}
     with pytest.raises(ServiceFailed) as caught:
         await control.ask(service, requests.get(service, StartLiability("the kitchen")))

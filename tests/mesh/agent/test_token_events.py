@@ -27,7 +27,7 @@ ME, YOU, OTHERS = ("0x" + f"{number:02x}" * 20 for number in (1, 2, 3))
 
 @asynccontextmanager
 async def heard(place: Place, agent: Agent) -> AsyncIterator[list[Any]]:
-    """The events that are told on the running agent's keys."""
+    """The events that are published on the keys of the running agent."""
     events: list[Any] = []
 
     def hear(sample: zenoh.Sample) -> None:
@@ -50,7 +50,7 @@ async def until_handled(place: Place, agent: Agent) -> None:
     await until(lambda: agent.parts.chain_head.head >= head, what=f"block {head}", seconds=30)
 
 
-async def test_what_comes_goes_and_is_allowed_is_told_as_the_legacy_stack_did(place: Place) -> None:
+async def test_transfers_and_approvals_of_the_agent_are_published_like_the_legacy_stack(place: Place) -> None:
     robot, person, provider = (place.address(role) for role in ("robot", "person", "provider"))
     async with place.agent("robot") as agent, heard(place, agent) as events:
         await place.chains["person"].tokens.transfer(robot, 11)
@@ -69,7 +69,7 @@ async def test_what_comes_goes_and_is_allowed_is_told_as_the_legacy_stack_did(pl
     assert approvals == [ApprovalEvent(robot, person, 13), ApprovalEvent(person, robot, 14)]
 
 
-async def test_what_others_do_among_themselves_is_not_told(place: Place) -> None:
+async def test_transfers_and_approvals_between_others_are_not_published(place: Place) -> None:
     async with place.agent("robot") as agent, heard(place, agent) as events:
         await place.chains["person"].tokens.transfer(place.address("provider"), 1)
         await place.chains["person"].tokens.approve(place.address("provider"), 1)
@@ -89,7 +89,7 @@ async def test_events_are_of_the_token_of_the_settings(place: Place) -> None:
     assert events == [TransferEvent(place.address("robot"), person, 2)]
 
 
-async def test_what_happened_while_the_agent_was_down_is_told_when_it_is_back_and_nothing_again(place: Place) -> None:
+async def test_events_during_downtime_are_published_after_the_restart_and_none_twice(place: Place) -> None:
     person, robot = place.address("person"), place.address("robot")
     async with place.agent("robot") as agent, heard(place, agent) as events:
         await place.chains["person"].tokens.transfer(robot, 1)
@@ -97,22 +97,22 @@ async def test_what_happened_while_the_agent_was_down_is_told_when_it_is_back_an
         await until_handled(place, agent)
     await place.chains["person"].tokens.transfer(robot, 2)
     agent = place.agent("robot")
-    told: list[Any] = []
+    published: list[Any] = []
     async with Network(Endpoints(connect=(place.endpoint,))) as network:
         key = str(EthEventKey(robot, "transfer"))
         subscriber: Any = network.session.declare_subscriber(
-            key, lambda sample: told.append(TransferEvent.decode(sample.payload.to_bytes()))
+            key, lambda sample: published.append(TransferEvent.decode(sample.payload.to_bytes()))
         )
         async with agent:
             await place.chains["person"].tokens.transfer(robot, 3)
-            await until(lambda: TransferEvent(person, robot, 3) in told, seconds=30)
+            await until(lambda: TransferEvent(person, robot, 3) in published, seconds=30)
             await until_handled(place, agent)
         subscriber.undeclare()
-    assert TransferEvent(person, robot, 1) not in told
-    assert len(told) == len(set(told))
+    assert TransferEvent(person, robot, 1) not in published
+    assert len(published) == len(set(published))
 
 
-async def test_a_transfer_that_lands_in_another_block_after_a_reorganisation_is_told_once(place: Place) -> None:
+async def test_a_transfer_in_another_block_after_a_reorganisation_is_published_once(place: Place) -> None:
     chain, person = place.chains["person"], place.address("person")
     friend = Account.from_key(new_private_key()).address
     async with place.agent("robot") as agent, heard(place, agent) as events:
@@ -143,26 +143,26 @@ async def raw_of(place: Place, tx: str) -> str:
     return "0x" + signed.raw.hex()
 
 
-def told_by(*told: Transfer | Approval, taken_back: tuple[Transfer | Approval, ...] = ()) -> list[str]:
-    """The events that are told of the first, the taken back, and the first again, by their keys' last part."""
+def published_by(*events: Transfer | Approval, reverted: tuple[Transfer | Approval, ...] = ()) -> list[str]:
+    """The last parts of the keys when `events` are published, `reverted` ones reverted, and all published again."""
     keys: list[str] = []
-    events = TokenEvents(lambda key, _: keys.append(key.rpartition("/")[2]), ME)
-    for event in told:
-        events.publish(event)
-    for event in reversed(taken_back):
-        events.revert(event)
-    for event in told:
-        events.publish(event)
+    token_events = TokenEvents(lambda key, _: keys.append(key.rpartition("/")[2]), ME)
+    for event in events:
+        token_events.publish(event)
+    for event in reversed(reverted):
+        token_events.revert(event)
+    for event in events:
+        token_events.publish(event)
     return keys
 
 
 def test_equal_events_of_one_transaction_are_several() -> None:
     twice = Transfer(ME, YOU, 5, "0x1"), Transfer(ME, YOU, 5, "0x1")
-    assert told_by(*twice) == ["transfer"] * 4
-    assert told_by(*twice, taken_back=twice) == ["transfer"] * 2
-    assert told_by(*twice, taken_back=twice[:1]) == ["transfer"] * 3
+    assert published_by(*twice) == ["transfer"] * 4
+    assert published_by(*twice, reverted=twice) == ["transfer"] * 2
+    assert published_by(*twice, reverted=twice[:1]) == ["transfer"] * 3
 
 
-def test_the_same_from_another_transaction_is_told() -> None:
-    assert told_by(Approval(ME, YOU, 5, "0x1"), taken_back=(Approval(ME, YOU, 5, "0x2"),)) == ["approval"] * 2
-    assert told_by(Approval(OTHERS, YOU, 5, "0x1")) == []
+def test_an_equal_event_of_another_transaction_is_published() -> None:
+    assert published_by(Approval(ME, YOU, 5, "0x1"), reverted=(Approval(ME, YOU, 5, "0x2"),)) == ["approval"] * 2
+    assert published_by(Approval(OTHERS, YOU, 5, "0x1")) == []

@@ -41,7 +41,7 @@ async def test_a_demand_becomes_a_contract_with_its_terms(place: Place, generati
 
 
 @GENERATIONS
-async def test_concurrent_demands_become_a_contract_each(place: Place, generation: int) -> None:
+async def test_each_of_several_concurrent_demands_becomes_a_contract(place: Place, generation: int) -> None:
     """Generation 5 counts the orders of an account: one that is overtaken is signed again, on both sides."""
     before = await place.balance("robot")
     async with place.provider(), working(place.agent("robot")), place.agent("person", generation=generation) as person:
@@ -54,7 +54,7 @@ async def test_concurrent_demands_become_a_contract_each(place: Place, generatio
 
 
 async def test_overtaken_offers_of_generation_5_are_signed_again(place: Place) -> None:
-    """Both of the robot's offers bear the same nonce, since neither was taken when they were made."""
+    """Both offers of the robot have the same nonce, because neither was taken when they were made."""
     robot = working(place.agent("robot"))
     people = [place.agent(role, generation=5) for role in ("person", "provider")]
     async with robot, people[0], people[1], asyncio.timeout(30):
@@ -68,7 +68,7 @@ async def test_overtaken_offers_of_generation_5_are_signed_again(place: Place) -
 
 
 async def test_an_overtaken_demand_of_generation_5_is_signed_again_without_a_rejection(place: Place) -> None:
-    """Nobody offers to do it, so no provider says that its nonce is used: the person knows it of the other demand."""
+    """It has no offer, so no provider rejects its used nonce: the person knows from the other demand."""
     robot = place.agent("robot", generation=5)
     async with place.provider(), robot, place.agent("person", generation=5) as person:
         trader = person.runtime.trader
@@ -83,7 +83,7 @@ async def test_an_overtaken_demand_of_generation_5_is_signed_again_without_a_rej
         await asyncio.wait([lonely])
 
 
-async def test_the_factory_is_allowed_what_all_open_demands_may_cost(place: Place) -> None:
+async def test_the_allowance_of_the_factory_covers_all_open_demands(place: Place) -> None:
     async with place.agent("person") as person:
         demands = [asyncio.create_task(person.demand(OBJECTIVE, cost=cost)) for cost in (7000, 500)]
         await until_found(lambda: all_posted(person, 2))
@@ -102,7 +102,7 @@ async def test_short_funds_raise_before_anything_is_sent(place: Place) -> None:
         assert await waiting(person) == []
 
 
-async def test_open_demands_count_towards_what_can_be_paid_until_they_are_given_up(place: Place) -> None:
+async def test_open_demands_reserve_tokens_until_they_are_cancelled(place: Place) -> None:
     balance = await place.balance("person")
     async with place.agent("person") as person:
         first = asyncio.create_task(person.demand(OBJECTIVE, cost=balance))
@@ -145,7 +145,7 @@ async def test_closing_the_agent_fails_the_wait_for_a_contract(place: Place) -> 
     with pytest.raises(ClosedError):
         await asyncio.wait_for(demand, 10)
     async with place.agent("person") as person:
-        assert await waiting(person) == [], "nobody waits for it any more"
+        assert await waiting(person) == [], "a closed agent does not wait for it"
 
 
 async def test_closing_the_agent_fails_the_wait_for_an_outcome(place: Place) -> None:
@@ -236,7 +236,7 @@ async def test_an_order_of_an_earlier_run_is_settled_when_it_is_taken(place: Pla
         await until_found(lambda: all_posted(person, 0))
 
 
-async def test_a_contract_of_others_can_be_waited_for(place: Place) -> None:
+async def test_an_agent_can_wait_for_a_contract_of_others(place: Place) -> None:
     robot = offering(place.agent("robot"))
     async with place.provider(), robot, place.agent("person") as person, place.agent("provider") as stranger:
         address = (await person.demand(job(place))).address
@@ -257,14 +257,14 @@ async def test_a_contract_that_has_ended_has_its_outcome_at_once(place: Place) -
         assert later.runtime.trader.watched == frozenset()
 
 
-async def test_what_is_no_contract_can_not_be_waited_for(place: Place) -> None:
+async def test_waiting_for_an_address_that_is_not_a_contract_raises(place: Place) -> None:
     async with place.agent("person") as person:
         with pytest.raises(NotALiability):
             await person.contract(place.address("robot"))
         assert person.runtime.trader.watched == frozenset()
 
 
-async def test_giving_up_to_wait_for_an_outcome_leaves_it_to_others(place: Place) -> None:
+async def test_cancelling_one_wait_for_an_outcome_does_not_affect_others(place: Place) -> None:
     robot = offering(place.agent("robot"))
     async with place.provider(), robot, place.agent("person") as person:
         contract = await person.demand(job(place))

@@ -19,7 +19,7 @@ from tests.support.market import MODEL, Place
 from tests.support.waiting import until, until_found
 
 
-async def test_a_demand_that_nobody_takes_expires_at_its_deadline(place: Place) -> None:
+async def test_a_demand_without_a_match_expires_at_its_deadline(place: Place) -> None:
     async with place.provider(), place.agent("person") as person:
         deadline = await place.chains["person"].block_number() + 5
         demand = asyncio.create_task(person.demand(OBJECTIVE, lifetime=5))
@@ -53,7 +53,7 @@ def rejection(place: Place, role: str, order: str, *, reason: str = "Unwanted") 
 
 
 def untrue_rejections(place: Place, order: str) -> list[Rejection]:
-    """Of another order; in a provider's name, unsigned, or signed by somebody else; by somebody who is no provider."""
+    """For another order; unsigned or signed by another account; by an account that is not a provider."""
     true = rejection(place, "provider", order)
     forged = rejection(place, "robot", order)
     return [
@@ -88,7 +88,7 @@ async def test_a_rejection_is_believed_of_the_lighthouses_providers_only(
         assert (caught.value.rejection.reason, caught.value.rejection.detail) == ("Unwanted", "go away")
 
 
-async def test_a_rejection_of_what_is_a_contract_already_means_nothing(place: Place) -> None:
+async def test_a_rejection_of_an_order_that_became_a_contract_is_ignored(place: Place) -> None:
     """Another provider was quicker, and this one says so before the person has read of the contract on the chain.
 
     A person of generation 5 would sign a second demand, and pay for two contracts.
@@ -116,7 +116,9 @@ async def test_a_rejection_of_what_is_a_contract_already_means_nothing(place: Pl
         assert await chain.liabilities.next_nonce(me.address) == before + 1
 
 
-async def test_a_provider_without_room_is_asked_again(place: Place, caplog: pytest.LogCaptureFixture) -> None:
+async def test_an_order_is_sent_again_to_a_provider_whose_book_was_full(
+    place: Place, caplog: pytest.LogCaptureFixture
+) -> None:
     async with place.agent("person") as person, Network(Endpoints(connect=(place.endpoint,))) as network:
         demand = asyncio.create_task(person.demand(cid_of_file(job(place))))
         await posted(person)
@@ -130,7 +132,7 @@ async def test_a_provider_without_room_is_asked_again(place: Place, caplog: pyte
 
 
 async def test_orders_of_a_reverted_contract_are_sent_again(place: Place) -> None:
-    """The provider who made it is gone, and another one has never heard of them."""
+    """The provider that created it is gone, and another one does not know the orders."""
     async with working(place.agent("robot")) as robot, place.agent("person") as person:
         async with place.provider():
             contract = await person.demand(cid_of_bytes(b"a job that nobody can begin"))
@@ -183,8 +185,8 @@ async def test_a_contract_that_is_created_again_does_not_fail_at_the_deadline(pl
         outcome.cancel()
 
 
-async def test_a_contract_on_our_terms_that_a_stranger_has_signed_leaves_our_demand_open(place: Place) -> None:
-    """He copies the demand with its nonce, so its hash is the same, and takes an offer of the same account."""
+async def test_a_contract_on_equal_terms_of_another_signer_leaves_our_demand_open(place: Place) -> None:
+    """The other signer copies the demand with its nonce, so its hash is the same, and takes an offer of the person."""
     async with place.agent("person", enable_executor=False) as person:
         demanding = asyncio.create_task(person.demand(OBJECTIVE))
         await posted(person)
@@ -209,7 +211,7 @@ async def test_a_contract_on_our_terms_that_a_stranger_has_signed_leaves_our_dem
         await asyncio.wait([demanding])
 
 
-async def test_an_offer_that_can_not_be_signed_again_stops_nothing(
+async def test_an_offer_that_can_not_be_signed_again_does_not_stop_the_agent(
     place: Place, caplog: pytest.LogCaptureFixture
 ) -> None:
     """One of two offers of generation 5 was taken; for the fee of the other one the robot has too little by then."""

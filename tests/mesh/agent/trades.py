@@ -1,4 +1,4 @@
-"""What is traded in the tests, and when it is known."""
+"""Jobs and orders of the tests of trading, and waiting for their effects."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ OBJECTIVE = cid_of_bytes(b"something to be done")
 
 
 def working(robot: Agent) -> Agent:
-    """The same robot, which does whatever it is asked and played."""
+    """The same robot, which offers work for every demand and handles every message."""
 
     @robot.on("*")
     async def nothing(job: Job, message: Any) -> None:
@@ -33,7 +33,7 @@ def job(place: Place) -> Path:
 
 
 async def waiting(agent: Agent) -> list[str]:
-    """The kinds of what is in an agent's outbox."""
+    """The kinds of the messages in an agent's outbox."""
     return [message.kind for message in await agent.parts.ledger.outbox(head=0)]
 
 

@@ -127,7 +127,7 @@ async def prepare(endpoint: str | AsyncBaseProvider, keys: tuple[bytes, ...]) ->
 
 
 async def read_to(chain: Chain, first: int, last: int, *, lighthouses: Iterable[str] = ()) -> list[BlockEvents]:
-    """What is told of the blocks from `first` to `last`."""
+    """The events of the blocks from `first` to `last`."""
     blocks: list[BlockEvents] = []
     async with asyncio.timeout(10), aclosing(chain.follow(first, lighthouses=lighthouses)) as events:
         async for block in events:

@@ -102,7 +102,7 @@ def test_a_keyfiles_address_is_read_without_the_password(keyfile: Path) -> None:
     assert keyfile_address(keyfile) == ADDRESS
 
 
-def test_a_wrong_password_is_one_clear_error(keyfile: Path, tmp_path: Path) -> None:
+def test_a_wrong_password_is_an_error_that_does_not_show_it(keyfile: Path, tmp_path: Path) -> None:
     password_file = _password_file(tmp_path, "mellon")
     with pytest.raises(WrongPassword) as caught:
         Account.from_keyfile(keyfile, password_file)
@@ -113,7 +113,7 @@ def test_a_wrong_password_is_one_clear_error(keyfile: Path, tmp_path: Path) -> N
     assert "mellon" not in str(caught.value)
 
 
-def test_a_missing_keyfile_says_how_to_make_one(tmp_path: Path) -> None:
+def test_the_error_of_a_missing_keyfile_has_the_command_to_make_one(tmp_path: Path) -> None:
     with pytest.raises(KeyfileError) as caught:
         Account.from_keyfile(tmp_path / "no.json", _password_file(tmp_path, "x"))
     assert caught.value.path == str(tmp_path / "no.json")

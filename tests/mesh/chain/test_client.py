@@ -91,7 +91,7 @@ async def test_ether_balances_and_transfers(market: DeployedMarket) -> None:
         assert await chain.tokens.eth_balance() > 10**15
 
 
-async def test_without_funds_there_is_one_clear_error(market: DeployedMarket) -> None:
+async def test_a_transaction_without_funds_raises(market: DeployedMarket) -> None:
     poor = Account.from_key(new_private_key())
     async with market.chain(poor) as chain:
         with pytest.raises(InsufficientFunds) as caught:
@@ -235,7 +235,7 @@ async def test_the_named_validator_finalizes_a_generation_3_liability(market: De
     assert (record.is_finalized, record.is_success, record.validator) == (True, False, validator)
 
 
-async def test_a_promisee_is_refunded_when_no_result_comes(market: DeployedMarket) -> None:
+async def test_a_promisee_is_refunded_without_a_result(market: DeployedMarket) -> None:
     async with market.chain(market.provider) as chain:
         before = await chain.tokens.balance(market.promisee.address)
         created = await chain.liabilities.create("airalab", market.demand(cost=9), market.offer(cost=9))

@@ -141,7 +141,7 @@ async def test_a_node_that_is_still_indexing_is_asked_for_the_receipt_again(anvi
 
 async def test_sending_again_after_a_lost_answer_continues_the_first_transaction(anvil: Anvil) -> None:
     """The node takes the transaction and is gone before it says so; the caller tries again when it is back."""
-    wire, friend = _Deaf(anvil.url), unused_address()
+    wire, friend = _AnswerLosingTransport(anvil.url), unused_address()
     async with Node(wire, timing=QUICK) as node:
         sender = TransactionSender(node, Account.from_key(anvil.private_keys[0]))
         wire.loses = True
@@ -160,8 +160,8 @@ async def test_sending_again_after_a_lost_answer_continues_the_first_transaction
     await wire.close()
 
 
-class _Deaf(HttpTransport):
-    """A way to a node that can lose the answers to what is sent."""
+class _AnswerLosingTransport(HttpTransport):
+    """A transport that can lose the answers to sent transactions."""
 
     loses = False
 

@@ -15,7 +15,7 @@ NAME = b"airalab"
 
 
 def _log(name: bytes, *, announced: int) -> dict[str, object]:
-    """A factory's NewLighthouse, with a name that is said to have `announced` bytes."""
+    """A factory's NewLighthouse, with a name whose length is stated as `announced` bytes."""
     return {
         "address": FACTORY,
         "topics": [keccak256(b"NewLighthouse(address,string)"), address_bytes(LIGHTHOUSE).rjust(32, b"\0")],
@@ -38,5 +38,5 @@ def test_a_name_that_fills_its_words_is_decoded() -> None:
 
 
 @pytest.mark.parametrize("name", [b"", NAME, b"\xff" * 70])
-def test_a_missing_or_invalid_name_is_no_event(name: bytes) -> None:
+def test_a_log_with_a_missing_or_invalid_name_is_not_an_event(name: bytes) -> None:
     assert decode_log(_log(name, announced=70)) is None

@@ -126,7 +126,7 @@ async def test_a_cursor_past_the_head_is_an_error(market: DeployedMarket) -> Non
 
 
 async def test_events_of_another_factorys_liabilities_are_left_out(market: DeployedMarket) -> None:
-    """A second factory on the same chain makes liabilities of its own; they are no business of the first."""
+    """A second factory on the same chain makes liabilities of its own; the first does not report them."""
     async with market.chain(market.deployer) as chain:
         other = await deploy(chain.node, market.deployer)
     elsewhere: dict[str, Any] = {"lighthouse": other.lighthouse, "token": other.xrt}

@@ -37,14 +37,14 @@ if TYPE_CHECKING:
 
 
 class Fork:
-    """A chain whose last blocks can be replaced, with contracts and one account that approves things."""
+    """A chain whose last blocks can be replaced, with contracts and an account that approves allowances."""
 
     def __init__(self, chain: Chain, friend: str) -> None:
         self.chain = chain
         self.friend = friend
 
     async def approve(self, value: int) -> int:
-        """Make one event, in a block of its own; the block's number."""
+        """Make one event, in a separate block; the number of the block."""
         await self.chain.tokens.approve(self.friend, value)
         return await self.chain.block_number()
 
@@ -85,13 +85,13 @@ async def fork(request: pytest.FixtureRequest) -> AsyncIterator[Fork]:
 async def _until(
     events: AsyncGenerator[BlockEvents, None], is_last: Callable[[BlockEvents], bool]
 ) -> list[BlockEvents]:
-    """What is told up to and including the first item that `is_last` likes."""
-    told: list[BlockEvents] = []
+    """The blocks up to and including the first one for which `is_last` is true."""
+    blocks: list[BlockEvents] = []
     async with asyncio.timeout(10):
         async for block in events:
-            told.append(block)
+            blocks.append(block)
             if is_last(block):
-                return told
+                return blocks
     raise AssertionError("the events ended")
 
 

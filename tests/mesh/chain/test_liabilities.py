@@ -150,7 +150,7 @@ async def test_watching_waits_for_the_end_and_returns_the_record(market: Deploye
         ended = await watching
         assert (ended.address, ended.is_success, ended.result) == (liability, True, cid(3))
         assert ended == await chain.liabilities.get(liability)
-        assert await reader.liabilities.watch(liability) == ended, "what has ended already is told at once"
+        assert await reader.liabilities.watch(liability) == ended, "a liability that has ended is returned at once"
 
 
 async def test_watching_waits_for_confirmations(market: DeployedMarket) -> None:

@@ -62,10 +62,10 @@ async def test_becoming_a_provider_approves_and_stakes_exactly_the_stake(market:
         state = await chain.lighthouses.become_provider("first", STAKE)
         assert (state.stakes, state.current) == ({account.address: STAKE}, account.address)
         assert await chain.tokens.allowance(account.address, beacon) == 0
-        told = events_of(await read_to(chain, start + 1, await chain.block_number(), lighthouses=[beacon]))
-    assert [event.value for event in told if isinstance(event, Approval)] == [STAKE]
-    assert [event.value for event in told if isinstance(event, Transfer)] == [STAKE]
-    assert [event.provider for event in told if isinstance(event, Online)] == [account.address]
+        events = events_of(await read_to(chain, start + 1, await chain.block_number(), lighthouses=[beacon]))
+    assert [event.value for event in events if isinstance(event, Approval)] == [STAKE]
+    assert [event.value for event in events if isinstance(event, Transfer)] == [STAKE]
+    assert [event.provider for event in events if isinstance(event, Online)] == [account.address]
 
 
 async def test_a_provider_that_stakes_enough_already_sends_nothing(market: DeployedMarket) -> None:
@@ -87,8 +87,8 @@ async def test_becoming_a_provider_resumes_after_an_interruption(market: Deploye
     async with market.chain(account) as chain:
         start = await chain.block_number()
         assert (await chain.lighthouses.become_provider("third", STAKE)).stakes == {account.address: STAKE}
-        told = events_of(await read_to(chain, start + 1, await chain.block_number()))
-    assert not [event for event in told if isinstance(event, Approval)]
+        events = events_of(await read_to(chain, start + 1, await chain.block_number()))
+    assert not [event for event in events if isinstance(event, Approval)]
 
 
 async def test_a_stake_sent_before_a_crash_is_not_sent_again(tmp_path: Path) -> None:

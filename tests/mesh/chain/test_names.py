@@ -52,7 +52,7 @@ def test_names_ignore_case() -> None:
 
 
 def _content_resolver(multihash: bytes) -> bytes:
-    """Code that deploys a resolver which answers one multihash, whatever it is asked."""
+    """Code that deploys a resolver that answers every call with one multihash."""
     words = (32, 34, int.from_bytes(multihash[:32], "big"), int.from_bytes(multihash[32:].ljust(32, b"\0"), "big"))
     stores = b"".join(
         b"\x7f" + word.to_bytes(32, "big") + bytes((0x60, 32 * at, 0x52)) for at, word in enumerate(words)

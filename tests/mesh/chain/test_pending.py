@@ -59,7 +59,7 @@ async def dropped(anvil: Anvil, friend: str, *, transactions: Path) -> str:
     return caught.value.tx
 
 
-async def test_a_restarted_process_sends_what_the_node_forgot_again(anvil: Anvil, tmp_path: Path) -> None:
+async def test_a_restarted_process_sends_transactions_again_that_the_node_lost(anvil: Anvil, tmp_path: Path) -> None:
     friend = unused_address()
     forgotten = await dropped(anvil, friend, transactions=tmp_path)
     async with open_sender(anvil, transactions=tmp_path) as (node, sender):
@@ -68,7 +68,7 @@ async def test_a_restarted_process_sends_what_the_node_forgot_again(anvil: Anvil
         await node.request("evm_mine")
         assert (await sending).tx == forgotten
         assert await node.eth_balance(friend) == 5
-    assert _files(tmp_path) == [], "what is settled is not kept"
+    assert _files(tmp_path) == [], "settled transactions are not kept"
 
 
 async def test_the_nonce_of_a_forgotten_transaction_is_used_again(anvil: Anvil, tmp_path: Path) -> None:
@@ -112,7 +112,7 @@ async def test_a_transaction_folder_belongs_to_one_chain(tmp_path: Path) -> None
 
 
 async def test_a_transaction_that_lost_its_nonce_is_sent_with_the_next(anvil: Anvil) -> None:
-    """Somebody sends with the same key and number through another node, and wins."""
+    """Another client sends with the same key and nonce through another node, and is mined first."""
     account, friend = Account.from_key(anvil.private_keys[0]), unused_address()
     async with Node(anvil.url, timing=QUICK) as node:
         sending = asyncio.create_task(TransactionSender(node, account).send(to=friend, data=b"", value=5))

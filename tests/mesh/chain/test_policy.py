@@ -69,7 +69,7 @@ async def test_never_more_than_the_ceiling_is_offered(anvil: Anvil) -> None:
     assert int(sent["type"], 16) == 2
 
 
-async def test_a_replacement_offers_what_nodes_require_or_is_not_made(anvil: Anvil) -> None:
+async def test_a_replacement_offers_the_fees_that_nodes_require_or_is_not_made(anvil: Anvil) -> None:
     async with Node(anvil.url, timing=QUICK) as node:
         policy, market = FeePolicy(ceiling=100 * GWEI), await node.gas_market()
         bumped = policy.replacement(market, Fees(50 * GWEI, 7))

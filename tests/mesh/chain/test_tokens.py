@@ -51,7 +51,7 @@ async def test_a_symbol_of_32_bytes_is_decoded(market: DeployedMarket) -> None:
     async with market.chain() as chain:
         token = await chain.tokens.info(address)
     assert (token.symbol, token.name) == ("MKR", "MKR")
-    assert token.decimals == 0, "what is no number of decimals is none"
+    assert token.decimals == 0, "an answer that is not a number counts as no decimals"
 
 
 async def test_a_token_without_a_description_has_no_symbol_and_no_decimals(market: DeployedMarket) -> None:

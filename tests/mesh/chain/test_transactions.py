@@ -90,7 +90,7 @@ async def test_a_nonce_taken_by_another_client_is_replaced(node: EmbeddedChain) 
 
 
 async def test_a_transaction_that_fails_only_when_mined_has_its_reason(node: EmbeddedChain) -> None:
-    """Between the simulation and the block somebody else takes the tokens."""
+    """Another account takes the tokens between the simulation and the block."""
     wire = _Wire(node)
     deployer, friend = (Account.from_key(key) for key in node.funded_keys[:2])
     deployment = await deploy(node.provider, deployer)

@@ -40,7 +40,7 @@ async def test_a_file_is_fetched_from_its_holder_and_then_served(
             assert (await third.fetch(cid)).read_bytes() == data
 
 
-async def test_a_file_that_nobody_holds_is_unavailable_after_the_timeout(store: Store, session: zenoh.Session) -> None:
+async def test_a_file_without_a_holder_is_unavailable_after_the_timeout(store: Store, session: zenoh.Session) -> None:
     cid = cid_of_bytes(b"nobody's")
     async with Exchange(session, store) as exchange:
         begin = time.monotonic()

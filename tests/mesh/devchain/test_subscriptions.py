@@ -50,7 +50,7 @@ async def test_web3_receives_new_heads_and_the_logs_it_subscribed_to(
         async with asyncio.timeout(30):
             async for message in web3.socket.process_subscriptions():
                 heard[str(message["subscription"])].append(message["result"])
-                if [len(told) for told in heard.values()] == [2, 1]:
+                if [len(results) for results in heard.values()] == [2, 1]:
                     break
         block = await web3.eth.get_block(before + 2)
     assert [head["number"] for head in heard[heads]] == [before + 1, before + 2]
@@ -102,12 +102,12 @@ async def test_logs_of_replaced_blocks_are_removed_before_new_ones_are_sent(
         subscription = await client.subscribe("logs", {"address": deployment.xrt})
         for value in (1, 2):
             await chain.tokens.approve(deployment.factory, value)
-        told = [await client.next_notification(subscription) for _ in range(2)]
+        notifications = [await client.next_notification(subscription) for _ in range(2)]
         await node.request("evm_revert", [hex(await chain.block_number() - 2)])
         await node.mine(2)
         await chain.tokens.approve(deployment.factory, 3)
-        told += [await client.next_notification(subscription) for _ in range(3)]
-    assert [(int(log["data"], 16), log["removed"]) for log in told] == [
+        notifications += [await client.next_notification(subscription) for _ in range(3)]
+    assert [(int(log["data"], 16), log["removed"]) for log in notifications] == [
         (1, False),
         (2, False),
         (2, True),

@@ -221,7 +221,7 @@ def test_an_order_that_left_before_its_deadline_does_not_expire() -> None:
     assert demand not in aging.expire(5)
 
 
-def test_an_order_that_left_and_was_added_again_expires_once() -> None:
+def test_an_order_that_was_removed_and_added_again_expires_once() -> None:
     demand = verified_demand(deadline=5)
     aging = book(demand)
     aging.remove(order_id(demand))
@@ -250,7 +250,7 @@ def test_the_book_holds_no_reference_to_an_order_that_left(how: str) -> None:
     assert sys.getrefcount(gone) == before
 
 
-def test_memory_is_bounded_when_orders_come_and_go_with_any_deadlines() -> None:
+def test_memory_is_bounded_for_orders_with_any_deadlines() -> None:
     pairs = [
         (verified_demand(cost=number, deadline=2**256 - 1 - number), verified_offer(cost=number, deadline=2**255))
         for number in range(500)

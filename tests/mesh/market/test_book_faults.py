@@ -53,7 +53,7 @@ def test_each_error_names_the_orders_at_fault(
 @pytest.mark.parametrize(
     ("reason", "word"), [("CostMismatch", "CostMismatch"), ("", "Reverted"), ("please pay\nme", "Reverted")]
 )
-def test_a_text_of_a_strangers_token_is_not_a_reason(reason: str, word: str) -> None:
+def test_the_text_of_an_unknown_token_is_not_a_reason(reason: str, word: str) -> None:
     assert reason_word(reason) == word
 
 

@@ -36,7 +36,7 @@ def test_a_failed_transaction_costs_gas_if_it_was_mined() -> None:
     assert (ledger.earnings().gas_used, ledger.earnings().spent) == (30_000, 7)
 
 
-def test_a_reorganisation_takes_off_what_it_reverts() -> None:
+def test_a_reorganisation_subtracts_reverted_earnings() -> None:
     ledger = EarningsLedger()
     ledger.created(created(), fee=5)
     ledger.created(created(OTHER), fee=1)
@@ -49,7 +49,7 @@ def test_a_reorganisation_takes_off_what_it_reverts() -> None:
     )
 
 
-def test_a_reorganisation_does_not_take_off_what_others_did() -> None:
+def test_a_reorganisation_does_not_subtract_earnings_of_others() -> None:
     ledger = EarningsLedger()
     ledger.liability_reverted(ADDRESS)
     ledger.finalization_reverted(ADDRESS)

@@ -116,7 +116,7 @@ async def test_an_invalid_nonce_does_not_stop_the_provider(local: LocalMarket) -
         assert (await local.liability_of(demand)).promisor == local.address("robot")
 
 
-async def test_what_a_reorganisation_reverts_is_done_again(local: LocalMarket) -> None:
+async def test_transactions_that_a_reorganisation_reverts_are_sent_again(local: LocalMarket) -> None:
     async with local.provider() as provider:
         early = local.demand(cost=0)
         local.publish(early, local.offer(cost=0))

@@ -134,7 +134,7 @@ async def test_a_failure_that_may_pass_is_tried_again_until_the_last_attempt(loc
     assert (ledger.earnings().gas_used, ledger.earnings().spent) == (8000, 56)
 
 
-async def test_what_the_contracts_refuse_is_raised_at_once(local: LocalMarket) -> None:
+async def test_a_revert_is_raised_at_once(local: LocalMarket) -> None:
     transaction = Transaction(Reverted("OrderUsed"))
     async with queue_of(local) as queue:
         with pytest.raises(Reverted):

@@ -96,7 +96,7 @@ async def test_after_forget_the_lighthouse_is_asked_again(local: LocalMarket) ->
         assert not await ours.has_come(since=0)
 
 
-async def test_without_a_stake_there_is_no_turn(local: LocalMarket) -> None:
+async def test_a_provider_without_a_stake_has_no_turn(local: LocalMarket) -> None:
     await local.create_lighthouse(timeout_blocks=1, provider=1)
     await local.mine(50)
     async with turns(local, "poor") as never:

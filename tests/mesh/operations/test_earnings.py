@@ -26,7 +26,7 @@ COST = 10**9
 """More than the gas of a job is worth; the cost limits what is minted for the gas."""
 
 
-async def test_logged_earnings_are_what_the_account_gained_and_spent(
+async def test_logged_earnings_equal_the_gains_and_costs_of_the_account(
     anvil: Anvil, router: EmbeddedRouter, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)

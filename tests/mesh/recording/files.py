@@ -21,7 +21,7 @@ T0 = 1_535_622_771 * SECOND
 
 
 def mcap_file(write: Callable[[Writer], None], **options: Any) -> bytes:
-    """A file with whatever `write` does to its writer."""
+    """A file with the records that `write` gives to its writer."""
     stream = io.BytesIO()
     writer = Writer(stream, **options)
     writer.start("", "a test")

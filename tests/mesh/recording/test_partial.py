@@ -1,4 +1,4 @@
-"""Recordings that a crash cut: continuing them, and recovering what is readable."""
+"""Recordings cut off by a crash: continuing them, and recovering their readable part."""
 
 from __future__ import annotations
 

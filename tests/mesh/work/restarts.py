@@ -55,7 +55,7 @@ async def paid(place: Place) -> Paying:
     return Paying(place, await place.balance("robot"))
 
 
-async def made_by_a_provider_that_goes(place: Place, person: Agent) -> Contract:
-    """A contract whose Result finds no provider."""
+async def made_by_a_provider_that_leaves(place: Place, person: Agent) -> Contract:
+    """A contract whose provider is gone when its result is sent."""
     async with place.provider():
         return await person.demand(words(place), cost=COST)

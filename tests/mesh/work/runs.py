@@ -62,7 +62,7 @@ class Making:
         )
 
     def recorded(self) -> list[tuple[str, bytes, str]]:
-        """What is in the closed recording: topic, payload, type."""
+        """The messages of the closed recording: topic, payload, type."""
         messages = open_objective(self.path).messages()
         return [(message.topic, message.payload, message.type.zenoh_encoding) for message in messages]
 

@@ -1,4 +1,4 @@
-"""How much the ledger holds, for whoever asks how the agent is."""
+"""The counts of the ledger that an agent reports in its status."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ async def test_an_objective_is_played_in_order_to_the_handlers_and_the_robot_is_
         assert cid_of_file(await contract.recording()) == outcome.result
 
 
-async def test_the_recording_holds_what_was_played_and_what_the_handler_published(place: Place) -> None:
+async def test_the_recording_holds_the_played_messages_and_those_of_the_handler(place: Place) -> None:
     robot = offering(place.agent("robot"))
 
     @robot.on("/go")
@@ -63,7 +63,7 @@ async def test_the_recording_holds_what_was_played_and_what_the_handler_publishe
     assert about["objective"] == contract.liability.objective
 
 
-async def test_messages_come_at_their_recorded_times(place: Place) -> None:
+async def test_messages_are_played_at_their_recorded_times(place: Place) -> None:
     robot = offering(place.agent("robot", playback="recorded"))
     times: list[float] = []
 
@@ -220,7 +220,7 @@ async def test_a_burst_of_played_messages_arrives_whole(place: Place) -> None:
 
 
 async def test_a_late_device_message_of_a_played_topic_keeps_its_role(place: Place) -> None:
-    """What was played and what was said on the same topic can be told apart in the recording."""
+    """The recording distinguishes played messages from device messages of the same topic."""
     robot = offering(place.agent("robot"))
 
     @robot.on("/go")

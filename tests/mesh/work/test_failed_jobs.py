@@ -111,12 +111,12 @@ async def test_a_topic_without_handler_is_refused_before_anything_is_played(plac
     assert done == []
 
 
-async def test_a_file_that_is_no_recording_is_refused(place: Place) -> None:
+async def test_a_file_that_is_not_a_recording_is_refused(place: Place) -> None:
     note, _ = await refusal(place, doing_nothing(offering_unseen(place.agent("robot"))), b"please go to the kitchen\n")
     assert "not-a-recording" in note
 
 
-async def test_an_objective_that_nobody_holds_is_given_up_and_refunded(place: Place) -> None:
+async def test_a_job_whose_objective_is_unavailable_fails_and_is_refunded(place: Place) -> None:
     robot = doing_nothing(offering_unseen(place.agent("robot", fetch_timeout=0.2)))
     note, _ = await refusal(place, robot, cid_of_bytes(b"held by nobody"))
     assert "is not available" in note
@@ -139,7 +139,7 @@ async def test_a_job_whose_objective_is_missing_does_not_hold_up_the_next(place:
         assert job.phase is Phase.INCOMING
 
 
-async def test_a_failure_that_was_meant_is_logged_without_a_traceback(
+async def test_a_job_failed_by_its_handler_is_logged_without_a_traceback(
     place: Place, caplog: pytest.LogCaptureFixture
 ) -> None:
     robot = offering(place.agent("robot"))

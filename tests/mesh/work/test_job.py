@@ -45,7 +45,7 @@ async def test_only_chosen_topics_are_recorded_and_all_are_played(making: Making
     assert sorted(topic for topic, _, _ in making.recorded()) == ["/a", "/said"]
 
 
-async def test_progress_counts_what_is_done_with(making: Making) -> None:
+async def test_progress_counts_the_handled_messages(making: Making) -> None:
     run = making.run(objective(("/a", "0"), ("/a", "1"), ("/a", "2")), position=1)
     run.open()
     positions = Positions()
@@ -73,7 +73,7 @@ async def test_the_handler_gets_one_message_after_the_other_and_sees_which(makin
     await run.close()
 
 
-async def test_a_failing_handler_stops_the_playing_with_its_error_and_its_cause(making: Making) -> None:
+async def test_a_failing_handler_stops_the_playback_with_its_error_and_its_cause(making: Making) -> None:
     run = making.run(objective(*(("/a", str(number)) for number in range(5)), step_ns=10**10))
     run.open()
 
@@ -87,7 +87,7 @@ async def test_a_failing_handler_stops_the_playing_with_its_error_and_its_cause(
     await run.close()
 
 
-async def test_a_handler_that_ends_cancelled_is_a_failure_and_not_the_end(making: Making) -> None:
+async def test_a_handler_that_ends_cancelled_fails_without_cancelling_the_playback(making: Making) -> None:
     run = making.run(objective(("/a", "0"), ("/a", "1")))
     run.open()
 
@@ -101,7 +101,7 @@ async def test_a_handler_that_ends_cancelled_is_a_failure_and_not_the_end(making
     await run.close()
 
 
-async def test_cancelling_the_playing_cancels_the_handler_and_counts_what_was_done(making: Making) -> None:
+async def test_cancelling_the_playback_cancels_the_handler_and_counts_handled_messages(making: Making) -> None:
     run = making.run(objective(("/a", "0"), ("/a", "1"), ("/a", "2")))
     run.open()
     ended: list[str] = []

@@ -1,4 +1,4 @@
-"""What a run records of all that is said on the job's topics."""
+"""Which messages on the topics of a job a run records."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def device(router: EmbeddedRouter) -> Iterator[zenoh.Session]:
         yield opened
 
 
-async def test_what_the_agent_publishes_is_recorded_with_its_type(making: Making) -> None:
+async def test_messages_of_the_agent_are_recorded_with_their_type(making: Making) -> None:
     run = making.run()
     run.open()
     run.publish("/led", "on")
@@ -76,7 +76,7 @@ async def test_a_type_that_the_objective_describes_is_recorded_with_that_descrip
     assert (topic.name, topic.type.schema_data) == ("/scanned", b"float32 angle\n")
 
 
-async def test_what_another_session_puts_before_the_end_is_recorded(making: Making, device: zenoh.Session) -> None:
+async def test_messages_of_another_session_before_the_end_are_recorded(making: Making, device: zenoh.Session) -> None:
     run = making.run()
     run.open()
     await until_heard(device, f"{TOPICS}/wheel")
@@ -120,7 +120,7 @@ async def test_a_forged_end_mark_of_another_session_does_not_cut_the_recording(
     assert (b"arrived") in [payload for _, payload, _ in making.recorded()]
 
 
-async def test_what_can_not_be_recorded_is_counted_and_the_rest_recorded(making: Making, device: zenoh.Session) -> None:
+async def test_unrecordable_messages_are_counted_and_the_others_recorded(making: Making, device: zenoh.Session) -> None:
     run = making.run()
     run.open()
     await until_heard(device, f"{TOPICS}/good")

@@ -65,7 +65,7 @@ async def test_a_position_keeps_the_phase(ledger: Ledger) -> None:
     assert (job.phase, job.position) == (Phase.COMPLETE, 3)
 
 
-async def test_a_job_set_aside_is_unknown_until_it_is_added_again_with_all_that_was(ledger: Ledger) -> None:
+async def test_a_job_set_aside_is_unknown_until_it_is_added_again_with_its_state(ledger: Ledger) -> None:
     await ledger.add_job(liability())
     await ledger.set_phase(liability().address, Phase.RUNNING, position=7)
     await ledger.set_aside(liability().address)
@@ -153,7 +153,7 @@ async def test_a_message_posted_twice_is_kept_once(ledger: Ledger) -> None:
     assert await ledger.outbox(head=0) == [message()]
 
 
-async def test_settling_takes_a_message_out_and_says_whether_it_was_there(ledger: Ledger) -> None:
+async def test_settling_removes_a_message_and_returns_whether_it_was_there(ledger: Ledger) -> None:
     await ledger.post(message())
     assert await ledger.settle("a message")
     assert not await ledger.settle("a message")
@@ -177,7 +177,7 @@ async def test_cursors_are_kept_by_name(ledger: Ledger) -> None:
     assert await ledger.cursor("listener") == 42
 
 
-async def test_what_is_remembered_of_the_chain_is_kept_with_the_cursor(ledger: Ledger) -> None:
+async def test_the_history_of_the_chain_is_kept_with_the_cursor(ledger: Ledger) -> None:
     assert await ledger.history("listener") == b""
     await ledger.set_cursor("listener", 41)
     assert await ledger.history("listener") == b""
@@ -185,7 +185,7 @@ async def test_what_is_remembered_of_the_chain_is_kept_with_the_cursor(ledger: L
     assert (await ledger.cursor("listener"), await ledger.history("listener")) == (42, b"blocks")
 
 
-async def test_an_order_that_became_a_contract_is_kept_for_when_it_did_not(ledger: Ledger) -> None:
+async def test_a_spent_order_returns_when_its_contract_is_reverted(ledger: Ledger) -> None:
     one, other = outgoing(demand(deadline=50)), outgoing(demand())
     for order in (one, other):
         await ledger.post(order)
@@ -208,6 +208,6 @@ async def test_only_the_latest_spent_orders_are_kept(path: Path) -> None:
         assert [await ledger.unspend(f"0x{number}") for number in range(4)] == [False, False, True, True]
 
 
-async def test_what_is_not_in_the_outbox_is_not_spent(ledger: Ledger) -> None:
+async def test_an_order_that_is_not_in_the_outbox_is_not_spent(ledger: Ledger) -> None:
     await ledger.spend("an order of before", "0xA")
     assert not await ledger.unspend("0xA")

@@ -1,4 +1,4 @@
-"""The ledger's file: it outlives a kill, and what is wrong with it is one clear line."""
+"""The ledger's file: it survives a kill, and an unusable file is an error."""
 
 from __future__ import annotations
 
@@ -50,16 +50,16 @@ asyncio.run(main())
 
 
 def write_until_killed(path: Path) -> int:
-    """The last block that a process has told of having written, before SIGKILL."""
+    """The last block that a process reported as written before SIGKILL."""
     process = subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
-    with process, process.stdout as told:
-        blocks = [told.readline() for _ in range(50)]
+    with process, process.stdout as output:
+        blocks = [output.readline() for _ in range(50)]
         process.kill()
-        return int([*blocks, *told.read().splitlines()][-1])
+        return int([*blocks, *output.read().splitlines()][-1])
 
 
-async def test_what_was_written_survives_a_kill(path: Path) -> None:
+async def test_written_rows_survive_a_kill(path: Path) -> None:
     last = await asyncio.to_thread(write_until_killed, path)
     async with Ledger(path) as ledger:
         cursor = await ledger.cursor("listener")
@@ -109,7 +109,7 @@ def no_file(path: Path) -> Path:
     return path
 
 
-async def test_a_file_that_is_no_database_is_one_clear_line(no_database: Path) -> None:
+async def test_a_file_that_is_not_a_database_is_an_error(no_database: Path) -> None:
     error = await refused(no_database)
     assert isinstance(error, LedgerUnusable)
     assert (error.code, error.path, error.why) == ("ledger-unusable", no_database, "file is not a database")
@@ -117,20 +117,20 @@ async def test_a_file_that_is_no_database_is_one_clear_line(no_database: Path) -
     assert error.hint
 
 
-async def test_a_folder_in_the_files_place_is_one_clear_line(no_file: Path) -> None:
+async def test_a_folder_at_the_path_of_the_ledger_is_an_error(no_file: Path) -> None:
     error = await refused(no_file)
     assert isinstance(error, LedgerUnusable)
     assert (error.code, error.path, error.why) == ("ledger-unusable", no_file, "unable to open database file")
 
 
-async def test_a_folder_that_can_not_be_made_is_one_clear_line(no_database: Path) -> None:
+async def test_a_folder_that_can_not_be_created_is_an_error(no_database: Path) -> None:
     error = await refused(no_database / "ledger.sqlite")
     assert isinstance(error, LedgerUnusable)
     assert (error.code, error.path) == ("ledger-unusable", no_database / "ledger.sqlite")
     assert str(no_database) in str(error)
 
 
-async def test_a_closed_ledger_says_so(path: Path) -> None:
+async def test_a_closed_ledger_raises(path: Path) -> None:
     ledger = Ledger(path)
     with pytest.raises(ClosedError):
         await ledger.cursor("listener")
@@ -142,7 +142,7 @@ async def test_a_closed_ledger_says_so(path: Path) -> None:
         await ledger.add_job(liability())
 
 
-async def test_a_full_disk_is_one_clear_line_and_nothing_is_half_written(ledger: Ledger, path: Path) -> None:
+async def test_a_full_disk_is_an_error_and_nothing_is_half_written(ledger: Ledger, path: Path) -> None:
     await ledger.add_job(liability())
     address, signed = liability().address, message()
     room = path.with_name(path.name + "-wal").stat().st_size

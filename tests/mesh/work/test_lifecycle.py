@@ -11,7 +11,7 @@ LIABILITY = "0x" + "12" * 20
 
 
 @pytest.mark.parametrize("phase", [Phase.INCOMING, Phase.READY, Phase.RUNNING])
-def test_whatever_has_not_ended_can_fail(phase: Phase) -> None:
+def test_a_job_that_has_not_ended_can_fail(phase: Phase) -> None:
     assert advance(LIABILITY, phase, Phase.COMPLETE) is Phase.COMPLETE
 
 
@@ -29,7 +29,7 @@ def test_the_chain_can_end_a_job_in_any_phase(phase: Phase) -> None:
         (Phase.FINALIZED, Phase.COMPLETE),
     ],
 )
-def test_no_job_goes_back_or_skips_its_objective(phase: Phase, to: Phase) -> None:
+def test_a_job_does_not_go_back_or_skip_its_objective(phase: Phase, to: Phase) -> None:
     with pytest.raises(WrongPhase) as caught:
         advance(LIABILITY, phase, to)
     assert (caught.value.code, caught.value.phase, caught.value.liability) == ("wrong-phase", phase, LIABILITY)
@@ -40,7 +40,7 @@ def test_every_phase_has_its_next_ones_and_only_the_last_has_none() -> None:
     assert [phase for phase in Phase if not NEXT[phase]] == [Phase.FINALIZED]
 
 
-def test_a_job_of_somebody_else_has_no_phase() -> None:
+def test_a_job_of_another_agent_has_no_phase() -> None:
     error = WrongPhase(LIABILITY, asked="start", phase=None)
     assert (error.code, error.liability, error.asked, error.phase) == ("wrong-phase", LIABILITY, "start", None)
     assert LIABILITY in str(error)

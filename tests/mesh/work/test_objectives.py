@@ -64,7 +64,7 @@ async def test_an_objective_of_another_agent_is_fetched(place: Place, parts: Age
     assert parts.store.has(cid)
 
 
-async def test_an_objective_that_nobody_has_is_unavailable(place: Place) -> None:
+async def test_an_objective_without_a_holder_is_unavailable(place: Place) -> None:
     async with opened(place, fetch_timeout=0.1) as parts:
         with pytest.raises(ContentUnavailable):
             await objectives(parts).examine(cid_of_bytes(b"nobody's"))

@@ -30,7 +30,7 @@ NEVER = RetryPolicy(initial=3600.0, ceiling=3600.0)
 
 
 class Post:
-    """An outbox on a network of its own, with the chain's head and the time as the test sets them."""
+    """An outbox with its own network; the test sets the chain's head and the time."""
 
     def __init__(self, ledger: Ledger, channel: Channel, network: Network, policy: RetryPolicy) -> None:
         self.head = 0
@@ -61,7 +61,7 @@ async def post(router: EmbeddedRouter, tmp_path: Path) -> AsyncIterator[Post]:
 
 @pytest.fixture
 async def received(router: EmbeddedRouter) -> AsyncIterator[list[tuple[str, Any]]]:
-    """What somebody else hears on the market: key and message."""
+    """The messages that another session receives on the market: key and message."""
     messages: list[tuple[str, Any]] = []
     async with Network(Endpoints(connect=(router.endpoint,))) as network:
         network.session.declare_subscriber(
@@ -75,7 +75,7 @@ async def listened_to(post: Post) -> None:
     await until_heard(post.network.session, f"aira/{MARKET}/x")
 
 
-async def test_what_is_posted_is_sent_at_once_on_its_key(post: Post, received: list[tuple[str, Any]]) -> None:
+async def test_a_posted_message_is_sent_at_once_on_its_key(post: Post, received: list[tuple[str, Any]]) -> None:
     await listened_to(post)
     ours = offer()
     await post.outbox.post(ours)
@@ -84,9 +84,7 @@ async def test_what_is_posted_is_sent_at_once_on_its_key(post: Post, received: l
     assert received == [(f"aira/{MARKET}/offer/{ours.model}/{digest}", ours)]
 
 
-async def test_what_has_no_effect_is_sent_again_and_what_has_is_not(
-    post: Post, received: list[tuple[str, Any]]
-) -> None:
+async def test_messages_are_sent_again_until_they_have_an_effect(post: Post, received: list[tuple[str, Any]]) -> None:
     await listened_to(post)
     first, second = demand(), result()
     async with Background() as tasks:
@@ -114,7 +112,7 @@ async def test_an_order_is_forgotten_at_its_deadline_and_a_result_never(post: Po
     assert [waiting.kind for waiting in await post.ledger.outbox(head=0)] == ["result"]
 
 
-async def test_what_waits_survives_a_restart(
+async def test_waiting_messages_survive_a_restart(
     router: EmbeddedRouter, tmp_path: Path, received: list[tuple[str, Any]]
 ) -> None:
     ours = result()
@@ -127,7 +125,7 @@ async def test_what_waits_survives_a_restart(
     assert received[0][1] == ours
 
 
-async def test_all_is_sent_at_once_when_the_network_comes_back(router: EmbeddedRouter, tmp_path: Path) -> None:
+async def test_all_messages_are_sent_at_once_when_the_network_is_back(router: EmbeddedRouter, tmp_path: Path) -> None:
     async with opened(router, tmp_path, NEVER) as post:
         await check_sending_on_return(router, post)
 
@@ -136,7 +134,7 @@ async def check_sending_on_return(router: EmbeddedRouter, post: Post) -> None:
     ours, arrived = demand(), [b""]
 
     async def comes_back() -> bool:
-        """The client may be quicker than the subscriber of who looks on; then nobody is there to see it."""
+        """False if the client sent before the observer of this test had subscribed."""
         await asyncio.to_thread(router.stop)
         await until(lambda: not post.network.connected)
         await post.outbox.post(ours)
@@ -213,7 +211,7 @@ async def test_all_is_sent_at_once_when_a_provider_appears(
             assert sorted(repr(message) for _, message in received) == sorted(map(repr, ours))
 
 
-async def test_expired_orders_are_dropped_when_their_block_is_there(post: Post) -> None:
+async def test_orders_are_dropped_at_their_deadline_block(post: Post) -> None:
     await post.outbox.post(demand(deadline=10))
     await post.outbox.expire(9)
     assert len(await post.ledger.outbox(head=0)) == 1
@@ -221,13 +219,13 @@ async def test_expired_orders_are_dropped_when_their_block_is_there(post: Post) 
     assert await post.ledger.outbox(head=0) == []
 
 
-def test_a_result_is_known_by_its_liability_and_an_order_by_its_hash() -> None:
+def test_results_are_identified_by_liability_and_orders_by_hash() -> None:
     assert outgoing_identity(result(success=True)) == outgoing_identity(result(success=False)) == f"result {LIGHTHOUSE}"
     one, other = demand(), demand()
     assert outgoing_identity(one) == message_hash(one).hex() != outgoing_identity(other)
 
 
-def test_an_entry_says_what_is_sent_and_until_when() -> None:
+def test_an_entry_has_the_kind_payload_and_deadline_of_its_message() -> None:
     order = demand(deadline=77)
     assert (outgoing(order).kind, outgoing(order).deadline) == ("demand", 77)
     assert (outgoing(result()).kind, outgoing(result()).deadline) == ("result", None)

@@ -9,7 +9,7 @@ from mesh.agent import Agent, Phase
 from mesh.recording import open_objective
 from mesh.work import Ledger
 from schemas import String, cid_of_file
-from tests.mesh.work.restarts import COST, WORDS, Paying, made_by_a_provider_that_goes, paid, speaking, words
+from tests.mesh.work.restarts import COST, WORDS, Paying, made_by_a_provider_that_leaves, paid, speaking, words
 from tests.support.market import in_phase, offering, offering_unseen
 from tests.support.orders import result
 from tests.support.waiting import until, until_found
@@ -69,7 +69,7 @@ async def test_a_running_job_can_be_stopped_again_and_again(place: Place, paid: 
     assert await paid.once()
 
 
-async def test_a_job_that_the_chain_ended_meanwhile_is_not_done(place: Place) -> None:
+async def test_a_job_that_ended_on_the_chain_during_the_downtime_is_not_done(place: Place) -> None:
     said: list[str] = []
     seen: list[Phase] = []
     async with place.provider(), place.agent("person") as person:
@@ -104,7 +104,7 @@ async def reading(robot: Agent) -> None:
     await until_found(read, what=f"block {head}")
 
 
-async def test_a_liability_that_has_ended_before_the_agent_heard_of_it_is_no_job(place: Place) -> None:
+async def test_a_liability_that_ended_before_the_agent_read_it_is_not_a_job(place: Place) -> None:
     said: list[str] = []
     async with place.provider(), place.agent("person") as person:
         async with offering(place.agent("robot", enable_executor=False)) as robot:
@@ -123,7 +123,7 @@ async def test_a_liability_that_has_ended_before_the_agent_heard_of_it_is_no_job
 
 
 async def created_again(robot: Agent, contract: Contract) -> None:
-    """Have the chain take a contract back and tell it again, as when another block holds the same transaction."""
+    """Revert a contract and create it again, as when the same transaction is mined in another block."""
     hashes = await robot.parts.chain.liabilities.order_hashes(contract.address)
     await robot.runtime.listener.liability_reverted(contract.address)
     assert await robot.parts.ledger.job(contract.address) is None
@@ -178,7 +178,7 @@ async def held(robot: Agent, contract: Contract) -> bool:
 async def test_a_finished_job_that_was_set_aside_sends_its_result_again(place: Place, paid: Paying) -> None:
     said: list[str] = []
     async with place.agent("person") as person, speaking(offering(place.agent("robot")), said) as robot:
-        contract = await made_by_a_provider_that_goes(place, person)
+        contract = await made_by_a_provider_that_leaves(place, person)
         await in_phase(robot, contract, Phase.COMPLETE)
         await created_again(robot, contract)
         async with place.provider():

@@ -11,7 +11,7 @@ from mesh.agent import Phase
 from mesh.recording import open_objective
 from mesh.work.outbox import outgoing
 from schemas import String, cid_of_file
-from tests.mesh.work.restarts import COST, WORDS, Paying, made_by_a_provider_that_goes, paid, speaking, words
+from tests.mesh.work.restarts import COST, WORDS, Paying, made_by_a_provider_that_leaves, paid, speaking, words
 from tests.mesh.work.samples import liability
 from tests.support.market import in_phase, offering
 from tests.support.orders import result
@@ -26,7 +26,7 @@ __all__ = ["paid"]
 
 
 async def test_a_job_that_awaits_its_finish_keeps_its_recording_over_a_restart(place: Place) -> None:
-    """Without handlers: what the device has said until the restart is in the Result."""
+    """Without handlers: the result holds the messages of the device before the restart."""
     async with place.provider(), place.agent("person") as person:
         async with offering(place.agent("robot")) as robot:
             contract = await person.demand(words(place))
@@ -51,10 +51,10 @@ async def test_a_job_that_awaits_its_finish_keeps_its_recording_over_a_restart(p
     assert [data for topic, data in messages if topic == "/say"] == WORDS, "nothing is played twice"
 
 
-async def test_a_finished_job_is_paid_when_the_provider_comes_late(place: Place, paid: Paying) -> None:
+async def test_a_finished_job_is_paid_when_the_provider_starts_late(place: Place, paid: Paying) -> None:
     said: list[str] = []
     async with place.agent("person") as person, speaking(offering(place.agent("robot")), said) as robot:
-        contract = await made_by_a_provider_that_goes(place, person)
+        contract = await made_by_a_provider_that_leaves(place, person)
         await in_phase(robot, contract, Phase.COMPLETE)
         assert not await paid.once()
         async with place.provider():
@@ -68,7 +68,7 @@ async def test_a_finished_job_is_paid_after_a_restart(place: Place, paid: Paying
     said: list[str] = []
     async with place.agent("person") as person:
         async with speaking(offering(place.agent("robot")), said) as robot:
-            contract = await made_by_a_provider_that_goes(place, person)
+            contract = await made_by_a_provider_that_leaves(place, person)
             await in_phase(robot, contract, Phase.COMPLETE)
         async with speaking(place.agent("robot"), said) as robot, place.provider():
             outcome = await contract.outcome()
@@ -80,7 +80,7 @@ async def test_a_finished_job_is_paid_after_a_restart(place: Place, paid: Paying
 
 
 async def test_a_result_is_out_of_the_outbox_before_its_job_is_marked_as_finalized(place: Place) -> None:
-    """A crash between the two would else have it sent for ever: the block is handled again, the marked job skipped."""
+    """Otherwise a crash between the two would have the result sent for a job that is marked and skipped."""
     ours = liability(promisor=place.address("robot"))
     signed = result(liability=ours.address)
 
