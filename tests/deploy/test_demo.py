@@ -92,7 +92,7 @@ def test_the_edge_image_has_no_chain_client(images: Images) -> None:
 
 
 def secrets_of(market: ComposeDeployment) -> dict[str, str]:
-    """What nobody may see, by where it is: passwords, accounts' private keys, and a line of each certificate's key."""
+    """The secrets by their place: passwords, accounts' private keys, and a line of each certificate's key."""
     found = {}
     for service in ("router", "provider", "agent"):
         found[f"{service}'s certificate"] = market.execute(service, "cat", "/secrets/identity.key").splitlines()[1]

@@ -1,4 +1,4 @@
-"""A market with a job under way, and what may befall it: each time the job ends paid, once, and nobody lifts a hand.
+"""Failures during a job: each time the job is paid exactly once, without help of an operator.
 
 All faults happen to one market, one after the other: what one has left behind must not hurt the next.
 """

@@ -1,4 +1,4 @@
-"""What the compose files, the Dockerfile and the locks of the images promise, read without any engine."""
+"""The compose files, the Dockerfile and the locks of the images, read without a container engine."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FOREIGN = {"ipfs"}
 
 @cache
 def compose(file: Path) -> dict[str, Any]:
-    """What is in a compose file, its aliases and merges resolved."""
+    """The contents of a compose file, with its aliases and merges resolved."""
     python = require("podman-compose").with_name("python")
     read = "import json, sys, yaml; print(json.dumps(yaml.safe_load(open(sys.argv[1]))))"
     done = subprocess.run([python, "-c", read, file], capture_output=True, text=True, timeout=60, check=True)
@@ -40,7 +40,7 @@ def services() -> dict[str, dict[str, Any]]:
 
 @cache
 def stages() -> dict[str, tuple[str, str]]:
-    """The stages of the Dockerfile: what each is made of, and its lines."""
+    """The stages of the Dockerfile: their base images and their lines."""
     text = (ROOT / "Dockerfile").read_text()
     parts = STAGE.split(text)
     return {name: (base, lines) for base, name, lines in zip(parts[1::3], parts[2::3], parts[3::3], strict=True)}

@@ -1,4 +1,4 @@
-"""The systemd units: known to systemd, closed to what a service does not need, and what they call is there."""
+"""The systemd units: valid for systemd, with minimal rights, and with commands that exist."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_systemd_finds_nothing_wrong(machine: Path, unit: str) -> None:
 
 
 def test_systemd_reports_an_unknown_directive(machine: Path) -> None:
-    """What the tests above stand on."""
+    """The tests above rely on this."""
     unit = machine / "etc/systemd/system/aira-wrong.service"
     unit.write_text((UNITS / "aira-router.service").read_text().replace("MemoryMax", "MemoryMaximum"))
     try:
@@ -143,7 +143,7 @@ def test_each_secret_that_a_unit_names_is_a_credential_of_it(unit: str) -> None:
 
 @pytest.mark.parametrize("unit", [path.name for path in UNITS.glob("*.service")])
 def test_a_unit_does_not_contradict_the_common_file(unit: str) -> None:
-    """A file in aira-.service.d is read after the unit, and wins: what is to differ is in a file of its own."""
+    """A file in aira-.service.d is read after the unit, and wins: settings that differ are in a separate file."""
     common = {line.partition("=")[0] for line in lines((UNITS / "aira-.service.d/10-every-service.conf").read_text())}
     own = {line.partition("=")[0] for line in lines((UNITS / unit).read_text())}
     assert own & common <= {"Environment", "After", "Wants"}

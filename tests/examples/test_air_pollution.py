@@ -1,4 +1,4 @@
-"""The lesson of the air pollution sensor: voltages on a simulated Uno's inputs, and what the asker gets of them."""
+"""The lesson of the air pollution sensor: voltages on a simulated Uno's inputs, and the measurements of them."""
 
 from __future__ import annotations
 

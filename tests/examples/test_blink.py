@@ -36,7 +36,7 @@ def demand(example: str, objective: str | Path, out: Path, market: dict[str, str
 
 
 def said_on(recording: Path, topic: str) -> list[tuple[str, int]]:
-    """What is recorded on a topic, and when, in nanoseconds."""
+    """The messages recorded on a topic, with their times in nanoseconds."""
     messages = open_objective(recording).messages()
     return [(String.decode(each.payload).data, each.log_time_ns) for each in messages if each.topic == topic]
 

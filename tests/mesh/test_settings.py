@@ -1,4 +1,4 @@
-"""Settings: where they come from, who wins, and what is said of a mistake."""
+"""Settings: their sources, the order of precedence, and the errors of invalid ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a server waits for missing files, and for what it needs to open."""
+"""How a server waits for missing files and for its dependencies."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ def _with_subclasses(error: type[AiraError]) -> Iterator[type[AiraError]]:
 
 
 class Interrupted:
-    """`aira` with these arguments, which gets a signal when it has said `at`, and `after` so many seconds."""
+    """`aira` with these arguments, which gets a signal `after` so many seconds from when it printed `at`."""
 
     def __init__(
         self,
@@ -111,7 +111,7 @@ class Interrupted:
 
 
 class Serving(Server):
-    """A command that serves until it is stopped; ready when it has said `says`."""
+    """A command that serves until it is stopped; ready when it has printed `says`."""
 
     name = "command"
 
@@ -127,11 +127,11 @@ class Serving(Server):
         return ["env", "-u", "AIRA_CONFIG", "PYTHONUNBUFFERED=1", *settings, *self._command]
 
     def is_ready(self) -> bool:
-        """Whether it has said so."""
+        """Whether it has printed that."""
         return self._says in self.log()
 
     def wait_until_said(self, words: str) -> None:
-        """Return when it has said these words, now or before."""
+        """Return when its output has these words, now or already."""
         try:
             wait_until(lambda: words in self.log(), what=repr(words), seconds=SECONDS)
         except AssertionError as late:

@@ -22,7 +22,7 @@ STOP_SECONDS = 5
 
 
 class Project:
-    """One project with a name of its own. Use it in `with`: whatever is left at the end is removed by force.
+    """One project with a name of its own. Use it in `with`: the rest is removed by force at the end.
 
     `variables` stand in for an `.env` file; the one that lies beside the compose file is not read.
     """
@@ -56,7 +56,7 @@ class Project:
         self._sweep()
 
     def compose(self, *words: str, seconds: float = SECONDS) -> str:
-        """A command of podman-compose; what it prints."""
+        """Run a command of podman-compose; returns its output."""
         return self.engine.run([*self._compose, *words], seconds=seconds, cwd=self._place)
 
     def build(self, *services: str) -> None:
@@ -76,7 +76,7 @@ class Project:
         self.compose("down", "--volumes", "--timeout", str(STOP_SECONDS), seconds=UP_SECONDS)
 
     def leftovers(self) -> list[str]:
-        """What there is of this project: containers, pods, volumes, networks."""
+        """The resources of this project: containers, pods, volumes, networks."""
         found = []
         for kind, names in self._mine().items():
             found += [f"{kind} {name}" for name in names]
@@ -105,7 +105,7 @@ class Project:
         self.engine("stop", "--time", str(STOP_SECONDS), self.container(service))
 
     def pause(self, service: str) -> None:
-        """Freeze the service: it keeps its connections and answers nobody, until `unpause`."""
+        """Freeze the service: it keeps its connections but does not answer until `unpause`."""
         self.engine("pause", self.container(service))
 
     def unpause(self, service: str) -> None:
@@ -136,7 +136,7 @@ class Project:
         return str(next(network["IPAddress"] for network in networks.values()))
 
     def facts(self, service: str) -> Any:
-        """What the engine knows of the service's container."""
+        """The engine's description of the service's container."""
         return self.engine.facts("inspect", "--format", "json", self.container(service))[0]
 
     def is_running(self, service: str) -> bool:
@@ -144,20 +144,20 @@ class Project:
         return bool(self.facts(service)["State"]["Running"])
 
     def exit_code(self, service: str) -> int | None:
-        """What the service ended with; None while it runs."""
+        """The exit code of the service; None while it runs."""
         state = self.facts(service)["State"]
         return None if state["Running"] or state["Status"] != "exited" else int(state["ExitCode"])
 
     def log(self, service: str) -> str:
-        """All that the service has said, on both of its outputs."""
+        """The log of the service, stdout and stderr."""
         return log_text(Path(self.facts(service)["HostConfig"]["LogConfig"]["Path"]))
 
     def execute(self, service: str, *words: str, seconds: float = SECONDS) -> str:
-        """Run a command inside the service's container; what it prints."""
+        """Run a command inside the service's container; returns its output."""
         return self.engine("exec", self.container(service), *words, seconds=seconds)
 
     def _mine(self) -> dict[str, list[str]]:
-        """By name, not by label: what the engine made by itself has no label of the project's."""
+        """By name, not by label: containers that the engine creates by itself have no label of the project."""
         named = ["--format", "{{.Name}}", "--filter", f"name={self.name}"]
         return {
             "container": self.containers(),
@@ -167,7 +167,7 @@ class Project:
         }
 
     def _sweep(self) -> None:
-        """Remove everything by force, also what is frozen, half made or needed by another."""
+        """Remove everything by force, also containers that are paused, incomplete or needed by another."""
         paused = self.engine(
             "ps",
             "--filter",

@@ -142,7 +142,7 @@ class Engine:
             _cannot(f"no container runs on this machine: {error}")
 
     def forget_old_images(self) -> None:
-        """Remove what was built for runs of the day before, and earlier."""
+        """Remove the images of runs of earlier days."""
         self("image", "prune", "--force", "--filter", f"until={CACHE_AGE}")
 
     def _import(self, image: str, tar: Path, *options: str, stands_for: Path | None = None) -> None:
@@ -156,7 +156,7 @@ class Engine:
 
 
 def _cannot(reason: str) -> None:
-    """Skip the test, or fail it where all peers are asked for."""
+    """Skip the test, or fail it if all peers are required."""
     if os.environ.get("AIRA_REQUIRE_PEERS") == "1":
         pytest.fail(reason, pytrace=False)
     pytest.skip(reason)

@@ -1,4 +1,4 @@
-"""The project's compose files with real containers: a market that jobs are put to, and what its chain says of them."""
+"""The project's compose files with real containers: a market, its jobs, and their events on its chain."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ READY_SECONDS = 240.0
 CUT_SECONDS = 30.0
 """For which a service or a site is off its network."""
 JOB_SECONDS = 180.0
-"""Given to a job that something is done to, besides what its objective plays."""
+"""Seconds for a job during a failure, in addition to the duration of its objective."""
 
 
 @dataclass(frozen=True)

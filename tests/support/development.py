@@ -1,4 +1,4 @@
-"""The people of a development market, `aira up` or `aira chain up`, whose keys are in its folder."""
+"""The accounts of a development market, `aira up` or `aira chain up`, whose keys are in its folder."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ class Place:
         return self.market.accounts[role].address
 
     async def balance(self, role: str) -> int:
-        """What a role has, wn."""
+        """The balance of a role, wn."""
         return await self.chains[role].tokens.balance(self.address(role))
 
     def settings(self, role: str, **options: Any) -> Settings:
@@ -132,7 +132,7 @@ class Place:
             yield await stack.enter_async_context(self.agent("person"))
 
     async def forget_blocks(self, count: int) -> None:
-        """Reorganise the chain: its last blocks, and what happened in them, make room for one more of empty ones."""
+        """Reorganise the chain: one more empty block than there were replace its last blocks and their transactions."""
         head = await self.chains["provider"].block_number()
         await self.node.request("evm_revert", [hex(head - count)])
         await self.node.mine(count + 1)

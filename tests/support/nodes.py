@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Anvil(Server):
-    """An anvil node, chain id 31337, that makes a block for each transaction unless `arguments` say otherwise.
+    """An anvil node, chain id 31337, that mines a block for each transaction unless `arguments` change that.
 
     Its chain is in memory: `stop` and `start` begin a new one on the same port, unless `arguments` name a state file.
     """

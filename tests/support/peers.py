@@ -1,4 +1,4 @@
-"""Which real programs a test may use, and what happens to the test where one is missing."""
+"""The real programs that tests use: a test without its program is skipped, or fails if all are required."""
 
 from __future__ import annotations
 

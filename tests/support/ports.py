@@ -1,4 +1,4 @@
-"""Ports on loopback that nobody uses."""
+"""Free ports on loopback."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def free_endpoint() -> str:
 
 
 def answers(port: int) -> bool:
-    """Whether somebody accepts connections on 127.0.0.1:`port`."""
+    """Whether a server accepts connections on 127.0.0.1:`port`."""
     with socket.socket() as probe:
         probe.settimeout(1)
         return probe.connect_ex(("127.0.0.1", port)) == 0

@@ -87,7 +87,7 @@ class Server(ABC):
         self._end(signal.SIGKILL)
 
     def pause(self) -> None:
-        """Freeze the process: it keeps its connections but answers nobody, until `resume`."""
+        """Freeze the process: it keeps its connections but does not answer until `resume`."""
         self._running().send_signal(signal.SIGSTOP)
 
     def resume(self) -> None:
@@ -100,7 +100,7 @@ class Server(ABC):
         self._remove_folder()
 
     def log(self) -> str:
-        """What the process has printed since it was last started."""
+        """The output of the process since its last start."""
         return self._log.read_text(errors="replace") if self._log.exists() else ""
 
     def __enter__(self) -> Self:

@@ -21,7 +21,7 @@ FOREIGN = ("process_", "python_")
 
 
 class Page(NamedTuple):
-    """What was answered."""
+    """A response."""
 
     status: int
     text: str
@@ -50,7 +50,7 @@ class Scrape:
         return found[0] if found else 0.0
 
     def changes(self, before: Scrape) -> dict[str, float]:
-        """What has changed since, as `name{label,…}`: counters of the mesh only, without their lighthouse."""
+        """The changes since then, as `name{label,…}`: counters of the mesh only, without their lighthouse."""
         counters = {name for name in self.names() if name.endswith("_total")}
         found: dict[str, float] = {}
         for (name, labels), value in self.samples.items():

@@ -41,7 +41,7 @@ class Site:
     def certify(
         self, name: str, address: str, *roles: str, days: float = 1, hosts: tuple[str, ...] = ()
     ) -> MemberFolder:
-        """Make a certificate, of which the roster says nothing."""
+        """Make a certificate that is not in the roster."""
         folder = MemberFolder(self.folder / name)
         folder.make(Holder(address=address, name=name, roles=roles, hosts=hosts), site=self.authority, days=days)
         return folder

@@ -36,7 +36,7 @@ def is_matched(publisher: zenoh.Publisher) -> bool:
 
 
 def routed(endpoint: str) -> bytes:
-    """What a subscriber behind the router hears when another client publishes."""
+    """The message that a subscriber behind the router receives when another client publishes."""
     heard: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     with zenoh.open(client_config(endpoint)) as listener, zenoh.open(client_config(endpoint)) as speaker:
         listener.declare_subscriber(KEY, lambda sample: heard.put(sample.payload.to_bytes()))

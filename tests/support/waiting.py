@@ -1,4 +1,4 @@
-"""Waiting for what comes about elsewhere: asked again and again, and given up loudly."""
+"""Waiting for a condition: it is checked repeatedly, and the test fails at the deadline."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PAUSE = 0.005
 async def until(
     condition: Callable[[], object], *, what: str = "", seconds: float = SECONDS, pause: float = PAUSE
 ) -> None:
-    """Return when `condition()` is true; fail the test if it isn't within `seconds`. It is asked after each `pause`."""
+    """Return when `condition()` is true; fail the test after `seconds`. It is checked after each `pause`."""
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, f"{what or 'the condition'} did not come about within {seconds:g} s"

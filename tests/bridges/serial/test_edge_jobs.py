@@ -1,4 +1,4 @@
-"""JobTracker that boards do: what reaches which board, and what the recordings have of it."""
+"""Jobs that boards do: which messages reach which board, and what the recordings contain."""
 
 from __future__ import annotations
 

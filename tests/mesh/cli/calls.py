@@ -1,4 +1,4 @@
-"""Calls of `aira objective` in this process, and what a refused one says."""
+"""Calls of `aira objective` in this process, and the error of a refused one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reading logs with `aira logs`: a process that follows, and somebody who answers whatever a test wants."""
+"""Reading logs with `aira logs`: a process that follows, and a service that answers with the events of a test."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Follower:
         self.said = ""
 
     def until(self, words: str, *, once_more: bool = False) -> str:
-        """All that it has said, once a line holds all of these words; with `once_more` one that comes now."""
+        """All its output, once a line has all of these words; with `once_more` only lines printed from now on count."""
         start = len(self.said) if once_more else 0
         deadline = time.monotonic() + SECONDS
         while not any(all(word in line for word in words.split("|")) for line in self.said[start:].splitlines()):
@@ -67,7 +67,7 @@ def event(message: str, **fields: Any) -> LogEvent:
 
 @contextmanager
 def pretender(endpoint: str, *events: LogEvent, missed: int = 0) -> Iterator[None]:
-    """Somebody who answers for the robot with these events, each time that it is asked."""
+    """A service that answers each query for the robot's log with these events."""
     key = str(RpcKey(ROBOT.address, "logs"))
     reply = LogsRead(instance="\x1b[2J", began="\x1b[2J", entries=events, last=1, missed=missed).encode()
     with zenoh.open(client_config(endpoint)) as session:

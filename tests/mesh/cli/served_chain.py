@@ -50,7 +50,7 @@ class Person:
 
 
 def write_quick_keyfile(path: Path, key: bytes, password: str = PASSWORD) -> Path:
-    """A keyfile whose key is derived in no time, for tests of something else."""
+    """A keyfile with a fast key derivation, for tests of other things."""
     path.write_text(json.dumps(create_keyfile_json(key, password.encode(), kdf="pbkdf2", iterations=1)))
     return path
 
@@ -197,6 +197,6 @@ class ServedChain:
 
 
 def columns(text: str) -> dict[str, str]:
-    """What is printed in two columns, by the first one."""
+    """The facts printed in two columns, by their names."""
     pairs = (line.split("  ", 1) for line in text.splitlines() if "  " in line)
     return {name.strip(): value.strip() for name, value in pairs}

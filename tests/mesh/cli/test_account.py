@@ -44,7 +44,7 @@ def account(*arguments: str | Path) -> Result:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Result]:
-    """A keyfile and a password file that were made, and what was printed."""
+    """A new keyfile and password file, and the command's output."""
     folder = tmp_path_factory.mktemp("accounts") / "new" / "folder"
     keyfile, password = folder / "robot.json", folder / "password"
     return keyfile, password, account("new", keyfile, "--password-file", password)
@@ -145,7 +145,7 @@ def imported(folder: Path, *arguments: str | Path, given: str | None = None) -> 
 
 
 def assert_imported(folder: Path, done: Result) -> None:
-    """The key is in the keyfile, under the password, and nowhere in what was printed."""
+    """The key is in the keyfile, under the password, and not in the output."""
     assert (done.exit_code, done.stdout, done.stderr) == (0, f"{ADDRESS}\n", "")
     account = Account.from_keyfile(folder / "key.json", folder / "password")
     assert account.address == ADDRESS

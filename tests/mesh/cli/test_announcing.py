@@ -1,4 +1,4 @@
-"""What a server says when it begins is one event, also where it is several lines for people."""
+"""The announcement of a server is one event, also when people see several lines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Flags: what an empty one means, and numbers that can't be."""
+"""Flags: empty values and invalid numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`aira health`, and the servers that it asks: what they say while they start, work, and wait."""
+"""`aira health`, and the servers that it asks: their answers while they start, work and wait."""
 
 from __future__ import annotations
 

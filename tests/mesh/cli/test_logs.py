@@ -1,4 +1,4 @@
-"""`aira logs`: what it shows of an answer, whom it asks, and how it ends."""
+"""`aira logs`: what it prints of an answer, which peer it asks, and how it ends."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_invalid_arguments_are_refused_before_connecting(wrong: tuple[str, ...])
 
 
 def test_ctrl_c_stops_waiting_for_an_answer(router: EmbeddedRouter) -> None:
-    """Somebody who never answers."""
+    """An agent that never answers."""
     queries: list[zenoh.Query] = []
     with zenoh.open(client_config(router.endpoint)) as session:
         queryable: Any = session.declare_queryable(str(RpcKey(ROBOT.address, "logs")), queries.append)

@@ -1,4 +1,4 @@
-"""`aira objective`: files that others have, and what is said on the mesh."""
+"""`aira objective`: files of other peers, and objectives packed from live messages."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Holder:
-    """Somebody in the mesh who has a file."""
+    """A peer that has a file."""
 
     def __init__(self, endpoint: str, folder: Path, content: bytes) -> None:
         self._endpoint = endpoint
@@ -79,7 +79,7 @@ def test_a_missing_file_and_a_missing_router_are_one_clear_line(router: Embedded
 
 
 class Speaker:
-    """A device that says the same thing again and again until it is left."""
+    """A device that publishes the same messages repeatedly until the context ends."""
 
     def __init__(self, endpoint: str, key: str) -> None:
         self._endpoint = endpoint

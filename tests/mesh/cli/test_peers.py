@@ -1,4 +1,4 @@
-"""`aira peers`: who is on the channel, and status many are on the IPFS side."""
+"""`aira peers`: who is on the channel, and how many nodes are on the IPFS side."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What commands print: columns, and JSON that loses nothing."""
+"""The output of commands: columns, and JSON without loss."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`aira replay`: what is put where, when, and what is refused."""
+"""`aira replay`: which messages are published where and when, and what is refused."""
 
 from __future__ import annotations
 

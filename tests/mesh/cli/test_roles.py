@@ -1,4 +1,4 @@
-"""The commands that serve and the one that asks, in this process: what they print, and what they leave behind."""
+"""The commands that serve and `aira demand`, in this process: their output and the files they leave."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ ORDER = {"model": MODEL, "cost": "0", "validator": "", "validator_fee": "0", "li
 
 
 class Printed:
-    """What was printed so far."""
+    """The output so far."""
 
     def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
         self._capsys = capsys

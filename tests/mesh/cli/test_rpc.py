@@ -1,4 +1,4 @@
-"""`aira rpc`: services called from the command line; arguments checked before anything is asked."""
+"""`aira rpc`: services called from the command line; arguments are checked before the call."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_the_list_has_every_service_with_its_arguments() -> None:
 
 
 async def ask(place: Place, service: str, *arguments: str, as_json: bool = False) -> None:
-    """Call a service of the robot as somebody without an account."""
+    """Call a service of the robot without an account."""
     called = place.address("robot"), service, arguments
     await call_service(place.settings("watcher"), called, timeout=10.0, as_json=as_json)
 

@@ -1,4 +1,4 @@
-"""Commands that serve, as processes of their own that talk to each other, and what they say when they can't."""
+"""Commands that serve, as separate processes that talk to each other, and their errors."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ agent.run()
 
 
 class Development:
-    """`aira up` and what other processes need to know of it."""
+    """`aira up` and what other processes need to use it."""
 
     def __init__(self, folder: Path, *, block_time: str = "0.3") -> None:
         self.folder = folder

@@ -1,4 +1,4 @@
-"""`aira status`: what agents, providers and bridges say of themselves."""
+"""`aira status`: what agents, providers and bridges report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`aira up` as a process of its own: what runs its chain, and whether that is kept."""
+"""`aira up` as a separate process: which engine runs its chain, and whether its state is kept."""
 
 from __future__ import annotations
 

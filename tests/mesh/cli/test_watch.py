@@ -40,7 +40,7 @@ SECONDS = 60.0
 
 
 class PrintedOutput:
-    """What was printed so far."""
+    """The output so far."""
 
     def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
         self._capsys = capsys

@@ -28,7 +28,7 @@ def held(served: ServedChain, who: str) -> int:
 
 @pytest.fixture
 def poor(served: ServedChain, tmp_path: Path) -> dict[str, str]:
-    """The variables of somebody without ETH."""
+    """The variables of an account without ETH."""
     keyfile = write_quick_keyfile(tmp_path / "poor.json", new_private_key())
     return {"AIRA_KEYFILE": str(keyfile)}
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope="module")
 def town(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServedChain]:
-    """A served chain with the contracts, and people with money, who keep their files to themselves."""
+    """A served chain with the contracts, and funded accounts with private files."""
     with ServedChain(tmp_path_factory.mktemp("town")) as founded:
         for file in (founded.folder / "password", *(person.keyfile for person in founded.people.values())):
             file.chmod(0o600)

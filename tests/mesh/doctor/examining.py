@@ -1,4 +1,4 @@
-"""A context examined in this process, and what was found."""
+"""Running the checks of a context in this process, and their results."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ SECONDS = 60.0
 
 
 class Found(defaultdict[str, list[CheckResult]]):
-    """What was found, by the names of the checks; those that were left out are not in it."""
+    """The results by the names of the checks, without skipped ones."""
 
     def one(self, name: str) -> CheckResult:
-        """What the only check of that name found."""
+        """The result of the only check of that name."""
         (result,) = self[name]
         return result
 
@@ -34,7 +34,7 @@ class Found(defaultdict[str, list[CheckResult]]):
         return [name for name, results in self.items() for result in results if not result.ok]
 
     def cause(self, name: str) -> str:
-        """What the only check that failed found, which is that one, and which says what to do."""
+        """Message and hint of the check of that name, which must be the only failed one."""
         assert self.failed == [name], dict(self)
         (result,) = [result for result in self[name] if not result.ok]
         assert result.status is CheckStatus.FAIL
@@ -59,7 +59,7 @@ async def made(checks: Sequence[Check], *, seconds: float = SECONDS) -> Found:
 
 
 def settings_of(endpoints: Endpoints, **options: Any) -> Settings:
-    """The settings of somebody who connects there, as the holder of that certificate."""
+    """The settings of a client of these endpoints, with their certificate."""
     tls = endpoints.tls
     files: dict[str, Any] = {} if tls is None else {"tls_ca": str(tls.ca)}
     if tls is not None and tls.pair is not None:
@@ -68,5 +68,5 @@ def settings_of(endpoints: Endpoints, **options: Any) -> Settings:
 
 
 def context_of_member(site: Site, folder: MemberFolder, **options: str) -> DoctorContext:
-    """An operator's context, of whom only the network matters, with the identity in a folder."""
+    """The context of an operator with the identity in a folder, for checks of the network."""
     return DoctorContext(settings=settings_of(site.client(folder), **options), requested_role="operator")

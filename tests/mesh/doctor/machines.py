@@ -1,4 +1,4 @@
-"""A chain with contracts and people, of whom one is examined."""
+"""A chain with contracts and accounts, one of which the doctor checks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clocks: what is tolerated, and what is said where they differ."""
+"""Clocks: which differences pass, and the reports of larger ones."""
 
 from __future__ import annotations
 

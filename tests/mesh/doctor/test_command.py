@@ -163,7 +163,7 @@ def test_the_default_role_is_that_of_the_certificate(tmp_path: Path) -> None:
 
 
 def shown(*roles: str) -> CertificateInfo:
-    """What a certificate with these roles says."""
+    """The identity of a certificate with these roles."""
     return CertificateInfo(address=ARM, name="somebody", roles=roles, until=0.0)
 
 

@@ -1,4 +1,4 @@
-"""The IPFS daemon: one that is not there, one without PubSub, one that wants a password, and a sound one."""
+"""The IPFS daemon: unreachable, without PubSub, with a password, and one that passes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Mute(JsIpfs):
 
 
 async def found_at(api: str, **options: Any) -> Found:
-    """What is found of the daemon there."""
+    """The results of checking the daemon at `api`."""
     return await made(
         checks(DoctorContext(settings=Settings(ipfs_http_provider=api, **options), requested_role="bridge"))
     )

@@ -1,4 +1,4 @@
-"""Routers that are passed, dead, foreign, or open to everybody."""
+"""Routers that pass, that are down, of a foreign site, or open to everybody."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A router that listens on every address of its machine: asked as itself, by none of its certificate's names."""
+"""A router that listens on every address of its machine, which no name in its certificate covers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The serial line: ports that are not there, may not be used or are taken, and boards that answer or don't."""
+"""The serial line: ports that are missing, not permitted or in use, and boards that answer or do not."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ AS_NOBODY = LOOK.replace("print", "if os.geteuid() == 0: os.setgroups([]), os.se
 
 @pytest.fixture
 def silent() -> Iterator[str]:
-    """A port at whose other end nobody answers."""
+    """A port without an answering board."""
     master, slave = os.openpty()
     yield os.ttyname(slave)
     os.close(master)

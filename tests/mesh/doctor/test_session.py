@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tests.support.routers import EmbeddedRouter
 
 FAR = 0.15
-"""Seconds that each byte takes on its way to the one who reads: three times as long as a put waits for the next."""
+"""Seconds by which each byte to the reader is delayed: three times as long as a put waits for the next."""
 
 
 @asynccontextmanager

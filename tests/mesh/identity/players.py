@@ -44,7 +44,7 @@ MEMBERS = (
     Member(name="witness", address=ADDRESSES["witness"], roles=("router",)),
 )
 WHO = ("arm", "ann", "miner", "boss", "board", "bridge", "screen", "stranger", "gone")
-"""Who tries. The stranger has a certificate of the site and is not in the roster."""
+"""The identities of the matrix. The stranger has a certificate of the site and is not in the roster."""
 
 MODEL = "QmWATWQ7fVPP2EFGu71UkfnqhYXDYH566qy47CnJDgvs8u"
 HASH = "ab" * 32

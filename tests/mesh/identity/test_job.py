@@ -1,4 +1,4 @@
-"""A job on a closed site: robot, person and provider have what they need, and no change of the roster breaks it off."""
+"""A job on a closed site: the members have the rights they need, and changes of the roster do not interrupt it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ROLES = {"robot": "agent", "person": "person", "provider": "provider"}
 
 
 def tls(folder: MemberFolder) -> dict[str, str]:
-    """The settings of who has this identity."""
+    """The settings of the holder of this identity."""
     return {"tls_ca": str(folder.ca), "tls_certificate": str(folder.certificate), "tls_key": str(folder.key)}
 
 

@@ -1,4 +1,4 @@
-"""Several routers of one site: linked, they are one market, and nobody else can link himself to them."""
+"""Several routers of one site: linked routers carry one market, and a stranger's router can not link to them."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def linked(site: Site, own: MemberFolder, port: int) -> Settings:
 
 
 async def until_it_arrives(speaker: zenoh.Session, listener: zenoh.Session) -> None:
-    """Return when what one says is heard by the other."""
+    """Return when the listener receives messages of the speaker."""
     heard: list[bytes] = []
 
     def said() -> bool:

@@ -54,13 +54,13 @@ class Stage:
         self._kept.append(declared)
 
     def clear(self) -> None:
-        """Withdraw what the test has declared."""
+        """Undeclare everything that the test declared."""
         for declared in self._kept:
             declared.undeclare()
         self._kept.clear()
 
     def are_past(self) -> None:
-        """Return when the router has taken all that the identities have sent: they ask what nobody may."""
+        """Return when the router has processed all messages of the identities: each sends a forbidden query."""
         ask_all({who: [(who, "aira/nobody")] for who in WHO}, self.sessions, seconds=1.0)
 
 
@@ -86,7 +86,7 @@ def named(who: str, keys: set[str]) -> set[str]:
 def ask_all(
     questions: dict[str, list[tuple[str, str]]], sessions: dict[str, zenoh.Session], *, seconds: float
 ) -> dict[str, set[str]]:
-    """Ask all at the same time; the keys that were answered, by who asked."""
+    """Query all keys at the same time; the answered keys by identity."""
     lock, answered, threads = threading.Lock(), defaultdict[str, set[str]](set), []
 
     def ask(who: str, session: zenoh.Session, selectors: list[str]) -> None:
@@ -106,7 +106,7 @@ def ask_all(
 
 
 async def heard_by_witness(stage: Stage, kind: zenoh.SampleKind, expected: dict[str, set[str]]) -> dict[str, set[str]]:
-    """What the witness hears when each identity publishes or deletes on each of its keys."""
+    """The messages that the witness receives when each identity publishes or deletes on each of its keys."""
     heard = defaultdict[str, set[str]](set)
 
     def hear(sample: zenoh.Sample) -> None:

@@ -1,4 +1,4 @@
-"""The roster: what it may say, and what is said of one that can't be used."""
+"""The roster: its contents, and the errors of an unusable one."""
 
 from __future__ import annotations
 

@@ -175,7 +175,7 @@ async def test_a_second_router_of_the_site_takes_over(site: Site, arm: MemberFol
 
 
 async def heard(listener: zenoh.Session, speaker: zenoh.Session, key: str) -> None:
-    """Return when what one puts on the key has reached the other."""
+    """Return when a message on the key has reached the subscriber."""
     heard: list[str] = []
     with listener.declare_subscriber(key, lambda sample: heard.append(str(sample.key_expr))):
         await until_heard(speaker, key)

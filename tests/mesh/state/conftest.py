@@ -49,7 +49,7 @@ class Folder(NamedTuple):
         return self.home / CHAIN / "recordings"
 
     def contents(self) -> dict[str, bytes]:
-        """All its files, but for those that SQLite makes and deletes as it goes."""
+        """All its files, except the temporary ones of SQLite."""
         found = sorted(path for path in self.path.rglob("*") if path.is_file() and path.suffix[-4:] not in PASSING)
         return {path.relative_to(self.path).as_posix(): path.read_bytes() for path in found}
 
@@ -80,7 +80,7 @@ async def folder(tmp_path: Path) -> Folder:
 
 
 def names_in(folder: Path) -> list[str]:
-    """What a folder has, hidden files too."""
+    """The names in a folder, with hidden files."""
     return sorted(path.name for path in folder.iterdir())
 
 
@@ -91,13 +91,13 @@ def unpacked(archive: Path) -> bytes:
 
 
 def members(archive: Path) -> dict[str, bytes]:
-    """What is in a backup, read by other means."""
+    """The files in a backup, read with other libraries."""
     with tarfile.open(fileobj=io.BytesIO(unpacked(archive))) as tar:
         return {member.name: tar.extractfile(member).read() for member in tar}  # type: ignore[union-attr]
 
 
 def forge(archive: Path, forged: Path, change: Callable[[list[tuple[tarfile.TarInfo, bytes]]], None]) -> Path:
-    """A backup whose members `change` has had in its hands."""
+    """A copy of the backup whose members `change` modified."""
     listed = []
     for name, data in members(archive).items():
         header = tarfile.TarInfo(name)

@@ -1,4 +1,4 @@
-"""Backups that strangers have had in their hands, and what a disk has done to them."""
+"""Backups that are forged, damaged or truncated."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ async def test_a_file_larger_than_the_free_space_is_refused_at_its_header(
 async def test_more_files_than_checksums_can_list_are_refused_early(
     archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Empty ones cost a forger a few bits each, and the disk a name."""
+    """An empty file costs a forger a few bits, and the disk a name."""
 
     def change(members: Members) -> None:
         del members[-1]
@@ -140,7 +140,7 @@ async def test_a_backup_with_too_many_files_to_restore_is_not_made(
 
 
 async def test_a_prepared_temporary_file_gets_no_data(folder: Folder, tmp_path: Path) -> None:
-    """In a folder of all, such as /tmp: under the name that the backup has until it is whole."""
+    """In a shared folder such as /tmp, under the temporary name of the backup."""
     prepared = tmp_path / f".it.{os.getpid()}"
     prepared.touch(mode=0o666)
     with prepared.open("rb") as kept_open:
@@ -157,7 +157,7 @@ def changed(archive: Path, forged: Path, place: float) -> Path:
 
 
 async def test_a_flipped_bit_is_detected(archive: Path, tmp_path: Path) -> None:
-    """But for those that make no difference, as the window of a frame."""
+    """Except bits without effect, such as the window size of a frame."""
     found = 0
     for place in range(40):
         forged = changed(archive, tmp_path / "forged", place / 40)
@@ -229,7 +229,7 @@ async def test_an_invalid_description_is_refused(archive: Path, tmp_path: Path, 
 
 
 async def test_parts_outside_the_folder_are_refused(archive: Path, tmp_path: Path, folder: Folder) -> None:
-    """What a backup says that it has moves nothing that is not in it."""
+    """Parts that the backup names but does not contain are not moved."""
     outside = tmp_path / "outside"
     outside.mkdir()
     parts = [*json.loads(members(archive)["state.json"])["parts"], "../outside", str(outside), ""]

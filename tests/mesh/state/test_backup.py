@@ -1,4 +1,4 @@
-"""Backups: what is in them and what is not, also while everything changes."""
+"""Backups: their contents, also when the state changes during the backup."""
 
 from __future__ import annotations
 

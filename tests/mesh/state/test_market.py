@@ -1,4 +1,4 @@
-"""An agent loses its disk, is restored from a backup that was made in the middle of its work, and goes on."""
+"""An agent loses its disk, is restored from a backup made during its work, and continues."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ STEPS = range(4)
 
 
 class Robot:
-    """A robot of the same account and memory in each of its lives, and all that any of them has said."""
+    """A robot that runs several times with the same account and data folder, and all messages that it published."""
 
     def __init__(self, place: Place) -> None:
         self._place = place

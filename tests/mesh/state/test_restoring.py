@@ -1,4 +1,4 @@
-"""Restoring: where it goes, what it refuses, and that nothing is ever half there."""
+"""Restoring a backup: what it replaces, what it refuses, and that it never leaves a part incomplete."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ asyncio.run(restore(*map(pathlib.Path, sys.argv[1:])))
 
 @contextmanager
 def program(text: str, *arguments: Path) -> Iterator[None]:
-    """A Python program that has said its first line, and is killed in the end."""
+    """A Python program that has printed its first line; it is killed at the end."""
     command = [sys.executable, "-c", text, *map(str, arguments)]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
         try:
@@ -242,7 +242,7 @@ async def test_a_ledger_with_views_triggers_or_virtual_tables_is_refused(
 
 
 def forge_ledger(archive: Path, forged: Path, data: bytes) -> Path:
-    """The same backup with another ledger, whose checksum is right."""
+    """The same backup with another ledger and its correct checksum."""
     sums = json.loads(members(archive)["checksums.json"])
     name = f"{ADDRESS}/{CHAIN}/ledger.sqlite"
     sums[name] = hashlib.sha256(data).hexdigest()
@@ -270,7 +270,7 @@ async def test_an_unwritable_folder_is_an_error(archive: Path, tmp_path: Path) -
 
 
 async def test_a_mounted_folder_is_kept_and_filled(archive: Path, tmp_path: Path) -> None:
-    """As the volume of a container, or a StateDirectory."""
+    """Like the volume of a container, or a StateDirectory."""
     target = tmp_path / "volume"
     target.mkdir()
     inode = target.stat().st_ino

@@ -1,4 +1,4 @@
-"""Fixtures for the tests of what an operator sees."""
+"""Fixtures for the tests of logs, metrics and health."""
 
 from __future__ import annotations
 

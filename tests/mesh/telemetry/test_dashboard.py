@@ -44,7 +44,7 @@ CONTENT: Final = ContentMetrics(
 
 
 class Known(NamedTuple):
-    """What is served under a name."""
+    """The metric family of a name."""
 
     type: str
     labels: set[str]

@@ -1,4 +1,4 @@
-"""Events of the log: what they hold, and that each is one line, whatever it quotes."""
+"""Events of the log: their fields, and that each is one line even with hostile text."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 
 @pytest.fixture
 def kept(caplog: pytest.LogCaptureFixture, request: pytest.FixtureRequest) -> Iterator[LogHandler]:
-    """This process keeps its log, beside what pytest does with it."""
+    """This process keeps its log, in addition to pytest's own capture."""
     caplog.set_level(logging.INFO)
     keep_log(max_events=getattr(request, "param", 2_000))
     root = logging.getLogger()

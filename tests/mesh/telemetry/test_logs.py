@@ -1,4 +1,4 @@
-"""The log of whole processes: whatever happens in one that logs in JSON, each of its lines is a JSON object."""
+"""The log of whole processes: every line of a process that logs in JSON is a JSON object."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ run_until_stopped(main, settings=load(), role="robot")
 
 
 def said(body: str, *, code: int = 0, **variables: str) -> list[str]:
-    """What a program of this body says, on stdout and stderr together."""
+    """The lines that a program with this body prints, on stdout and stderr together."""
     done = run(sys.executable, "-c", START.format(body="\n    ".join(body.strip().splitlines())), **variables)
     assert done.returncode == code, done.stderr
     return [*done.stdout.splitlines(), *done.stderr.splitlines()]

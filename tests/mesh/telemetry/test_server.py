@@ -1,4 +1,4 @@
-"""The two pages over HTTP: what is asked rightly, what is not, who is slow, and where nothing can be served."""
+"""The two pages over HTTP: valid and invalid requests, slow clients, and addresses that can't be used."""
 
 from __future__ import annotations
 

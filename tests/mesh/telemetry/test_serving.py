@@ -1,4 +1,4 @@
-"""Metrics and health of what runs in an event loop: before it has begun, while it works, when the loop is held up."""
+"""Metrics and health of a role in an event loop: before its start, while it works, and when the loop is blocked."""
 
 from __future__ import annotations
 

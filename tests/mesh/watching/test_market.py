@@ -1,4 +1,4 @@
-"""A market as it is watched: what is shown in the one stream, what is not believed, what a model leaves out."""
+"""Watching a market: the events of its stream, the messages it refuses, and the filter by model."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ EVENT = str(EventKey(ROBOT.address, CONTRACT, "incoming"))
 
 
 class Market:
-    """Somebody who writes on a channel, and somebody who watches it."""
+    """A writer on a channel, and a watcher of it."""
 
     def __init__(self, watch: MarketWatch, channel: Channel, writer: Network) -> None:
         self.watch = watch
@@ -48,7 +48,7 @@ class Market:
         self.session = writer.session
 
     async def heard(self) -> None:
-        """Wait until what is put is heard, on every kind of key."""
+        """Wait until messages on every kind of key are received."""
         rejection = RejectKey(MARKET, "0" * 64, ROBOT.address)
         for key in (str(rejection), EVENT, *(str(self.key(message)) for message in (demand(), offer(), result()))):
             await until_heard(self.session, key)

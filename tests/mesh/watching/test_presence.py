@@ -1,4 +1,4 @@
-"""Who is on a channel, and what each says of itself; strangers say anything."""
+"""The peers of a channel and their statuses, also false ones of strangers."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def bridge_status(*, bridge: str = STRANGER.address) -> BridgeStatus:
 
 @contextmanager
 def answering(session: zenoh.Session, key: str, payload: bytes) -> Iterator[None]:
-    """Meanwhile every question on the key has this answer."""
+    """Answer every query on the key with this payload."""
 
     def answer(query: zenoh.Query) -> None:
         query.reply(key, payload)
@@ -82,7 +82,7 @@ def answering(session: zenoh.Session, key: str, payload: bytes) -> Iterator[None
 
 
 class Meeting:
-    """A channel, seen by somebody, on which others show themselves."""
+    """A channel with a reader, on which peers announce themselves."""
 
     def __init__(self, seen: Channel, reader: Network, shown: Channel, writer: Network) -> None:
         self.seen = seen

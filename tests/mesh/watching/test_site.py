@@ -1,4 +1,4 @@
-"""Watching on a closed site: a watcher sees what happens, an operator asks how everybody is, others do neither."""
+"""Watching on a closed site: a watcher sees events, an operator reads statuses, other members can do neither."""
 
 from __future__ import annotations
 
