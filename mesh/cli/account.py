@@ -55,14 +55,14 @@ def new(keyfile: Path, password_file: Path, as_json: bool) -> None:
     help="file with the password of the new KEYFILE; created with a random one if missing",
 )
 @click.option("--private-key-file", type=FILE, help="file with the private key, 64 hexadecimal digits")
-@click.option("--from-keyfile", type=FILE, help="another keyfile to take the key from")
-@click.option("--from-password-file", type=FILE, help="file with the password of that keyfile [asked for]")
+@click.option("--from-keyfile", type=FILE, help="another keyfile, from which to copy the key")
+@click.option("--from-password-file", type=FILE, help="file with the password of that keyfile [prompted for]")
 @with_json
 def import_account(keyfile: Path, password_file: Path, as_json: bool, **source: Any) -> None:
     """Write an existing key, encrypted, to KEYFILE. Prints the address. Never overwrites a file.
 
     The key comes from --private-key-file or from another keyfile. Without either, it is read from standard input; a
-    terminal asks for it and does not show it. It is never an argument, as everyone on the machine can see those.
+    terminal prompts for it without echo. It is never an argument, because every user of the machine can see those.
     """
     try:
         _check_no_key(keyfile)
@@ -84,10 +84,10 @@ def _import(
     from mesh.chain import copy_keyfile, write_keyfile
 
     if private_key_file is not None and from_keyfile is not None:
-        raise InvalidOptions("a key comes from --private-key-file or from --from-keyfile, not from both")
+        raise InvalidOptions("--private-key-file and --from-keyfile can't be used together")
     if from_keyfile is None:
         if from_password_file is not None:
-            raise InvalidOptions("--from-password-file goes with --from-keyfile")
+            raise InvalidOptions("--from-password-file needs --from-keyfile")
         key = private_key_in(private_key_file)
         return write_keyfile(keyfile, key, password_in(password_file))
     opened_by, where = password_of(from_keyfile, from_password_file)
@@ -96,22 +96,22 @@ def _import(
 
 
 def _check_no_key(keyfile: Path) -> None:
-    """Raise `InvalidPrivateKey` if someone typed a private key instead of a file's name."""
+    """Raise `InvalidPrivateKey` if the file's name is a private key."""
     digits = keyfile.name.removeprefix("0x")
     if len(digits) == 64 and not digits.strip("0123456789abcdefABCDEF"):
         raise InvalidPrivateKey(
-            "this looks like a private key, not like the name of a keyfile",
-            hint="give the key on standard input; it is in your shell's history now, so better use a new one",
+            "the keyfile's name looks like a private key",
+            hint="your shell's history may contain this key now, so use a new one, and give it on standard input",
         )
 
 
-@command.command("show", short_help="print the address, and what the account holds")
+@command.command("show", short_help="show an account's address and balances")
 @click.argument("file", metavar="[KEYFILE]", required=False, type=FILE)
-@click.option("--balance", is_flag=True, help="also ask the chain for its ETH, its XRT and its next order nonce")
+@click.option("--balance", is_flag=True, help="also show its ETH, its XRT and its next order nonce, from the chain")
 @with_json
 @with_chain_settings()
 def show(settings: Settings, file: Path | None, balance: bool, as_json: bool) -> None:
-    """Print the address of the account in KEYFILE (by default the settings'). Needs no password."""
+    """Print the address of the account in KEYFILE (by default the keyfile in the settings). Needs no password."""
     try:
         address = required_address(settings) if file is None else address_in_keyfile(file)
     except AiraError as error:
@@ -157,11 +157,11 @@ KEY_DIGITS = 64
 def free_path(keyfile: Path) -> Path:
     """Return the path after creating its folder. Raises `FileExists`, `FileUnwritable`."""
     if keyfile.exists():
-        raise FileExists(f"{keyfile} exists already", hint="keyfiles are never overwritten; choose another name")
+        raise FileExists(f"{keyfile} already exists", hint="keyfiles are never overwritten; choose another name")
     try:
         keyfile.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise FileUnwritable(f"can't make the folder of {keyfile}: {error.strerror}") from None
+        raise FileUnwritable(f"can't create the folder of {keyfile}: {error.strerror}") from None
     return keyfile
 
 
@@ -178,19 +178,17 @@ def password_in(path: Path) -> str:
         raise PasswordFileUnusable(f"can't use the password file {path}: {error.strerror}") from None
     password = _first_line(path, what="password file")
     if not password:
-        raise PasswordFileUnusable(
-            f"the password file {path} is empty", hint="write one line with the password into it"
-        )
+        raise PasswordFileUnusable(f"the password file {path} is empty", hint="write the password to its first line")
     return password
 
 
 def private_key_in(path: Path | None) -> bytes:
-    """The private key in a file; without a file, from standard input or typed unseen on a terminal.
+    """The private key in a file; without a file, from standard input or a terminal prompt without echo.
 
     Raises `InvalidPrivateKey`, which never shows the text, and `PasswordFileUnusable` for a file that can't be read.
     """
     if path is None:
-        text, where = _asked("private key: "), "what was given"
+        text, where = _asked("private key: "), "the input"
     else:
         text, where = _first_line(path, what="private key"), f"the first line of {path}"
     digits = text.strip().removeprefix("0x")
@@ -201,20 +199,20 @@ def private_key_in(path: Path | None) -> bytes:
     if len(digits) != KEY_DIGITS or len(key) != KEY_DIGITS // 2:
         raise InvalidPrivateKey(
             f"{where} is not a private key",
-            hint="a private key has 64 hexadecimal digits, with or without 0x before them",
+            hint="a private key has 64 hexadecimal digits, with or without the prefix 0x",
         )
     return key
 
 
 def password_of(keyfile: Path, path: Path | None) -> tuple[str, str]:
-    """The password of a keyfile, and where it came from: a file, standard input or a terminal."""
+    """The password of a keyfile, and its source: a file, standard input or a terminal."""
     if path is not None:
         return _first_line(path, what="password file"), str(path)
     return _asked(f"password of {keyfile}: "), "the answer"
 
 
 def _asked(question: str) -> str:
-    """A line of standard input. A terminal asks for it and does not show it."""
+    """A line of standard input. A terminal prompts for it without echo."""
     import getpass
 
     try:
@@ -223,14 +221,12 @@ def _asked(question: str) -> str:
         line = ""
     line = line.rstrip("\r\n")
     if not line:
-        raise InvalidPrivateKey(
-            f"nothing was entered for the {question.removesuffix(': ')}", hint="give one line on the standard input"
-        )
+        raise InvalidPrivateKey(f"the {question.removesuffix(': ')} is empty", hint="enter one line on standard input")
     return line
 
 
 def _first_line(path: Path, *, what: str) -> str:
-    """The first line of a file. Raises `PasswordFileUnusable`, which shows nothing of the file."""
+    """The first line of a file. Raises `PasswordFileUnusable`, which shows no part of the file."""
     try:
         return path.read_text(encoding="utf-8").split("\n", 1)[0].rstrip("\r")
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Amounts of tokens as people write them.
+"""Amounts of tokens in commands.
 
 All commands follow one rule: a number alone counts whole tokens (`1.5` is one and a half XRT); a number that ends in
 `wn` (XRT, 10^-9), `wei` (ETH, 10^-18) or `units` (any token) counts the smallest unit. In JSON amounts are text, in the
@@ -41,7 +41,7 @@ class Unit:
         return f"{whole:,}{digits}"
 
     def parse(self, text: str) -> int:
-        """The amount in the smallest unit that a text stands for. Raises `InvalidAmount`."""
+        """Parse an amount into the smallest unit. Raises `InvalidAmount`."""
         found = AMOUNT.fullmatch(text.strip())
         if found is None:
             raise InvalidAmount(f"{text[:40]!r} is not an amount", hint=self._hint())
@@ -54,10 +54,12 @@ class Unit:
             raise InvalidAmount(f"{text[:40]!r} is not an amount of {self.symbol}", hint=self._hint())
         if len(part) > decimals:
             unit = self.symbol if decimals else self.smallest
-            raise InvalidAmount(f"{text[:40]!r} has more decimals than {unit} has ({decimals})", hint=self._hint())
+            raise InvalidAmount(
+                f"{text[:40]!r} has more than {decimals} decimals, the most that {unit} has", hint=self._hint()
+            )
         amount = int(whole.replace("_", "") + part.ljust(decimals, "0"))
         if amount > UNLIMITED:
-            raise InvalidAmount(f"{text[:40]!r} is more than a contract can count", hint=self._hint())
+            raise InvalidAmount(f"{text[:40]!r} is more than a contract can store", hint=self._hint())
         return amount
 
     def _hint(self) -> str:

@@ -24,18 +24,18 @@ if TYPE_CHECKING:
 
 
 DEPLOYMENT_GAS: Final = 9_500_000
-"""Slightly more than a whole deployment uses. An account that can't pay for this much is refused at the start."""
+"""Slightly more than a whole deployment uses. An account that can't pay for it is rejected at the start."""
 
 
 command = LazyGroup(
     "chain",
-    help="A chain to develop on, and the network's contracts on any chain.",
-    lazy={"up": ("mesh.cli.up:chain_up", "serve a chain with the contracts, for development")},
+    help="Run a development chain; deploy and inspect the network's contracts on any chain.",
+    lazy={"up": ("mesh.cli.up:chain_up", "serve a development chain with the contracts")},
 )
 
 
-@command.command("deploy", short_help="put the contracts on a chain")
-@click.option("--lighthouse", default="airalab", show_default=True, help="name of the first lighthouse, one label")
+@command.command("deploy", short_help="deploy the contracts to a chain")
+@click.option("--lighthouse", default="airalab", show_default=True, help="name of the first lighthouse (one ENS label)")
 @with_lighthouse_options
 @click.option(
     "--refund-delay",
@@ -44,14 +44,14 @@ command = LazyGroup(
     show_default=True,
     help="blocks until the cost of an unfinished job can be refunded; can't be changed later",
 )
-@click.option("--again", is_flag=True, help="deploy even if the chain has the contracts; the old ones stay as they are")
+@click.option("--again", is_flag=True, help="deploy even if the chain already has the contracts; the old ones stay")
 @with_json
 @with_signing_settings()
 def deploy_contracts(settings: Settings, **options: Any) -> None:
     """Deploy the contracts: ENS registry and names, XRT, factory, and a first lighthouse.
 
-    The settings' account pays the gas, owns the names and gets the first million XRT. Sends about twenty transactions,
-    one after another, and prints the settings for those who use the contracts.
+    The settings' account pays the gas, owns the names and receives the first million XRT. Sends about twenty
+    transactions, one after another, and prints the settings that use the contracts.
     """
     run_to_end(lambda: _deploy(settings, **options))
 
@@ -75,9 +75,7 @@ async def _deploy(
         timeout_blocks=timeout_blocks,
         refund_delay=refund_delay,
     )
-    check_lighthouse(
-        plan.lighthouse, minimal_stake=plan.minimal_stake
-    )  # it is created last, which is late for an error
+    check_lighthouse(plan.lighthouse, minimal_stake=plan.minimal_stake)  # it is created last, too late for an error
     account = await asyncio.to_thread(load_account, settings)
     node = chain_of(settings, account).node
     async with node:
@@ -98,7 +96,7 @@ async def _check_not_deployed(settings: Settings, node: Node) -> None:
     try:
         async with chain_of(settings, None) as chain:
             raise AlreadyDeployed(
-                f"the chain {node.chain_id} has the contracts already (factory {chain.factory})",
+                f"the chain {node.chain_id} already has the contracts (factory {chain.factory})",
                 hint="use them, or deploy a second set with --again; for another lighthouse: `aira lighthouse create`",
             )
     except NoContracts:
@@ -147,7 +145,7 @@ def _print_deployment(settings: Settings, deployment: Deployment, *, chain_id: i
             "gas used": f"{deployment.gas_used:,}",
         }
     )
-    print_line("\nsettings of those who use it:\n")
+    print_line("\nsettings to use these contracts:\n")
     for name, value in options.items():
         print_line(f'{name} = "{value}"')
 
@@ -159,13 +157,13 @@ CONTRACT_FACTS: Final = ("ens", "factory", "xrt", "isOurCode", "lighthouse", "li
 """The fields that are null in JSON if the chain has no contracts."""
 
 
-@command.command("status", short_help="show the node, the contracts and the account's money")
+@command.command("status", short_help="show the node, the contracts and the account's balances")
 @with_json
 @with_chain_settings("lighthouse_contract")
 def status(settings: Settings, as_json: bool) -> None:
-    """Show the node and its chain, the contracts and whose code they have, and the account's balances.
+    """Show the node and its chain, the contracts and which code they run, and the account's balances.
 
-    The exit code is 1 if the chain has no contracts; the rest is shown all the same.
+    The exit code is 1 if the chain has no contracts; everything else is still shown.
     """
     run_to_end(lambda: _status(settings, as_json))
 
@@ -231,14 +229,14 @@ def _readable_status(facts: dict[str, Any]) -> dict[str, str | None]:
         "base fee": None if facts["baseFee"] is None else GWEI.show(int(facts["baseFee"])),
     }
     if facts["factory"] is not None:
-        whose = "this project's, by their code" if facts["isOurCode"] else "not this project's code"
-        there = facts["lighthouse"] or "none of that name"
+        code = "this project's code" if facts["isOurCode"] else "not this project's code"
+        found = facts["lighthouse"] or "not found:"
         shown |= {
-            "contracts": whose,
+            "contracts": code,
             "ENS registry": facts["ens"],
             "factory": facts["factory"],
             "XRT": facts["xrt"],
-            "lighthouse": f"{there}  {facts['lighthouseName']}",
+            "lighthouse": f"{found}  {facts['lighthouseName']}",
         }
     if facts["account"] is not None:
         amounts = [ETH.show(int(facts["wei"]))]
@@ -249,7 +247,7 @@ def _readable_status(facts: dict[str, Any]) -> dict[str, str | None]:
 
 
 def _ago(timestamp: int) -> str:
-    """How long ago a block was made, in a unit that fits."""
+    """How long ago a block was created, in a fitting unit."""
     seconds = max(0, int(time.time()) - timestamp)
     for name, length in (("day", 86_400), ("hour", 3_600), ("minute", 60)):
         if seconds >= 2 * length:

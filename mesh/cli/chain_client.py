@@ -1,4 +1,4 @@
-"""What commands share that use a chain: opening it, and finding accounts, tokens and their units."""
+"""Shared by commands that use a chain: opening it, and finding accounts, tokens and their units."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from schemas.records import Liability
 
 SLOW: Final = 3.0
-"""Seconds until a command says that it waits for a transaction."""
+"""Seconds after which a command reports that it waits for a transaction."""
 FACTORY: Final = "factory"
 
 
@@ -47,10 +47,10 @@ async def open_signing_chain(settings: Settings) -> AsyncIterator[Chain]:
 
 @contextmanager
 def notice_when_slow() -> Iterator[None]:
-    """Around sending a transaction: prints to stderr that it is waited for, if it takes longer than usual."""
+    """Print to stderr that a command is waiting for its transaction, if this takes longer than usual."""
 
     def notice() -> None:
-        click.echo("waiting until the transaction is mined; Ctrl-C leaves it to the chain", err=True)
+        click.echo("waiting until the transaction is mined; Ctrl-C stops waiting, but does not cancel it", err=True)
 
     timer = asyncio.get_running_loop().call_later(SLOW, notice)
     try:
@@ -72,19 +72,20 @@ def required_address(settings: AccountSettings) -> str:
     address = own_address(settings)
     if address is None:
         raise AccountMissing(
-            "no account: no address is given, and keyfile is not set", hint="give an address or --keyfile"
+            "no account: neither an address nor a keyfile is given", hint="give an address or --keyfile"
         )
     return address
 
 
 def address_in_keyfile(keyfile: str | Path) -> str:
-    """The address that a keyfile claims, without its password. Raises `ConfigurationError`."""
+    """The address that a keyfile states, read without its password. Raises `ConfigurationError`."""
     from mesh.chain import keyfile_address
 
     address = keyfile_address(Path(keyfile).expanduser())
     if address is None:
         raise AccountMissing(
-            f"{keyfile} does not contain its address", hint="keyfiles may leave it out; use one with an address"
+            f"{keyfile} does not contain its address",
+            hint="the address is optional in keyfiles; use a keyfile with one",
         )
     return address
 
@@ -121,8 +122,8 @@ async def unit_of(chain: Chain, token: str | None) -> Unit:
 async def units_of(chain: Chain, liabilities: Iterable[Liability]) -> dict[str, Unit]:
     """The units of the tokens that liabilities are paid in, by the tokens' addresses.
 
-    The symbol of a token other than XRT has its address beside it, since anyone can name a token anything. A token
-    without a unit counts in its smallest one.
+    The symbol of a token other than XRT includes its address, because anyone can choose any symbol. A token without a
+    known unit is counted in its smallest one.
     """
     return {token: await _unit_of(chain, token) for token in {liability.token for liability in liabilities}}
 
@@ -143,6 +144,6 @@ async def check_balance(chain: Chain, unit: Unit, needed: int, *, token: str | N
     balance = await chain.tokens.balance(token=token)
     if balance < needed:
         raise BalanceTooLow(
-            f"{chain.account.address} has {unit.show(balance)}, but {unit.show(needed)} are needed",
-            hint="transfer more to the account, or give a smaller amount",
+            f"{chain.account.address} has {unit.show(balance)}, but needs {unit.show(needed)}",
+            hint="transfer more to the account, or use a smaller amount",
         )

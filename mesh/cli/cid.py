@@ -17,7 +17,7 @@ from schemas import cid_of_file, cid_of_stream
 def command(files: tuple[Path, ...]) -> None:
     """Print the CIDv0 of FILES, their name on IPFS and in the mesh; `-` reads standard input.
 
-    One file gives its CID alone; several give a line each, with the CID and the file.
+    For one file, only its CID is printed; for several, a line for each with the CID and the file.
     """
     for path in files:
         cid = _cid(path)

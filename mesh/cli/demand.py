@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class Amount(click.ParamType[str]):
-    """An amount as people write it. Its syntax is checked here; how much it is depends on the token."""
+    """An amount. Its syntax is checked here; its value depends on the token."""
 
     name = "amount"
 
@@ -39,14 +39,14 @@ class Amount(click.ParamType[str]):
 
 
 @click.command("demand")
-@click.option("--model", required=True, help="CID or ENS name of the behaviour that you want")
-@click.option("--objective", required=True, help="file to play, or its CID")
+@click.option("--model", required=True, help="CID or ENS name of the model: the behaviour that you order")
+@click.option("--objective", required=True, help="objective to play: a file or a CID")
 @click.option(
     "--cost",
     type=Amount(),
     default="0",
     show_default=True,
-    help="what you pay: 1.5 counts whole tokens (XRT), 1500000000wn (units for other tokens) the smallest unit",
+    help="what you pay: whole tokens (1.5), or the smallest unit (1500000000wn for XRT, 15units for other tokens)",
 )
 @click.option("--validator", default="", help="address or ENS name of the validator of the result [none]")
 @click.option(
@@ -57,7 +57,7 @@ class Amount(click.ParamType[str]):
     type=click.IntRange(min=1),
     default=1000,
     show_default=True,
-    help="blocks for which the demand is valid",
+    help="number of blocks for which the demand is valid",
 )
 @click.option("--out", type=click.Path(path_type=Path), help="file to write the recording to")
 @with_json
@@ -70,10 +70,11 @@ class Amount(click.ParamType[str]):
     *options_of(ChainSettings),
 )
 def command(settings: Settings, **order: Any) -> None:
-    """Publish a demand and wait for the contract, the work and the payment. Ctrl-C stops waiting; the contract goes on.
+    """Publish a demand and wait for the contract, the work and the payment. Ctrl-C stops waiting, but does not cancel
+    the demand or the contract.
 
     The exit code is 1 if the work was not done and the cost was returned, or if the recording (--out) is not
-    available. With --json one object is printed when the contract has ended; it has an `error` if the code is 1.
+    available. --json prints one object when the contract has ended; it has an `error` if the exit code is 1.
     """
     run_to_end(lambda: demand(settings, **order))
 
@@ -87,7 +88,7 @@ async def demand(
     source = await asyncio.to_thread(_file_or_cid, objective)
     fee = XRT.parse(validator_fee)
     if fee and not terms["validator"]:
-        raise InvalidOptions("--validator-fee needs --validator", hint="name the validator, or leave the fee out")
+        raise InvalidOptions("--validator-fee needs --validator", hint="give --validator, or omit the fee")
     if out is not None:
         await asyncio.to_thread(_check_writable, out)
     # A server with the same settings may run beside this and serve metrics at the same port.
@@ -123,7 +124,7 @@ async def _wait_for_end(contract: Contract, out: Path | None, *, as_json: bool) 
     failure: AiraError | None = None
     if not outcome.success:
         failure = JobNotDone(
-            "the job was not done; its cost was returned", hint=_failure_hint(contract, outcome.result)
+            "the job was not done; the cost was returned", hint=_failure_hint(contract, outcome.result)
         )
         facts["error"] = str(failure)
     if out is not None:
@@ -143,10 +144,10 @@ async def _wait_for_end(contract: Contract, out: Path | None, *, as_json: bool) 
 
 
 def _failure_hint(contract: Contract, result: str) -> str:
-    """Where to look for the reason of a failure."""
+    """Where to find the reason of a failure."""
     if result:
-        return f"its recording may say why: aira objective show {result}"
-    return f"it ended without a result: aira liability show {contract.address}"
+        return f"the recording may show why: `aira objective show {result}`"
+    return f"it ended without a result; see `aira liability show {contract.address}`"
 
 
 async def _save_recording(contract: Contract, out: Path) -> None:
@@ -156,7 +157,7 @@ async def _save_recording(contract: Contract, out: Path) -> None:
         await asyncio.to_thread(shutil.copyfile, recording, out)
     except OSError as error:
         raise OutputFailed(
-            f"can't write the recording to {out}: {error.strerror}", hint=f"it was fetched to {recording}"
+            f"can't write the recording to {out}: {error.strerror}", hint=f"the store has it: {recording}"
         ) from None
 
 
@@ -176,10 +177,10 @@ def _check_writable(out: Path) -> None:
     """Check that a file can be written there, before anything is paid. Leaves no file behind."""
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        there = out.exists()
+        existed = out.exists()
         with out.open("ab"):
             pass
-        if not there:
+        if not existed:
             out.unlink()
     except OSError as error:
         raise FileUnwritable(f"can't write the recording to {out}: {error.strerror}") from None

@@ -23,28 +23,33 @@ if TYPE_CHECKING:
 
 COLOURS: Final = {CheckStatus.OK: "green", CheckStatus.WARN: "yellow", CheckStatus.FAIL: "red"}
 MARK: Final = 6
-"""Columns of the status before each line."""
+"""Width of the status column."""
 
 
 @click.command("doctor")
 @click.option(
     "--role",
     type=click.Choice(get_args(Role)),
-    help="the role that this machine should run [inferred from the settings]",
+    help="the role to check this machine for [inferred from the settings]",
 )
 @click.option(
     "--timeout",
     type=click.FloatRange(0, 600, min_open=True),
     default=15.0,
     show_default=True,
-    help="seconds for all checks together",
+    help="time limit in seconds for all checks together",
 )
-@click.option("--chain-id", type=click.IntRange(1), help="the chain id that the node should have (EIP-155)")
-@click.option("--port", default="", help="for an edge agent: its serial port, as in `aira edge PORT`")
+@click.option("--chain-id", type=click.IntRange(1), help="the expected chain id (EIP-155)")
+@click.option("--port", default="", help="for an edge agent: the serial port, as in `aira edge PORT`")
 @click.option(
-    "--protocol", type=click.Choice(["frames", "rosserial"]), default="frames", help="the protocol of its board"
+    "--protocol",
+    type=click.Choice(["frames", "rosserial"]),
+    default="frames",
+    help="for an edge agent: the protocol of the board",
 )
-@click.option("--baud", type=click.IntRange(300, 4_000_000), default=57_600, help="bits per second of its port")
+@click.option(
+    "--baud", type=click.IntRange(300, 4_000_000), default=57_600, help="for an edge agent: bits per second of the port"
+)
 @click.option("--agent", default="", help="for an edge agent: address of the agent that its device belongs to")
 @click.option("--device", default="", help="for an edge agent: name of that device")
 @with_json
@@ -63,17 +68,17 @@ MARK: Final = 6
     "ipfs_authorization_file",
 )
 def command(settings: Settings, as_json: bool, timeout: float, role: Role | None, **options: Any) -> None:
-    """Look at everything that a role needs on this machine, and say what is wrong and what to do about it.
+    """Check whether this machine can run a role, and suggest a fix for each problem.
 
-    The router and what it lets this identity do, the clocks, the chain and its contracts, the account and its money,
-    the disk; for a bridge also the IPFS daemon, for an edge agent the serial port and its board (which opening the port
-    starts anew). Nothing is changed or spent, and no key or password is shown.
+    Checks the router and this identity's rights there, the clocks, the chain and its contracts, the account and its
+    balances, and the disk; for a bridge also the IPFS daemon, for an edge agent the serial port and its board (opening
+    the port resets most boards). Changes and spends nothing, and shows no key or password.
 
-    A line for each check: ok, warn (it works now) or FAIL. With --json an object for each: name, ok, found, do. What
-    can't be tried because of a failure before it is left out. Exits 1 if anything fails.
+    Prints a line for each check: ok, warn (it works now) or FAIL; with --json an object with name, ok, found and do. A
+    check that depends on a failed one is skipped. The exit code is 1 if a check fails.
     """
     try:
-        context = _case(settings, role, **options)
+        context = _context_of(settings, role, **options)
     except AiraError as error:
         fail(error)
     failed: list[str] = []
@@ -82,11 +87,11 @@ def command(settings: Settings, as_json: bool, timeout: float, role: Role | None
         sys.exit(1)
 
 
-def _case(settings: Settings, role: Role | None, **options: Any) -> DoctorContext:
-    """Who is examined. Raises `InputError` for options that can't be meant together."""
+def _context_of(settings: Settings, role: Role | None, **options: Any) -> DoctorContext:
+    """The context to check. Raises `InputError` for options that can't be combined."""
     agent, device = options["agent"], options["device"]
     if bool(agent) != bool(device):
-        raise InvalidOptions("--agent and --device go together, and one is missing")
+        raise InvalidOptions("--agent and --device must be given together")
     return with_identity(
         DoctorContext(
             settings=settings,
@@ -100,24 +105,24 @@ def _case(settings: Settings, role: Role | None, **options: Any) -> DoctorContex
 
 
 async def _examine(context: DoctorContext, failed: list[str], *, seconds: float, as_json: bool) -> None:
-    """Make the checks and tell each; the names of those that fail go into `failed`."""
+    """Run the checks, print each result, and append the names of failed ones to `failed`."""
     from mesh.doctor import checks_for, run_checks
 
     by_status: dict[CheckStatus, list[str]] = {status: [] for status in CheckStatus}
-    left_out: list[str] = []
-    async with checks_for(context) as checks, aclosing(run_checks(checks, seconds=seconds)) as examined:
+    skipped: list[str] = []
+    async with checks_for(context) as checks, aclosing(run_checks(checks, seconds=seconds)) as completed:
         width = max(len(check.name) for check in checks)
-        async for checked in examined:
+        async for checked in completed:
             if checked.result is None:
-                left_out.append(checked.name)
+                skipped.append(checked.name)
                 continue
             by_status[checked.result.status].append(checked.name)
             if as_json:
                 _print_object(context, checked)
             else:
-                _say_line(context, checked, width)
+                _print_result(context, checked, width)
     if not as_json:
-        _sum_up(context, len(checks), by_status, left_out)
+        _print_summary(context, len(checks), by_status, skipped)
     failed += by_status[CheckStatus.FAIL]
 
 
@@ -127,7 +132,7 @@ def _print_object(context: DoctorContext, checked: CompletedCheck) -> None:
     print_json({"name": checked.name, "ok": checked.result.ok, "found": found, "do": do})
 
 
-def _say_line(context: DoctorContext, checked: CompletedCheck, width: int) -> None:
+def _print_result(context: DoctorContext, checked: CompletedCheck, width: int) -> None:
     assert checked.result is not None
     status, found, do = checked.result
     mark = click.style(f"{status.value:<{MARK}}", fg=COLOURS[status], bold=status is CheckStatus.FAIL)
@@ -136,13 +141,15 @@ def _say_line(context: DoctorContext, checked: CompletedCheck, width: int) -> No
         print_line(f"{'':<{MARK + width}}  -> {printable(context.without_secrets(do))}")
 
 
-def _sum_up(context: DoctorContext, count: int, by_status: dict[CheckStatus, list[str]], left_out: list[str]) -> None:
+def _print_summary(
+    context: DoctorContext, count: int, by_status: dict[CheckStatus, list[str]], skipped: list[str]
+) -> None:
     failed, warned = by_status[CheckStatus.FAIL], by_status[CheckStatus.WARN]
     print_line()
-    if left_out:
-        print_line(f"not tried, because of a failure before: {', '.join(left_out)}")
+    if skipped:
+        print_line(f"skipped because of an earlier failure: {', '.join(skipped)}")
     if failed:
-        print_line(f"{plural(len(failed), 'check')} of {count} failed for the role {context.role}: {', '.join(failed)}")
+        print_line(f"{len(failed)} of {plural(count, 'check')} failed for the role {context.role}: {', '.join(failed)}")
     else:
-        warnings = f"; with a warning: {', '.join(warned)}" if warned else ""
-        print_line(f"all {count} checks are in order for the role {context.role}{warnings}")
+        warnings = f"; with warnings: {', '.join(warned)}" if warned else ""
+        print_line(f"all {count} checks passed for the role {context.role}{warnings}")

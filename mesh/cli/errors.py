@@ -18,7 +18,7 @@ class InvalidAmount(InputError):
 
 
 class FileUnreadable(InputError):
-    """A file that was named can't be read."""
+    """The named file can't be read."""
 
     code = "file-unreadable"
 
@@ -36,7 +36,7 @@ class FolderMissing(InputError):
 
 
 class FileUnwritable(ConfigurationError):
-    """The system refuses to write a file."""
+    """The operating system refuses to write a file."""
 
     code = "file-unwritable"
 
@@ -48,7 +48,7 @@ class NotAFileOrCid(InputError):
 
 
 class OutputFailed(AiraError):
-    """What a command has done can't be printed, or written to a file."""
+    """The output of a command can't be printed or written to a file."""
 
     code = "output-failed"
 
@@ -60,19 +60,19 @@ class PackageMissing(ConfigurationError):
 
 
 class NoAnswer(RemoteError):
-    """No agent, provider or bridge answers at an address."""
+    """No agent, provider or bridge answers for an address."""
 
     code = "no-answer"
 
 
 class InvalidPrivateKey(InputError):
-    """A text is not a private key, or is one where a file is named. Its text is never part of the error."""
+    """A text is not a private key, or a private key was given as a file's name. The error never contains it."""
 
     code = "invalid-private-key"
 
 
 class PasswordFileUnusable(ConfigurationError):
-    """A file with a password or a key can't be read or made, or is empty."""
+    """A file with a password or a key can't be read or created, or is empty."""
 
     code = "password-file-unusable"
 
@@ -84,13 +84,13 @@ class AccountMissing(ConfigurationError):
 
 
 class AlreadyDeployed(ConfigurationError):
-    """The chain has the contracts already."""
+    """The chain already has the contracts."""
 
     code = "already-deployed"
 
 
 class BalanceTooLow(ChainError):
-    """An account has less of a token than the command is to spend."""
+    """An account has less of a token than the command needs."""
 
     code = "balance-too-low"
 
@@ -108,19 +108,19 @@ class NotALighthouse(ChainError):
 
 
 class NameTaken(ChainError):
-    """A lighthouse of that name exists."""
+    """A lighthouse of that name already exists."""
 
     code = "name-taken"
 
 
 class InvalidLighthouse(InputError):
-    """A name or a minimal stake that the factory would refuse."""
+    """The factory would reject the name or the minimal stake."""
 
     code = "invalid-lighthouse"
 
 
 class InvalidStake(InputError):
-    """A stake can't be changed by that amount."""
+    """The stake can't be changed by that amount."""
 
     code = "invalid-stake"
 
@@ -168,7 +168,7 @@ class JobNotDone(RemoteError):
 
 
 class HealthUnavailable(RemoteError):
-    """No server answers with its health at an address."""
+    """No server reports its health at an address."""
 
     code = "health-unavailable"
 
@@ -192,7 +192,7 @@ class RosterMissing(ConfigurationError):
 
 
 class NothingRecorded(RemoteError):
-    """No message came on the keys that were recorded."""
+    """No message arrived on the recorded keys."""
 
     code = "nothing-recorded"
 

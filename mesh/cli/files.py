@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from mesh.settings import Settings
 
 STORE_SETTINGS: Final = ("data_dir", "keyfile")
-"""The settings that say where the store is."""
+"""The settings that locate the store."""
 FETCH_SETTINGS: Final = (*options_of(NetworkSettings), "fetch_timeout", *STORE_SETTINGS)
-"""The settings with which a file is found in the store or fetched from the mesh."""
+"""The settings to find a file in the store or fetch it from the mesh."""
 LARGEST_FILE: Final = 8 << 30
 """Bytes of the largest file that commands put into the store."""
 
@@ -41,14 +41,14 @@ def require_readable(path: Path) -> Path:
 def require_new_file(path: Path) -> Path:
     """Return the path if a new file can be created there: no file is overwritten. Raises `InputError`."""
     if path.exists():
-        raise FileExists(f"{path} exists already", hint="choose another name, or move the file away")
+        raise FileExists(f"{path} already exists", hint="choose another name, or move the file")
     if not path.parent.is_dir():
-        raise FolderMissing(f"there is no directory {path.parent}", hint="create it first")
+        raise FolderMissing(f"the directory {path.parent} does not exist", hint="create it first")
     return path
 
 
 def write_error(path: Path, error: OSError) -> FileUnwritable:
-    """The error to raise when the system refuses to write a file."""
+    """The error for a file that the system refuses to write."""
     return FileUnwritable(f"can't write {path}: {error.strerror}")
 
 
@@ -67,7 +67,7 @@ def file_or_cid(text: str) -> Path | str:
 
 
 def open_store(settings: Settings) -> Store:
-    """The store of the settings' account; without an account, one beside those of the accounts.
+    """The store of the settings' account; without an account, the store that the data folder has for no account.
 
     This and the store's methods block on the disk; use threads. Raises `ConfigurationError`.
     """

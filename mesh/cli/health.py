@@ -1,4 +1,4 @@
-"""`aira health`: asks a server with metrics for its health, as a container's health check does."""
+"""`aira health`: requests a server's health, as a container's health check does."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ if TYPE_CHECKING:
     from mesh.telemetry.health import Health
 
 LOOPBACK_OF: Final = {"0.0.0.0": "127.0.0.1", "::": "::1"}
-"""The address to ask a server that listens on all interfaces."""
+"""The address at which to reach a server that listens on all interfaces."""
 LARGEST_ANSWER: Final = 65_536
 """The most bytes of an answer that are read."""
 
 
 @click.command("health")
-@click.option("--url", help="the server, as http://HOST:PORT [the settings' metrics_listen]")
+@click.option("--url", help="address of the server, http://HOST:PORT [the settings' metrics_listen]")
 @click.option(
     "--timeout", type=click.FloatRange(min=0, min_open=True), default=8.0, show_default=True, help="seconds to wait"
 )
 @with_json
 @with_settings("metrics_listen")
 def command(settings: Settings, url: str | None, timeout: float, as_json: bool) -> None:
-    """Show the state of each part of a server, which must run with --metrics-listen HOST:PORT.
+    """Show the state of each part of a server that runs with --metrics-listen HOST:PORT.
 
-    The exit code is 0 if all parts are alive, and 1 if one is not or nothing answers, as container health checks
-    expect.
+    The exit code is 0 if all parts are alive, and 1 if one is not or the server does not answer, as container health
+    checks expect.
     """
     try:
         host, port = _server_address(url, settings)
@@ -57,7 +57,7 @@ def _server_address(url: str | None, settings: Settings) -> tuple[str, int]:
         return _parse_url(url)
     if not settings.metrics_listen:
         raise InvalidServerAddress(
-            "no server is named",
+            "the address of the server is missing",
             hint="give --url http://HOST:PORT, or the same metrics_listen as the server",
         )
     host, port = listen_address(settings.metrics_listen)
@@ -71,7 +71,7 @@ def _parse_url(url: str) -> tuple[str, int]:
     except ValueError:
         parts, found = None, (None, None)
     if parts is None or parts.scheme != "http" or not found[0] or not found[1]:
-        raise InvalidServerAddress(f"{url!r} is not the address of a server", hint="give --url http://HOST:PORT")
+        raise InvalidServerAddress(f"{url!r} is not a server address", hint="give --url http://HOST:PORT")
     return found[0], found[1]
 
 
@@ -92,9 +92,11 @@ def _fetch_health(host: str, port: int, *, timeout: float) -> Health:
         why = getattr(error, "strerror", None) or str(error) or type(error).__name__
         raise HealthUnavailable(
             f"no server answers at {where}: {why}",
-            hint="is the server running, with --metrics-listen HOST:PORT?",
+            hint="check that the server runs with --metrics-listen HOST:PORT",
         ) from None
     except msgspec.MsgspecError:
-        raise HealthUnavailable(f"the server at {where} is not one of the mesh", hint="give its --url") from None
+        raise HealthUnavailable(
+            f"the answer of the server at {where} is not a health report", hint="give the right --url"
+        ) from None
     finally:
         connection.close()

@@ -24,22 +24,22 @@ if TYPE_CHECKING:
 
 DAYS = click.FloatRange(0, 36_500, min_open=True)
 SITE = click.option("--site", required=True, type=FOLDER, help="folder of the site, created by `aira identity site`")
-ROSTER = click.option("--roster", type=FILE, help="roster of the site, which is updated")
+ROSTER = click.option("--roster", type=FILE, help="roster file of the site, to update")
 
 
 @click.group("identity")
 def command() -> None:
     """Create and show the certificates by which a site's routers identify who connects.
 
-    The common name of a certificate is an account's address. The roster, a TOML file, says what its holder may do; put
-    `revoked = true` there to exclude a member.
+    The common name of a certificate is an account's address. The roster, a TOML file, defines what its holder may do;
+    set `revoked = true` there to exclude a member.
     """
 
 
 @command.command("site", short_help="create a site")
 @click.argument("folder", type=FOLDER)
 @click.option("--name", default="AIRA mesh site", show_default=True, help="the site's name")
-@click.option("--days", type=DAYS, default=3650, show_default=True, help="how long its certificate is valid")
+@click.option("--days", type=DAYS, default=3650, show_default=True, help="validity of its certificate, in days")
 def site(folder: Path, name: str, days: float) -> None:
     """Create the certificate and the key of a site in FOLDER. Anyone with the key can admit members."""
     try:
@@ -53,20 +53,27 @@ def site(folder: Path, name: str, days: float) -> None:
 @command.command("new", short_help="create a member's certificate and key")
 @click.argument("folder", type=FOLDER)
 @SITE
-@click.option("--name", required=True, help="the member's name; for an edge agent, also its device's name")
+@click.option("--name", required=True, help="the member's name; for an edge agent, by default also its device's name")
 @click.option("--address", help="the account's address [not needed for a router]")
 @click.option("--keyfile", type=FILE, help="the account's keyfile, instead of its address")
-@click.option("--role", "roles", multiple=True, required=True, type=click.Choice(list(ROLES)), help="one or more")
-@click.option("--host", "hosts", multiple=True, help="a router's name or IP address")
+@click.option(
+    "--role",
+    "roles",
+    multiple=True,
+    required=True,
+    type=click.Choice(list(ROLES)),
+    help="a role of the member (may be repeated)",
+)
+@click.option("--host", "hosts", multiple=True, help="for a router: a host name or IP address (may be repeated)")
 @click.option("--agent", default="", help="for an edge agent: address of the agent that its device belongs to")
-@click.option("--device", default="", help="name of that device [the member's name]")
-@click.option("--days", type=DAYS, default=90, show_default=True, help="how long the certificate is valid")
+@click.option("--device", default="", help="for an edge agent: name of that device [the member's name]")
+@click.option("--days", type=DAYS, default=90, show_default=True, help="validity of the certificate, in days")
 @ROSTER
 @with_json
 def new(folder: Path, site: Path, days: float, roster: Path | None, as_json: bool, **about: Any) -> None:
     """Create a key and a certificate in FOLDER, and print the member's entry for the roster.
 
-    With --roster the entry is written there. Never overwrites a file or shows a key.
+    With --roster, add the entry to that file instead. Keys are never shown, and files never overwritten.
     """
     try:
         facts, member = _create_member(folder, _site(site), days, roster, **about)
@@ -79,12 +86,12 @@ def new(folder: Path, site: Path, days: float, roster: Path | None, as_json: boo
         click.echo(f"\n# for the roster:\n{entry_of(member)}", nl=False)
 
 
-@command.command("show", short_help="show whose a certificate is")
+@command.command("show", short_help="show a certificate's holder and validity")
 @click.argument("folder", type=FOLDER)
-@click.option("--roster", type=FILE, help="roster of the site, to look the member up in")
+@click.option("--roster", type=FILE, help="roster of the site, in which to look up the member")
 @with_json
 def show(folder: Path, roster: Path | None, as_json: bool) -> None:
-    """Print name, address, roles, validity and fingerprint of the identity in FOLDER."""
+    """Print the name, address, roles, validity and fingerprint of the identity in FOLDER."""
     try:
         facts = _member(folder).facts()
         standing = _roster_state(facts, roster) if roster is not None else None
@@ -97,17 +104,17 @@ def show(folder: Path, roster: Path | None, as_json: bool) -> None:
 @click.argument("folders", metavar="FOLDER...", nargs=-1, required=True, type=FOLDER)
 @SITE
 @click.option("--within", type=DAYS, help="only certificates that expire within this many days [all]")
-@click.option("--days", type=DAYS, default=90, show_default=True, help="how long the new certificate is valid")
+@click.option("--days", type=DAYS, default=90, show_default=True, help="validity of the new certificate, in days")
 @ROSTER
 @with_json
 def renew(
     folders: tuple[Path, ...], site: Path, within: float | None, days: float, roster: Path | None, as_json: bool
 ) -> None:
-    """Replace the certificate in each FOLDER by a new one for the same member and key. The keys need not be there.
+    """Replace the certificate in each FOLDER by a new one for the same member and key. The key files are not needed.
 
-    Sessions go on, and use the new certificate when they next connect. --within is for timers: certificates that last
-    longer stay. If one fails, the others are still renewed. With --roster, revoked members get no new certificate.
-    --json prints an object for each FOLDER.
+    Open sessions continue, and use the new certificate when they next connect. With --within, certificates that expire
+    later are not renewed, so a timer can run this. If one renewal fails, the others still run. With --roster, revoked
+    members get no new certificate. --json prints an object for each FOLDER.
     """
     failed: AiraError | None = None
     for folder in folders:
@@ -128,19 +135,20 @@ def renew(
         fail(failed)
 
 
-@command.command("check", short_help="check what the router allows an identity")
+@command.command("check", short_help="check that the router admits this identity")
 @click.option("--agent", default="", help="for an edge agent: address of the agent that its device belongs to")
 @click.option("--device", default="", help="for an edge agent: name of that device")
 @with_settings(*options_of(NetworkSettings))
 def check(settings: Settings, agent: str, device: str) -> None:
-    """Connect with the settings' certificate, and check that the router accepts what this identity sends.
+    """Connect with the settings' certificate, and check that the router accepts this identity's messages.
 
-    A router drops what it does not allow without an error. Exits with 1 if it does not admit or allow this identity.
+    A router drops denied messages without an error. The exit code is 1 if it does not admit this identity, or denies
+    all its operations.
     """
     try:
         address = _own_address(settings)
         if bool(agent) != bool(device):
-            raise InvalidOptions("--agent and --device go together, and one is missing")
+            raise InvalidOptions("--agent and --device must be given together")
     except AiraError as error:
         fail(error)
     run_to_end(lambda: _check(settings, address, agent, device))
@@ -151,7 +159,7 @@ async def _check(settings: Settings, address: str, agent: str, device: str) -> N
     from mesh.network.endpoints import Endpoints
 
     await check_admission(Endpoints.from_settings(settings), address, agent=agent, device=device)
-    click.echo(f"{address} is let in and heeded at {', '.join(settings.connect)}")
+    click.echo(f"{', '.join(settings.connect)} admits {address} and forwards its messages")
 
 
 def _own_address(settings: Settings) -> str:
@@ -175,7 +183,9 @@ def _create_member(
     from mesh.identity.roster import Member, entry_of, roster_from
 
     if "router" in about["roles"] and not about["hosts"]:
-        raise InvalidOptions("a router needs --host", hint="clients check the name or IP address in its certificate")
+        raise InvalidOptions(
+            "a router needs --host", hint="clients verify the host name or IP address in its certificate"
+        )
     name, agent, device = (_text(about[field]) for field in ("name", "agent", "device"))
     roles = tuple(dict.fromkeys(about["roles"]))
     member = Member(name=name, address=_address(about), roles=roles, agent=agent, device=device)
@@ -211,13 +221,13 @@ def _address(about: dict[str, Any]) -> str:
         from mesh.cli.chain_client import address_in_keyfile
 
         if about["address"] is not None:
-            raise InvalidOptions("both --address and --keyfile are given", hint="give one of them")
+            raise InvalidOptions("--address and --keyfile can't be used together", hint="give one of them")
         return address_in_keyfile(about["keyfile"])
     if about["address"] is not None:
         return str(about["address"])
     if set(about["roles"]) == {"router"}:
         return "0x" + secrets.token_hex(20)  # a router has no account, but its name must be unique
-    raise InvalidOptions("the certificate needs an address", hint="give the account's --address or its --keyfile")
+    raise InvalidOptions("the address is missing", hint="give the account's --address or --keyfile")
 
 
 def _roster_state(facts: CertificateFacts, path: Path) -> str:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 ENTRY_POINTS: Final = "aira.commands"
 HELP_WIDTH: Final = 100
-"""Characters of the line of help of an installed command."""
+"""Most characters of the short help of an installed command."""
 
 
 class BrokenCommand(ConfigurationError):
@@ -36,7 +36,7 @@ class BrokenCommand(ConfigurationError):
         package = entry.package
         super().__init__(
             f"can't load the command {name!r} of {package}: {type(error).__name__}: {error}",
-            hint=f"reinstall or uninstall {package}; other commands work without it",
+            hint=f"reinstall or uninstall {package}; other commands still work",
         )
         self.name = name
         self.package = package
@@ -45,7 +45,7 @@ class BrokenCommand(ConfigurationError):
 class LazyGroup(click.Group):
     """A group of commands of its own, of commands imported on first use, and of installed ones.
 
-    `lazy` maps a name to where the command is (`module:attribute`) and its line of help. `installed` is the prefix of
+    `lazy` maps a name to the command's location (`module:attribute`) and its short help. `installed` is the prefix of
     the entry points that belong to the group: "" for the root, "bridge " for `aira bridge`, None for no entry points.
     A name in `lazy` wins over an entry point of the same name.
     """
@@ -63,7 +63,7 @@ class LazyGroup(click.Group):
 
     @cached_property
     def _installed(self) -> dict[str, EntryPoint]:
-        """The installed commands of this group. Reading them takes a few ms, so only what needs them does."""
+        """The installed commands of this group. Reading them takes a few ms, so this happens only when needed."""
         if self._prefix is None:
             return {}
         from mesh.plugins import entry_points
@@ -89,7 +89,7 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """As click's, but an unknown command is answered with the nearest known one."""
+        """As click's, but the error for an unknown command suggests the nearest known one."""
         name = args[0] if args else ""
         if name and not name.startswith("-") and name not in self.commands and name not in self._lazy:
             known = self.list_commands(ctx)
@@ -99,14 +99,14 @@ class LazyGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Import the command and run it. Ctrl-C meanwhile is exit code 130, as it is once the command runs."""
+        """Import the command and run it. Ctrl-C during the import also exits with 130."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
             sys.exit(INTERRUPTED)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """The list of commands, importing the installed ones only: their help is nowhere else."""
+        """The list of commands. Imports only installed ones, whose help is not known otherwise."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, self._help_of(name)) for name in self.list_commands(ctx)])
 

@@ -29,36 +29,40 @@ HEAD = ("LIABILITY", "STATE", "COST", "PROMISEE", "PROMISOR")
 
 command = LazyGroup(
     "liability",
-    help="""Liabilities, the contracts that hold the money of a job until it is done.
+    help="""Liabilities: the contracts that hold the cost of a job until it is finalized.
 
-    The promisee asks for the work and pays, the promisor does it.""",
+    The promisee orders the work and pays; the promisor does it.""",
     lazy={
-        "cancel": ("mesh.cli.liability_cancel:cancel", "call the work off together, or get a refund after the delay"),
-        "watch": ("mesh.cli.liability_watch:watch", "follow one until it has ended, or all of them"),
+        "cancel": ("mesh.cli.liability_cancel:cancel", "cancel one by agreement, or refund it after the delay"),
+        "watch": ("mesh.cli.liability_watch:watch", "follow one until it ends, or all of them"),
     },
 )
 
 
-@command.command("list", short_help="list those of an account, or all")
+@command.command("list", short_help="list the liabilities of an account, or all")
 @click.option("--account", help="address or ENS name of a promisee or promisor [the settings' account]")
-@click.option("--all", "everybody", is_flag=True, help="those of all accounts")
+@click.option("--all", "everybody", is_flag=True, help="list the liabilities of all accounts")
 @click.option(
     "--state",
     type=click.Choice(["any", "open", "finalized"]),
     default="any",
     show_default=True,
-    help="only open ones, or only those that have ended",
+    help="list only open liabilities, or only finalized ones",
 )
 @click.option(
-    "--from-block", type=click.IntRange(min=0), default=0, show_default=True, help="only those created since this block"
+    "--from-block",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="list only liabilities created at this block or later",
 )
 @with_json
 @with_chain_settings()
 def list_liabilities(settings: Settings, **what: Any) -> None:
-    """List the liabilities of an account, first those that it pays for, then those that it works for; or all.
+    """List the liabilities of an account: first those in which it is the promisee, then those in which it is the
+    promisor, each oldest first. Without an account in the settings, list all.
 
-    Each kind is listed oldest first. Without an account in the settings, all are listed. Reading a long chain takes
-    time; --from-block shortens it.
+    Reading a long chain takes time; --from-block makes it faster.
     """
     run_to_end(lambda: _list(settings, **what))
 
@@ -101,13 +105,12 @@ async def _liabilities_of(chain: Chain, whose: str | None, from_block: int) -> S
     return list({liability.address: liability for liability in (*paid, *worked)}.values())
 
 
-@command.command("show", short_help="show one: parties, terms, cost and state")
+@command.command("show", short_help="show the parties, terms, cost and state of one")
 @click.argument("address")
 @with_json
 @with_chain_settings()
 def show(settings: Settings, address: str, as_json: bool) -> None:
-    """Show the liability at ADDRESS: its parties, its terms, its cost, its state, and from which block on it can be
-    refunded."""
+    """Show the liability at ADDRESS: its parties, terms, cost and state, and from which block it can be refunded."""
     run_to_end(lambda: _show(settings, address, as_json))
 
 
@@ -129,7 +132,7 @@ async def print_liability(chain: Chain, liability: Liability, *, own: str | None
 
 
 async def refund_state(chain: Chain, liability: Liability) -> RefundState | None:
-    """When an open liability can be refunded; None if it has ended, or its contracts offer no refund."""
+    """When an open liability can be refunded; None if it is finalized, or its contracts offer no refund."""
     from mesh.chain import NotOffered
 
     try:
@@ -141,16 +144,16 @@ async def refund_state(chain: Chain, liability: Liability) -> RefundState | None
 def refund_words(refund: RefundState) -> str:
     """When the promisee can get a refund, for people."""
     if refund.is_refundable:
-        return "possible now, by `aira liability cancel --refund`"
+        return "possible now: `aira liability cancel --refund`"
     blocks = refund.refundable_from - refund.block_number
-    return f"possible from block {refund.refundable_from:,} on, in {plural(blocks, 'block')}"
+    return f"possible from block {refund.refundable_from:,}, in {plural(blocks, 'block')}"
 
 
 OUTCOMES: Final[Mapping[str, str]] = {
-    "open": "open, the money is held",
-    "paid": "paid: done, and the promisor has the money",
-    "failed": "failed: not done, and the promisee has the money back",
-    "called-off": "called off without a result, and the promisee has the money back",
+    "open": "open: the contract holds the cost",
+    "paid": "paid: the job was done, and the promisor was paid",
+    "failed": "failed: the job was not done, and the cost was returned to the promisee",
+    "called-off": "cancelled or refunded: there is no result, and the cost was returned to the promisee",
 }
 """The states of a liability, and what they mean."""
 

@@ -24,22 +24,22 @@ if TYPE_CHECKING:
 
 @click.command("cancel")
 @click.argument("address")
-@click.option("--signature", "signatures", multiple=True, help="a party's signature, as printed by its own command")
-@click.option("--refund", is_flag=True, help="refund the promisee after the delay, without signatures")
+@click.option("--signature", "signatures", multiple=True, help="a party's signature, as its own command printed it")
+@click.option("--refund", is_flag=True, help="refund the promisee after the refund delay, without signatures")
 @with_json
 @with_signing_settings()
 def cancel(settings: Settings, address: str, signatures: tuple[str, ...], refund: bool, as_json: bool) -> None:
-    """Cancel the liability at ADDRESS: the promisee gets the cost back, and nobody is paid.
+    """Cancel the liability at ADDRESS: the promisee gets the cost back, and the promisor is not paid.
 
-    Both parties must agree. The first party runs this without --signature, which prints its signature and sends
+    Both parties must agree. The first party runs this command without --signature: it prints a signature and sends
     nothing. The other party runs it with that --signature, which ends the liability. Anyone else can end it with both
     signatures.
 
-    If the promisor has disappeared, --refund pays the promisee back once the refund delay has passed. Anyone may do
-    that; `aira liability show` says from which block on.
+    If the promisor has disappeared, --refund returns the cost once the refund delay has passed. Anyone may do this;
+    `aira liability show` prints the block from which it is possible.
     """
     if refund and signatures:
-        raise click.UsageError("--refund needs no --signature")
+        raise click.UsageError("--refund and --signature can't be used together")
     if refund:
         run_to_end(lambda: _refund(settings, address, as_json))
     else:
@@ -53,7 +53,7 @@ async def _refund(settings: Settings, address: str, as_json: bool) -> None:
         if not state.is_refundable:
             raise NotRefundable(
                 f"{liability.address} can't be refunded yet: {refund_words(state)}",
-                hint="before that, both parties can cancel it: `aira liability cancel` without --refund",
+                hint="until then both parties can cancel it: `aira liability cancel` without --refund",
             )
         with notice_when_slow():
             settled = await chain.liabilities.refund(liability.address)
@@ -74,7 +74,7 @@ async def _cancel(settings: Settings, address: str, signatures: Sequence[str], a
         elif not signed:
             raise NotAParty(
                 f"the account is neither promisee nor promisor of {liability.address}",
-                hint="give both parties' signatures, or the keyfile of one of them",
+                hint="give the signatures of both parties, or the keyfile of one of them",
             )
         elif signatures:
             raise SignatureMissing(
@@ -89,12 +89,12 @@ async def _open_liability(chain: Chain, address: str) -> Liability:
     """The liability. Raises `LiabilityEnded` if it is finalized."""
     liability = await chain.liabilities.get(address)
     if liability.is_finalized:
-        raise LiabilityEnded(f"{liability.address} has ended already: {OUTCOMES[state_of(liability)]}")
+        raise LiabilityEnded(f"{liability.address} has already ended: {OUTCOMES[state_of(liability)]}")
     return liability
 
 
 def _signed(chain: Chain, liability: Liability, signatures: Sequence[str]) -> dict[str, str]:
-    """Party → signature (0x…): of the given signatures, and of the own account if it is a party."""
+    """Party → signature (0x…): the given signatures, and that of the own account if it is a party."""
     from schemas import cancellation_hash, recover
 
     assert chain.account is not None
@@ -107,13 +107,13 @@ def _signed(chain: Chain, liability: Liability, signatures: Sequence[str]) -> di
             signer = recover(digest, signature)
         except InvalidMessage as error:
             raise InvalidSignature(
-                f"not a signature: {error.detail}", hint="a signature is 0x and 130 hexadecimal digits"
+                f"invalid signature: {error.detail}", hint="a signature is 0x and 130 hexadecimal digits"
             ) from None
         found = {party: signature for party, address in parties.items() if address == signer}
         if not found:
             raise InvalidSignature(
                 f"the signature is by {signer}, or for another liability",
-                hint=f"it must be by {liability.promisee} or {liability.promisor}",
+                hint=f"the signer must be {liability.promisee} or {liability.promisor}",
             )
         signed |= found
     return signed
@@ -128,8 +128,8 @@ def _print_signature(chain: Chain, liability: Liability, signed: dict[str, str],
         facts = {"liability": liability.address, "signer": chain.account.address, "party": party}
         print_json(facts | {"signature": signature, "needed": whose})
         return
-    print_line(f"as the {party}, you agree to call off {liability.address} by this signature:\n\n{signature}\n")
-    print_line(f"nothing was sent. The {other}, {whose}, ends it with\n")
+    print_line(f"as the {party}, you agree to cancel {liability.address} with this signature:\n\n{signature}\n")
+    print_line(f"Nothing was sent. The {other}, {whose}, can end it with:\n")
     print_line(f"aira liability cancel {liability.address} --signature {signature}")
 
 

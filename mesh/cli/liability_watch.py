@@ -1,4 +1,4 @@
-"""`aira liability watch`: follows one liability until it has ended, or all of them."""
+"""`aira liability watch`: follows one liability until it ends, or all of them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from mesh.cli.chain_client import open_chain, own_address, units_of
-from mesh.cli.liability import OUTCOMES, liability_json, print_liability, state_of
+from mesh.cli.liability import liability_json, print_liability, state_of
 from mesh.cli.options import with_chain_settings, with_json
 from mesh.cli.output import print_json, print_line, short_address
 from mesh.outage_log import OutageLog
@@ -36,14 +36,16 @@ log = logging.getLogger(__name__)
 
 @click.command("watch")
 @click.argument("address", required=False)
-@click.option("--from-block", type=click.IntRange(min=0), help="without ADDRESS: start at this block [the next]")
+@click.option(
+    "--from-block", type=click.IntRange(min=0), help="without ADDRESS: the first block to read [the next one]"
+)
 @with_json
 @with_chain_settings("confirmations", "poll_interval")
 def watch(settings: Settings, address: str | None, from_block: int | None, as_json: bool) -> None:
-    """Follow the liability at ADDRESS until it has ended, and show it. If the node is lost, wait for it.
+    """Wait until the liability at ADDRESS has ended, then show it. If the node is unreachable, wait for it.
 
-    Without ADDRESS, print each liability that is created and each that ends, until Ctrl-C; with --json an object on
-    each line.
+    Without ADDRESS, print each liability when it is created and when it ends, until Ctrl-C; with --json one object per
+    line.
     """
     if address is None:
         run_to_end(lambda: _watch_all(settings, from_block, as_json))
@@ -56,7 +58,7 @@ async def _watch(settings: Settings, address: str, as_json: bool) -> None:
     async with open_chain(settings) as chain:
         liability = await chain.liabilities.get(address)
         if not liability.is_finalized and not as_json:
-            print_line(f"{liability.address} is {OUTCOMES['open']}; waiting for its end (Ctrl-C leaves it as it is)")
+            print_line(f"{liability.address} is open; waiting until it ends (Ctrl-C stops waiting)")
         await print_liability(chain, await chain.liabilities.watch(address), own=own, as_json=as_json)
 
 
@@ -65,7 +67,7 @@ async def _watch_all(settings: Settings, from_block: int | None, as_json: bool) 
     async with open_chain(settings) as chain:
         cursor = await chain.block_number() + 1 if from_block is None else from_block
         if not as_json:
-            click.echo(f"watching from block {cursor:,} on; Ctrl-C ends it", err=True)
+            click.echo(f"watching from block {cursor:,}; Ctrl-C stops it", err=True)
         async for event in _follow(chain, cursor):
             if as_json:
                 print_json(event.json())
@@ -75,7 +77,7 @@ async def _watch_all(settings: Settings, from_block: int | None, as_json: bool) 
 
 @dataclass(frozen=True, kw_only=True)
 class LiabilityEvent:
-    """A liability was created, or ended. `liability` is its current record, `unit` the unit of its token."""
+    """A liability was created or has ended. `liability` is its current record, `unit` the unit of its token."""
 
     event: str
     block_number: int
@@ -93,7 +95,7 @@ class LiabilityEvent:
         promisor, promisee = (
             short_address(address, own=own) for address in (self.liability.promisor, self.liability.promisee)
         )
-        word = "made" if self.event == "made" else state_of(self.liability)
+        word = "created" if self.event == "made" else state_of(self.liability)
         cost = self.unit.show(self.liability.cost)
         return f"block {self.block_number:,}  {self.liability.address}  {word:<10}  {promisor} for {promisee}, {cost}"
 
@@ -112,18 +114,19 @@ class EventReverted:
 
     def line(self, *, own: str | None) -> str:
         """The event in a line for people."""
-        return f"the chain was reorganised: {self.liability} was not {self.what} after all"
+        what = "creation" if self.what == "made" else "end"
+        return f"a reorganisation reverted the {what} of {self.liability}"
 
 
 class _PrintedOutages(OutageLog):
-    """Prints to stderr that the node is lost, once in an outage."""
+    """Prints to stderr that the node is unreachable, once per outage."""
 
     def __init__(self) -> None:
         super().__init__(log, "chain")
         self._has_failed = False
 
     def failed(self, error: AiraError, consequence: str) -> None:
-        """Print `error`, unless the outage is known."""
+        """Print `error`, unless the outage is already known."""
         if not self._has_failed:
             click.echo(f"aira: {error}; waiting for it", err=True)
         self._has_failed = True
@@ -134,7 +137,7 @@ class _PrintedOutages(OutageLog):
 
 
 async def _follow(chain: Chain, cursor: int) -> AsyncIterator[LiabilityEvent | EventReverted]:
-    """What happens to liabilities from a block on. Waits while the node is lost, and prints that once."""
+    """Events of liabilities from a block on. Waits while the node is unreachable, and prints that once."""
     outages = _PrintedOutages()
     async with aclosing(chain.follow(cursor, outages=outages)) as blocks:
         async for block in blocks:

@@ -22,20 +22,24 @@ if TYPE_CHECKING:
 
 command = LazyGroup(
     "lighthouse",
-    help="""Lighthouses, the markets: create and show them, become a provider of one.
+    help="""List, show and create lighthouses (the markets); become a provider of one.
 
-    Stakes are in XRT (1.5), or with the ending wn in its smallest unit (1500000000wn). A lighthouse is named by its
-    label (airalab), its ENS name or its address.""",
+    Stakes are in XRT (1.5), or with the suffix wn in its smallest unit (1500000000wn). Name a lighthouse by its label
+    (airalab), its ENS name or its address.""",
     lazy={
-        "join": ("mesh.cli.lighthouse_stake:join", "stake, and become a provider"),
-        "leave": ("mesh.cli.lighthouse_stake:leave", "withdraw the stake, or a part of it"),
+        "join": ("mesh.cli.lighthouse_stake:join", "become a provider by staking XRT"),
+        "leave": ("mesh.cli.lighthouse_stake:leave", "withdraw the stake or a part of it"),
     },
 )
 
 
 @command.command("list", short_help="list all lighthouses")
 @click.option(
-    "--from-block", type=click.IntRange(min=0), default=0, show_default=True, help="only those created since this block"
+    "--from-block",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="list only lighthouses created at this block or later",
 )
 @with_json
 @with_chain_settings()
@@ -68,15 +72,15 @@ async def _list(settings: Settings, from_block: int, as_json: bool) -> None:
         head = ("NAME", "ADDRESS", "MINIMAL STAKE", "TIMEOUT", "PROVIDERS", "STAKED")
         print_table(head, rows, numbers=head[2:])
     else:
-        print_line("no lighthouse was made here" + (f" since block {from_block:,}" if from_block else ""))
+        print_line("there is no lighthouse" + (f" since block {from_block:,}" if from_block else ""))
 
 
-@command.command("info", short_help="show one: its rules, its providers, whose turn it is")
+@command.command("info", short_help="show the rules, the providers and the turn of one")
 @click.argument("name", required=False)
 @with_json
 @with_chain_settings("lighthouse_contract")
 def info(settings: Settings, name: str | None, as_json: bool) -> None:
-    """Show a lighthouse (by default the settings'): its rules, its providers, and whose turn it is."""
+    """Show a lighthouse (by default that of the settings): its rules, its providers, and whose turn it is."""
     run_to_end(lambda: _info(settings, name or settings.lighthouse_contract, as_json))
 
 
@@ -91,10 +95,10 @@ async def _info(settings: Settings, name: str, as_json: bool) -> None:
             provider["maySend"] = may_send[provider["provider"]]
         print_json(facts)
     else:
-        _say_info(name, state, block, may_send)
+        _print_info(name, state, block, may_send)
 
 
-def _say_info(name: str, state: LighthouseState, block: int, may_send: dict[str, bool]) -> None:
+def _print_info(name: str, state: LighthouseState, block: int, may_send: dict[str, bool]) -> None:
     alive = state.keep_alive_block
     print_facts(
         {
@@ -119,8 +123,8 @@ def _say_info(name: str, state: LighthouseState, block: int, may_send: dict[str,
             )
             for number, (provider, stake) in enumerate(state.stakes.items(), 1)
         ]
-        head = ("", "PROVIDER", "STAKE", "A TURN", "MAY SEND NOW")
-        print_table(head, rows, numbers=("", "STAKE", "A TURN"))
+        head = ("", "PROVIDER", "STAKE", "PER TURN", "MAY SEND NOW")
+        print_table(head, rows, numbers=("", "STAKE", "PER TURN"))
 
 
 def _turn(state: LighthouseState) -> str | None:
@@ -138,7 +142,9 @@ def _turn(state: LighthouseState) -> str | None:
 @with_json
 @with_signing_settings()
 def create(settings: Settings, **plan: Any) -> None:
-    """Create a lighthouse named NAME: 1 to 32 letters a to z, digits and -. Anyone can stake there as a provider."""
+    """Create a lighthouse named NAME (1 to 32 characters of a to z, 0 to 9 and -).
+
+    Anyone can stake there as a provider."""
     run_to_end(lambda: _create(settings, **plan))
 
 
@@ -182,15 +188,15 @@ LARGEST_STAKE: Final = 2**128 - 1
 
 
 def check_lighthouse(name: str, *, minimal_stake: int) -> None:
-    """Raise `InvalidLighthouse` for a name or a minimal stake (wn) that the factory would refuse."""
+    """Raise `InvalidLighthouse` for a name or a minimal stake (wn) that the factory would reject."""
     if not LABEL.fullmatch(name):
         raise InvalidLighthouse(
             f"{name[:40]!r} is not a valid name for a lighthouse",
-            hint="1 to 32 letters a to z, digits and -, such as `airalab`",
+            hint="use 1 to 32 characters of a to z, 0 to 9 and -, such as `airalab`",
         )
     if not 1 <= minimal_stake <= LARGEST_STAKE:
         raise InvalidLighthouse(
-            f"a minimal stake of {XRT.show(minimal_stake)} is out of range", hint="it is at least 1 wn"
+            f"a minimal stake of {XRT.show(minimal_stake)} is out of range", hint="use at least 1 wn"
         )
 
 
@@ -201,7 +207,7 @@ async def find_lighthouse(chain: Chain, name: str) -> str:
     """
     address = await chain.names.lighthouse(name)
     if not await chain.lighthouses.exists(address):
-        raise NotALighthouse(f"{address} is not a lighthouse of this factory", hint="`aira lighthouse list` shows them")
+        raise NotALighthouse(f"{address} is not a lighthouse of this factory", hint="`aira lighthouse list` lists them")
     return address
 
 

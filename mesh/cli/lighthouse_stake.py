@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 @with_json
 @with_signing_settings("lighthouse_contract")
 def join(settings: Settings, words: tuple[str, ...], as_json: bool) -> None:
-    """Add VALUE to the stake at LIGHTHOUSE (by default the settings') to be one of its providers.
+    """Add VALUE to the stake at LIGHTHOUSE (by default that of the settings), to become one of its providers.
 
-    Approves the amount for the lighthouse first if necessary. Each minimal stake allows one transaction a turn.
+    Approves the amount for the lighthouse first if necessary. Each minimal stake allows one transaction per turn.
     """
     run_to_end(lambda: _join(settings, words, as_json))
 
@@ -36,7 +36,7 @@ def join(settings: Settings, words: tuple[str, ...], as_json: bool) -> None:
 async def _join(settings: Settings, words: Sequence[str], as_json: bool) -> None:
     name, value = lighthouse_and_value(words, settings)
     if value is None:
-        raise InvalidOptions("the VALUE to stake is missing", hint=f"for example `aira lighthouse join {name} 20`")
+        raise InvalidOptions("VALUE is missing", hint=f"for example: `aira lighthouse join {name} 20`")
     async with open_signing_chain(settings) as chain:
         assert chain.account is not None
         state = await chain.lighthouses.get(await find_lighthouse(chain, name))
@@ -49,7 +49,7 @@ async def _join(settings: Settings, words: Sequence[str], as_json: bool) -> None
 
 
 def _check_stake(state: LighthouseState, *, staked: int, added: int) -> None:
-    """Raise `InvalidStake` for a stake that the lighthouse would refuse."""
+    """Raise `InvalidStake` for a stake that the lighthouse would reject."""
     hint = f"stake {XRT.show(max(1, state.minimal_stake - staked))} or more"
     if not added:
         raise InvalidStake("the stake to add must be more than 0", hint=hint)
@@ -63,9 +63,9 @@ def _check_stake(state: LighthouseState, *, staked: int, added: int) -> None:
 @with_json
 @with_signing_settings("lighthouse_contract")
 def leave(settings: Settings, words: tuple[str, ...], as_json: bool) -> None:
-    """Withdraw VALUE from the stake at LIGHTHOUSE (by default the settings').
+    """Withdraw VALUE from the stake at LIGHTHOUSE (by default that of the settings).
 
-    Without VALUE, or if less than the minimum would remain, all of it is withdrawn. Without a stake you stop being a
+    Without VALUE, or if less than the minimum would remain, withdraw all of it. Without a stake you stop being a
     provider.
     """
     run_to_end(lambda: _leave(settings, words, as_json))
@@ -83,7 +83,7 @@ async def _leave(settings: Settings, words: Sequence[str], as_json: bool) -> Non
         if value is not None and not 0 < value <= staked:
             raise InvalidStake(
                 f"can't withdraw {XRT.show(value)} from a stake of {XRT.show(staked)}",
-                hint="without VALUE, all of it is withdrawn",
+                hint="omit VALUE to withdraw all of it",
             )
         with notice_when_slow():
             await chain.lighthouses.withdraw(state.address, staked if value is None else value)
@@ -121,8 +121,8 @@ def print_stake(name: str, address: str, state: LighthouseState, *, as_json: boo
     print_facts(
         {
             "lighthouse": f"{state.address}  {name}",
-            "provider": f"{address}{'' if stake else '  (no more)'}",
+            "provider": f"{address}{'' if stake else '  (no longer a provider)'}",
             "stake": XRT.show(stake),
-            "a turn": plural(quota, "transaction") if stake else None,
+            "per turn": plural(quota, "transaction") if stake else None,
         }
     )

@@ -26,25 +26,25 @@ if TYPE_CHECKING:
 POLL_INTERVAL: Final = 0.5
 """Seconds between two requests for new events."""
 DEVICE_LOG: Final = "/log"
-"""The topic on which an edge agent answers for its device's log."""
+"""The topic on which an edge agent serves its device's log."""
 
 
 @click.command("logs")
 @click.argument("address")
-@click.option("--device", help="the log of the edge agent that serves this device of the agent")
-@click.option("--follow", "-f", is_flag=True, help="also show new events, until Ctrl-C")
+@click.option("--device", help="show the log of the edge agent that serves this device")
+@click.option("--follow", "-f", is_flag=True, help="also show new events until Ctrl-C")
 @click.option(
     "--lines",
     "-n",
     type=click.IntRange(min=0),
     default=100,
     show_default=True,
-    help="the number of last events to show",
+    help="number of past events to show",
 )
 @click.option(
-    "--level", type=click.Choice(LEVELS[:-1]), default="debug", show_default=True, help="the lowest level to show"
+    "--level", type=click.Choice(LEVELS[:-1]), default="debug", show_default=True, help="lowest level to show"
 )
-@click.option("--liability", default="", metavar="ADDRESS", help="only events of this contract")
+@click.option("--liability", default="", metavar="ADDRESS", help="show only events of this liability")
 @click.option(
     "--timeout", type=click.FloatRange(min=0, min_open=True), default=3.0, show_default=True, help="seconds to wait"
 )
@@ -61,10 +61,10 @@ def command(
     timeout: float,
     as_json: bool,
 ) -> None:
-    """Show the last log events of the agent, provider or bridge with ADDRESS.
+    """Show the latest log events of the agent, provider or bridge with ADDRESS.
 
-    Each keeps its last 2,000 events, from its log_level on. --json prints an object on each line, as the role itself
-    writes with log_format = "json".
+    Each keeps its last 2,000 events of its log_level or above. --json prints one object per line, in the format that
+    log_format = "json" selects.
     """
     from mesh.telemetry.events import human_line, json_line
 
@@ -94,45 +94,45 @@ async def _show(
     async with Network(endpoints_of(settings)) as network, Background() as tasks:
         tasks.start(wait_for_broken_pipe(), "readers of stdout")
         reader = LogReader(network.session, key, **wanted)
-        look = await reader.poll(timeout=timeout)
-        if not look.answered:
+        update = await reader.poll(timeout=timeout)
+        if not update.answered:
             raise NoAnswer(
-                f"no log at {key}: nothing answers",
-                hint="is it running, on the same router? see `aira peers`; on a closed site only operators may ask",
+                f"no answer at {key}",
+                hint="check with `aira peers` that it runs on this router; on a site, only operators may read logs",
             )
-        _tell(look, line)
-        while look.more:
-            look = await reader.poll(timeout=timeout)
-            _tell(look, line)
+        _print_update(update, line)
+        while update.more:
+            update = await reader.poll(timeout=timeout)
+            _print_update(update, line)
         if follow:
             await _follow(reader, line, timeout=timeout)
 
 
 async def _follow(reader: LogReader, line: Callable[[LogEvent], str], *, timeout: float) -> None:
-    """Show new events. Prints to stderr when the answers stop, and when they are back."""
+    """Show new events. Prints to stderr when it stops answering, and when it answers again."""
     from mesh.network import ServiceFailed
     from mesh.watching.logs import LogUpdate
 
-    trouble = ""
+    reported = ""
     while True:
         await asyncio.sleep(POLL_INTERVAL)
         try:
-            look = await reader.poll(timeout=timeout)
-            met = "" if look.answered else "nobody answers now; waiting"
+            update = await reader.poll(timeout=timeout)
+            failure = "" if update.answered else "no answer; waiting"
         except ServiceFailed as error:
-            look, met = LogUpdate([]), printable(str(error))
-        if met != trouble:
-            _note(met or "it answers again")
-            trouble = met
-        _tell(look, line)
+            update, failure = LogUpdate([]), printable(str(error))
+        if failure != reported:
+            _note(failure or "answering again")
+            reported = failure
+        _print_update(update, line)
 
 
-def _tell(look: LogUpdate, line: Callable[[LogEvent], str]) -> None:
-    for began in look.began:
-        _note(f"it has begun anew at {printable(began)}")
-    if look.missed:
-        _note(f"missed {plural(look.missed, 'event')}, which came faster than they could be read")
-    for event in look.events:
+def _print_update(update: LogUpdate, line: Callable[[LogEvent], str]) -> None:
+    for began in update.began:
+        _note(f"restarted at {printable(began)}")
+    if update.missed:
+        _note(f"missed {plural(update.missed, 'event')}: they arrived faster than they could be read")
+    for event in update.events:
         print_line(line(event))
 
 

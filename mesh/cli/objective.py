@@ -32,28 +32,28 @@ if TYPE_CHECKING:
 
 
 PIN = "user"
-"""The pin of files that a user added, which stay until the user removes them."""
+"""The pin of files that a user added; they are never evicted."""
 
 
 command = LazyGroup(
     "objective",
-    help="Objectives and recordings: MCAP files (or ROS 1 bags) with messages for a robot, or from one.",
+    help="Create, show, check and fetch objectives and recordings: MCAP files (or ROS 1 bags) of a robot's messages.",
     lazy={
-        "pack": ("mesh.cli.objective_pack:pack_objective", "make one from JSON lines, a bag, or live messages"),
-        "show": ("mesh.cli.objective_show:show", "summary, topics, schemas, and when the messages come"),
+        "pack": ("mesh.cli.objective_pack:pack_objective", "create one from JSON lines, a bag, or live messages"),
+        "show": ("mesh.cli.objective_show:show", "show the summary, topics, schemas and message times"),
     },
 )
 
 
-@command.command("add", short_help="put files into the store, where robots can fetch them")
+@command.command("add", short_help="add files to the store, from which robots fetch them")
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path))
 @with_json
 @with_settings(*STORE_SETTINGS)
 def add(settings: Settings, files: tuple[Path, ...], as_json: bool) -> None:
-    """Put FILES into the store and print their CIDs. The mesh can fetch them by CID while an agent with this store
-    runs; with --keyfile it is the store of that account.
+    """Add FILES to the store and print their CIDs. With --keyfile, use the store of that account.
 
-    Files that robots would refuse are added with a warning.
+    Others can fetch the files by CID while an agent with this store runs. Files that robots would refuse are added with
+    a warning.
     """
     run_sync(lambda: _add(settings, files, as_json=as_json))
 
@@ -69,7 +69,9 @@ def _add(settings: Settings, files: tuple[Path, ...], *, as_json: bool) -> None:
             with progress(f"examining {path.name}") as tell:
                 outcome = preflight(path, progress=tell)
             if not outcome.ok:
-                click.echo(f"aira: robots would refuse it ({outcome.reason}): {printable(outcome.detail)}", err=True)
+                click.echo(
+                    f"aira: robots would refuse this file ({outcome.reason}): {printable(outcome.detail)}", err=True
+                )
             added.append({"cid": cid, "file": str(path), "reason": outcome.reason})
             if not as_json:
                 click.echo(cid if len(files) == 1 else f"{cid}  {path}")
@@ -83,7 +85,7 @@ def _add(settings: Settings, files: tuple[Path, ...], *, as_json: bool) -> None:
 @with_json
 @with_settings(*FETCH_SETTINGS)
 def get(settings: Settings, cid: str, out: Path, as_json: bool) -> None:
-    """Fetch the file with CID from the store or the mesh. Every block is verified."""
+    """Fetch the file with this CID from the store or the mesh, and verify every block."""
     run_to_end(lambda: _get(settings, cid, out, as_json=as_json))
 
 
@@ -105,17 +107,17 @@ async def _get(settings: Settings, cid: str, out: Path, *, as_json: bool) -> Non
 CHECK_SETTINGS = (*STORE_SETTINGS, "objective_size_limit", "objective_expanded_limit")
 
 
-@command.command("check", short_help="whether a robot would take it; or the whole store")
+@command.command("check", short_help="check whether a robot would accept it, or check the whole store")
 @click.argument("objective", required=False)
 @click.option("--topics", help="topics that the robot accepts, separated by commas [any]")
 @with_json
 @with_settings(*CHECK_SETTINGS)
 def check(settings: Settings, objective: str | None, topics: str | None, as_json: bool) -> None:
-    """Check OBJECTIVE, a file or a CID in the store, as a robot does before it accepts a job: its format, its size and
-    expanded size, every checksum, its schemas, its topics.
+    """Check OBJECTIVE, a file or a CID in the store, as a robot does before it accepts a job: the format, the size and
+    expanded size, all checksums, the schemas and the topics.
 
-    Without OBJECTIVE, check every file of the store against its CID. The exit code is 1 if a check fails; the reason
-    is a word for programs.
+    Without OBJECTIVE, check every file of the store against its CID. The exit code is 1 if a check fails. The printed
+    reason is a stable code.
     """
 
     def work() -> bool:
@@ -140,7 +142,7 @@ def _check(settings: Settings, store: Store, objective: str, *, topics: str | No
         )
     elif outcome.ok and outcome.objective is not None:
         length = format_duration(outcome.objective.duration_ns)
-        click.echo(f"{cid}  fit to be played: {plural(outcome.objective.count, 'message')}, {length}")
+        click.echo(f"{cid}  valid: {plural(outcome.objective.count, 'message')}, {length}")
     else:
         click.echo(f"{cid}  {outcome.reason}: {printable(outcome.detail)}")
     return outcome.ok
@@ -163,7 +165,7 @@ def _check_store(store: Store, *, as_json: bool) -> bool:
     else:
         click.echo(f"{plural(check.files, 'file')}, {format_size(check.bytes)}, {len(check.damaged)} damaged")
         for cid in check.damaged:
-            click.echo(f"{cid}  damaged, and set aside; fetch it again")
+            click.echo(f"{cid}  damaged and moved aside; fetch it again")
     return not check.damaged
 
 
@@ -172,8 +174,9 @@ def _check_store(store: Store, *, as_json: bool) -> bool:
 @click.argument("out", type=click.Path(path_type=Path), required=False)
 @with_json
 def convert(bag: Path, out: Path | None, as_json: bool) -> None:
-    """Convert a ROS 1 bag to the MCAP file OUT [BAG with the suffix .mcap]. Keeps payloads, types, times, topics and
-    connection headers, and notes the bag's CID. Prints the new file's CID."""
+    """Convert a ROS 1 bag to the MCAP file OUT [BAG with the suffix .mcap], and print its CID.
+
+    Preserves payloads, types, times, topics and connection headers, and records the bag's CID."""
     run_sync(lambda: _convert(bag, out or bag.with_suffix(".mcap"), as_json=as_json))
 
 
@@ -182,27 +185,33 @@ def _convert(bag: Path, out: Path, *, as_json: bool) -> None:
     require_new_file(out)
     with progress(f"reading {bag.name}") as tell:
         if open_objective(bag, GENEROUS, progress=tell).format != "bag":
-            raise NotARecording(bag, "it is no ROS 1 bag")
+            raise NotARecording(bag, "it is not a ROS 1 bag")
     source = cid_of_file(bag)
     try:
         with progress(f"converting {bag.name}") as tell:
             bag_to_mcap(bag, out, cid=source, limits=GENEROUS, progress=tell)
     except OSError as error:
         raise write_error(out, error) from None
-    made, cid = open_objective(out, GENEROUS), cid_of_file(out)
+    converted, cid = open_objective(out, GENEROUS), cid_of_file(out)
     if as_json:
-        facts = {"cid": cid, "file": str(out), "source": source, "messages": made.count, "durationNs": made.duration_ns}
+        facts = {
+            "cid": cid,
+            "file": str(out),
+            "source": source,
+            "messages": converted.count,
+            "durationNs": converted.duration_ns,
+        }
         print_json(facts)
     else:
-        click.echo(f"{cid}  {out}  {plural(made.count, 'message')}, {format_duration(made.duration_ns)}")
+        click.echo(f"{cid}  {out}  {plural(converted.count, 'message')}, {format_duration(converted.duration_ns)}")
 
 
-@command.command("recover", short_help="save what is readable of a damaged file")
+@command.command("recover", short_help="save the readable part of a damaged file")
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), help="file to write [NAME.recovered.mcap]")
 @with_json
 def recover_file(file: Path, out: Path | None, as_json: bool) -> None:
-    """Write what is readable of FILE, a truncated or damaged MCAP file, to a new file, which notes what is missing."""
+    """Write the readable part of FILE, a truncated or damaged MCAP file, to a new file that records what is missing."""
     run_sync(lambda: _recover(file, out, as_json=as_json))
 
 
@@ -221,4 +230,4 @@ def _recover(file: Path, out: Path | None, *, as_json: bool) -> None:
         )
         return
     click.echo(f"{cid}  {recovered.path}  {plural(recovered.messages, 'message')}")
-    click.echo(f"what is missing: {printable(recovered.why) or 'nothing'}")
+    click.echo(f"missing: {printable(recovered.why) or 'nothing'}")

@@ -1,4 +1,4 @@
-"""`aira objective pack`: makes an objective from JSON lines, a bag, or messages recorded now."""
+"""`aira objective pack`: creates an objective from JSON lines, a bag, or live messages."""
 
 from __future__ import annotations
 
@@ -38,7 +38,9 @@ _BAG = b"#ROSBAG V"
 @click.command("pack")
 @click.argument("source", required=False, type=click.Path(path_type=Path, allow_dash=True))
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="MCAP file to write")
-@click.option("--hear", "keys", multiple=True, metavar="KEY", help="record the messages on KEY (may be repeated)")
+@click.option(
+    "--hear", "keys", multiple=True, metavar="KEY", help="record the messages on this key expression (may be repeated)"
+)
 @click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="how long to record [until Ctrl-C]")
 @with_json
 @with_settings(*options_of(NetworkSettings))
@@ -47,18 +49,19 @@ def pack_objective(
 ) -> None:
     """Create an objective, an MCAP file, and print its CID.
 
-    SOURCE (`-`: standard input) is a ROS 1 bag, or JSON lines such as
+    SOURCE (`-` for standard input) is a ROS 1 bag, or JSON lines such as
 
     \b
       {"topic": "/blink", "time": 0}
       {"topic": "/blink", "time": 0.5, "data": "blue"}
       {"topic": "/move", "time": 2, "data": {"x": 1.5}}
 
-    `time` is in seconds from the start, by default that of the previous line. `data` becomes a std_msgs/Empty if it is
-    missing, a std_msgs/String if it is text, else JSON. `type` sets another type: std_msgs/Empty, std_msgs/String,
-    json, json;NAME, or any other encoding (`ros1;my_msgs/Move`) with a base64 payload in `data`.
+    `time` is in seconds from the start; the default is the time of the previous line. `data` becomes a std_msgs/Empty
+    if it is missing, a std_msgs/String if it is text, and JSON otherwise. `type` sets another type:
+    std_msgs/Empty, std_msgs/String, json, json;NAME, or any other encoding (`ros1;my_msgs/Move`) with a base64 payload
+    in `data`.
 
-    --hear records live messages instead: `aira/agent/ADDRESS/device/lamp/**` are those of a device.
+    --hear records live messages instead; `aira/agent/ADDRESS/device/lamp/**` selects those of a device.
     """
     if (source is None) == (not keys):
         run_sync(_refuse)
@@ -69,7 +72,7 @@ def pack_objective(
 
 
 def _refuse() -> None:
-    raise InvalidOptions("give either a SOURCE or --hear", hint="a SOURCE is a file, --hear takes a key")
+    raise InvalidOptions("give either SOURCE or --hear", hint="SOURCE is a file; --hear takes a key expression")
 
 
 def _from_file(source: Path, out: Path, *, as_json: bool) -> None:
@@ -121,9 +124,9 @@ async def _record(settings: Settings, keys: Sequence[str], out: Path, *, seconds
     expressions = [key_expression(key) for key in keys]
     require_new_file(out)
     async with Network(endpoints_of(settings)) as network:
-        click.echo(f"hearing {', '.join(expressions)}; Ctrl-C ends it", err=True)
+        click.echo(f"recording {', '.join(expressions)}; Ctrl-C stops it", err=True)
         try:
-            with progress("hearing") as tell:
+            with progress("recording") as tell:
                 total = None if seconds is None else int(seconds * 10)
                 await record_keys(
                     network.session, expressions, out, seconds=seconds, tell=lambda done: tell(int(done * 10), total)
@@ -133,7 +136,7 @@ async def _record(settings: Settings, keys: Sequence[str], out: Path, *, seconds
 
 
 def _print_if_made(out: Path, *, as_json: bool) -> None:
-    """Print the recording also when Ctrl-C ended it: the file is complete."""
+    """Print the recording even if Ctrl-C stopped it: the file is complete."""
     if out.exists():
         _print_made(out, as_json=as_json)
 
@@ -169,7 +172,7 @@ def key_expression(text: str) -> str:
         return str(zenoh.KeyExpr(text))
     except zenoh.ZError as error:
         raise InvalidDestination(
-            f"{text!r} is not a key expression: {error}", hint="`*` stands for one chunk, `**` for any number"
+            f"{text!r} is not a key expression: {error}", hint="`*` matches one chunk, `**` any number of chunks"
         ) from None
 
 
@@ -219,7 +222,8 @@ async def record_keys(
             await asyncio.to_thread(target.unlink)
     if not summary.messages:
         raise NothingRecorded(
-            f"no message came on {', '.join(keys)}", hint="`aira/agent/ADDRESS/device/**` are an agent's devices"
+            f"no message arrived on {', '.join(keys)}",
+            hint="`aira/agent/ADDRESS/device/**` selects the devices of an agent",
         )
     return summary
 

@@ -1,4 +1,4 @@
-"""`aira objective show`: what is in an objective or a recording."""
+"""`aira objective show`: shows the content of an objective or a recording."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ BARS: Final = " ▁▂▃▄▅▆▇█"
 @click.command("show")
 @click.argument("objective")
 @click.option("--schemas", is_flag=True, help="also print the schema of each type")
-@click.option("--png", type=click.Path(path_type=Path), help="plot the messages per second to this file")
+@click.option("--png", type=click.Path(path_type=Path), help="also plot the messages per second to this PNG file")
 @with_json
 @with_settings(*FETCH_SETTINGS)
 def show(settings: Settings, objective: str, schemas: bool, png: Path | None, as_json: bool) -> None:
-    """Show what is in OBJECTIVE, a file or a CID: its duration, its topics and their types, its metadata, and when its
-    messages come."""
+    """Show the content of OBJECTIVE, a file or a CID: its duration, topics, types, metadata, and the times of its
+    messages."""
     path = run_sync(lambda: file_or_cid(objective))
     if isinstance(path, str):
         path = _fetched(settings, path)
@@ -152,7 +152,7 @@ def _print_topics(objective: Objective) -> None:
     click.echo()
     print_table(("topic", "type", "messages", "rate", "when"), rows, numbers=("messages", "rate"))
     if objective.duration_ns:
-        click.echo(f"each column of `when` is {format_duration(rates.span_ns)} long")
+        click.echo(f"each column of `when` stands for {format_duration(rates.span_ns)}")
 
 
 def _bars(counts: Sequence[int]) -> str:
@@ -174,7 +174,7 @@ def draw(rates: TopicRates, path: Path, *, title: str) -> None:
         from matplotlib.figure import Figure
     except ImportError:
         raise PackageMissing(
-            "drawing needs matplotlib, which is not installed", hint="pip install 'aira-mesh[plot]'"
+            "--png needs matplotlib, which is not installed", hint="pip install 'aira-mesh[plot]'"
         ) from None
     figure = Figure(figsize=(10, 4), layout="constrained")
     axes = figure.add_subplot()
@@ -182,7 +182,7 @@ def draw(rates: TopicRates, path: Path, *, title: str) -> None:
     edges = [number * rates.span_ns / 1e9 for number in range(spans + 1)]
     for topic in sorted(rates.counts):
         axes.stairs(rates.per_second(topic), edges, label=_plain_text(topic))
-    axes.set(title=_plain_text(title), xlabel="seconds from the first message", ylabel="messages a second")
+    axes.set(title=_plain_text(title), xlabel="seconds from the first message", ylabel="messages per second")
     axes.set_ylim(bottom=0)
     if rates.counts:
         axes.legend(loc="upper right", fontsize="small")

@@ -34,7 +34,7 @@ CHAIN_SETTINGS: Final = (
 """The settings that name a chain, and the contracts on it."""
 ACCOUNT_SETTINGS: Final = ("keyfile", "keyfile_password_file")
 TRANSACTION_SETTINGS: Final = ("data_dir", "max_fee_gwei", "confirmations", "poll_interval")
-"""The settings of how transactions are sent."""
+"""The settings for sending transactions."""
 
 
 def with_settings(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -73,13 +73,13 @@ def with_signing_settings(*more: str) -> Callable[[Callable[..., Any]], Callable
 
 def with_json(function: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command the flag `--json`; it is called with `as_json`."""
-    return click.option("--json", "as_json", is_flag=True, help="print JSON, and nothing else, to stdout")(function)
+    return click.option("--json", "as_json", is_flag=True, help="print JSON only to stdout")(function)
 
 
 def with_lighthouse_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command that creates a lighthouse `--minimal-stake` and `--timeout-blocks`."""
     stake = click.option(
-        "--minimal-stake", default="1", show_default=True, help="the least that a provider stakes, in XRT (or 5wn)"
+        "--minimal-stake", default="1", show_default=True, help="least stake of a provider, in XRT (1.5) or wn (5wn)"
     )
     timeout = click.option(
         "--timeout-blocks",
@@ -92,8 +92,8 @@ def with_lighthouse_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _given(value: str | tuple[str, ...] | None) -> str | tuple[str, ...] | None:
-    """A flag's value, None if it was not given. An empty text sets the option to nothing, but click gives an empty
-    list also when there was no flag."""
+    """A flag's value, None if it was not given. An empty text is a value; an empty list is not, because click also
+    passes one when the flag is absent."""
     return None if value == () else value
 
 

@@ -23,7 +23,7 @@ T = TypeVar("T")
 
 COLUMN_GAP: Final = "  "
 LARGEST_NUMBER: Final = 2**53
-"""Integers from here on lose digits in programs that read JSON numbers as doubles, so they are printed as text."""
+"""Integers of this size lose digits in programs that read JSON numbers as doubles, so they are printed as text."""
 SIZE_UNITS: Final = ("bytes", "KiB", "MiB", "GiB", "TiB")
 BAR_INTERVAL: Final = 0.1
 """Seconds between two updates of a progress bar."""
@@ -32,7 +32,7 @@ PIPE_INTERVAL: Final = 0.5
 
 
 def run_sync(work: Callable[[], T]) -> T:
-    """Call `work`, which needs no event loop. Prints an `AiraError` and exits, as `run_to_end` does."""
+    """Call `work`, which needs no event loop. Prints an `AiraError` and exits like `run_to_end`."""
     try:
         return work()
     except AiraError as error:
@@ -43,7 +43,7 @@ def print_line(text: str = "") -> None:
     """Print a line to stdout. If that fails, print the reason to stderr and exit with 1."""
     try:
         click.echo(text)
-    except BrokenPipeError:  # the reader has left: click ends the program quietly
+    except BrokenPipeError:  # the reader closed the pipe: click ends the program quietly
         raise
     except OSError as error:
         with open(os.devnull, "w") as nowhere:  # flushing the rest of the buffer at exit would fail again
@@ -75,7 +75,7 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[object]], *, number
 
 
 def printable(text: str) -> str:
-    """Text from others without control characters, which could steer the terminal."""
+    """Text from others without control characters, which could control the terminal."""
     return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
 
 
@@ -85,7 +85,7 @@ def plural(count: int, one: str) -> str:
 
 
 def short_address(address: str, *, own: str | None = None) -> str:
-    """The ends of an address, for a line in which another one is to be copied; `you` for the reader's own."""
+    """An address shortened to its ends, for lines with a full address beside it; `you` for the user's own."""
     return "you" if address == own else f"{address[:6]}…{address[-4:]}"
 
 
@@ -108,10 +108,10 @@ def format_duration(nanoseconds: int) -> str:
 
 
 def announce(log: Logger, event: str, text: str, **fields: object) -> None:
-    """Print that a server has started, or how, and log it as `event` at every log level.
+    """Print `text`, which says that a server has started, and log it as `event` at every log level.
 
-    People get `text` as it is, unless the program logs in JSON; the log gets it on one line. The event has those of
-    `fields` that are text.
+    Nothing is printed if the program logs in JSON. The log gets the text on one line; the event has those of `fields`
+    that are text.
     """
     import logging
 
@@ -134,7 +134,7 @@ def announce(log: Logger, event: str, text: str, **fields: object) -> None:
 def progress(label: str) -> Iterator[Callable[[int, int | None], None]]:
     """Show a progress bar on stderr, if that is a terminal.
 
-    Gives a function to call with how much is done, and of how much (None: unknown), from any one thread.
+    Yields a function to call, from any one thread, with the amount done and the total (None if unknown).
     """
     if not sys.stderr.isatty():
         yield lambda done, total: None
@@ -155,8 +155,8 @@ def progress(label: str) -> Iterator[Callable[[int, int | None], None]]:
 async def wait_for_broken_pipe() -> None:
     """Raise `BrokenPipeError`, which ends the program quietly, when stdout is a pipe that nobody reads any more.
 
-    A command that waits for news runs this beside its work: it would notice otherwise only when it prints. Returns at
-    once where stdout is not a file of the system.
+    A command that waits for events runs this beside its work; otherwise it would notice only when it prints. Returns at
+    once if stdout is not a file of the system.
     """
     import asyncio
     import errno

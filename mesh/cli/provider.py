@@ -45,10 +45,10 @@ REPORT_INTERVAL: Final = 600.0
     *options_of(TelemetrySettings),
 )
 def command(settings: Settings) -> None:
-    """Match the demands and offers of a lighthouse, create their contracts and finalize them. Ctrl-C ends it.
+    """Match the demands and offers of a lighthouse, create liabilities and finalize them. Ctrl-C stops it.
 
-    The account needs a stake at the lighthouse, and ETH for gas. Earnings and costs are logged every ten minutes and at
-    the end.
+    The account needs a stake at the lighthouse, and ETH for gas. Earnings and costs are logged every ten minutes and
+    when it stops.
     """
     run_until_stopped(lambda: serve(settings), settings=settings, role="provider")
 
@@ -94,7 +94,7 @@ async def _open_provider(
 
 
 async def report_earnings(earnings: Callable[[], Earnings], *, interval: float = REPORT_INTERVAL) -> None:
-    """Log earnings and costs at intervals (seconds), if they have changed, and at the end."""
+    """Log earnings and costs periodically (interval in seconds) if they have changed, and at the end."""
     reported = None
     try:
         while True:

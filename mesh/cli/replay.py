@@ -35,27 +35,29 @@ ROLES: Final = ("objective", "device", "agent")
 
 @click.command("replay")
 @click.argument("source")
-@click.option("--to", metavar="DEVICE", help="a device of this account, ADDRESS/DEVICE, or the prefix of a key")
+@click.option("--to", metavar="DEVICE", help="destination: a device of this account, ADDRESS/DEVICE, or a key prefix")
 @click.option(
-    "--objective", "of_objective", is_flag=True, help="for a liability: its objective instead of its recording"
+    "--objective", "of_objective", is_flag=True, help="for a liability: publish its objective instead of its recording"
 )
-@click.option("--topics", help="only these topics, separated by commas")
-@click.option("--role", type=click.Choice(ROLES), help="only messages of the objective, the device or the agent")
+@click.option("--topics", help="publish only these topics (separated by commas)")
+@click.option(
+    "--role", type=click.Choice(ROLES), help="publish only messages of the objective, the device or the agent"
+)
 @click.option(
     "--rate", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True, help="speed factor"
 )
-@click.option("--at-once", is_flag=True, help="without pauses")
-@click.option("--from", "start", type=click.FloatRange(min=0), default=0.0, help="skip this many seconds")
+@click.option("--at-once", is_flag=True, help="publish without pauses")
+@click.option("--from", "start", type=click.FloatRange(min=0), default=0.0, help="skip this many seconds at the start")
 @with_json
 @with_settings(*dict.fromkeys((*FETCH_SETTINGS, *options_of(ChainSettings))))
 def command(settings: Settings, **options: Any) -> None:
-    """Publish the messages of SOURCE again: a file, a CID, or the recording of a liability, by its address.
+    """Publish the messages of SOURCE again. SOURCE is a file, a CID, or the address of a liability with a recording.
 
     --to is the destination: `lamp` is that device of the account in --keyfile, `0x…/lamp` a device of another agent,
-    and anything longer (`lab/stage`) a key prefix to which the topics are added. Without it, the recording of a
-    liability that has ended is published on its own topics.
+    and any other text with a slash (`lab/stage`) a key prefix to which the topics are appended. Without --to, the
+    recording of a liability that has ended is published on its own topics.
 
-    This creates no contract and pays nobody. Ctrl-C ends it.
+    No contract is created and nothing is paid. Ctrl-C stops it.
     """
     run_to_end(lambda: replay(settings, ReplayOptions(**options)))
 
@@ -94,7 +96,7 @@ async def replay(settings: Settings, asked: ReplayOptions) -> None:
             recording = await asyncio.to_thread(open_objective, path, GENEROUS, progress=tell)
         destination = given or own
         if destination is None:
-            raise InvalidDestination("a file needs a destination", hint="name a device or a key with --to")
+            raise InvalidDestination("the destination is missing", hint="name a device or a key with --to")
         _check_topics(recording, destination, asked)
         async with Network(endpoints_of(settings)) as network:
             began = time.monotonic()
@@ -116,8 +118,8 @@ async def _source(settings: Settings, store: Store, asked: ReplayOptions) -> tup
     cid = liability.objective if asked.of_objective else liability.result
     if not cid:
         raise NoRecording(
-            f"{liability.address} holds no recording" + ("" if liability.is_finalized else " yet: it has not ended"),
-            hint="play its objective with --objective",
+            f"{liability.address} has no recording" + ("" if liability.is_finalized else " yet: it has not ended"),
+            hint="publish its objective with --objective",
         )
     own = JobTopics(liability.promisor, liability.address) if liability.is_finalized else None
     return await fetch(settings, store, cid), own
@@ -126,13 +128,13 @@ async def _source(settings: Settings, store: Store, asked: ReplayOptions) -> tup
 def _check_topics(recording: Objective, destination: Destination, asked: ReplayOptions) -> None:
     """Check that every topic gives a valid key, before anything is sent. Raises `InvalidKey`, `UnknownTopic`."""
     chosen = _chosen(asked)
-    there = {topic.name for topic in recording.topics}
-    missing = sorted(chosen - there)
+    known = {topic.name for topic in recording.topics}
+    missing = sorted(chosen - known)
     if missing:
         raise UnknownTopic(
-            f"the recording has no topic {', '.join(missing)}", hint=f"it has {', '.join(sorted(there)) or 'none'}"
+            f"the recording has no topic {', '.join(missing)}", hint=f"it has {', '.join(sorted(known)) or 'none'}"
         )
-    for topic in chosen or there:
+    for topic in chosen or known:
         destination.key(topic, "")
 
 
@@ -210,7 +212,7 @@ def destination_of(settings: Settings, to: str) -> Destination:
         own = own_address(settings)
         if own is None:
             raise AccountMissing(
-                f"the device {to!r} needs an account",
+                f"no account for the device {to!r}",
                 hint="give --keyfile, or --to ADDRESS/DEVICE",
             )
         return _checked(DeviceTopics(own, to))
@@ -219,9 +221,9 @@ def destination_of(settings: Settings, to: str) -> Destination:
     try:
         prefix = str(zenoh.KeyExpr(to))
     except zenoh.ZError as error:
-        raise InvalidDestination(f"a key can't begin with {to!r}: {error}") from None
+        raise InvalidDestination(f"{to!r} is not a valid key prefix: {error}") from None
     if "*" in prefix or "$" in prefix:
-        raise InvalidDestination(f"{to!r} has a wildcard", hint="name one key")
+        raise InvalidDestination(f"{to!r} contains a wildcard", hint="give one key prefix")
     return KeyPrefix(prefix)
 
 

@@ -1,4 +1,4 @@
-"""`aira router`: a Zenoh router, open on this machine or closed by a roster."""
+"""`aira router`: a Zenoh router, open on loopback or restricted by a roster."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import click
 
 from mesh.cli.errors import FileUnwritable, RosterMissing
 from mesh.cli.options import with_json, with_settings
-from mesh.cli.output import announce, print_json, print_table, printable
+from mesh.cli.output import announce, plural, print_json, print_table, printable
 from mesh.errors import AiraError
 from mesh.log_context import log_event
 from mesh.outage_log import OutageLog
@@ -39,26 +39,26 @@ ROSTER_INTERVAL: Final = 1.0
 @with_settings(*SITE_SETTINGS, *options_of(TelemetrySettings))
 @click.pass_context
 def command(context: click.Context, settings: Settings) -> None:
-    """Run a Zenoh router, through which agents, providers and people exchange messages. Ctrl-C ends it.
+    """Run a Zenoh router, through which agents, providers and people exchange messages. Ctrl-C stops it.
 
-    With a roster it admits clients with a certificate of the site, and allows each what its role needs. Without one it
-    listens on loopback only. When the roster or its certificate changes, it restarts by itself; clients reconnect
-    within a second.
+    With a roster it admits clients that have a certificate of the site, and allows each only what its role needs.
+    Without one it listens on loopback only. When the roster or the certificate changes, it restarts automatically;
+    clients reconnect within a second.
     """
     context.obj = settings
     if context.invoked_subcommand is None:
         run_until_stopped(lambda: serve(settings), settings=settings, role="router")
 
 
-@command.command("acl", short_help="show who may do what")
-@click.option("--check", is_flag=True, help="print a table for people instead of Zenoh's rules")
+@command.command("acl", short_help="show the rights of each member")
+@click.option("--check", is_flag=True, help="print a readable table instead of Zenoh's rules")
 @click.option("--roster", type=click.Path(dir_okay=False, path_type=Path), help="roster [the settings']")
 @with_json
 @click.pass_obj
 def acl(settings: Settings, check: bool, roster: Path | None, as_json: bool) -> None:
-    """Print what the roster allows, as Zenoh's `access_control`; with --check as a table.
+    """Print the rights that the roster grants, as Zenoh's `access_control`; with --check as a table.
 
-    Everything else is denied.
+    The router denies everything else.
     """
     from mesh.identity import access_control
 
@@ -80,14 +80,14 @@ def acl(settings: Settings, check: bool, roster: Path | None, as_json: bool) -> 
         print_table(("NAME", "ADDRESS", "ROLES", "MAY", "KEYS"), rows)
 
 
-@command.command("config", short_help="write the same router's configuration for zenohd")
+@command.command("config", short_help="write an equivalent configuration for zenohd")
 @click.option("--out", required=True, type=click.Path(dir_okay=False, path_type=Path), help="file to write (JSON5)")
 @click.pass_obj
 def config(settings: Settings, out: Path) -> None:
-    """Write a configuration file with which `zenohd` works as `aira router` with the same options.
+    """Write a configuration file with which `zenohd` behaves like `aira router` with the same options.
 
-    Give those options before `config`. zenohd reads the file when it starts, so restart it after a change of the
-    roster.
+    Give those options before `config`. zenohd reads the file only when it starts: after a change of the roster, write
+    it again and restart zenohd.
     """
     from mesh.identity.routers import router_endpoints, zenohd_configuration
 
@@ -123,7 +123,7 @@ async def serve(settings: Settings) -> None:
                 with _serve_metrics(telemetry, network):
                     endpoints = await _wait_for_change(settings, endpoints, certificate)
             log.info(
-                "the roster or the certificate has changed: the router restarts", extra=log_event("router-restarted")
+                "the roster or the certificate changed: restarting the router", extra=log_event("router-restarted")
             )
 
 
@@ -148,9 +148,9 @@ async def _wait_for_change(settings: Settings, endpoints: Endpoints, certificate
             found = await asyncio.to_thread(router_endpoints, settings)
             await asyncio.to_thread(found.config)
         except AiraError as error:
-            outages.failed(error, "the router goes on as it is")
+            outages.failed(error, "the router keeps its previous roster")
             continue
-        outages.recovered("the roster can be used again")
+        outages.recovered("the roster is valid again")
         if found != endpoints or _own_certificate(found) != certificate:
             return found
 
@@ -166,8 +166,8 @@ def _own_certificate(endpoints: Endpoints) -> bytes:
 
 def _describe_access(endpoints: Endpoints) -> str:
     if endpoints.access is None:
-        return "without a roster: only this machine reaches it, and everybody on it may do everything"
-    return f"let in: {len(endpoints.access['subjects'])} of the roster, by certificate"
+        return "no roster: every client on this machine may do everything; other machines can't connect"
+    return f"roster: {plural(len(endpoints.access['subjects']), 'member')} admitted by certificate"
 
 
 def _roster(settings: Settings, path: Path | None) -> Roster:

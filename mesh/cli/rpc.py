@@ -39,7 +39,7 @@ ETH_BALANCES: Final = frozenset({"eth/eth_balance", "eth/account_eth_balance"})
 @click.option(
     "--timeout",
     type=click.FloatRange(min=0, min_open=True),
-    help="seconds to wait for the answer [10, or 240 for what sends a transaction]",
+    help="seconds to wait for the answer [10; 240 for services that send a transaction]",
 )
 @with_json
 @with_settings(*options_of(NetworkSettings))
@@ -53,18 +53,18 @@ def command(
     timeout: float | None,
     as_json: bool,
 ) -> None:
-    """Call SERVICE of the agent with ADDRESS, with arguments by name or as one JSON object:
+    """Call SERVICE of the agent with ADDRESS. Pass arguments by name or as one JSON object:
 
     aira rpc 0x… start address=0x…
 
-    Amounts are in the smallest unit of the agent's token, which is XRT (wn) by default; with --json amounts of ETH are
-    in wei. Agents refuse services that sign, send or spend (marked with * in --list) unless their settings open them;
-    an agent with an executor also refuses start, restart, resume and finish.
+    Amounts are in the smallest unit of the agent's token, by default XRT (wn). With --json, amounts of ETH are in wei.
+    Agents refuse services that sign, send or spend (marked with * in --list) unless open_services is set; an agent with
+    an executor also refuses start, restart, resume and finish.
     """
     if as_list:
         _list_services(as_json=as_json)
     elif address is None or service is None:
-        raise click.UsageError("an ADDRESS and a SERVICE are needed; --list shows the services")
+        raise click.UsageError("ADDRESS and SERVICE are required; --list shows the services")
     else:
         run_to_end(lambda: call_service(settings, (address, service, arguments), timeout=timeout, as_json=as_json))
 
@@ -107,7 +107,7 @@ async def call_service(
     if as_json:
         print_json(msgspec.json.decode(reply.encode()))
     if isinstance(reply, Done) and not reply.success:
-        raise ServiceFailed(service, printable(reply.msg) or "it was not done")
+        raise ServiceFailed(service, printable(reply.msg) or "the service failed")
     if isinstance(reply, LiabilityRead) and not reply.read:
         raise UnknownJob(f"the agent at {address} has no job for {getattr(request, 'address', 'it')}")
     if isinstance(reply, LogsRead) and not as_json:
@@ -118,7 +118,7 @@ async def call_service(
 
 
 def _balance_of(service: str, reply: Record) -> dict[str, str]:
-    """A balance of ETH with its unit. Only the agent knows the unit of its token, so other balances stay numbers."""
+    """A balance of ETH with its unit. Only the agent knows its token's unit, so other balances are plain numbers."""
     if service in ETH_BALANCES and isinstance(reply, Balance):
         return {"balance": ETH.show(reply.balance)}
     return {}
@@ -128,14 +128,14 @@ def _describe(reply: Record) -> dict[str, str]:
     """The fields of a reply for people; the fields of a nested record are listed among them."""
     if isinstance(reply, Status):
         return describe_status(reply)
-    told: dict[str, str] = {}
+    shown: dict[str, str] = {}
     for field in msgspec.structs.fields(reply):
         value = getattr(reply, field.name)
         if isinstance(value, Record):
-            told |= _describe(value)
+            shown |= _describe(value)
         elif value not in (None, ""):
-            told[field.encode_name] = _fact(value)
-    return told
+            shown[field.encode_name] = _fact(value)
+    return shown
 
 
 def _fact(value: object) -> str:
@@ -158,11 +158,11 @@ TYPES: Final[Mapping[Any, str]] = {
     int: "a whole number",
     str: "text",
 }
-"""What to write for a value of each type."""
+"""How error messages name the values of each type."""
 
 
 def argument_names(kind: type[Record]) -> list[str]:
-    """The names of a record's fields on the wire; optional ones are in brackets."""
+    """The wire names of a record's fields; optional ones are in brackets."""
     return [field.encode_name if field.required else f"[{field.encode_name}]" for field in _fields(kind)]
 
 
@@ -171,7 +171,7 @@ def request_of(service: str, arguments: Sequence[str]) -> Record:
     if service not in SERVICES:
         near = difflib.get_close_matches(service, SERVICES, n=1, cutoff=0)[0]
         raise UnknownService(
-            f"there is no service {service[:60]!r}", hint=f"did you mean {near}? --list shows all of them"
+            f"there is no service {service[:60]!r}", hint=f"did you mean {near}? --list shows all services"
         )
     kind = SERVICES[service].request
     given = _given(arguments)
@@ -198,7 +198,7 @@ def _given(arguments: Sequence[str]) -> dict[str, Any]:
         if not equals or not name:
             raise InvalidArgument(f"{argument[:60]!r} is not an argument", hint="write name=value, or one JSON object")
         if name in given:
-            raise InvalidArgument(f"{name[:60]} is given twice")
+            raise InvalidArgument(f"the argument {name[:60]} is given twice")
         given[name] = value
     return given
 
@@ -231,7 +231,7 @@ def _value(service: str, field: msgspec.structs.FieldInfo, given: Any) -> Any:
             return given
     if kind not in TYPES or (type(given) is kind and kind is not UInt256):
         return given
-    raise InvalidArgument(f"{service}: {field.encode_name} is {str(given)[:60]!r}, and must be {TYPES[kind]}")
+    raise InvalidArgument(f"{service}: {field.encode_name} must be {TYPES[kind]}, not {str(given)[:60]!r}")
 
 
 def _fields(kind: type[Record]) -> tuple[msgspec.structs.FieldInfo, ...]:

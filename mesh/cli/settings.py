@@ -1,4 +1,4 @@
-"""`aira settings`: the effective settings, and what each option means."""
+"""`aira settings`: shows the effective settings and the meaning of each option."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mesh.settings import MEANING, OPTIONS, Settings
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 @with_settings(*OPTIONS)
 def command(settings: Settings, as_json: bool) -> None:
-    """Show the effective settings as a TOML file, which can be edited and given to --config."""
+    """Print the effective settings as a TOML file, which you can edit and pass to --config."""
     values = {name: getattr(settings, name) for name in OPTIONS}
     if as_json:
         click.echo(msgspec.json.encode(values))

@@ -19,18 +19,18 @@ if TYPE_CHECKING:
 
 @click.group("state")
 def command() -> None:
-    """Show, back up and restore the state of the agents of a data folder: jobs, signed messages, unfinished recordings,
-    files by CID. Keyfiles and passwords are never part of it.
+    """Show, back up and restore the state of the agents of a data folder: jobs, signed messages, unfinished recordings
+    and content. Keyfiles and passwords are never included.
     """
 
 
-@command.command("show", short_help="show the state, or what is in a backup")
+@command.command("show", short_help="show the state, or the content of a backup")
 @click.argument("file", required=False, type=FILE)
 @with_json
 @with_settings("data_dir")
 def show(settings: Settings, file: Path | None, as_json: bool) -> None:
-    """Print the state of the agents of the data folder, which may run. With FILE, print what is in that backup, after
-    verifying its checksums.
+    """Show the state of the agents of the data folder; they may be running. With FILE, verify the checksums of that
+    backup and show its content.
     """
     if file is None:
         run_to_end(lambda: _show(settings.state_directory, as_json=as_json))
@@ -38,21 +38,21 @@ def show(settings: Settings, file: Path | None, as_json: bool) -> None:
         run_sync(lambda: _show_archive(file, as_json=as_json))
 
 
-@command.command("backup", short_help="write the state to a file, also while agents run")
+@command.command("backup", short_help="write the state to a file, even while agents run")
 @click.argument("file", type=FILE)
 @click.option(
     "--content",
     type=click.Choice(["needed", "all", "none"]),
     default="needed",
     show_default=True,
-    help="files by CID to include: pinned ones and those that jobs need, all, or none",
+    help="content files to include: pinned ones and those that jobs need, all, or none",
 )
 @with_json
 @with_settings("data_dir")
 def backup(settings: Settings, file: Path, content: str, as_json: bool) -> None:
-    """Write the state of the agents of the data folder to FILE (tar.zst), replacing it at the end.
+    """Write the state of the agents of the data folder to FILE (tar.zst). An existing FILE is replaced at the end.
 
-    The agents may run: the backup is what a crash at one moment would leave.
+    The agents may be running: the backup contains what a crash at one moment would leave.
     """
     run_to_end(lambda: _back_up(settings.state_directory, file, content, as_json=as_json))
 
@@ -64,15 +64,15 @@ def backup(settings: Settings, file: Path, content: str, as_json: bool) -> None:
     type=click.Choice(["refuse", "set-aside"]),
     default="refuse",
     show_default=True,
-    help="if there is a state already: refuse, or keep the old one in the folder .replaced-TIME",
+    help="if a state exists: refuse, or move it to the folder .replaced-TIME",
 )
 @with_json
 @with_settings("data_dir")
 def restore(settings: Settings, file: Path, existing: str, as_json: bool) -> None:
-    """Restore the backup FILE to the data folder, whose agents must not run.
+    """Restore the backup FILE to the data folder, whose agents must be stopped.
 
-    Changes nothing unless all of FILE is valid. Make sure that the agent that the backup came from never runs again:
-    two agents of one account would do every job twice.
+    Changes nothing unless FILE is valid as a whole. Make sure that the agent that was backed up never runs again: two
+    agents with one account would do every job twice.
     """
     run_to_end(lambda: _restore(settings.state_directory, file, existing, as_json=as_json))
 
@@ -110,7 +110,7 @@ def _print_inventory(found: Inventory) -> None:
             for account in found.accounts
         }
     )
-    print_facts({"transactions under way": found.transactions})
+    print_facts({"pending transactions": found.transactions})
 
 
 def _show_archive(file: Path, *, as_json: bool) -> None:
@@ -126,13 +126,13 @@ def _show_archive(file: Path, *, as_json: bool) -> None:
 def _print_archive(found: ArchiveContents) -> None:
     print_facts(
         {
-            "made": printable(found.made),
+            "created": printable(found.made),
             "by": printable(found.software),
             "parts": ", ".join(found.parts),
             "files": ", ".join(f"{count} {kind}" for kind, count in found.files.items()),
             "content": printable(found.content),
             "unpacked": format_size(found.bytes),
-            "checksums": "as they should be",
+            "checksums": "valid",
         }
     )
 
@@ -149,18 +149,18 @@ async def _back_up(folder: Path, file: Path, content: str, *, as_json: bool) -> 
             "backup": file,
             "size": format_size(done.size),
             "accounts": ", ".join(done.accounts) or None,
-            "jobs under way": done.jobs,
+            "open jobs": done.jobs,
             "content": plural(done.files, "file"),
-            "not held": ", ".join(done.missing) or None,
+            "missing": ", ".join(done.missing) or None,
         }
     )
 
 
 async def _restore(folder: Path, file: Path, existing: str, *, as_json: bool) -> None:
     from mesh.state import ExistingState
-    from mesh.state import restore as put_back
+    from mesh.state import restore as restore_backup
 
-    done = await put_back(file, folder, existing=ExistingState(existing))
+    done = await restore_backup(file, folder, existing=ExistingState(existing))
     jobs = {job.liability.address: job.phase.value for job in done.jobs}
     if as_json:
         aside = None if done.aside is None else str(done.aside)
@@ -169,9 +169,9 @@ async def _restore(folder: Path, file: Path, existing: str, *, as_json: bool) ->
     print_facts(
         {
             "restored to": folder,
-            "as it was at": printable(done.made),
-            "before that": done.aside,
-            "jobs under way": len(jobs),
+            "backup of": printable(done.made),
+            "old state": done.aside,
+            "open jobs": len(jobs),
         }
     )
     print_facts(jobs)

@@ -1,4 +1,4 @@
-"""`aira status` and `aira peers`: who is on a lighthouse's channel, and how each of them is."""
+"""`aira status` and `aira peers`: the peers on a lighthouse's channel, and their status."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ if TYPE_CHECKING:
 @with_json
 @with_settings(*options_of(NetworkSettings), "lighthouse_contract")
 def status(settings: Settings, address: str | None, timeout: float, as_json: bool) -> None:
-    """Show the status of the agent, provider or bridge with ADDRESS: whether its parts are alive, how far it has read
-    the chain, its jobs or its market.
+    """Show the status of the agent, provider or bridge with ADDRESS: the health of its parts, the last block read, and
+    its jobs or its market.
 
-    Without ADDRESS, show everyone on the lighthouse's channel, a line each; with --json one object for all.
+    Without ADDRESS, show one line for each peer on the lighthouse's channel; with --json one object for all.
     """
     if address is None:
         run_to_end(lambda: show_all(settings, timeout=timeout, as_json=as_json))
@@ -58,19 +58,19 @@ async def show_one(settings: Settings, named: str, *, timeout: float, as_json: b
 
     address = parse_address(named)
     async with watching(settings) as (network, channel):
-        told = await status_of(network.session, address, channel.lighthouse, timeout=timeout)
-    if not told:
+        found = await status_of(network.session, address, channel.lighthouse, timeout=timeout)
+    if not found:
         raise NoAnswer(
             f"no answer from {address}",
-            hint="is it running, on the same router? `aira peers` lists who is; a bridge needs its --lighthouse",
+            hint="check with `aira peers` that it runs on this router; for a bridge give its --lighthouse-contract",
         )
     if as_json:
-        print_json([_status_json(how) for how in told])
+        print_json([_status_json(status) for status in found])
         return
-    for place, how in enumerate(told):
+    for place, status in enumerate(found):
         if place:
             print_line()
-        print_facts(describe_status(how))
+        print_facts(describe_status(status))
 
 
 async def show_all(settings: Settings, *, timeout: float, as_json: bool) -> None:
@@ -79,15 +79,15 @@ async def show_all(settings: Settings, *, timeout: float, as_json: bool) -> None
 
     async with watching(settings) as (network, channel):
         peers = await present(channel)
-        told = await statuses(network.session, channel, peers, timeout=timeout)
+        found = await statuses(network.session, channel, peers, timeout=timeout)
     if as_json:
-        people = [{"role": peer.role, "address": peer.address, "status": _status_json(told[peer])} for peer in peers]
-        print_json({"lighthouse": channel.lighthouse, "peers": people})
+        listed = [{"role": peer.role, "address": peer.address, "status": _status_json(found[peer])} for peer in peers]
+        print_json({"lighthouse": channel.lighthouse, "peers": listed})
     elif peers:
-        rows = [(peer.role, peer.address, summarize_status(told[peer])) for peer in peers]
-        print_table(("role", "address", "how it is"), rows)
+        rows = [(peer.role, peer.address, summarize_status(found[peer])) for peer in peers]
+        print_table(("role", "address", "status"), rows)
     else:
-        print_line(f"nobody on {channel.lighthouse}")
+        print_line(f"no peers on {channel.lighthouse}")
 
 
 def _status_json(how: RoleStatus | None) -> dict[str, Any] | None:
@@ -99,7 +99,7 @@ def _status_json(how: RoleStatus | None) -> dict[str, Any] | None:
 @with_json
 @with_settings(*options_of(NetworkSettings), "lighthouse_contract")
 def peers(settings: Settings, as_json: bool) -> None:
-    """Show who is on the lighthouse's channel, by role and address, and how many nodes listen on the IPFS side.
+    """List the peers on the lighthouse's channel by role and address, and count the nodes on the IPFS side.
 
     Watchers are not listed. `aira status` shows the status of each peer.
     """
@@ -114,14 +114,14 @@ async def show_peers(settings: Settings, *, as_json: bool) -> None:
     async with watching(settings) as (network, channel):
         peers = await present(channel)
         bridges = [peer for peer in peers if peer.role == "bridge"]
-        told = await statuses(network.session, channel, bridges)
-    states = {peer: how for peer, how in told.items() if isinstance(how, BridgeStatus)}
+        found = await statuses(network.session, channel, bridges)
+    states = {peer: status for peer, status in found.items() if isinstance(status, BridgeStatus)}
     if as_json:
         print_json(_peers_json(channel.lighthouse, peers, states))
         return
     if peers:
         print_table(("role", "address"), [(peer.role, peer.address) for peer in peers])
-    print_line(f"{len(peers) or 'nobody'} on {channel.lighthouse}; on the IPFS side {_ipfs_side(bridges, states)}")
+    print_line(f"{plural(len(peers), 'peer')} on {channel.lighthouse}; IPFS side: {_ipfs_side(bridges, states)}")
 
 
 def _peers_json(lighthouse: str, peers: list[PresentPeer], states: dict[PresentPeer, BridgeStatus]) -> dict[str, Any]:
@@ -137,13 +137,13 @@ def _ipfs_side(bridges: list[PresentPeer], states: dict[PresentPeer, BridgeStatu
     """How many nodes of the legacy network are on the channel, according to a bridge."""
     best = _best(states)
     if best is None:
-        return "nobody knows: no bridge answers" if bridges else "nobody knows: there is no bridge"
+        return "unknown, no bridge answers" if bridges else "unknown, there is no bridge"
     nodes = plural(len(best.ipfs_peers), "node")
-    return nodes if best.state in ("connected", "alone") else f"{nodes}; the bridge says: {printable(best.state)}"
+    return nodes if best.state in ("connected", "alone") else f"{nodes}; the bridge reports: {printable(best.state)}"
 
 
 def _best(states: dict[PresentPeer, BridgeStatus]) -> BridgeStatus | None:
-    """The bridge whose count is used: the one that carries messages, or else the one that sees most nodes."""
+    """The bridge whose count is used: the active one, or else the one that sees most nodes."""
     return max(states.values(), key=lambda how: (how.carries, len(how.ipfs_peers)), default=None)
 
 
@@ -152,21 +152,21 @@ PHASES: Final = ("incoming", "ready", "running", "complete")
 
 
 def describe_status(how: RoleStatus) -> dict[str, str]:
-    """A status for people, by names. Its texts come from others, so they are made printable."""
-    told = _describe_bridge(how) if isinstance(how, BridgeStatus) else _describe_participant(how)
-    return {printable(name): printable(fact) for name, fact in told.items()}
+    """A status as names and texts. The texts come from others, so they are made printable."""
+    facts = _describe_bridge(how) if isinstance(how, BridgeStatus) else _describe_participant(how)
+    return {printable(name): printable(fact) for name, fact in facts.items()}
 
 
 def summarize_status(how: RoleStatus | None) -> str:
-    """A status in one line; None is a peer that does not answer."""
+    """A status in one line; None stands for a peer that did not answer."""
     if how is None:
-        return "does not answer"
+        return "no answer"
     if isinstance(how, BridgeStatus):
-        carries = "carries" if how.carries else "stands by"
-        words = [how.state, carries, f"{plural(len(how.ipfs_peers), 'node')} on the IPFS side"]
+        activity = "active" if how.carries else "standby"
+        words = [how.state, activity, f"{plural(len(how.ipfs_peers), 'node')} on the IPFS side"]
     else:
-        troubles = [f"{part} {state}" for part, state in how.parts.items() if state not in (ALIVE, OFF)]
-        words = [*(troubles or [ALIVE]), f"block {how.head:,}"]
+        failures = [f"{part} {state}" for part, state in how.parts.items() if state not in (ALIVE, OFF)]
+        words = [*(failures or [ALIVE]), f"block {how.head:,}"]
         if how.work is not None:
             words.append(plural(_open_jobs(how.work), "open job"))
         if how.market is not None:
@@ -184,7 +184,7 @@ def _describe_participant(how: Status) -> dict[str, str]:
     facts |= {} if how.work is None else _describe_work(how.work)
     facts |= {} if how.market is None else _describe_market(how.market)
     return facts | {
-        "runs for": format_duration(int(how.uptime) * 10**9),
+        "uptime": format_duration(int(how.uptime) * 10**9),
         "version": how.version,
         "Zenoh id": how.zenoh_id,
     }
@@ -197,7 +197,7 @@ def _describe_work(work: Work) -> dict[str, str]:
     return {
         "open jobs": open_jobs or "none",
         "done": f"{work.jobs.get('finalized', 0):,}",
-        "to be sent": plural(work.outbox, "message"),
+        "to send": plural(work.outbox, "message"),
         "store": f"{plural(store.files, 'file')}, {format_size(store.bytes)}{room}",
     }
 
@@ -205,10 +205,10 @@ def _describe_work(work: Work) -> dict[str, str]:
 def _describe_market(market: MarketStatus) -> dict[str, str]:
     return {
         "open orders": f"{market.open_orders:,}",
-        "contracts": f"{market.created:,} made, {market.finalized:,} finalized",
+        "contracts": f"{market.created:,} created, {market.finalized:,} finalized",
         "rejected": _counts(market.rejected),
-        "earned": f"{XRT.show(market.fees + market.minted)}, {XRT.show(market.fees)} of it fees",
-        "spent": f"{ETH.show(market.spent)} on {market.gas_used:,} gas",
+        "earned": f"{XRT.show(market.fees + market.minted)}, including {XRT.show(market.fees)} of fees",
+        "spent": f"{ETH.show(market.spent)} for {market.gas_used:,} gas",
     }
 
 
@@ -217,30 +217,30 @@ def _describe_bridge(how: BridgeStatus) -> dict[str, str]:
         "bridge": parse_address(how.bridge),
         "lighthouse": how.lighthouse,
         "state": how.state,
-        "carries": "yes" if how.carries else "no, it stands by",
-        "daemon": f"{how.daemon or 'not reached yet'} at {how.api}" + (f", {how.dialect}" if how.dialect else ""),
+        "active": "yes" if how.carries else "no, standby",
+        "daemon": f"{how.daemon or 'not connected yet'} at {how.api}" + (f", {how.dialect}" if how.dialect else ""),
         "IPFS side": plural(len(how.ipfs_peers), "node"),
         "mesh side": plural(len(how.mesh_peers), "peer"),
         "to IPFS": _describe_direction(how.to_ipfs),
         "to mesh": _describe_direction(how.to_mesh),
         **({} if how.content is None else {"content": _describe_content(how.content)}),
-        "losses": f"{how.losses:,} of the daemon",
+        "daemon losses": f"{how.losses:,}",
         "last error": how.last_error or "none",
-        "runs for": format_duration(int(how.uptime) * 10**9),
+        "uptime": format_duration(int(how.uptime) * 10**9),
     }
 
 
-def _describe_content(figures: ContentMetrics) -> str:
-    brought = f"{plural(figures.fetched, 'file')} fetched ({format_size(figures.fetched_bytes)})"
-    taken = f"{figures.added:,} added ({format_size(figures.added_bytes)})"
-    return f"{brought}, {taken}, {plural(figures.answered, 'block')} given, {figures.lies:,} false ones refused"
+def _describe_content(content: ContentMetrics) -> str:
+    fetched = f"{plural(content.fetched, 'file')} fetched ({format_size(content.fetched_bytes)})"
+    added = f"{content.added:,} added ({format_size(content.added_bytes)})"
+    return f"{fetched}, {added}, {plural(content.answered, 'block')} served, {content.lies:,} invalid ones rejected"
 
 
-def _describe_direction(way: DirectionStatus) -> str:
-    refused = f", {_counts(way.invalid)} refused" if way.invalid else ""
+def _describe_direction(direction: DirectionStatus) -> str:
+    rejected = f", {_counts(direction.invalid)} rejected" if direction.invalid else ""
     return (
-        f"{way.carried:,} carried ({way.per_second:.1f}/s), {way.waiting:,} waiting, "
-        f"{_counts(way.dropped)} dropped{refused}"
+        f"{direction.carried:,} relayed ({direction.per_second:.1f}/s), {direction.waiting:,} waiting, "
+        f"{_counts(direction.dropped)} dropped{rejected}"
     )
 
 

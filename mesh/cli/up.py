@@ -28,11 +28,11 @@ def with_engine(function: Callable[..., Any]) -> Callable[..., Any]:
         type=click.Choice(["auto", "anvil", "embedded"]),
         default="auto",
         show_default=True,
-        help="what runs the chain; auto uses anvil if it is found",
+        help="the EVM that runs the chain; auto uses anvil if it is installed",
     )
-    anvil = click.option("--anvil", type=click.Path(path_type=Path), help="the program anvil [found on the path]")
+    anvil = click.option("--anvil", type=click.Path(path_type=Path), help="the program anvil [searched on the PATH]")
     kept = click.Path(dir_okay=False, path_type=Path)
-    state = click.option("--state", type=kept, help="file in which anvil keeps the chain")
+    state = click.option("--state", type=kept, help="file in which anvil stores the chain")
     return engine(anvil(state(function)))
 
 
@@ -42,12 +42,12 @@ def find_engine(*, engine: str, anvil: Path | None, state: Path | None) -> Path 
 
     program = None if engine == "embedded" else find_anvil(anvil)
     if engine == "anvil" and program is None:
-        raise AnvilMissing("anvil is not on the path", hint="name it with --anvil FILE, or use --engine embedded")
+        raise AnvilMissing("anvil is not on the PATH", hint="give --anvil FILE, or use --engine embedded")
     if state is not None and program is None:
         raise AnvilMissing(
             "--state needs anvil, and "
-            + ("--engine embedded was given" if engine == "embedded" else "anvil is not on the path"),
-            hint="name anvil with --anvil FILE, or leave --state out",
+            + ("--engine embedded was given" if engine == "embedded" else "anvil is not on the PATH"),
+            hint="give --anvil FILE, or omit --state",
         )
     return program
 
@@ -57,22 +57,22 @@ log = logging.getLogger(__name__)
 
 @click.command("up")
 @click.option(
-    "--port", type=PORT, default=8545, show_default=True, help="port of the chain's JSON-RPC; 0 takes a free one"
+    "--port", type=PORT, default=8545, show_default=True, help="port of the chain's JSON-RPC; 0 selects a free one"
 )
 @click.option(
     "--block-time",
     type=BLOCK_TIME,
     default=1.0,
     show_default=True,
-    help="seconds between blocks, which are mined also if empty",
+    help="seconds between blocks; empty blocks are mined, too",
 )
 @with_engine
 @with_settings("listen", "data_dir", *options_of(TelemetrySettings))
 def command(settings: Settings, port: int, block_time: float, **engine: Any) -> None:
-    """Run a market for development: a Zenoh router, a chain with the contracts, and a provider. Ctrl-C ends it, and
-    the chain is lost unless --state keeps it.
+    """Run a market for development: a Zenoh router, a chain with the contracts, and a provider. Ctrl-C stops it. The
+    chain is lost then, unless --state stores it.
 
-    Writes the keyfiles of a robot and a person with funds to the data folder, and prints how to use them.
+    Writes keyfiles of a funded robot and a funded person to the data folder, and prints how to use them.
     """
     run_until_stopped(lambda: serve_market(settings, port, block_time, **engine), settings=settings, role="up")
 
@@ -116,18 +116,18 @@ log = logging.getLogger(__name__)
 
 
 @click.command("up")
-@click.option("--host", default="127.0.0.1", show_default=True, help="address to listen at")
-@click.option("--port", type=PORT, default=8545, show_default=True, help="port to listen at; 0 takes a free one")
+@click.option("--host", default="127.0.0.1", show_default=True, help="address to listen on")
+@click.option("--port", type=PORT, default=8545, show_default=True, help="port to listen on; 0 selects a free one")
 @click.option("--block-time", type=BLOCK_TIME, help="also mine an empty block at this interval, in seconds")
 @with_engine
 @with_json
 @with_settings("data_dir", *options_of(TelemetrySettings))
 def chain_up(settings: Settings, host: str, port: int, block_time: float | None, as_json: bool, **engine: Any) -> None:
-    """Serve a chain with the contracts on it, as JSON-RPC over HTTP and WebSocket. Ctrl-C ends it, and the chain is
-    lost unless --state keeps it.
+    """Serve a development chain with the contracts as JSON-RPC over HTTP and WebSocket. Ctrl-C stops it. The chain is
+    lost then, unless --state stores it.
 
-    Writes the keyfiles of three accounts with funds (provider, robot, person) to the data folder. Their keys are
-    public: use them for development only.
+    Writes keyfiles of three funded accounts (provider, robot, person) to the data folder. Their keys are public: use
+    them for development only.
     """
 
     async def serve() -> None:

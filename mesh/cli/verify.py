@@ -30,10 +30,10 @@ MARKS: Final = {True: "holds", False: "FAILS", None: "open"}
 
 @click.command("verify")
 @click.argument("liability", required=False)
-@click.option("--objective", type=FILE, help="the objective's file [fetched by its CID]")
-@click.option("--result", type=FILE, help="the recording's file [fetched by its CID]")
-@click.option("--message", type=FILE, help="the Result message as it was sent (JSON)")
-@click.option("--offline", is_flag=True, help="don't read the contract; checks that need it stay open")
+@click.option("--objective", type=FILE, help="file of the objective [fetched by its CID]")
+@click.option("--result", type=FILE, help="file of the recording [fetched by its CID]")
+@click.option("--message", type=FILE, help="file with the Result message as it was sent (JSON)")
+@click.option("--offline", is_flag=True, help="don't read the contract; the checks that need it stay open")
 @with_json
 @with_settings(*dict.fromkeys((*FETCH_SETTINGS, *options_of(ChainSettings))))
 def command(
@@ -45,13 +45,13 @@ def command(
     offline: bool,
     as_json: bool,
 ) -> None:
-    """Check the objective and the recording of LIABILITY, an address, against each other and against the contract: the
-    files by their CIDs, the signature, that the recording is complete and of this job, and that it plays the objective.
+    """Check the objective and the recording of LIABILITY (an address) against each other and against the contract: the
+    CIDs of both files, the signature, and that the recording is complete, belongs to this job and plays the objective.
 
-    Without LIABILITY it needs --objective and --result, but no chain and no network.
+    Without LIABILITY, --objective and --result are required, and neither a chain nor a network is used.
 
     Each check holds, fails, or stays open for lack of information. The exit code is 0 if none fails, 1 if one fails,
-    and 2 if they could not be made.
+    and 2 if the checks could not run.
     """
     exit_code = 0
 
@@ -61,7 +61,7 @@ def command(
         try:
             holds = await verify_job(settings, liability, files, offline=offline, as_json=as_json)
             exit_code = 0 if holds else 1
-        except AiraError as error:  # of any kind: exit code 1 says that the recording does not hold
+        except AiraError as error:  # of any kind: exit code 1 means that a check failed
             report(error)
             exit_code = 2
 
@@ -82,7 +82,7 @@ async def verify_job(
 ) -> bool:
     if (liability is None or offline) and None in (files.objective, files.result):
         raise InvalidOptions(
-            "without a liability to look up, both files are needed", hint="give --objective and --result"
+            "without a contract to read, both files are required", hint="give --objective and --result"
         )
     message = None if files.message is None else await asyncio.to_thread(require_readable(files.message).read_bytes)
     claim = await _claim(settings, liability, offline=offline)
@@ -134,8 +134,8 @@ def _print(claim: Claim, verdict: Verdict) -> None:
         }
     )
     rows = [(MARKS[finding.holds], finding.name, printable(finding.detail)) for finding in verdict.findings]
-    print_table(("", "what", "found"), rows)
+    print_table(("", "check", "found"), rows)
     failed = sum(finding.holds is False for finding in verdict.findings)
-    untold = sum(finding.holds is None for finding in verdict.findings)
-    open_ones = f"; {plural(untold, 'thing')} stayed open" if untold else ""
-    click.echo(f"{plural(failed, 'thing')} of {len(verdict.findings)} failed{open_ones}")
+    unknown = sum(finding.holds is None for finding in verdict.findings)
+    open_checks = f", {unknown} stayed open" if unknown else ""
+    click.echo(f"{failed} of {plural(len(verdict.findings), 'check')} failed{open_checks}")

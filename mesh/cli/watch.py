@@ -35,22 +35,22 @@ if TYPE_CHECKING:
 
 
 @click.command("watch")
-@click.option("--model", help="only events of this model (CID)")
-@click.option("--open", "with_open", is_flag=True, help="start with the orders that are open now")
+@click.option("--model", help="print only events of this model (CID)")
+@click.option("--open", "with_open", is_flag=True, help="first print the orders that are open now")
 @click.option(
-    "--readings", is_flag=True, help="show the content of results without a contract, such as sensor readings"
+    "--readings", is_flag=True, help="also print the content of results without a contract, such as sensor readings"
 )
 @with_json
 @with_settings(*options_of(NetworkSettings), "lighthouse_contract", "xrt_contract")
 def command(settings: Settings, model: str | None, with_open: bool, readings: bool, as_json: bool) -> None:
-    """Print what happens on a lighthouse, a line each: orders, rejections, contracts and their work, results. Ctrl-C
-    ends it.
+    """Print one line for each event on a lighthouse's channel: orders, rejections, contracts, jobs and results. Ctrl-C
+    stops it.
 
-    Needs a router, but no account and no chain. Only orders and results with valid signatures are shown; refused
-    messages are counted, and the counts printed at the end and on SIGUSR1. --json prints an object on each line, with
-    amounts in the token's smallest unit. With --model, results are those of contracts seen since the start.
+    Needs a router, but no account and no chain. Prints only orders and results with valid signatures; invalid messages
+    are counted, and the counts are printed at the end and on SIGUSR1. --json prints one object per line, with amounts
+    in the token's smallest unit. With --model, only results of contracts seen since the start are printed.
 
-    Contracts are reported by agents; `aira liability watch` reads them from the chain.
+    Agents report the contracts; `aira liability watch` reads them from the chain.
     """
     configure_logging(level="warning")
     run_until_stopped(lambda: watch(settings, model, with_open=with_open, readings=readings, as_json=as_json))
@@ -66,68 +66,67 @@ async def watch(
         parse_cid(model)
     async with AsyncExitStack() as stack:
         network, channel = await stack.enter_async_context(watching(settings))
-        words = None if as_json else EventFormatter(await _xrt(settings, network.session, channel))
-        tell = partial(_tell, words)
-        looking = await stack.enter_async_context(ReadingFetcher(network.session, tell)) if readings else None
+        formatter = None if as_json else EventFormatter(await _xrt(settings, network.session, channel))
+        show = partial(_print_event, formatter)
+        fetcher = await stack.enter_async_context(ReadingFetcher(network.session, show)) if readings else None
         seen = await stack.enter_async_context(MarketWatch(network.session, channel, model=model or "*"))
         tasks = await stack.enter_async_context(_report_beside(network, seen))
         if not as_json:
-            click.echo(f"watching {channel.lighthouse}; Ctrl-C ends it", err=True)
+            click.echo(f"watching {channel.lighthouse}; Ctrl-C stops it", err=True)
         if with_open:
             tasks.start(seen.recall(), "open orders")
-        async for something in seen:
-            tell(something)
-            if looking is not None:
-                looking.handle(something)
+        async for event in seen:
+            show(event)
+            if fetcher is not None:
+                fetcher.handle(event)
 
 
-def _tell(words: EventFormatter | None, something: MarketEvent | SensorReading) -> None:
-    """Print an event: with `words` for people, else as JSON."""
-
+def _print_event(formatter: EventFormatter | None, event: MarketEvent | SensorReading) -> None:
+    """Print an event: as a line by `formatter`, without one as JSON."""
     now = datetime.now(UTC)
-    if words is None:
-        print_json(event_json(something, time=now.isoformat(timespec="milliseconds").replace("+00:00", "Z")))
+    if formatter is None:
+        print_json(event_json(event, time=now.isoformat(timespec="milliseconds").replace("+00:00", "Z")))
     else:
-        print_line(f"{now.astimezone():%H:%M:%S}  {words.line(something)}")
+        print_line(f"{now.astimezone():%H:%M:%S}  {formatter.line(event)}")
 
 
 @asynccontextmanager
 async def _report_beside(network: Network, seen: MarketWatch) -> AsyncIterator[Background]:
-    """Print to stderr when the router is lost, and the counters on SIGUSR1 and at the end."""
+    """Print to stderr when the router is unreachable, and the counters on SIGUSR1 and at the end."""
     loop = asyncio.get_running_loop()
 
-    def tell() -> None:
+    def print_counters() -> None:
         click.echo(format_counters(seen.counters()), err=True)
 
-    loop.add_signal_handler(signal.SIGUSR1, tell)
+    loop.add_signal_handler(signal.SIGUSR1, print_counters)
     try:
         async with Background() as tasks:
-            tasks.start(_say_losses(network), "network losses")
+            tasks.start(_print_connection_changes(network), "network losses")
             tasks.start(wait_for_broken_pipe(), "readers of stdout")
             yield tasks
     except asyncio.CancelledError:  # by Ctrl-C; a closed pipe ends quietly
-        tell()
+        print_counters()
         raise
     finally:
         loop.remove_signal_handler(signal.SIGUSR1)
 
 
-def format_counters(tally: MarketCounters) -> str:
-    """The counters in a line for people."""
-    reasons = ", ".join(f"{count:,} {reason}" for reason, count in sorted(tally.refused.items()))
-    refused = f"{sum(tally.refused.values()):,} refused" + (f" ({reasons})" if reasons else "")
-    lost = f", {tally.lost:,} lost as this reader was too slow" if tally.lost else ""
-    return f"{plural(tally.received, 'message')} came by, {tally.duplicate:,} of them again, {refused}{lost}"
+def format_counters(counters: MarketCounters) -> str:
+    """The counters in one line."""
+    reasons = ", ".join(f"{count:,} {reason}" for reason, count in sorted(counters.refused.items()))
+    invalid = f"{sum(counters.refused.values()):,} invalid" + (f" ({reasons})" if reasons else "")
+    lost = f", {counters.lost:,} lost because this reader was too slow" if counters.lost else ""
+    return f"{plural(counters.received, 'message')} received, {counters.duplicate:,} duplicate, {invalid}{lost}"
 
 
-async def _say_losses(network: Network) -> None:
+async def _print_connection_changes(network: Network) -> None:
     async for _ in network.changes():
-        words = "the router is back" if network.connected else "the router is gone; waiting for it"
+        words = "connected to the router again" if network.connected else "lost the router; waiting for it"
         click.echo(f"aira: {words}", err=True)
 
 
 async def _xrt(settings: Settings, session: zenoh.Session, channel: Channel) -> str | None:
-    """The address of XRT: from the settings or, if they have a name for it, from the market's providers.
+    """The address of XRT: from the settings or, if these contain a name, from the market's providers.
 
     None if no provider answers, or they disagree.
     """
@@ -138,8 +137,8 @@ async def _xrt(settings: Settings, session: zenoh.Session, channel: Channel) -> 
         return parse_address(settings.xrt_contract)
     except InvalidAddress:
         providers = [peer for peer in await present(channel) if peer.role == "provider"]
-        told = await statuses(session, channel, providers)
-    named = {how.xrt for how in told.values() if isinstance(how, Status) and how.xrt}
+        found = await statuses(session, channel, providers)
+    named = {how.xrt for how in found.values() if isinstance(how, Status) and how.xrt}
     return named.pop() if len(named) == 1 else None
 
 
@@ -257,7 +256,7 @@ def _shown(reading: SensorReading) -> str:
 
 
 def _short_cid(cid: str) -> str:
-    """The ends of a CID, for a line in which another one is to be copied."""
+    """A CID shortened to its ends, for lines with a full one beside it."""
     return f"{cid[:6]}…{cid[-4:]}"
 
 

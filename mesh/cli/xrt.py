@@ -25,15 +25,15 @@ if TYPE_CHECKING:
     from mesh.cli.amounts import Unit
     from mesh.settings import Settings
 
-with_token = click.option("--token", help="ENS name or address of another ERC-20, whose units amounts are in [XRT]")
+with_token = click.option("--token", help="ENS name or address of another ERC-20 token [XRT]")
 
 
 @click.group("xrt")
 def command() -> None:
-    """Tokens: XRT, in which stakes and fees are paid, or any other ERC-20.
+    """Show, approve and transfer XRT, the token of stakes and fees, or any other ERC-20.
 
-    An AMOUNT alone counts whole tokens: 1.5 is one and a half XRT. With the suffix wn (10^-9 XRT), or units for any
-    token, it counts the smallest unit: 1500000000wn is the same amount. JSON has the smallest unit, as text.
+    A plain AMOUNT counts whole tokens: 1.5 is one and a half XRT. With the suffix wn (10^-9 XRT), or units for any
+    token, it counts the smallest unit: 1500000000wn is the same amount. In JSON, amounts are text in the smallest unit.
     """
 
 
@@ -43,7 +43,7 @@ def command() -> None:
 @with_json
 @with_chain_settings()
 def balance(settings: Settings, **what: Any) -> None:
-    """Show the balance of ACCOUNT (an address or ENS name; by default the settings' account)."""
+    """Show the balance of ACCOUNT, an address or ENS name; by default the account of the settings."""
     run_to_end(lambda: _balance(settings, **what))
 
 
@@ -58,14 +58,16 @@ async def _balance(settings: Settings, *, account: str | None, token: str | None
             print_line(unit.show(amount))
 
 
-@command.command("allowance", short_help="show how much a spender may take from an account")
+@command.command("allowance", short_help="show how much a spender may transfer from an account")
 @click.argument("spender", default=FACTORY)
 @click.option("--owner", help="address or ENS name of the owner [the settings' account]")
 @with_token
 @with_json
 @with_chain_settings()
 def allowance(settings: Settings, **what: Any) -> None:
-    """Show how much SPENDER may take from the account: `factory` (the default), a lighthouse's name, or an address."""
+    """Show how much SPENDER may transfer from the account.
+
+    SPENDER is `factory` (the default), a lighthouse's name, an ENS name or an address."""
     run_to_end(lambda: _allowance(settings, **what))
 
 
@@ -81,14 +83,14 @@ async def _allowance(settings: Settings, *, spender: str, owner: str | None, tok
             print_line(unit.show(amount))
 
 
-@command.command("approve", short_help="allow a spender to take up to an amount")
+@command.command("approve", short_help="allow a spender to transfer up to an amount")
 @click.argument("spender")
 @click.argument("amount")
 @with_token
 @with_json
 @with_signing_settings()
 def approve(settings: Settings, **what: Any) -> None:
-    """Allow SPENDER to take up to AMOUNT from the account, instead of the previous allowance; 0 revokes it.
+    """Allow SPENDER to transfer up to AMOUNT from the account. Replaces the previous allowance; 0 revokes it.
 
     SPENDER is `factory` (for costs and fees), a lighthouse's name (for stakes), an ENS name or an address.
     """
@@ -104,17 +106,17 @@ async def _approve(settings: Settings, *, spender: str, amount: str, token: str 
         if as_json:
             print_json({"spender": by, **await _token_json(chain, token, unit), "allowance": str(value), "tx": tx})
         else:
-            print_facts({"spender": by, "may take": unit.show(value), "transaction": tx})
+            print_facts({"spender": by, "allowance": unit.show(value), "transaction": tx})
 
 
-@command.command("transfer", short_help="send an amount")
+@command.command("transfer", short_help="transfer an amount to another account")
 @click.argument("to")
 @click.argument("amount")
 @with_token
 @with_json
 @with_signing_settings()
 def transfer(settings: Settings, **what: Any) -> None:
-    """Send AMOUNT from the account to TO, an address or ENS name."""
+    """Transfer AMOUNT from the account to TO, an address or ENS name."""
     run_to_end(lambda: _transfer(settings, **what))
 
 

@@ -52,10 +52,10 @@ def test_an_amount_is_read(unit: Unit, text: str, amount: int) -> None:
         (XRT, "5 ETH", "is not an amount of XRT"),
         (XRT, "5 wei", "is not an amount of XRT"),
         (PENNY, "5wn", "is not an amount of PNY"),
-        (XRT, "0.0000000001", "has more decimals than XRT has (9)"),
-        (XRT, "1.5wn", "has more decimals than wn has (0)"),
-        (PENNY, "0.125", "has more decimals than PNY has (2)"),
-        (POINT, str(UNLIMITED + 1), "is more than a contract can count"),
+        (XRT, "0.0000000001", "has more than 9 decimals"),
+        (XRT, "1.5wn", "has more than 0 decimals"),
+        (PENNY, "0.125", "has more than 2 decimals"),
+        (POINT, str(UNLIMITED + 1), "is more than a contract can store"),
     ],
 )
 def test_an_invalid_amount_is_refused_with_an_example(unit: Unit, text: str, words: str) -> None:

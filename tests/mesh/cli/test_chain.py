@@ -39,7 +39,7 @@ def bare(tmp_path: Path) -> Iterator[ServedChain]:
 def test_a_deployment_prints_all_addresses_and_the_settings_to_use_it(bare: ServedChain, tmp_path: Path) -> None:
     done = bare.aira(*DEPLOY)
     assert done.exit_code == 0, done.output
-    facts, _, options = done.stdout.partition("\nsettings of those who use it:\n\n")
+    facts, _, options = done.stdout.partition("\nsettings to use these contracts:\n\n")
     said = columns(facts)
     gas = int(said["gas used"].replace(",", ""))
     assert 0.8 * DEPLOYMENT_GAS < gas < DEPLOYMENT_GAS, "what is asked for before the beginning is right"
@@ -122,7 +122,7 @@ def test_status_shows_the_node_the_contracts_and_the_account(served: ServedChain
     deployment = served.deployment
     assert said["node"] == f"{served.url}  aira-embedded/py-evm"
     assert said["base fee"].endswith(" gwei")
-    assert said["contracts"] == "this project's, by their code"
+    assert said["contracts"] == "this project's code"
     assert (said["ENS registry"], said["factory"], said["XRT"]) == (deployment.ens, deployment.factory, deployment.xrt)
     assert said["lighthouse"] == f"{deployment.lighthouse}  airalab.lighthouse.3.robonomics.eth"
     assert said["account"].startswith(served.people["person"].address)
@@ -143,7 +143,7 @@ async def _chain_id(chain: Chain) -> int:
 
 def test_status_works_with_an_unknown_lighthouse(served: ServedChain) -> None:
     said = columns(served.aira("chain", "status", "--lighthouse-contract", "nowhere").stdout)
-    assert said["lighthouse"] == "none of that name  nowhere"
+    assert said["lighthouse"] == "not found:  nowhere"
     assert served.run_json("chain", "status", "--lighthouse-contract", "nowhere")["lighthouse"] is None
 
 

@@ -251,7 +251,7 @@ def test_check_distinguishes_admitted_members_from_refused_ones(tmp_path: Path) 
             done = check(folder)
             refused(done, IdentityDenied, address)
 
-    assert (arm.returncode, arm.stdout) == (0, f"{ARM} is let in and heeded at {site.endpoint}\n")
+    assert (arm.returncode, arm.stdout) == (0, f"{site.endpoint} admits {ARM} and forwards its messages\n")
     assert (screen.returncode, edge.returncode) == (0, 0), (screen.stderr, edge.stderr)
 
 

@@ -65,14 +65,14 @@ def test_the_list_has_a_line_for_each_since_a_block(served: ServedChain, market:
     since = served.aira("lighthouse", "list", "--from-block", str(block)).stdout
     assert [line.split()[0] for line in since.splitlines()] == ["NAME", market]
     done = served.aira("lighthouse", "list", "--from-block", str(block + 1))
-    assert done.stdout == f"no lighthouse was made here since block {block + 1:,}\n"
+    assert done.stdout == f"there is no lighthouse since block {block + 1:,}\n"
 
 
 def test_joining_approves_the_missing_allowance_and_leaving_returns_the_stake(served: ServedChain, market: str) -> None:
     person = served.people["person"].address
     before = served.ask("person", lambda chain: chain.tokens.balance())
     said = columns(served.aira("lighthouse", "join", market, "5").stdout)
-    assert (said["stake"], said["a turn"]) == ("5 XRT", "2 transactions")
+    assert (said["stake"], said["per turn"]) == ("5 XRT", "2 transactions")
     assert served.ask("person", lambda chain: chain.tokens.balance()) == before - 5 * XRT
     more = served.run_json("lighthouse", "join", market, "1000000000wn")
     assert (more["stake"], more["quota"], more["isProvider"]) == (str(6 * XRT), 3, True)
@@ -80,7 +80,7 @@ def test_joining_approves_the_missing_allowance_and_leaving_returns_the_stake(se
     assert (less["provider"], less["stake"], less["quota"]) == (person, str(4 * XRT), 2)
     said = columns(served.aira("lighthouse", "leave", market).stdout)
     assert said["stake"] == "0 XRT"
-    assert said["provider"] == f"{person}  (no more)"
+    assert said["provider"] == f"{person}  (no longer a provider)"
     assert served.ask("person", lambda chain: chain.tokens.balance()) == before
 
 

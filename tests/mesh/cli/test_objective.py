@@ -213,14 +213,14 @@ def test_a_file_that_robots_refuse_is_added_with_a_warning(tmp_path: Path) -> No
     done = call("add", tmp_path / "text", "--json")
     assert done.exit_code == 0
     assert done.stderr == (
-        "aira: robots would refuse it (not-a-recording): text: it is neither an MCAP file nor a ROS 1 bag\n"
+        "aira: robots would refuse this file (not-a-recording): text: it is neither an MCAP file nor a ROS 1 bag\n"
     )
     assert json.loads(done.stdout)[0]["reason"] == "not-a-recording"
 
 
 def test_a_playable_objective_passes_verification(sound: Path) -> None:
     done = call("check", sound)
-    assert (done.exit_code, done.stdout) == (0, f"{cid_of_file(sound)}  fit to be played: 3 messages, 0.04 s\n")
+    assert (done.exit_code, done.stdout) == (0, f"{cid_of_file(sound)}  valid: 3 messages, 0.04 s\n")
     call("add", sound)
     assert call("check", cid_of_file(sound)).stdout == done.stdout
 

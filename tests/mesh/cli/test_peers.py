@@ -54,7 +54,7 @@ async def test_an_empty_channel_is_printed_as_a_line(
     router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]
 ) -> None:
     await show_peers(Settings(connect=(router.endpoint,)), as_json=False)
-    assert capsys.readouterr().out == f"nobody on {MARKET}; on the IPFS side nobody knows: there is no bridge\n"
+    assert capsys.readouterr().out == f"0 peers on {MARKET}; IPFS side: unknown, there is no bridge\n"
 
 
 async def test_peers_are_listed_by_role_and_address(router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]) -> None:
@@ -91,4 +91,4 @@ async def test_of_several_bridges_the_one_that_carries_is_used(
 async def test_a_bridge_without_its_daemon_says_so(router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]) -> None:
     async with bridging(router, msgspec.structs.replace(bridge_status(), state="no daemon")) as settings:
         await show_peers(settings, as_json=False)
-    assert capsys.readouterr().out.endswith("on the IPFS side 0 nodes; the bridge says: no daemon\n")
+    assert capsys.readouterr().out.endswith("IPFS side: 0 nodes; the bridge reports: no daemon\n")

@@ -41,7 +41,7 @@ def options(site: Site) -> tuple[str, ...]:
 
 
 def test_without_a_roster_it_logs_that_only_this_machine_can_connect() -> None:
-    says = "without a roster: only this machine reaches it, and everybody on it may do everything"
+    says = "no roster: every client on this machine may do everything"
     with Serving(*AIRA, "router", "--listen", f"tcp/127.0.0.1:{free_port()}", says=says) as router:
         assert "listens at tcp/127.0.0.1:" in router.log()
 
@@ -112,14 +112,14 @@ async def test_a_roster_that_becomes_invalid_changes_nothing(site: Site) -> None
         async with network(site, arm) as arms, aclosing(arms.changes()) as changes:
             change = asyncio.ensure_future(anext(changes))
             site.roster.write_text("[[member]]\nname=")
-            await until(lambda: "the router goes on as it is" in router.log(), seconds=SECONDS)
+            await until(lambda: "the router keeps its previous roster" in router.log(), seconds=SECONDS)
             site.roster.write_text(good)
-            await until(lambda: "the roster can be used again" in router.log(), seconds=SECONDS)
+            await until(lambda: "the roster is valid again" in router.log(), seconds=SECONDS)
             assert not change.done()
             change.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await change
-        assert router.log().count("the router goes on as it is") == 1
+        assert router.log().count("the router keeps its previous roster") == 1
         assert "Traceback" not in router.log()
 
 

@@ -91,7 +91,7 @@ def test_a_number_beyond_256_bits_is_refused() -> None:
 def test_without_a_service_the_error_lists_what_is_needed(arguments: list[str]) -> None:
     done = CliRunner().invoke(main, ["rpc", *arguments])
     assert done.exit_code == 2
-    assert "an ADDRESS and a SERVICE are needed; --list shows the services" in done.stderr
+    assert "ADDRESS and SERVICE are required; --list shows the services" in done.stderr
 
 
 def test_the_list_has_every_service_with_its_arguments() -> None:

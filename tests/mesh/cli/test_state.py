@@ -32,7 +32,7 @@ def test_show_lists_the_state_of_agents(folder: Folder) -> None:
     assert head.split("  ")[0] == "ACCOUNT"
     assert row.split() == [ADDRESS, CHAIN, "99", "1", "running", "1", "1"]
     assert content == f"{ADDRESS}  2 files, 35 bytes (18 bytes pinned)"
-    assert transactions == "transactions under way  1"
+    assert transactions == "pending transactions  1"
 
 
 def test_show_prints_json(folder: Folder) -> None:
@@ -46,12 +46,12 @@ def test_show_prints_json(folder: Folder) -> None:
 def test_a_backup_is_created_shown_and_restored(folder: Folder, tmp_path: Path) -> None:
     made = call("backup", tmp_path / "it.tar.zst", "--data-dir", folder.path)
     assert made.exit_code == 0, made.output
-    assert f"accounts        {ADDRESS}" in made.stdout
-    assert "jobs under way  1" in made.stdout
+    assert f"accounts   {ADDRESS}" in made.stdout
+    assert "open jobs  1" in made.stdout
 
     shown = call("show", tmp_path / "it.tar.zst")
     assert shown.stdout.splitlines()[3] == "files      1 content, 1 ledgers, 1 pins, 1 recordings, 1 transactions"
-    assert shown.stdout.splitlines()[-1] == "checksums  as they should be"
+    assert shown.stdout.splitlines()[-1] == "checksums  valid"
 
     restored = call("restore", tmp_path / "it.tar.zst", "--data-dir", tmp_path / "new")
     assert restored.exit_code == 0, restored.output
@@ -77,7 +77,7 @@ def test_an_existing_state_is_an_error_with_a_hint(folder: Folder, tmp_path: Pat
     assert "--existing set-aside" in refused(done, StateExists, folder.path)
     again = call("restore", tmp_path / "it", "--data-dir", folder.path, "--existing", "set-aside")
     assert again.exit_code == 0
-    assert f"before that     {folder.path}/.replaced-" in again.stdout
+    assert f"old state    {folder.path}/.replaced-" in again.stdout
 
 
 async def test_a_state_in_use_is_refused_with_every_option(folder: Folder, tmp_path: Path) -> None:

@@ -140,7 +140,7 @@ async def test_a_peer_that_does_not_answer_is_listed(place: Place, capsys: pytes
 
         async def is_there() -> bool:
             await show_all(place.settings("watcher"), timeout=5.0, as_json=False)
-            return f"person  {STRANGER.address}  does not answer\n" in capsys.readouterr().out
+            return f"person  {STRANGER.address}  no answer\n" in capsys.readouterr().out
 
         await until_found(is_there, what="the silent one", seconds=30)
 
@@ -152,35 +152,35 @@ async def test_a_missing_peer_is_one_clear_line(router: EmbeddedRouter, capsys: 
     with pytest.raises(InvalidAddress):
         await show_one(settings, "robot", timeout=1.0, as_json=False)
     await show_all(settings, timeout=1.0, as_json=False)
-    assert capsys.readouterr().out == f"nobody on {MARKET}\n"
+    assert capsys.readouterr().out == f"no peers on {MARKET}\n"
 
 
 def test_the_work_of_an_agent_is_described() -> None:
     shown = describe_status(msgspec.structs.replace(status(), work=WORK, uptime=75.5))
     assert shown["agent"] == ROBOT.address
     assert (shown["open jobs"], shown["done"]) == ("2 ready, 1 running", "12,345")
-    assert (shown["to be sent"], shown["store"]) == ("1 message", "3 files, 2.0 KiB of 10.0 GiB")
-    assert (shown["block"], shown["runs for"]) == ("7 of chain 1", "75 s")
+    assert (shown["to send"], shown["store"]) == ("1 message", "3 files, 2.0 KiB of 10.0 GiB")
+    assert (shown["block"], shown["uptime"]) == ("7 of chain 1", "75 s")
 
 
 def test_the_market_of_a_provider_is_described() -> None:
     shown = describe_status(msgspec.structs.replace(status(role="provider"), market=MARKET_FACTS))
-    assert shown["contracts"] == "3 made, 2 finalized"
+    assert shown["contracts"] == "3 created, 2 finalized"
     assert shown["rejected"] == "3 (1 WrongSigner, 2 expired)"
-    assert shown["earned"] == "1.5 XRT, 1 XRT of it fees"
-    assert shown["spent"] == "0.002 ETH on 343,444 gas"
+    assert shown["earned"] == "1.5 XRT, including 1 XRT of fees"
+    assert shown["spent"] == "0.002 ETH for 343,444 gas"
 
 
 def test_a_bridge_is_described() -> None:
     way = msgspec.structs.replace(WAY, carried=12, per_second=0.5, dropped={"no-room": 3}, waiting=4)
     shown = describe_status(msgspec.structs.replace(bridge_status(), to_ipfs=way, last_error="refused", losses=2))
-    assert (shown["bridge"], shown["state"], shown["carries"]) == (STRANGER.address, "alone", "yes")
-    assert shown["to IPFS"] == "12 carried (0.5/s), 4 waiting, 3 (3 no-room) dropped"
-    assert (shown["losses"], shown["last error"]) == ("2 of the daemon", "refused")
+    assert (shown["bridge"], shown["state"], shown["active"]) == (STRANGER.address, "alone", "yes")
+    assert shown["to IPFS"] == "12 relayed (0.5/s), 4 waiting, 3 (3 no-room) dropped"
+    assert (shown["daemon losses"], shown["last error"]) == ("2", "refused")
     assert "content" not in shown
     counters = dict.fromkeys(ContentMetrics.__struct_fields__, 0) | {"fetched": 2, "fetched_bytes": 2048, "lies": 1}
     content = describe_status(msgspec.structs.replace(bridge_status(), content=ContentMetrics(**counters)))["content"]
-    assert content == "2 files fetched (2.0 KiB), 0 added (0 bytes), 0 blocks given, 1 false ones refused"
+    assert content == "2 files fetched (2.0 KiB), 0 added (0 bytes), 0 blocks served, 1 invalid ones rejected"
 
 
 def test_a_summary_begins_with_the_part_that_is_not_alive() -> None:

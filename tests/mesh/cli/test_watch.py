@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from tests.support.routers import EmbeddedRouter
 
 NOON = "2026-01-01T12:00:00.000Z"
-WATCHING = f"watching {MARKET}; Ctrl-C ends it\n"
+WATCHING = f"watching {MARKET}; Ctrl-C stops it\n"
 SECONDS = 60.0
 
 
@@ -159,13 +159,13 @@ def test_lines_are_printed_at_once_and_the_counters_at_the_end(
     process.send_signal(signal.SIGINT)
     output, errors = process.communicate(timeout=SECONDS)
     assert (process.returncode, output) == (0, "")
-    assert errors == "3 messages came by, 0 of them again, 1 refused (1 signature)\n"
+    assert errors == "3 messages received, 0 duplicate, 1 invalid (1 signature)\n"
 
 
 def test_a_signal_prints_the_counters(router: EmbeddedRouter, process: subprocess.Popen[str]) -> None:
     assert process.stderr is not None
     process.send_signal(signal.SIGUSR1)
-    assert process.stderr.readline() == "0 messages came by, 0 of them again, 0 refused\n"
+    assert process.stderr.readline() == "0 messages received, 0 duplicate, 0 invalid\n"
     process.send_signal(signal.SIGTERM)
     assert process.wait(SECONDS) == 0
 
@@ -181,9 +181,9 @@ def test_it_ends_silently_when_its_output_is_closed(router: EmbeddedRouter, proc
 def test_the_loss_and_return_of_the_router_are_printed(router: EmbeddedRouter, process: subprocess.Popen[str]) -> None:
     assert process.stderr is not None
     router.stop()
-    assert process.stderr.readline() == "aira: the router is gone; waiting for it\n"
+    assert process.stderr.readline() == "aira: lost the router; waiting for it\n"
     router.start()
-    assert process.stderr.readline() == "aira: the router is back\n"
+    assert process.stderr.readline() == "aira: connected to the router again\n"
 
 
 @pytest.mark.parametrize("command", [["watch"], ["peers"], ["status"], ["rpc", CONTRACT, "eth/accounts"]])

@@ -59,7 +59,7 @@ def test_a_transfer_is_in_xrt_unless_the_amount_ends_with_wn(served: ServedChain
 def test_an_allowance_is_by_default_the_factorys_and_can_be_granted_and_revoked(served: ServedChain) -> None:
     assert served.run_json("xrt", "allowance")["spender"] == served.deployment.factory
     done = columns(served.aira("xrt", "approve", "airalab", "2.5").stdout)
-    assert (done["spender"], done["may take"]) == (served.deployment.lighthouse, "2.5 XRT")
+    assert (done["spender"], done["allowance"]) == (served.deployment.lighthouse, "2.5 XRT")
     assert served.aira("xrt", "allowance", "airalab").stdout == "2.5 XRT\n"
     person = served.people["person"].address
     printed = served.run_json("xrt", "allowance", "airalab.lighthouse.5.robonomics.eth", "--owner", person, by="robot")

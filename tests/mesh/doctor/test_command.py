@@ -47,7 +47,7 @@ def test_a_sound_machine_has_a_line_for_each_check_and_ends_with_0(town: ServedC
         *("node", "chain", "node clock", "chain clock", "contracts", "lighthouse", "token"),
         *("keyfile", "ether", "tokens", "stake", "turn", "data folder", "disk space"),
     ]
-    assert last == "all 19 checks are in order for the role provider"
+    assert last == "all 19 checks passed for the role provider"
     assert "\x1b" not in done.stdout
     assert PASSWORD not in done.stdout
 
@@ -62,7 +62,7 @@ def test_a_warning_ends_with_0_and_is_named_at_the_end(
     done = aira("doctor", "--connect", router.endpoint, **variables)
 
     assert done.returncode == 0, done.stdout
-    assert done.stdout.endswith("checks are in order for the role agent; with a warning: keyfile\n")
+    assert done.stdout.endswith("checks passed for the role agent; with warnings: keyfile\n")
     assert f"-> chmod 600 {password}\n" in done.stdout
 
 
@@ -76,8 +76,8 @@ def test_a_failure_prints_a_hint_and_the_skipped_checks_and_exits_with_1(tmp_pat
         f"FAIL  router        {endpoint}: no router listens there",
         "                    -> start one there with `aira router`, or name another with --connect tcp/HOST:PORT",
         "",
-        "not tried, because of a failure before: session, own write, denied write, router clock",
-        "1 check of 5 failed for the role operator: router",
+        "skipped because of an earlier failure: session, own write, denied write, router clock",
+        "1 of 5 checks failed for the role operator: router",
     ]
 
 

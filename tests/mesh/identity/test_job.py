@@ -33,7 +33,7 @@ def router(site: Site) -> Serving:
     settings = site.settings()
     flags = ("--listen", site.endpoint, "--roster", settings.roster, "--tls-ca", settings.tls_ca)
     own = ("--tls-certificate", settings.tls_certificate, "--tls-key", settings.tls_key)
-    return Serving(*AIRA, "router", *flags, *own, says="let in: ")
+    return Serving(*AIRA, "router", *flags, *own, says="admitted by certificate")
 
 
 async def test_a_running_job_is_paid_while_one_member_is_revoked_and_another_renewed(
