@@ -33,9 +33,9 @@ def run_to_end(main: Callable[[], Coroutine[Any, Any, object]]) -> None:
 def run_until_stopped(
     main: Callable[[], Coroutine[Any, Any, object]], *, settings: Settings | None = None, role: str = ""
 ) -> None:
-    """Run a server; Ctrl-C and SIGTERM are its normal end. Errors end it with exit code 1 or 2.
+    """Run a server until Ctrl-C or SIGTERM, which are its normal end. Errors end it with exit code 1 or 2.
 
-    `settings` configure its log, `role` is its name there.
+    `settings` configures its log; `role` is its name there.
     """
     from mesh.telemetry.logs import configure_logging, configure_logging_from
 
@@ -57,7 +57,7 @@ def report(error: AiraError) -> None:
 
     A server that logs in JSON logs an event instead.
     """
-    from mesh.log_context import log_event  # here, as most commands never need it
+    from mesh.log_context import log_event  # imported here because most commands never need it
     from mesh.telemetry.events import without_secrets
     from mesh.telemetry.logs import logs_json
 
@@ -71,12 +71,12 @@ def report(error: AiraError) -> None:
 
 def _run(main: Callable[[], Coroutine[Any, Any, object]]) -> bool:
     """Run `main`; returns False if a signal stopped it."""
-    import asyncio  # here, as small commands only use `fail`
+    import asyncio  # imported here because small commands only use `fail`
 
     before = {number: signal.getsignal(number) for number in STOPPING}
     try:
         return asyncio.run(_until_signal(main))
-    except KeyboardInterrupt:  # before the loop handles signals, or a second Ctrl-C
+    except KeyboardInterrupt:  # before the loop handles signals, or by a second Ctrl-C
         return False
     except AiraError as error:
         fail(error)

@@ -1,6 +1,6 @@
-"""How a server starts while something that it needs is missing: a file, the router, the node, contracts, a stake.
+"""Starting a server while a dependency is missing: a file, the router, the node, contracts, a stake.
 
-By default it ends with an error. With `connect_timeout = -1` it waits and tries again, and logs once what it waits for.
+By default the server exits with an error. With `connect_timeout = -1` it retries, and logs once what it waits for.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 STARTUP: Final = RetryPolicy(initial=0.5, ceiling=5.0)
-"""Shorter delays than elsewhere: at a start somebody is usually setting the missing parts up."""
+"""Shorter delays than elsewhere: on start, someone is usually setting up the missing parts."""
 
 T = TypeVar("T")
 
@@ -39,15 +39,15 @@ class FilesMissing(ConfigurationError):
 
 
 class FilesNotReadable(ConfigurationError):
-    """The user may not read files that the settings name."""
+    """The user has no permission to read files that the settings name."""
 
     code = "files-not-readable"
 
     def __init__(self, files: Sequence[str]) -> None:
         user = os.geteuid()
         super().__init__(
-            f"user {user} may not read the files {', '.join(files)}",
-            hint=f"change their owner: chown -R {user} FOLDER",
+            f"user {user} has no permission to read {', '.join(files)}",
+            hint=f"change the owner: chown -R {user} FOLDER",
         )
         self.files = tuple(files)
 
@@ -68,7 +68,7 @@ async def wait_for_files(settings: Settings, *, retry: RetryPolicy = STARTUP) ->
 def file_delays(settings: Settings, *, retry: RetryPolicy = STARTUP) -> Iterator[float]:
     """Yield the seconds until the next check, as long as a file that the settings name is not readable.
 
-    Ends at once if the settings don't say to wait: reading the file reports the error then.
+    Ends at once if the settings don't say to wait; reading the file then reports the error.
     """
     outages, backoff = OutageLog(log, "files"), Backoff(retry)
     while waits_forever(settings) and (error := _file_error(settings)) is not None:
@@ -121,7 +121,7 @@ def _file_error(settings: Settings) -> ConfigurationError | None:
         except PermissionError:
             unreadable.append(str(path))
         except OSError:
-            continue  # such as a folder, which a container engine makes for a missing file: reading it reports that
+            continue  # such as a folder that a container engine created for a missing file: reading it fails later
     if unreadable:
         return FilesNotReadable(unreadable)
     return FilesMissing(missing) if missing else None

@@ -1,4 +1,4 @@
-"""The checks of the IPFS daemon for `aira doctor`: that it answers, accepts us, has PubSub and peers."""
+"""The checks of the IPFS daemon for `aira doctor`: its API, our credentials, PubSub and peers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mesh.settings import IpfsSettings, Settings
 
 CALL_TIMEOUT: Final = 4.0
-"""Seconds for a call."""
+"""Seconds until a call times out."""
 
 
 def checks(context: DoctorContext) -> list[Check]:
@@ -35,7 +35,7 @@ def checks(context: DoctorContext) -> list[Check]:
 async def check_daemon(settings: IpfsSettings) -> CheckResult:
     """Whether it answers and accepts our credentials. Raises `IpfsError`, `ConfigurationError`."""
     async with _connected(settings) as daemon:
-        return passed(f"{daemon.version} at {daemon.api}, speaks the {daemon.dialect} dialect")
+        return passed(f"{daemon.version} at {daemon.api}, with the {daemon.dialect} API")
 
 
 async def check_pubsub(settings: Settings) -> CheckResult:
@@ -43,19 +43,19 @@ async def check_pubsub(settings: Settings) -> CheckResult:
     async with _connected(settings) as daemon:
         topic = settings.lighthouse_contract
         listeners = len(await daemon.listeners(topic))
-        return passed(f"enabled; {listeners} other{'' if listeners == 1 else 's'} on {topic}")
+        return passed(f"enabled; {listeners} other subscriber{'' if listeners == 1 else 's'} of {topic}")
 
 
 async def check_swarm(settings: IpfsSettings) -> CheckResult:
-    """Whether the daemon is connected to others."""
+    """Whether the daemon has peers."""
     async with _connected(settings) as daemon:
         count = len(await daemon.swarm_peers())
         if not count:
             return warning(
-                "the daemon is connected to no other node, so nobody receives its messages",
-                hint="name the legacy nodes with --ipfs-swarm-connect /…/p2p/ID, or let the daemon reach the internet",
+                "the daemon has no peers, so its messages reach no other node",
+                hint="name legacy nodes with --ipfs-swarm-connect /…/p2p/ID, or give the daemon internet access",
             )
-        return passed(f"connected to {count} other{'' if count == 1 else 's'}")
+        return passed(f"connected to {count} peer{'' if count == 1 else 's'}")
 
 
 @asynccontextmanager

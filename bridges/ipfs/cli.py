@@ -32,9 +32,15 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-@click.command("ipfs", short_help="the legacy network's IPFS PubSub channel, and its content")
-@click.option("--api", help="the daemon's RPC, a multiaddr or a URL; same as --ipfs-http-provider")
-@click.option("--lighthouse", "lighthouses", multiple=True, metavar="NAME", help="a channel to bridge; repeatable")
+@click.command("ipfs", short_help="relay messages and content of the legacy network on IPFS")
+@click.option("--api", help="RPC of the IPFS daemon (a multiaddr or a URL); same as --ipfs-http-provider")
+@click.option(
+    "--lighthouse",
+    "lighthouses",
+    multiple=True,
+    metavar="NAME",
+    help="lighthouse whose channel to bridge (may be repeated) [the settings' lighthouse_contract]",
+)
 @with_settings(
     *options_of(NetworkSettings),
     *options_of(IpfsSettings),
@@ -49,9 +55,10 @@ log = logging.getLogger(__name__)
 def command(settings: Settings, api: str | None, lighthouses: tuple[str, ...]) -> None:
     """Relay messages and content between the mesh and the legacy network on IPFS. Ctrl-C stops it.
 
-    The daemon needs PubSub. It, the router and the chain's node may start later, and may restart. Several bridges may
-    serve one lighthouse, each with its own --data-dir: one is active, the others stand by. Until the node is reachable,
-    or without one (--web3-http-provider ""), ENS names in messages are not resolved and deadlines are not checked.
+    The daemon must have PubSub enabled. The bridge waits for the daemon, the router and the node, and reconnects to
+    them. Several bridges may serve one lighthouse, each with its own --data-dir: one is active, the others are on
+    standby. Without a node (--web3-http-provider ""), or until it is reachable, ENS names in messages are not resolved
+    and deadlines are not checked.
     """
     if api:
         settings = dataclasses.replace(settings, ipfs_http_provider=api)
@@ -82,7 +89,7 @@ async def _serve(settings: Settings, lighthouses: tuple[str, ...]) -> None:
     from mesh.starting import wait_for_files
     from mesh.telemetry.serving import Telemetry
 
-    base_url(settings.ipfs_http_provider)  # fails now rather than after the wait for files or a router
+    base_url(settings.ipfs_http_provider)  # fail now rather than after waiting for files or a router
     async with AsyncExitStack() as stack:
         telemetry = await stack.enter_async_context(Telemetry(settings.metrics_listen))
         await wait_for_files(settings)
@@ -111,7 +118,7 @@ async def _introduce(bridge: IpfsBridge, network: Network, stack: AsyncExitStack
 
 
 async def _network(settings: NetworkSettings, stack: AsyncExitStack, *, waiting: Callable[[str], None]) -> Network:
-    """The session, once there is a router; `waiting` is called with the error while there is none."""
+    """Open the session, and wait for a router; `waiting` is called with the error of each attempt."""
     from mesh.composition import endpoints_of
     from mesh.network import Network
 

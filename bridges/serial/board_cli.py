@@ -10,7 +10,7 @@ import click
 from mesh.errors import AiraError
 from mesh.running import INTERRUPTED, fail
 
-HELP = "lines to type: adc 0-7 MILLIVOLTS, noise 0-1, unplug, plug, reset, quit"
+HELP = "commands: adc 0-7 MILLIVOLTS, noise 0-1, unplug, plug, reset, quit"
 
 
 @click.group("board", short_help="run firmware on a simulated board")
@@ -24,14 +24,14 @@ def command() -> None:
 def run(firmware: Path, reset_on_open: bool) -> None:
     """Run FIRMWARE (an ELF file), print its port, and show its pins as they change.
 
-    Lines on stdin control the board: `adc 0 2500` puts 2.5 V on A0, `unplug` and `plug` pull and connect the cable,
-    `reset` presses the button, `noise 0.01` damages one byte in a hundred on the line. `quit` or Ctrl-C ends it.
+    Lines on stdin control the board: `adc 0 2500` puts 2.5 V on A0, `unplug` and `plug` disconnect and connect the
+    cable, `reset` presses the button, `noise 0.01` corrupts 1 % of the bytes on the line. `quit` or Ctrl-C stops it.
     """
     from bridges.serial.boards import SimulatedBoard
 
     try:
         with SimulatedBoard(firmware, resets=reset_on_open, watch=_show) as board:
-            click.echo(f"{HELP}\nuse it with: aira edge {board.port} --agent ADDRESS")
+            click.echo(f"{HELP}\nconnect it with: aira edge {board.port} --agent ADDRESS")
             for line in sys.stdin:
                 if line.strip() == "quit":
                     return

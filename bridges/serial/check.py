@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mesh.doctor.context import DoctorContext, SerialSettings
 
 ANSWER_TIMEOUT: Final = 5.0
-"""Seconds in which a board must answer. Opening the port restarts it, which takes almost two."""
+"""Seconds within which a board must answer. Opening the port resets it, which takes almost two."""
 
 
 def checks(context: DoctorContext) -> list[Check]:
@@ -35,7 +35,7 @@ def checks(context: DoctorContext) -> list[Check]:
 def check_port(settings: SerialSettings) -> CheckResult:
     """Whether the port exists, may be used, and is not in use. Raises `PortMissing`, `InputError`."""
     if not settings.port:
-        return failed("no serial port is named", hint="give --port /dev/ttyACM0, or usb:VENDOR:PRODUCT")
+        return failed("no serial port is given", hint="give --port /dev/ttyACM0, or --port usb:VENDOR:PRODUCT")
     path = PortName(settings.port).find()
     try:
         SerialPort(path, baud=settings.baud).close()
@@ -48,7 +48,7 @@ def check_port(settings: SerialSettings) -> CheckResult:
 
 
 def check_board(settings: SerialSettings, *, timeout: float = ANSWER_TIMEOUT) -> CheckResult:
-    """Whether a board answers in the protocol. Opening the port restarts most boards."""
+    """Whether a board answers in the protocol. Opening the port resets most boards."""
     dialect = load_dialect(settings.protocol)(baud=settings.baud)
     ready = threading.Event()
     line = SerialLine(
@@ -66,11 +66,11 @@ def check_board(settings: SerialSettings, *, timeout: float = ANSWER_TIMEOUT) ->
     if answered and (info := dialect.info) is not None:
         name = " ".join(filter(None, (info.name, info.version))) or "a sketch"
         took = time.monotonic() - began
-        return passed(f"{name} speaks {settings.protocol}, {len(info.topics)} topics, after {took:.1f} s")
+        return passed(f"{name} answered in {settings.protocol} after {took:.1f} s, with {len(info.topics)} topics")
     others = " or ".join(f"--protocol {name}" for name in dialect_names() if name != settings.protocol)
     return failed(
         f"no board answers in {settings.protocol} at {settings.baud:,} baud",
-        hint=f"is the firmware loaded, does --baud fit it, and does it speak {settings.protocol}? else {others}",
+        hint=f"check that the firmware is loaded, --baud, and the protocol: {others}",
     )
 
 
@@ -79,8 +79,12 @@ def _unusable(path: Path, error: LineError) -> CheckResult:
     if isinstance(error, PortForbidden):
         return _forbidden(path)
     if isinstance(error, PortBusy):
-        return failed(str(error), hint=f"`fuser {path}` shows which; if it is `aira edge`, stop it to check the line")
-    return failed(str(error), hint="is this the board's port? `ls -l /dev/serial/by-id` shows what is plugged in")
+        return failed(
+            str(error), hint=f"`fuser {path}` shows the process; if it is `aira edge`, stop it to check the line"
+        )
+    return failed(
+        str(error), hint="check that this is the board's port; `ls -l /dev/serial/by-id` lists connected devices"
+    )
 
 
 def _forbidden(path: Path) -> CheckResult:
@@ -90,7 +94,8 @@ def _forbidden(path: Path) -> CheckResult:
     found = f"{path} can't be opened by {user}: no permission; it belongs to the group {group}"
     if about.st_gid == 0:
         return failed(
-            f"{found}, which no user should join", hint="let udev assign it to the group dialout, and join that"
+            f"{found}, which no user should join",
+            hint="let udev assign the port to the group dialout, and join that group",
         )
     return failed(found, hint=f"sudo usermod -aG {group} {user}, then log in again (a service: restart it)")
 

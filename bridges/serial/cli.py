@@ -22,12 +22,12 @@ def _renaming(context: click.Context, option: click.Parameter, given: tuple[str,
     pairs = tuple(text.partition("=")[::2] for text in given)
     for text, (topic, name) in zip(given, pairs, strict=True):
         if not topic.startswith("/") or not name.startswith("/"):
-            raise click.BadParameter(f"{text!r} is not TOPIC=NAME, each with a / before it")
+            raise click.BadParameter(f"{text!r} is not /TOPIC=/NAME")
     return pairs
 
 
 def _parameter(context: click.Context, option: click.Parameter, given: tuple[str, ...]) -> dict[str, object]:
-    """Parse NAME=VALUE: numbers where possible, and lists if there are commas."""
+    """Parse NAME=VALUE; values become numbers if possible, and lists if they contain commas."""
     parameters: dict[str, object] = {}
     for text in given:
         name, equals, value = text.partition("=")
@@ -49,14 +49,14 @@ def _number(text: str) -> int | float | str:
 
 @click.command("edge", short_help="connect a device on a serial line to the mesh")
 @click.argument("port")
-@click.option("--agent", required=True, metavar="ADDRESS", help="account of the agent that the device belongs to")
+@click.option("--agent", required=True, metavar="ADDRESS", help="address of the agent that the device belongs to")
 @click.option("--name", default="board", show_default=True, help="name of the device in the agent's keys")
 @click.option(
     "--protocol",
     type=click.Choice(dialect_names()),
     default="frames",
     show_default=True,
-    help="the firmware's protocol: our own frames, rosserial version 2, or an installed one",
+    help="protocol of the firmware: frames (this project's), rosserial (version 2), or an installed one",
 )
 @click.option("--baud", type=click.IntRange(300, 4_000_000), default=57_600, show_default=True, help="bits per second")
 @click.option(
@@ -64,7 +64,7 @@ def _number(text: str) -> int | float | str:
     type=click.FloatRange(0, 3600),
     default=30.0,
     show_default=True,
-    help="seconds that a command waits for a board that is absent or busy",
+    help="seconds for which a command waits while the board is absent or busy",
 )
 @click.option(
     "--param",
@@ -72,7 +72,7 @@ def _number(text: str) -> int | float | str:
     multiple=True,
     metavar="NAME=VALUE",
     callback=_parameter,
-    help="a parameter that a rosserial sketch may request; several values with commas",
+    help="parameter for a rosserial sketch; separate several values by commas (may be repeated)",
 )
 @click.option(
     "--map",
@@ -80,7 +80,7 @@ def _number(text: str) -> int | float | str:
     multiple=True,
     metavar="TOPIC=NAME",
     callback=_renaming,
-    help="rename a topic of the board and all below it: /led=/left/led, /=/left",
+    help="rename a topic of the board and all topics below it, as in /led=/left/led or /=/left (may be repeated)",
 )
 @with_settings(*options_of(NetworkSettings), *options_of(TelemetrySettings))
 def command(
@@ -94,13 +94,13 @@ def command(
     parameters: dict[str, object],
     renamed: tuple[tuple[str, str], ...],
 ) -> None:
-    """Connect the device at PORT to its agent. Ctrl-C ends it.
+    """Connect the device at PORT to its agent. Ctrl-C stops it.
 
-    PORT is a path (/dev/ttyACM0, or one under /dev/serial/by-id, which does not change), or a USB id (usb:2341:0043,
-    followed by a serial number if there are several). If the port is missing or unplugged, the command waits for it.
+    PORT is a path (/dev/ttyACM0, or a stable one under /dev/serial/by-id) or a USB id (usb:2341:0043, with a serial
+    number appended if there are several such devices). If the port is missing or unplugged, the command waits for it.
 
-    A command on a topic of a job reaches all devices of the agent that have a topic of that name; --map renames those
-    of this device.
+    A command on a topic of a job reaches all devices of the agent that have a topic of that name. Use --map to rename
+    the topics of this device.
     """
     from bridges.serial.naming import DeviceId, TopicNames
     from bridges.serial.process import EdgeOptions, run_edge, serve_metrics, wait_for_files

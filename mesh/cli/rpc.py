@@ -231,7 +231,7 @@ def _value(service: str, field: msgspec.structs.FieldInfo, given: Any) -> Any:
             return given
     if kind not in TYPES or (type(given) is kind and kind is not UInt256):
         return given
-    raise InvalidArgument(f"{service}: {field.encode_name} must be {TYPES[kind]}, not {str(given)[:60]!r}")
+    raise InvalidArgument(f"{service}: {field.encode_name} is {str(given)[:60]!r}, but must be {TYPES[kind]}")
 
 
 def _fields(kind: type[Record]) -> tuple[msgspec.structs.FieldInfo, ...]:

@@ -1,4 +1,4 @@
-"""`aira doctor`: checks what a role needs on this machine, and says what is wrong and what to do about it."""
+"""`aira doctor`: checks whether this machine can run a role, and suggests a fix for each problem."""
 
 from __future__ import annotations
 

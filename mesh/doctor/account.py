@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
 READ_BY_OTHERS: Final = stat.S_IRGRP | stat.S_IROTH
 SECRETS: Final = tuple(map(Path, ("/run/secrets", "/run/credentials", "/secrets")))
-"""Folders of secrets of containers and systemd units, which no other user can read."""
+"""Folders in which containers and systemd units get secrets; no other user can read them."""
 DIGITS: Final = 9
 """Decimals shown of an amount; ether has eighteen."""
 AMPLE: Final = 20
-"""Transactions that the account's ETH should pay for."""
+"""Number of transactions for which the account should have ETH."""
 
 
 class Currency(NamedTuple):
@@ -40,7 +40,7 @@ class AccountChecks:
 
     def __init__(self, context: DoctorContext, chain_checks: ChainChecks) -> None:
         self._context = context
-        self._ledgers = chain_checks
+        self._chain_checks = chain_checks
         self.address = ""
         """EIP-55; empty until the keyfile is decrypted."""
 
@@ -55,12 +55,12 @@ class AccountChecks:
         if readable:
             names = " and ".join(map(str, readable))
             hint = f"chmod 600 {' '.join(map(str, readable))}"
-            return warning(f"{self.address}, but others on this machine may read {names}", hint=hint)
-        return passed(f"{self.address}, the password opens {files[0]}")
+            return warning(f"{self.address}, but other users of this machine can read {names}", hint=hint)
+        return passed(f"{self.address}, the password decrypts {files[0]}")
 
     async def check_ether(self) -> CheckResult:
         """Whether the account can pay gas. Raises `FeeTooHigh`."""
-        node = self._ledgers.node
+        node = self._chain_checks.node
         balance = await node.eth_balance(self.address)
         node.fees.offer(await node.gas_market())
         one = LEAST_GAS * await node.gas_price()
@@ -69,13 +69,15 @@ class AccountChecks:
         if count >= AMPLE:
             return passed(f"{shown}: gas for {'more than 1,000' if count > 1000 else f'{count:,}'} transactions")
         if count >= 1:
-            return warning(f"{shown}: gas for {count} transactions, and no more", hint="send it ETH; gas is paid in it")
+            return warning(f"{shown}: gas for only {count} transactions", hint="send it ETH to pay for gas")
         if self._context.role == "agent":
             return warning(
-                f"{shown}: gas for no transaction",
-                hint="send it ETH if it is to agree to fees, or to call off jobs; to work and be paid it needs none",
+                f"{shown}: not enough gas for a transaction",
+                hint="send it ETH if it should approve fees or cancel jobs; working and being paid needs none",
             )
-        return failed(f"{shown}: gas for no transaction", hint=f"send it {at_least(AMPLE * one, ETH)} or more for gas")
+        return failed(
+            f"{shown}: not enough gas for a transaction", hint=f"send it at least {at_least(AMPLE * one, ETH)}"
+        )
 
     async def check_tokens(self) -> CheckResult:
         """Whether the account has tokens to pay with."""
@@ -83,57 +85,59 @@ class AccountChecks:
         shown = f"{self.address} has {_amount(balance, coin)}"
         if balance or self._context.role != "person":
             return passed(shown)
-        return failed(f"{shown}: nothing to pay a job with", hint=f"send it {coin.symbol}: `aira xrt transfer` does")
+        return failed(
+            f"{shown}: it can't pay for a job", hint=f"send it {coin.symbol}, for example with `aira xrt transfer`"
+        )
 
     async def check_allowance(self) -> CheckResult:
         """Whether the factory may transfer the cost of a job, or the account can pay gas to allow it."""
-        chain, coin = self._ledgers.chain, await self._coin()
+        chain, coin = self._chain_checks.chain, await self._coin()
         allowed = await chain.tokens.allowance(self.address, chain.factory, token=self._context.settings.erc20_token)
         if allowed:
-            return passed(f"the factory may take {_amount(allowed, coin)}")
+            return passed(f"the factory may transfer {_amount(allowed, coin)}")
         node = chain.node
         approve = "`aira xrt approve factory AMOUNT`"
         if await node.eth_balance(self.address) < LEAST_GAS * await node.gas_price():
             return failed(
-                f"the factory may take no {coin.symbol} from {self.address}, which has no ETH to allow it",
-                hint=f"send it ETH for gas; `aira demand` then allows what a job costs, or {approve} does",
+                f"the factory may not transfer {coin.symbol} of {self.address}, which has no ETH to approve it",
+                hint=f"send it ETH for gas; then `aira demand` approves the cost of a job, or use {approve}",
             )
         return warning(
-            f"the factory may take no {coin.symbol} from {self.address} yet",
-            hint=f"{approve}; `aira demand` and agents do so by themselves, for what a job costs",
+            f"the factory may not transfer {coin.symbol} of {self.address} yet",
+            hint=f"`aira demand` and agents approve the cost of each job; to approve more, use {approve}",
         )
 
     async def check_stake(self) -> CheckResult:
         """Whether the account has a stake at its lighthouse. Raises `NoStake`."""
         from mesh.market.transaction_queue import NoStake
 
-        chain, name = self._ledgers.chain, self._context.settings.lighthouse_contract
+        chain, name = self._chain_checks.chain, self._context.settings.lighthouse_contract
         state = await chain.lighthouses.get(name)
         if self.address not in state.stakes:
             raise NoStake(self.address, name, minimal_stake=state.minimal_stake)
         stake = state.stakes[self.address]
         count = stake // state.minimal_stake if state.minimal_stake else 0
-        return passed(f"{_amount(stake, XRT)} at {name}: {count:,} transaction{'' if count == 1 else 's'} a turn")
+        return passed(f"{_amount(stake, XRT)} at {name}: {count:,} transaction{'' if count == 1 else 's'} per turn")
 
     async def check_turn(self) -> CheckResult:
         """Whose turn it is at the lighthouse."""
-        chain = self._ledgers.chain
+        chain = self._chain_checks.chain
         state = await chain.lighthouses.get(self._context.settings.lighthouse_contract)
         block, providers = await chain.block_number(), list(state.stakes)
         if state.current == self.address:
-            return passed(f"its own, {state.quota:,} transactions left of it")
-        place = f"{providers.index(state.current) + 1} of {len(providers)}" if state.current in providers else "gone"
-        alive = f"who was heard of {block - state.keep_alive_block:,} blocks ago"
-        alive = alive if state.keep_alive_block else "who was not heard of yet"
+            return passed(f"its own, with {state.quota:,} transactions left")
+        place = f"{providers.index(state.current) + 1} of {len(providers)}" if state.current in providers else "left"
+        active = f"last active {block - state.keep_alive_block:,} blocks ago"
+        active = active if state.keep_alive_block else "not active yet"
         may = "may send now" if await chain.lighthouses.is_turn(state.address, self.address) else "waits for its turn"
-        return passed(f"{state.current}'s ({place}), {alive}; this account {may}")
+        return passed(f"{state.current} ({place}), {active}; this account {may}")
 
     async def _coin(self) -> Currency:
-        token = await self._ledgers.chain.tokens.info(self._context.settings.erc20_token)
+        token = await self._chain_checks.chain.tokens.info(self._context.settings.erc20_token)
         return Currency(token.symbol or "tokens", token.decimals)
 
     async def _balance(self) -> int:
-        return await self._ledgers.chain.tokens.balance(self.address, token=self._context.settings.erc20_token)
+        return await self._chain_checks.chain.tokens.balance(self.address, token=self._context.settings.erc20_token)
 
 
 def _amount(count: int, coin: Currency) -> str:
@@ -144,7 +148,7 @@ def _amount(count: int, coin: Currency) -> str:
 
 
 def at_least(count: int, coin: Currency) -> str:
-    """The same, rounded up: what is shown is never too little."""
+    """The same, rounded up, so that the shown amount suffices."""
     last = 10 ** max(0, coin.decimals - DIGITS)
     return _amount(-(-count // last) * last, coin)
 

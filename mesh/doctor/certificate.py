@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class CertificateInfo:
-    """What a certificate says: its holder's address (as in keys), name and roles, and its expiry (seconds since the
-    epoch)."""
+    """The content of a certificate: its holder's address (as in keys), name and roles, and when it expires (seconds
+    since the epoch)."""
 
     address: str
     name: str
@@ -27,9 +27,9 @@ class CertificateInfo:
 
 
 def certificate_info(tls: Tls, *, mode: str) -> CertificateInfo | None:
-    """What the own certificate says; None if there is none. `mode` is `router` or `client`.
+    """Read the own certificate; None if there is none. `mode` is `router` or `client`.
 
-    Raises `ConfigurationError` for unusable files, and for a certificate whose common name is no address.
+    Raises `ConfigurationError` for unusable files, and for a certificate whose common name is not an address.
     """
     check_files(tls, mode=mode)
     if tls.pair is None:
@@ -40,8 +40,8 @@ def certificate_info(tls: Tls, *, mode: str) -> CertificateInfo | None:
         address = parse_address(address).lower()
     except InvalidAddress:
         raise ConfigurationError(
-            f"the certificate {tls.certificate} is for {address or 'nobody'!r}, and not for an address",
-            hint="`aira identity new` makes certificates by which routers know an account",
+            f"the common name of the certificate {tls.certificate} is {address!r}, not an address",
+            hint="create a certificate with `aira identity new`",
         ) from None
     return CertificateInfo(
         address=address,
@@ -52,7 +52,7 @@ def certificate_info(tls: Tls, *, mode: str) -> CertificateInfo | None:
 
 
 def own_identity(settings: Settings) -> CertificateInfo | None:
-    """What the certificate in the settings says; None also if it is unusable, which a check reports."""
+    """Read the certificate of the settings; None also if it is unusable, which a check reports."""
     try:
         tls = Tls.from_settings(settings)
         return None if tls is None else certificate_info(tls, mode="client")

@@ -22,7 +22,7 @@ T = TypeVar("T")
 QUICK: Final = Timing(request_timeout=3.0, attempts=1)
 """No retries: a node that does not answer at once is a result."""
 DEVELOPMENT: Final = ("anvil", "eth-tester", "ethereumtester", "hardhat", "ganache", "aira")
-"""Client names of development chains, in lower case. These make a block only when there are transactions."""
+"""Client names of development chains, in lower case. They mine a block only when there are transactions."""
 
 
 class ChainChecks:
@@ -61,13 +61,13 @@ class ChainChecks:
             )
             if syncing:
                 return failed(
-                    f"{endpoint} is still syncing: it is at block {number:,}",
-                    hint="wait until it is done; until then it does not know the newest blocks",
+                    f"{endpoint} is still syncing at block {number:,}",
+                    hint="wait until it is synced; until then it does not have the newest blocks",
                 )
             if is_stalled(client, number=number, age=age):
                 return failed(
                     f"{endpoint} is stalled: its newest block {number:,} is {duration(age)} old",
-                    hint="is the node connected to others, and has its disk free space? see its log",
+                    hint="see the node's log: check its peers and its free disk space",
                 )
             old = f"{duration(max(age, 0))} old"
             about = f"chain {node.chain_id}, block {number:,}, {old}"
@@ -79,8 +79,8 @@ class ChainChecks:
         found = self.node.chain_id
         if self._expected and found != self._expected:
             return failed(
-                f"{self.node.endpoint} is on the chain {found}, and it should be {self._expected}",
-                hint="name a node of the right chain with --web3-http-provider",
+                f"{self.node.endpoint} is on the chain {found}, not on {self._expected}",
+                hint="give a node of the expected chain with --web3-http-provider",
             )
         return passed(f"{found}, genesis {await self._genesis()}")
 
@@ -96,12 +96,14 @@ class ChainChecks:
         where = f"factory {chain.factory}, XRT {chain.xrt}"
         if expected == "mesh" and not ours:
             return failed(
-                f"the factory or XRT is not this project's code: {where}",
-                hint="give --contracts original if they are the original ones; else check --ens-contract and the names",
+                f"the factory or XRT does not run this project's code: {where}",
+                hint="give --contracts original if they are the originals; else check --ens-contract and the names",
             )
         if expected == "original" and ours:
-            return failed(f"they are not the original contracts, but this project's: {where}", hint="--contracts mesh")
-        return passed(f"{'this project' if ours else 'the original one'}'s: {where}")
+            return failed(
+                f"these are this project's contracts, not the originals: {where}", hint="give --contracts mesh"
+            )
+        return passed(f"{'contracts of this project' if ours else 'original contracts'}: {where}")
 
     async def check_lighthouse(self) -> CheckResult:
         """Whether the lighthouse exists and belongs to the factory. Raises `UnknownName`."""
@@ -109,15 +111,15 @@ class ChainChecks:
         address = await self.chain.names.lighthouse(name)
         if not await self.chain.lighthouses.exists(address):
             return failed(
-                f"{name} is {address}, which is no lighthouse of this factory",
-                hint="`aira lighthouse list` shows them; name one with --lighthouse-contract",
+                f"{name} is {address}, which is not a lighthouse of this factory",
+                hint="choose one of `aira lighthouse list` with --lighthouse-contract",
             )
         state = await self.chain.lighthouses.get(address)
         providers = len(state.stakes)
         if not providers:
             return warning(
-                f"{name} ({address}) has no provider: nobody matches its orders",
-                hint="`aira lighthouse join STAKE` makes an account its provider; then run `aira provider`",
+                f"{name} ({address}) has no provider, so its orders are not matched",
+                hint="become its provider with `aira lighthouse join STAKE`, then run `aira provider`",
             )
         return passed(f"{name} is {address}, with {providers} provider{'s' if providers > 1 else ''}")
 
@@ -126,7 +128,7 @@ class ChainChecks:
         token = await self.chain.tokens.info(self._settings.erc20_token)
         if not token.total_supply:
             raise NoContracts(f"token with any supply at {token.address}", self.node.chain_id)
-        return passed(f"{token.symbol or 'without a symbol'}, {token.decimals} decimals, at {token.address}")
+        return passed(f"{token.symbol or 'no symbol'}, {token.decimals} decimals, at {token.address}")
 
     async def _genesis(self) -> str:
         return "0x" + (await self.node.block_hash(0)).hex()[:16] + "…"
@@ -141,7 +143,7 @@ async def check_node_clock(endpoint: str) -> CheckResult:
 
 
 async def _unless_refused(asked: Awaitable[Any], *, otherwise: T) -> T:
-    """A node's answer, or `otherwise` if it refuses the method, as gateways do that allow only some."""
+    """A node's answer, or `otherwise` if it refuses the method, as gateways with restricted methods do."""
     try:
         answer: T = await asked
     except RequestRefused:
@@ -173,5 +175,5 @@ def nodes_of(settings: Settings) -> tuple[str, ...]:
 
 def is_stalled(client: str, *, number: int, age: float) -> bool:
     """Whether a newest block of this age (seconds) means that the node has stopped getting blocks. On a development
-    chain it does not: a block is made only when there are transactions."""
+    chain it does not: a block is mined only when there are transactions."""
     return age > RECENT and number > 0 and not client.lower().startswith(DEVELOPMENT)

@@ -1,4 +1,4 @@
-"""Checks and their results. All run at the same time, each on its own, within one time limit for all."""
+"""Checks and their results. All checks run concurrently, within one common time limit."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ class CheckStatus(Enum):
 
     OK = "ok"
     WARN = "warn"
-    """It works now, but something should be done at some time, or for some uses."""
+    """It works now, but needs attention later or for some uses."""
     FAIL = "FAIL"
 
 
 class CheckResult(NamedTuple):
-    """What a check found, in one line, and what to do about it (empty if it is in order)."""
+    """What a check found, in one line, and what to do about it (empty if it passed)."""
 
     status: CheckStatus
     message: str
@@ -52,31 +52,31 @@ class CheckResult(NamedTuple):
 
 
 def passed(message: str) -> CheckResult:
-    """It is in order."""
+    """The check passed."""
     return CheckResult(CheckStatus.OK, message)
 
 
 def warning(message: str, *, hint: str) -> CheckResult:
-    """It works now, but something should be done."""
+    """It works now, but needs attention."""
     return CheckResult(CheckStatus.WARN, message, hint)
 
 
 def failed(message: str, *, hint: str) -> CheckResult:
-    """It does not work."""
+    """The check failed."""
     return CheckResult(CheckStatus.FAIL, message, hint)
 
 
 def from_error(error: AiraError) -> CheckResult:
     """An error as a failed check."""
-    return failed(str(error), hint=error.hint or "see docs/deploy.md; `aira settings` shows the settings in force")
+    return failed(str(error), hint=error.hint or "see docs/deploy.md; `aira settings` shows the effective settings")
 
 
 @dataclass(frozen=True, eq=False)
 class Check:
     """Something to check: `run` returns the result; an `AiraError` that it raises is a failed check.
 
-    It runs if at least one check of each group in `needs` has run and not failed. So a cause is reported once, and not
-    again by every check that depends on it.
+    It runs if at least one check of each group in `needs` has run and not failed. So a cause is reported once,
+    not by every check that depends on it.
     """
 
     name: str
@@ -154,8 +154,8 @@ async def _run(
     except TimeoutError:
         if not limit.expired():
             raise
-        return failed(f"no answer within {seconds:g} s", hint="a longer --timeout tells a slow one from a dead one")
+        return failed(f"no answer within {seconds:g} s", hint="try a longer --timeout if it may be slow")
     except ModuleNotFoundError as error:
         if (extra := EXTRAS.get((error.name or "").partition(".")[0])) is None:
             raise
-        return failed(f"this needs {error.name}, which is not installed here", hint=f"pip install 'aira-mesh[{extra}]'")
+        return failed(f"the check needs {error.name}, which is not installed", hint=f"pip install 'aira-mesh[{extra}]'")

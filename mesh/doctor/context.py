@@ -1,4 +1,4 @@
-"""What the doctor examines: the settings, the role, and what follows from them. Pure but for the certificate's file."""
+"""The context of the checks: the settings, the role, and what follows from them. Reads only the certificate's file."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ class SerialSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class DoctorContext:
-    """The machine to examine.
+    """The machine to check.
 
-    `requested_role` is the role given on the command line; `identity` is what the certificate says; `agent` and
+    `requested_role` is the role given on the command line; `identity` is the content of the certificate; `agent` and
     `device` name the device of an edge agent; `chain_id` is the expected chain (EIP-155; 0: any).
     """
 
@@ -58,7 +58,7 @@ class DoctorContext:
 
     @property
     def role(self) -> Role:
-        """The requested role, or the one that the settings imply: by the roster, the serial port, the certificate."""
+        """The requested role, or the one implied by the roster, the serial port or the certificate."""
         if self.requested_role is not None:
             return self.requested_role
         if self.settings.roster:
@@ -75,10 +75,10 @@ class DoctorContext:
 
     @property
     def areas(self) -> frozenset[Area]:
-        """What mesh itself checks: what the role needs."""
+        """The areas that the role needs and this package checks."""
         areas = AREAS[self.role]
         if self.role == "bridge" and not (self.settings.web3_http_provider or self.settings.web3_ws_provider).strip():
-            areas -= {"chain"}  # a bridge can do without
+            areas -= {"chain"}  # optional for a bridge
         return areas
 
     @property
@@ -99,7 +99,7 @@ class DoctorContext:
 
     @property
     def is_secure(self) -> bool:
-        """Whether it connects to a site, where everyone shows a certificate."""
+        """Whether it connects to a site, where everyone presents a certificate."""
         return any(locator.startswith(TLS_PREFIXES) for locator in self.connect)
 
     @property
@@ -133,7 +133,7 @@ def _redacted(address: str) -> str:
 
 
 def with_identity(context: DoctorContext) -> DoctorContext:
-    """The context with what the certificate says: its roles and, for an edge agent, its device by default."""
+    """The context with the certificate's content: its roles and, for an edge agent, its device by default."""
     identity = own_identity(context.settings)
     if identity is None:
         return context

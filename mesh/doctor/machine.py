@@ -1,6 +1,6 @@
-"""This machine: its clock compared with others, and the disk that holds its state.
+"""This machine: its clock compared with others, and the disk with its state.
 
-A wrong clock makes certificates look expired or not yet valid, and the times in recordings worthless. The checks of the
+A wrong clock makes certificates look expired or not yet valid, and the times in recordings useless. The checks of the
 disk block.
 """
 
@@ -26,17 +26,17 @@ SOON: Final = 7 * DAY
 TOLERATED: Final = 5.0
 """Seconds by which two clocks may differ."""
 AHEAD: Final = 30.0
-"""Seconds by which a block may be in the future: development chains add a second per block, however fast."""
+"""Seconds by which a block may be in the future: development chains add a second per block, even if they are faster."""
 RECENT: Final = 120.0
 """Seconds for which the time of a block can be compared with the clock."""
 CURE: Final = (
-    "set the clock, best by NTP (timedatectl set-ntp true); certificates hold by it, and recordings have their times"
-    " from it"
+    "set the clock, preferably by NTP (timedatectl set-ntp true); the validity of certificates and the times in"
+    " recordings depend on it"
 )
 PROBE: Final = 64 * 1024
 """Bytes written as a test and deleted."""
 LEAST: Final = 100 * 1024**2
-"""Free bytes below which ledger and recordings will soon fail."""
+"""Free bytes below which writing the ledger and recordings will soon fail."""
 FULL: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 FORBIDDEN: Final = (errno.EACCES, errno.EPERM)
 SLOW: Final = 1.0
@@ -47,7 +47,7 @@ def compare_router_clock(theirs: float, ours: float) -> CheckResult:
     """Compare the router's clock with this one, both read at the same moment (seconds since the epoch)."""
     ahead = ours - theirs
     if abs(ahead) <= TOLERATED:
-        return passed(f"{abs(ahead):.2f} s from the router's clock")
+        return passed(f"differs by {abs(ahead):.2f} s from the router's clock")
     return failed(f"this machine's clock is {_apart(ahead)} the router's", hint=CURE)
 
 
@@ -55,20 +55,18 @@ def compare_node_clock(theirs: float, ours: float) -> CheckResult:
     """Compare the clock of the node's machine, in whole seconds, with this one (seconds since the epoch)."""
     ahead = ours - theirs
     if abs(ahead) <= TOLERATED + 1:
-        return passed("as the node's clock, to the second")
-    return failed(f"this machine's clock is {_apart(ahead)} that of the node's machine", hint=CURE)
+        return passed("agrees with the node's clock to the second")
+    return failed(f"this machine's clock is {_apart(ahead)} the clock of the node's machine", hint=CURE)
 
 
 def compare_chain_clock(block_time: float, ours: float) -> CheckResult:
     """Compare the time of the newest block with this clock (seconds since the epoch)."""
     age = ours - block_time
     if age < -AHEAD:
-        return failed(
-            f"the newest block is from the future: this clock is {duration(-age)} behind the chain's", hint=CURE
-        )
+        return failed(f"this machine's clock is {duration(-age)} behind the newest block", hint=CURE)
     if age > RECENT:
-        return passed(f"the newest block is {duration(age)} old, and says nothing about the clock")
-    return passed(f"fits the newest block, {'of now' if age < 1 else duration(age) + ' old'}")
+        return passed(f"the newest block is {duration(age)} old, too old to compare clocks")
+    return passed(f"agrees with the newest block, {'0 s' if age < 1 else duration(age)} old")
 
 
 def duration(seconds: float) -> str:
@@ -82,7 +80,7 @@ def duration(seconds: float) -> str:
 def time_left(until: float) -> str:
     """How long it is until then (seconds since the epoch)."""
     left = until - time.time()
-    return f"{duration(left)} left" if left > 0 else "over"
+    return f"{duration(left)} left" if left > 0 else "expired"
 
 
 def _apart(ahead: float) -> str:
@@ -94,53 +92,53 @@ def check_data_folder(folder: Path, *, slow: float = SLOW) -> CheckResult:
 
     Taking more than `slow` seconds is a warning.
     """
-    there = _nearest(folder)
+    existing = _nearest(folder)
     began = time.monotonic()
     try:
-        with tempfile.NamedTemporaryFile(dir=there, prefix=".aira-doctor-") as probe:
+        with tempfile.NamedTemporaryFile(dir=existing, prefix=".aira-doctor-") as probe:
             probe.write(bytes(PROBE))
             probe.flush()
             os.fsync(probe.fileno())
     except OSError as error:
-        return _refused(folder, there, error)
+        return _write_failure(folder, existing, error)
     took = time.monotonic() - began
     if took > slow:
         return warning(
-            f"{there} takes {took:.1f} s to write and sync a small file",
-            hint="use a local disk for --data-dir; each step of a job waits for it",
+            f"{existing} takes {took:.1f} s to write and sync a small file",
+            hint="use a local disk for --data-dir; each step of a job waits for the disk",
         )
-    if there != folder:
-        return passed(f"{folder} will be created at the start; {there} is writable")
-    return passed(f"{folder} is written and synced in {took * 1000:.0f} ms, and belongs to {_owner(folder)}")
+    if existing != folder:
+        return passed(f"{folder} will be created on start; {existing} is writable")
+    return passed(f"{folder} is writable (a file was synced in {took * 1000:.0f} ms) and belongs to {_owner(folder)}")
 
 
 def check_disk_space(folder: Path, *, content_limit: int, least: int = LEAST) -> CheckResult:
     """Whether at least `least` bytes are free, and the store has room to grow to `content_limit` bytes."""
     free = shutil.disk_usage(_nearest(folder)).free
     kept = sum(map(_size, folder.glob("*/content/*")))
-    shown = f"{_gigabytes(free)} free, {_gigabytes(kept)} kept of at most {_gigabytes(content_limit)}"
+    shown = f"{_gigabytes(free)} free, content uses {_gigabytes(kept)} of at most {_gigabytes(content_limit)}"
     if free < least:
-        return failed(f"{shown} in {folder}", hint="free some space, or give --data-dir on another disk")
+        return failed(f"{shown} in {folder}", hint="free some space, or use another disk with --data-dir")
     if free + kept < content_limit:
-        return warning(shown, hint="give a --content-limit that the disk has room for, or free some space")
+        return warning(shown, hint="reduce --content-limit, or free some space")
     return passed(shown)
 
 
-def _refused(folder: Path, there: Path, error: OSError) -> CheckResult:
-    """Why no file can be written in `there`: the folder, or the one in which it will be created."""
+def _write_failure(folder: Path, existing: Path, error: OSError) -> CheckResult:
+    """Why no file can be written in `existing`: the folder, or the one in which it will be created."""
     if error.errno in FULL:
         return failed(
-            f"the disk of {there} is full: {error.strerror}",
-            hint="free some space there, or give --data-dir on another disk",
+            f"the disk of {existing} is full: {error.strerror}",
+            hint="free some space there, or use another disk with --data-dir",
         )
-    other = "give another folder with --data-dir"
+    other = "use another folder with --data-dir"
     if error.errno not in FORBIDDEN:
-        return failed(f"{there} can't be written: {error.strerror}", hint=other)
+        return failed(f"{existing} is not writable: {error.strerror}", hint=other)
     user = os.geteuid()
     # A folder above may belong to the system: don't suggest changing its owner.
-    own = f"sudo chown -R {user} {folder}" if there == folder else f"sudo install -d -o {user} {folder}"
+    own = f"sudo chown -R {user} {folder}" if existing == folder else f"sudo install -d -o {user} {folder}"
     return failed(
-        f"{there} can't be written: {error.strerror}; it belongs to {_owner(there)}, and this is {_user(user)}",
+        f"{existing} is not writable: {error.strerror}; it belongs to {_owner(existing)}, not to {_user(user)}",
         hint=f"{own}, or {other}",
     )
 

@@ -32,12 +32,12 @@ class NoRouter(ConfigurationError):
 
     def __init__(self, role: str) -> None:
         option = "--listen" if role == "router" else "--connect"
-        super().__init__("the settings name no router", hint=f"give {option} tcp/127.0.0.1:7447, or another address")
+        super().__init__("the settings name no router", hint=f"give {option}, such as {option} tcp/127.0.0.1:7447")
 
 
 @asynccontextmanager
 async def checks_for(context: DoctorContext) -> AsyncIterator[list[Check]]:
-    """The checks for a context. Run them before leaving the block: that closes what they have opened."""
+    """The checks for a context. Run them inside the block: leaving it closes what they opened."""
     areas = context.areas
     async with AsyncExitStack() as stack:
         checks: list[Check] = []
@@ -69,7 +69,7 @@ def _registered_checks(context: DoctorContext) -> list[Check]:
 
 
 def _or_reason(name: str, collect: Callable[[], list[Check]]) -> list[Check]:
-    """These checks, or one failed check that says why there are none: a missing package, an unusable setting."""
+    """These checks, or one failed check if a package is missing or a setting unusable."""
     try:
         return collect()
     except (AiraError, ModuleNotFoundError) as error:
@@ -100,7 +100,7 @@ def _network_checks(context: DoctorContext, stack: AsyncExitStack) -> list[Check
     sessions: list[Check] = []
     for locator, router in zip(context.connect, routers, strict=True):
         if is_everywhere(locator):
-            continue  # Zenoh opens no session to a host that the certificate does not name
+            continue  # Zenoh opens no session to a host that is not in the certificate
         sessions += _session_checks(context, locator, needs=(*needs, (router,)), stack=stack)
     return [*certificate, *routers, *sessions]
 
@@ -114,7 +114,7 @@ def _session_checks(
     checks = SessionChecks(context, locator, stack)
     label = f"{locator}: " if len(context.connect) > 1 else ""
     session = Check("session", partial(_labelled, label, checks.check_session), needs)
-    if context.role == "router":  # its rights elsewhere are a matter of the routers that it links to
+    if context.role == "router":  # the routers that it links to decide about its rights there
         return [session]
     own = Check("own write", partial(_labelled, label, checks.check_own_write), _all_of(session))
     denied = Check("denied write", partial(_labelled, label, checks.check_denied_write), _all_of(own))

@@ -30,8 +30,10 @@ SECONDS: Final = 3.0
 """Seconds after which a router that has not answered counts as dead."""
 PLACE: Final = re.compile(r"(?P<kind>tcp|tls)/(?:\[(?P<six>[^\]]+)\]|(?P<host>[^:]+)):(?P<port>[0-9]+)")
 LOOPBACK: Final = dict(zip(WILDCARD_HOSTS, ("127.0.0.1", "::1"), strict=True))
-"""Where this machine reaches a router that listens on all addresses."""
-OWN_FILES: Final = "give --tls-ca, --tls-certificate and --tls-key of its site; `aira identity show` tells of them"
+"""The address at which this machine reaches a router that listens on all addresses."""
+OWN_FILES: Final = (
+    "give --tls-ca, --tls-certificate and --tls-key of the router's site; `aira identity show` describes a certificate"
+)
 
 
 def check_router_address(locator: str, settings: Settings) -> CheckResult:
@@ -42,15 +44,15 @@ def check_router_address(locator: str, settings: Settings) -> CheckResult:
     check_locators(locator)
     place = PLACE.match(locator)
     if place is None:
-        return passed(f"{locator} can't be tried by itself; the session shows whether it answers")
+        return passed(f"{locator} can't be checked without a session; see the session check")
     host, port = place["six"] or place["host"], int(place["port"])
     host = LOOPBACK.get(host, host)
     try:
         socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     except (socket.gaierror, UnicodeError):
         return failed(
-            f"{locator}: the name {host} is not known here",
-            hint="check its spelling and this machine's name server, or give the router's IP address",
+            f"{locator}: can't resolve the name {host}",
+            hint="check its spelling and this machine's DNS settings, or use the router's IP address",
         )
     began = time.monotonic()
     try:
@@ -65,7 +67,7 @@ def check_router_address(locator: str, settings: Settings) -> CheckResult:
 
 
 def is_everywhere(locator: str) -> bool:
-    """Whether a router listens on all addresses, so that this locator is no name in its certificate."""
+    """Whether a router listens on all addresses, so that its certificate does not name this locator."""
     place = PLACE.match(locator)
     return place is not None and place["kind"] == "tls" and (place["six"] or place["host"]) in WILDCARD_HOSTS
 
@@ -74,12 +76,12 @@ def check_certificate(context: DoctorContext) -> CheckResult:
     """Whether the own certificate can be used, and for how long. Raises `ConfigurationError` if it can't."""
     tls = Tls.from_settings(context.settings)
     if tls is None:
-        return failed("a tls/ endpoint needs the site's certificate, and none is named", hint=OWN_FILES)
+        return failed("a tls/ endpoint needs the site's certificate, but none is set", hint=OWN_FILES)
     own = certificate_info(tls, mode="router" if context.role == "router" else "client")
     if own is None:
         return warning(
-            "there is the site's certificate, and none of our own",
-            hint="ask the site's operator for one, and " + OWN_FILES,
+            "the site's certificate is set, but no certificate of our own",
+            hint="ask the site's operator for a certificate, then " + OWN_FILES,
         )
     whose = f"{own.name or 'no name'}, {', '.join(own.roles) or 'no role'}, {own.address}"
     return _lasting(f"{whose}: valid", own.until, whose="own")
@@ -89,19 +91,19 @@ def check_roster(context: DoctorContext) -> CheckResult:
     """Whether the router's settings and roster can be used. Raises `ConfigurationError`."""
     router_endpoints(context.settings)
     if not context.settings.roster:
-        return passed("none: the router listens on this machine only, and lets everybody write everything")
+        return passed("none: the router listens on loopback only, and every client may do everything")
     roster = read_roster(Path(context.settings.roster).expanduser())
     admitted = roster.admitted()
     if not admitted:
         return failed(
-            f"{context.settings.roster} has no member who is admitted",
-            hint="`aira identity new FOLDER --site SITE --role ROLE --roster FILE` makes a member",
+            f"{context.settings.roster} admits no member",
+            hint="add one with `aira identity new FOLDER --site SITE --role ROLE --roster FILE`",
         )
     own = context.identity.address if context.identity is not None else ""
     if own and context.settings.link and own not in {member.address for member in admitted}:
         return failed(
-            f"{own} is not in {context.settings.roster}: the routers that this one links to deny it everything",
-            hint="add it there with the role router, and to the rosters of the others",
+            f"{own} is not in {context.settings.roster}, so the routers that this one links to deny all its operations",
+            hint="add it with the role router, there and to the rosters of those routers",
         )
     revoked = len(roster.member) - len(admitted)
     members = f"{len(admitted)} member{'' if len(admitted) == 1 else 's'}, {revoked or 'none'} revoked"
@@ -112,36 +114,37 @@ def _unanswered(locator: str, error: OSError) -> CheckResult:
     if isinstance(error, ConnectionRefusedError):
         return failed(
             f"{locator}: no router listens there",
-            hint="start one there with `aira router`, or name another with --connect tcp/HOST:PORT",
+            hint="start one with `aira router`, or give another address with --connect tcp/HOST:PORT",
         )
     why = f"no answer within {SECONDS:g} s" if isinstance(error, TimeoutError) else error.strerror or str(error)
     return failed(
-        f"{locator}: {why}", hint="is the machine on and on this network, and does its firewall let the port through?"
+        f"{locator}: {why}", hint="check that the machine is on and reachable, and that its firewall allows the port"
     )
 
 
 def _shown(locator: str, tls: Tls | None, place: tuple[str, int], answers: str) -> CheckResult:
-    """The certificate that a router behind TLS shows, and whether it accepts ours."""
+    """The certificate that a TLS router presents, and whether it accepts ours."""
     if tls is None:
-        return failed(f"{locator}: the router wants to know who comes, and there is no certificate", hint=OWN_FILES)
+        return failed(f"{locator}: the router requires a certificate, but none is set", hint=OWN_FILES)
     if (why := refusal_reason(tls, locator, SECONDS)) is not None:
-        return failed(f"{locator}: {why}", hint=f"is this router of the site of {tls.ca}? {OWN_FILES}")
+        return failed(f"{locator}: {why}", hint=f"check that {tls.ca} is of this router's site; {OWN_FILES}")
     certificate = _certificate_of(tls, place, named=not is_everywhere(locator))
     if certificate is None:
         return failed(
-            f"{locator}: something listens there that makes no handshake (TLS 1.3)",
-            hint="is this the router's port, and is it a tls/ one? `aira router --listen tls/HOST:PORT` opens such",
+            f"{locator}: the TLS 1.3 handshake failed",
+            hint="check that this is the router's port, and that the router runs with --listen tls/HOST:PORT",
         )
     whose = next(
-        iter(subject_values(certificate, "organizationName") + subject_values(certificate, "commonName")), "nobody"
+        iter(subject_values(certificate, "organizationName") + subject_values(certificate, "commonName")),
+        "an unnamed holder",
     )
-    shown = f"{answers}, takes our certificate and shows that of {whose}"
+    shown = f"{answers}, accepts our certificate and presents that of {whose}"
     return _lasting(shown, expiry_of(certificate), whose="router")
 
 
 def _certificate_of(tls: Tls, place: tuple[str, int], *, named: bool) -> dict[str, Any] | None:
-    """The certificate that a router shows, verified against our site and, if `named`, against the host; None if the
-    handshake fails."""
+    """The certificate that a router presents, verified against our site and, if `named`, against the host; None if
+    the handshake fails."""
     context = tls_context(tls, ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = named
     try:
@@ -160,5 +163,5 @@ def _lasting(words: str, until: float, *, whose: str) -> CheckResult:
     day = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(until))
     if until - time.time() > SOON:
         return passed(f"{words}, until {day} ({left})")
-    renew = "`aira identity renew FOLDER --site SITE` where the site's key is; sessions take the new one by themselves"
+    renew = "`aira identity renew FOLDER --site SITE` where the site's key is; open sessions switch automatically"
     return warning(f"{words}, but only until {day} ({left})", hint=f"renew the {whose} certificate: {renew}")

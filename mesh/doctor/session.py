@@ -1,7 +1,7 @@
 """Sessions at a router: whether one opens, what this identity may write, and that everything else is denied.
 
-A router does not report a denial: the message just disappears. So a second session of the same identity subscribes to
-keys that it may read and that no role may write, while the first session writes there. What arrives was not denied.
+A router does not report a denial: it drops the message. So a second session of the same identity subscribes to
+keys that it may read and that no role may write, while the first session writes there. Whatever arrives was not denied.
 These probe keys belong to no family of `schemas.keys`, so no program takes them for messages.
 """
 
@@ -37,7 +37,7 @@ ANYBODY: Final = "0x" + "0" * 40
 STRANGER: Final = "0x" + "0" * 36 + "dead"
 """An address under which no other identity may write."""
 ROSTER: Final = (
-    "start the router with its roster: `aira router --roster FILE`, or zenohd with what `aira router config` writes"
+    "start the router with its roster: `aira router --roster FILE`, or zenohd with the output of `aira router config`"
 )
 FORWARD_TIMEOUT: Final = 2.0
 """Seconds in which the router would have forwarded a message that it allows."""
@@ -50,7 +50,7 @@ GRACE: Final = 0.2
 
 
 class ProbeKeys(NamedTuple):
-    """Where test writes go: those at `own` must pass, those at `foreign` must be denied."""
+    """The keys of test writes: those at `own` must pass, those at `foreign` must be denied."""
 
     own: str
     foreign: dict[str, str]
@@ -63,13 +63,13 @@ class ProbeKeys(NamedTuple):
         if context.agent:
             agent = address_chunk(context.agent)
             own = f"aira/agent/{agent}/device/{name_chunk(context.device)}/doctor/{chance}"
-            return cls(own, {"the jobs of its agent": f"aira/agent/{agent}/liability/doctor/{chance}"})
+            return cls(own, {"its agent's jobs": f"aira/agent/{agent}/liability/doctor/{chance}"})
         market = lighthouse_chunk(context.settings.lighthouse_contract)
         return cls(
             f"aira/agent/{address_chunk(address)}/doctor/{chance}",
             {
                 f"the market {market}": f"aira/{market}/doctor/{chance}",
-                "the space of another": f"aira/agent/{STRANGER}/doctor/{chance}",
+                "another agent's keys": f"aira/agent/{STRANGER}/doctor/{chance}",
             },
         )
 
@@ -86,7 +86,7 @@ class SessionPair:
     """An open session that writes and one that reads.
 
     `stamped` is the router's timestamp of a sample and the wall-clock time of its arrival here (seconds since the
-    epoch), once there was one.
+    epoch); None before the first sample.
     """
 
     def __init__(self, writer: zenoh.Session, reader: zenoh.Session) -> None:
@@ -98,7 +98,7 @@ class SessionPair:
         """Seconds until the reader receives what is written at `key`; None if it never does."""
         heard: asyncio.Queue[Received] = asyncio.Queue()
         with ExitStack() as declared:
-            self._hear(declared, key, heard.put_nowait)
+            self._subscribe(declared, key, heard.put_nowait)
             if not await self._comes_through(key, heard):
                 return None
             began = time.monotonic()
@@ -141,8 +141,8 @@ class SessionPair:
                 self._put(barrier)
                 if not await _within(FORWARD_TIMEOUT, lambda: barrier in heard):
                     raise RemoteError(
-                        f"an allowed write did not come back in {FORWARD_TIMEOUT:g} s: denied ones can't be told apart",
-                        hint="is the router overloaded, or the network? try again",
+                        f"no allowed write arrived within {FORWARD_TIMEOUT:g} s, so denied writes can't be detected",
+                        hint="try again; the router or the network may be overloaded",
                     )
                 await asyncio.sleep(GRACE)
             else:
@@ -165,10 +165,10 @@ class SessionPair:
     def _watched(self, declared: ExitStack, key: str, heard: set[str] | None = None) -> Any:
         """A publisher of the writer at `key`, to which the reader subscribes."""
         keys = set() if heard is None else heard
-        self._hear(declared, key, lambda heard: keys.add(str(heard.sample.key_expr)))
+        self._subscribe(declared, key, lambda heard: keys.add(str(heard.sample.key_expr)))
         return declared.enter_context(self._writer.declare_publisher(key))
 
-    def _hear(self, declared: ExitStack, key: str, take: Callable[[Received], object]) -> None:
+    def _subscribe(self, declared: ExitStack, key: str, take: Callable[[Received], object]) -> None:
         loop = asyncio.get_running_loop()
 
         def heard(sample: zenoh.Sample) -> None:
@@ -205,7 +205,7 @@ class SessionChecks:
         reader = await self._stack.enter_async_context(Network(endpoints))
         self._pair = SessionPair(writer.session, reader.session)
         routers = ", ".join(str(zid) for zid in writer.session.info.routers_zid())
-        return passed(f"open in {took * 1000:.0f} ms, at the router {routers}")
+        return passed(f"opened in {took * 1000:.0f} ms at the router {routers}")
 
     async def check_own_write(self) -> CheckResult:
         """Whether the router forwards what this identity may write. Raises `IdentityDenied`."""
@@ -213,11 +213,11 @@ class SessionChecks:
         if self._roles == ("watcher",):
             if not await pair.is_subscribed(self._keys.own):
                 raise IdentityDenied(self._address)
-            return passed("a watcher writes nothing; what it wants to hear, the router sends")
+            return passed("a watcher may not write; the router forwards its subscriptions")
         took = await pair.round_trip(self._keys.own)
         if took is None:
             raise IdentityDenied(self._address)
-        return passed(f"heard back through the router in {took * 1000:.1f} ms")
+        return passed(f"received through the router after {took * 1000:.1f} ms")
 
     async def check_denied_write(self) -> CheckResult:
         """Whether the router denies what no role may write."""
@@ -229,13 +229,13 @@ class SessionChecks:
             return self._open(" and ".join(names[key] for key in delivered))
         if not tried:
             return self._untried()
-        return passed("refused, as it should be: " + " and ".join(f"a write in {names[key]}" for key in tried))
+        return passed("denied as expected: " + " and ".join(f"a write to {names[key]}" for key in tried))
 
     async def check_clock(self) -> CheckResult:
         """Compare this clock with the router's, which timestamps what it forwards."""
         stamped = self._opened().stamped
         if stamped is None:
-            return passed("the router does not tell its time")
+            return passed("the router does not report its time")
         return compare_router_clock(*stamped)
 
     def _opened(self) -> SessionPair:
@@ -245,26 +245,26 @@ class SessionChecks:
     def _open(self, where: str) -> CheckResult:
         """The result when the router forwarded a write that no role may make."""
         if "router" in self._roles:
-            return passed("not tried: a router's own identity may write everything; ask with a member's")
+            return passed("not checked: a router's identity may write everything; use a member's identity")
         if self._locator.startswith(TLS_PREFIXES):
-            return failed(f"the router lets anybody write anything: a write in {where} came through", hint=ROSTER)
+            return failed(f"the router allows any write: a write to {where} was forwarded", hint=ROSTER)
         if is_loopback(self._locator):
-            return passed("the router is open: everybody may write everything, which is fine on this machine alone")
+            return passed("the router is open: every client may write everything, which is acceptable on loopback")
         return failed(
-            f"the router is open to everybody who reaches it: a write in {where} came through",
-            hint="begin a site with a roster and certificates, as docs/sites.md shows: `aira identity site FOLDER`",
+            f"the router is open to every client that can reach it: a write to {where} was forwarded",
+            hint="create a site with a roster and certificates (docs/sites.md): `aira identity site FOLDER`",
         )
 
     def _untried(self) -> CheckResult:
-        """The result when this identity may read none of the foreign keys, so that nothing could be tried."""
+        """The result when this identity may read none of the foreign keys, so that nothing could be checked."""
         if self._context.agent:
             return warning(
-                "not tried: this identity hears nothing of its agent's jobs",
-                hint="does the roster name this --agent and --device for it? `aira router acl --check --roster FILE`",
+                "not checked: this identity can't read its agent's jobs",
+                hint="check --agent and --device of its entry: `aira router acl --check --roster FILE`",
             )
         return failed(
-            f"the router does not let this identity hear the market {self._context.settings.lighthouse_contract}",
-            hint="give --lighthouse-contract of the site, or have the market named in the roster's `lighthouses`",
+            f"the router does not let this identity read the market {self._context.settings.lighthouse_contract}",
+            hint="give --lighthouse-contract of the site, or add the market to `lighthouses` in the roster",
         )
 
 
@@ -273,7 +273,7 @@ def _is_matching(publisher: Any) -> bool:
 
 
 async def _within(seconds: float, condition: Callable[[], bool]) -> bool:
-    """Whether the condition comes true within so many seconds."""
+    """Whether the condition becomes true within this many seconds."""
     ends = time.monotonic() + seconds
     while not condition():
         if time.monotonic() > ends:

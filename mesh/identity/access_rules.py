@@ -1,4 +1,4 @@
-"""What each member may do by the roster, and Zenoh's `access_control` configuration for it. Pure.
+"""The rights of each member by the roster, and Zenoh's `access_control` configuration for them. Pure.
 
 Zenoh 1.10: a message passes if the key expression of one rule includes its own. `ingress` is what a member sends,
 `egress` what is sent to it. Zenoh identifies a member by the first common name of its certificate.
@@ -92,7 +92,7 @@ def access_control(roster: Roster) -> dict[str, Any]:
                     }
                 )
     members = roster.admitted()
-    # In lower case and in EIP-55: the certificates may have been made by other tools.
+    # In lower case and in EIP-55: other tools may have created the certificates.
     subjects = [
         {"id": member.address, "cert_common_names": [member.address, parse_address(member.address)]}
         for member in members

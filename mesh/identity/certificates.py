@@ -54,7 +54,7 @@ class Holder:
 
 @dataclass(frozen=True, kw_only=True)
 class CertificateFacts:
-    """What a member's certificate says. `fingerprint` is SHA-256 of the certificate, 64 hexadecimal digits."""
+    """The content of a member's certificate. `fingerprint` is SHA-256 of the certificate, 64 hexadecimal digits."""
 
     holder: Holder
     since: datetime
@@ -109,13 +109,13 @@ def member_certificate(
 
 
 def facts_of(certificate: x509.Certificate, path: Path) -> CertificateFacts:
-    """Read a member's certificate. Raises `IdentityError` if its common name is no address; `path` is its file."""
+    """Read a member's certificate. Raises `IdentityError` if its common name is not an address; `path` is its file."""
     names = _texts(certificate, NameOID.COMMON_NAME)
     try:
         address = parse_address(names[0] if names else "")
     except InvalidAddress:
         shown = repr(names[0]) if names else "empty"
-        raise IdentityError(path, f"the common name of the certificate is {shown}, and not an address") from None
+        raise IdentityError(path, f"the common name of the certificate is {shown}, not an address") from None
     holder = Holder(
         address=address.lower(),
         name=next(iter(_texts(certificate, NameOID.ORGANIZATION_NAME)), ""),
@@ -187,7 +187,7 @@ def _host(text: str) -> x509.GeneralName:
     except ValueError:
         pass
     if not HOST_NAME.fullmatch(text):
-        raise InputError(f"{text!r} is not a host", hint="give a name or an IP address, without a port")
+        raise InputError(f"{text!r} is not a host", hint="give a host name or an IP address, without a port")
     return x509.DNSName(text)
 
 
@@ -208,4 +208,4 @@ def _contents(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise IdentityError(path, f"it can't be read: {error.strerror}") from None
+        raise IdentityError(path, f"can't read it: {error.strerror}") from None

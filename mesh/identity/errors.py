@@ -16,7 +16,7 @@ class IdentityError(ConfigurationError):
     code = "identity-unusable"
 
     def __init__(self, path: Path, why: str, *, hint: str = "") -> None:
-        super().__init__(f"{path}: {why}", hint=hint or "`aira identity new` makes certificates and keys")
+        super().__init__(f"{path}: {why}", hint=hint or "create certificates and keys with `aira identity new`")
         self.path = path
 
 

@@ -42,7 +42,7 @@ PUBLIC: Final = 0o644
 
 @dataclass(frozen=True)
 class SiteFolder:
-    """The folder of a site's certificate and key. Whoever has the key can admit anyone."""
+    """The folder of a site's certificate and key. Anyone with the key can admit members."""
 
     path: Path
 
@@ -104,7 +104,7 @@ class MemberFolder:
         authority, site_key = _opened(site)
         facts, public_key = self.facts(), read_certificate(self.certificate).public_key()
         if self.ca.exists() and read_certificate(self.ca) != authority:
-            raise IdentityError(self.ca, f"this identity is not of the site in {site.path}")
+            raise IdentityError(self.ca, f"this identity does not belong to the site in {site.path}")
         certificate = member_certificate(facts.holder, public_key, site=authority, site_key=site_key, days=days)
         fresh = self.certificate.with_suffix(".new")
         with suppress(FileNotFoundError):
@@ -114,7 +114,7 @@ class MemberFolder:
         return facts_of(certificate, self.certificate)
 
     def facts(self) -> CertificateFacts:
-        """What the certificate says. Raises `IdentityError` for files that are missing, malformed, or no pair."""
+        """The content of the certificate. Raises `IdentityError` for missing, malformed or unmatched files."""
         certificate = read_certificate(self.certificate)
         if self.key.exists():
             check_pair(certificate, read_key(self.key), self.key)
@@ -144,11 +144,13 @@ def with_fingerprint(path: Path, address: str, *, old: str, new: str) -> str:
     where = f"{path}, member {member.name!r}"
     if member.revoked:
         raise RosterError(
-            where, "it is revoked, so its certificate is not renewed", hint="delete the folder of its certificate"
+            where,
+            "it is revoked, so its certificate is not renewed",
+            hint="delete the folder of its certificate",
         )
     if member.fingerprint not in ("", old):
-        hint = "is this folder outdated? if the roster is, put this fingerprint there"
-        raise RosterError(where, f"it has another certificate than the one with the fingerprint {old}", hint=hint)
+        hint = "use the folder of the current certificate, or correct the fingerprint in the roster"
+        raise RosterError(where, f"its certificate has another fingerprint than {old}", hint=hint)
     return re.sub(":?".join(re.findall("..", old)), new, before, flags=re.IGNORECASE)
 
 
@@ -173,7 +175,7 @@ def _opened(site: SiteFolder) -> tuple[Any, Any]:
     certificate, key = read_certificate(site.certificate), read_key(site.key)
     check_pair(certificate, key, site.key)
     if certificate.not_valid_after_utc <= datetime.now(UTC):
-        raise IdentityError(site.certificate, "the site's certificate has expired", hint="make a new site")
+        raise IdentityError(site.certificate, "the site's certificate has expired", hint="create a new site")
     return certificate, key
 
 
@@ -181,7 +183,9 @@ def _prepare(folder: Path, *files: Path) -> None:
     """Create the folder. Raises `ConfigurationError` if one of the files exists."""
     for file in files:
         if file.exists():
-            raise ConfigurationError(f"{file} exists already", hint="nothing is overwritten; choose another folder")
+            raise ConfigurationError(
+                f"{file} already exists", hint="files are never overwritten; choose another folder"
+            )
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     except OSError as error:
@@ -203,6 +207,6 @@ def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:
-        raise RosterError(str(path), f"it can't be read: {error.strerror}") from None
+        raise RosterError(str(path), f"can't read it: {error.strerror}") from None
     except UnicodeDecodeError:
         raise RosterError(str(path), "it is not UTF-8 text") from None

@@ -1,6 +1,6 @@
 """The roster of a site, a TOML file: its members, their roles, and its markets.
 
-    lighthouses = ["airalab.lighthouse.3.robonomics.eth"]   # the site's markets; both generations' if not given
+    lighthouses = ["airalab.lighthouse.3.robonomics.eth"]   # the site's markets; default: those of both generations
 
     [[member]]
     name = "arm-1"
@@ -12,10 +12,10 @@
 An edge agent (role `edge`) may name the `agent` (address) whose device it serves, and the `device`; by default these
 are its own address and name.
 
-`ROLES` says what each role may do; everything else is denied. Its keys are Zenoh key expressions with placeholders:
+`ROLES` defines what each role may do; everything else is denied. Its keys are Zenoh key expressions with placeholders:
 `{own}` is the member's address, `{agent}` and `{device}` those of an edge agent, `{market}` each lighthouse of the
 site. A grant covers the keys and selectors that lie entirely within its own. `schemas.keys` defines the key
-families. Nobody may delete on a market: its keys name no owner, so a storage there would lose another member's
+families. No role may delete on a market: its keys name no owner, so a storage there would lose other members'
 orders.
 """
 
@@ -54,7 +54,7 @@ class Right(Enum):
     PUT = "put"
     """Publish."""
     DELETE = "delete"
-    """Delete what storages hold."""
+    """Delete what storages keep."""
     SERVE = "serve"
     """Declare a queryable, receive queries and reply to them."""
     TOKEN = "token"
@@ -99,7 +99,7 @@ _HOLD_CONTENT: Final = _grant("get serve", "aira/cid/*")
 ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
     {
         "agent": (_OWN_SPACE, *_READ_MARKET, _orders("offer", "result"), _presence("agent"), _HOLD_CONTENT),
-        # A person who orders work runs an agent, too.
+        # A person who orders work also runs an agent.
         "person": (_OWN_SPACE, *_READ_MARKET, _orders("demand"), _presence("agent", "person"), _HOLD_CONTENT),
         "provider": (
             _OWN_SPACE,
@@ -171,7 +171,7 @@ def read_roster(path: Path) -> Roster:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise RosterError(
-            str(path), f"it can't be read: {error.strerror}", hint="`aira identity new --roster FILE` creates one"
+            str(path), f"can't read it: {error.strerror}", hint="`aira identity new --roster FILE` creates one"
         ) from None
     except UnicodeDecodeError:
         raise RosterError(str(path), "it is not UTF-8 text") from None
@@ -227,7 +227,7 @@ def _check_unique(where: str, what: str, texts: Iterable[str]) -> None:
     seen: set[str] = set()
     for text in texts:
         if text in seen:
-            raise RosterError(where, f"the {what} {text!r} is there twice")
+            raise RosterError(where, f"the {what} {text!r} occurs twice")
         seen.add(text)
 
 

@@ -42,13 +42,13 @@ def router_endpoints(settings: Settings) -> Endpoints:
     for locator in (*settings.listen, *settings.link):
         if not locator.startswith("tls/"):
             raise ConfigurationError(
-                f"with a roster, {locator} can't be used: it does not identify who connects", hint="use tls/HOST:PORT"
+                f"with a roster, {locator} can't be used: it does not authenticate clients", hint="use tls/HOST:PORT"
             )
     tls = Tls.from_settings(settings)
     if tls is None:
         raise ConfigurationError(
-            "a router with a roster needs the site's certificate, its own and its key",
-            hint="give --tls-ca, --tls-certificate and --tls-key; `aira identity new --role router` makes them",
+            "a router with a roster needs the site's certificate, its own certificate and its key",
+            hint="give --tls-ca, --tls-certificate and --tls-key; `aira identity new --role router` creates them",
         )
     access = access_control(roster)
     return Endpoints(mode="router", listen=settings.listen, connect=settings.link, tls=tls, access=access)
@@ -60,7 +60,7 @@ def check_loopback(listen: tuple[str, ...]) -> None:
     for locator in listen:
         if not is_loopback(locator):
             raise ConfigurationError(
-                f"without a roster a router listens on loopback only, and {locator} is open to everybody",
+                f"without a roster a router may listen on loopback only, but other machines can reach {locator}",
                 hint="listen on tcp/127.0.0.1:7447, or give --roster; `aira identity new --roster FILE` creates one",
             )
 
@@ -89,7 +89,7 @@ def zenohd_configuration(endpoints: Endpoints) -> str:
         for each in sections:
             section = section.setdefault(each, {})
         section[name] = value
-    heading = "// Made by `aira router config`; zenohd reads it when it starts: zenohd --config FILE\n"
+    heading = "// Created by `aira router config`; zenohd reads it when it starts: zenohd --config FILE\n"
     return heading + json.dumps(nested, indent=2) + "\n"
 
 
@@ -101,7 +101,7 @@ class IdentityDenied(RemoteError):
     def __init__(self, address: str) -> None:
         super().__init__(
             f"the router accepts {address} but denies all its operations: it is not in the roster, or revoked",
-            hint="ask the site's operator; `aira router acl --check --roster FILE` says who may do what",
+            hint="ask the site's operator; `aira router acl --check --roster FILE` lists the rights of each member",
         )
         self.address = address
 

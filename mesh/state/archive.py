@@ -1,7 +1,7 @@
 """The file of a backup: a tar (ustar, regular files only) in one zstd frame, which `tar --zstd` lists and unpacks.
 
 Its first member, `state.json`, names the format; its last, `checksums.json`, has the SHA-256 of all others, so that a
-truncated file is noticed. A header takes 512 bytes to read and no more, so that a hostile file can't exhaust memory.
+truncated file is noticed. Headers are read in units of 512 bytes, so that a hostile file can't exhaust memory.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class ArchiveWriter:
             while left:
                 data = source.read(min(left, PIECE))
                 if not data:
-                    raise ConfigurationError(f"{name} became shorter while it was read", hint="try again")
+                    raise ConfigurationError(f"{name} shrank while it was read", hint="try again")
                 digest.update(data)
                 self._stream.write(data)
                 left -= len(data)
@@ -113,7 +113,7 @@ class ArchiveWriter:
         if len(sums) > LARGEST_TEXT:
             raise ConfigurationError(
                 f"{len(self._sums):,} files are more than a backup can list",
-                hint="leave out content that agents can fetch again: --content needed, or none",
+                hint="exclude content that agents can fetch again: --content needed, or none",
             )
         self._add_text(CHECKSUMS, sums)
         self._stream.write(bytes(2 * tarfile.BLOCKSIZE))
@@ -157,10 +157,10 @@ def read_archive(path: Path, open_sink: Callable[[str, int], AbstractContextMana
         about, sums, listed = reading.about(), {}, 0
         while (header := reading.header()).name != CHECKSUMS:
             if part_of(header.name) not in about.parts or header.name in sums:
-                raise ArchiveUnusable(path, f"it contains {header.name[:200]!r}, which is no part of a state")
+                raise ArchiveUnusable(path, f"it contains {header.name[:200]!r}, which is not part of a state")
             listed += len(header.name) + DIGITS
             if listed > LARGEST_TEXT:
-                raise ArchiveUnusable(path, "it holds more files than its checksums could list")
+                raise ArchiveUnusable(path, "it contains more files than its checksums can list")
             with open_sink(header.name, header.size) as sink:
                 sums[header.name] = reading.copy(header.size, sink)
         text = reading.text(header)
@@ -168,7 +168,7 @@ def read_archive(path: Path, open_sink: Callable[[str, int], AbstractContextMana
         stated = reading.decoded(text, dict[str, str])
         if stated != sums:
             wrong = next(iter(sorted(name for name in {*sums, *stated} if sums.get(name) != stated.get(name))))
-            raise ArchiveUnusable(path, f"{wrong[:200]} is not as it was written")
+            raise ArchiveUnusable(path, f"the checksum of {wrong[:200]} does not match")
         return about
 
 
@@ -182,7 +182,7 @@ class _ArchiveReader:
         try:
             self._file = self._path.open("rb")
         except OSError as error:
-            raise ArchiveUnusable(self._path, f"it can't be read: {error.strerror}", hint="name another") from None
+            raise ArchiveUnusable(self._path, f"can't read it: {error.strerror}", hint="use another backup") from None
         self._stream = zstandard.ZstdDecompressor().stream_reader(self._file)
         return self
 
@@ -193,15 +193,15 @@ class _ArchiveReader:
         """The first member."""
         header = self.header()
         if header.name != ABOUT:
-            raise ArchiveUnusable(self._path, "it is no backup of a state", hint="`aira state backup` makes one")
+            raise ArchiveUnusable(self._path, "it is not a backup of a state", hint="`aira state backup` creates one")
         text = self.text(header)
         stated = self.decoded(text, dict[str, object]).get("format")
         if stated != FORMAT:
             why = f"it was written by another version (format {str(stated)[:20]}, this one knows {FORMAT})"
-            raise ArchiveUnusable(self._path, why, hint="use the aira-mesh that made it, or a newer one")
+            raise ArchiveUnusable(self._path, why, hint="use the version of aira-mesh that wrote it, or a newer one")
         about = self.decoded(text, ArchiveInfo)
         if not all(is_part(part) for part in about.parts) or len(set(about.parts)) < len(about.parts):
-            raise ArchiveUnusable(self._path, "it claims parts that no state has")
+            raise ArchiveUnusable(self._path, "it names parts that no state has")
         return about
 
     def header(self) -> tarfile.TarInfo:
@@ -210,9 +210,9 @@ class _ArchiveReader:
         try:
             header = tarfile.TarInfo.frombuf(block, "utf-8", "surrogateescape")
         except tarfile.HeaderError:
-            raise ArchiveUnusable(self._path, "it is damaged, or no backup") from None
+            raise ArchiveUnusable(self._path, "it is damaged or not a backup") from None
         if header.type != tarfile.REGTYPE or header.size < 0:
-            raise ArchiveUnusable(self._path, f"{header.name[:200]!r} in it is no plain file")
+            raise ArchiveUnusable(self._path, f"{header.name[:200]!r} in it is not a regular file")
         return header
 
     def text(self, header: tarfile.TarInfo) -> bytes:
@@ -248,7 +248,7 @@ class _ArchiveReader:
         except zstandard.ZstdError as error:
             raise ArchiveUnusable(self._path, f"it is damaged ({error})") from None
         if any(rest) or len(rest) > 2 * tarfile.BLOCKSIZE:
-            raise ArchiveUnusable(self._path, "something follows its end")
+            raise ArchiveUnusable(self._path, "it has data after its end")
 
     def _read(self, size: int) -> bytes:
         """Exactly `size` bytes."""
@@ -257,9 +257,9 @@ class _ArchiveReader:
             try:
                 piece = self._stream.read(left)
             except (zstandard.ZstdError, OSError) as error:
-                raise ArchiveUnusable(self._path, f"it is damaged, or no backup ({error})") from None
+                raise ArchiveUnusable(self._path, f"it is damaged or not a backup ({error})") from None
             if not piece:
-                raise ArchiveUnusable(self._path, "it ends in the middle")
+                raise ArchiveUnusable(self._path, "it is truncated")
             pieces.append(piece)
             left -= len(piece)
         return b"".join(pieces)

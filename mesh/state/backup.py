@@ -1,9 +1,9 @@
 """Back up the state of all agents of a data folder while they run.
 
 A ledger is copied as it is at one moment. Then the recordings of its running jobs are opened, and the ledger is copied
-again to check that these jobs are still running. If not, all is repeated: a job that the backup calls running always
-comes with its recording. Of the open files as many bytes are read as they had then. A restored agent finds what a crash
-at that moment would have left.
+again to check that these jobs are still running. If not, this is repeated, so that a backup always contains the
+recordings of its running jobs. Each open file is read up to the size that it has when reading starts. A restored agent
+finds what a crash at that moment would have left.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class ContentScope(StrEnum):
 class BackupReport:
     """What a backup contains: the accounts, the number of unfinalized jobs and of content files; its size in bytes.
 
-    `missing` are CIDs that jobs need and the store does not have (or not intact): agents fetch them again.
+    `missing` are CIDs that jobs need and the store does not have (or only damaged): agents fetch them again.
     """
 
     accounts: tuple[str, ...]

@@ -36,14 +36,14 @@ ACTIVE: Final = (
     "SELECT CASE type WHEN 'table' THEN 'virtual table' ELSE type END FROM sqlite_master"
     " WHERE type IN ('view', 'trigger') OR sql LIKE 'CREATE VIRTUAL%'"
 )
-"""Finds what would run code when a foreign ledger is read or written."""
+"""Finds what would run code when an untrusted ledger is read or written."""
 CURSOR: Final = "listener"
 """`mesh.agent.listener.ChainListener.CURSOR`, whose module loads web3."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LedgerFacts:
-    """What a ledger holds at one moment. `block` is the last one handled, None before the first."""
+    """The content of a ledger at one moment. `block` is the last one handled, None before the first."""
 
     jobs: Mapping[str, JobRecord]
     """Jobs that are not finalized, by the address of their liability."""
@@ -107,7 +107,7 @@ def copy_ledger(ledger: Path, copy: Path) -> None:
             copy.unlink(missing_ok=True)
             with closing(sqlite3.connect(copy)) as target:
                 source.backup(target)
-                target.execute("PRAGMA journal_mode = DELETE")  # one file, without a log beside it
+                target.execute("PRAGMA journal_mode = DELETE")  # a single file, without a separate log
     except sqlite3.Error as error:
         raise LedgerUnusable(ledger, error) from None
 
@@ -122,13 +122,13 @@ def check_ledger(ledger: Path) -> None:
                 raise LedgerUnusable(ledger, found)
             _check_version(database, ledger)
             if (kind := database.execute(ACTIVE).fetchone()) is not None:
-                raise LedgerUnusable(ledger, f"it contains a {kind[0]}, which no ledger has")
+                raise LedgerUnusable(ledger, f"it contains a {kind[0]}, which ledgers never have")
     except sqlite3.Error as error:
         raise LedgerUnusable(ledger, error) from None
 
 
 async def read_ledger(copy: Path) -> LedgerFacts:
-    """What a copy of a ledger holds."""
+    """Read a copy of a ledger."""
     async with Ledger(copy) as ledger:
         waiting = [decode(one.payload) for one in await ledger.outbox(head=0)]
         return LedgerFacts(
@@ -152,7 +152,7 @@ def locked_ledger(ledger: Path) -> Iterator[None]:
                 raise StateInUse(ledger) from None
             raise LedgerUnusable(ledger, error) from None
         except sqlite3.DatabaseError:
-            pass  # no ledger, or a damaged one: no agent works with it
+            pass  # not a ledger, or a damaged one, which no agent uses
         yield
 
 

@@ -5,7 +5,7 @@
     0x…/content/Qm…                         files by their CID, and `.pins` beside them
     transactions/1-5f3a…/0x…/….jsonl        pending transactions
 
-Keyfiles and passwords are not part of it, and so never in a backup. Other files are left alone.
+Keyfiles and passwords are not part of it, and so never in a backup. Other files are never changed.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ _CHAIN_NAME: Final = re.compile(_CHAIN)
 
 
 class ArchiveUnusable(InputError):
-    """A file is no backup, is damaged, or contains unexpected files. Nothing of it was used."""
+    """A file is not a backup, is damaged, or contains unexpected files. Nothing of it was used."""
 
     code = "archive-unusable"
 
-    def __init__(self, path: Path, why: str, *, hint: str = "take another backup; nothing was changed") -> None:
+    def __init__(self, path: Path, why: str, *, hint: str = "use another backup; nothing was changed") -> None:
         super().__init__(f"{path} can't be used: {why}", hint=hint)
         self.path = path
 
@@ -63,14 +63,14 @@ class StateInUse(ConfigurationError):
 
 
 class StateExists(ConfigurationError):
-    """The data folder has a state already."""
+    """The data folder already has a state."""
 
     code = "state-exists"
 
     def __init__(self, folder: Path, parts: Sequence[str]) -> None:
         super().__init__(
-            f"{folder} has a state already: {', '.join(parts)}",
-            hint="give another folder with --data-dir, or --existing set-aside to keep the old state beside the new",
+            f"{folder} already has a state: {', '.join(parts)}",
+            hint="use another folder with --data-dir, or move the old state aside with --existing set-aside",
         )
         self.folder = folder
         self.parts = tuple(parts)
@@ -82,7 +82,7 @@ class NoState(ConfigurationError):
     code = "state-missing"
 
     def __init__(self, folder: Path) -> None:
-        super().__init__(f"there is no agent's state in {folder}", hint="name its folder with --data-dir")
+        super().__init__(f"{folder} has no state of an agent", hint="give the data folder with --data-dir")
         self.folder = folder
 
 
@@ -92,7 +92,7 @@ class StateChanging(ConfigurationError):
     code = "state-changing"
 
     def __init__(self, path: Path) -> None:
-        super().__init__(f"the jobs of {path} change too quickly to be copied", hint="try again, or stop the agent")
+        super().__init__(f"the jobs of {path} change too fast to be copied", hint="try again, or stop the agent")
         self.path = path
 
 
@@ -142,9 +142,9 @@ def parts_in(folder: Path) -> tuple[str, ...]:
 
 def part_of(name: str) -> str | None:
     """The part of the state that a file belongs to, by its name in a backup: an account's folder, or the folder of its
-    transactions on one chain. None if it is no file of a state.
+    transactions on one chain. None if it is not a file of a state.
 
-    A part is restored as a whole. No accepted name leads out of the folder.
+    A part is restored as a whole. No accepted name can escape the folder.
     """
     found = _ACCOUNT_FILE.fullmatch(name) or _TRANSACTION.fullmatch(name)
     return found["part"] if found else None
@@ -156,7 +156,7 @@ def is_part(name: str) -> bool:
 
 
 def pin_name(address: str, cid: str, label: str) -> str:
-    """The name of a pin in a backup. (A tar header has no room for its file name of 111 letters.)"""
+    """The name of a pin in a backup. (Its file name of 111 letters does not fit into a tar header.)"""
     return f"{address}/{CONTENT}/{PINS}/{cid}/{label}"
 
 

@@ -80,8 +80,8 @@ async def restore(archive: Path, folder: Path, *, existing: ExistingState = Exis
             await asyncio.to_thread(check_ledger, ledger)
             jobs += (await read_ledger(ledger)).jobs.values()
         await asyncio.to_thread(_sync, staging)
-        there = _check_free(folder, parts, existing, locks=locks)
-        aside = _exchange(staging, folder, parts, there)
+        replaced = _check_free(folder, parts, existing, locks=locks)
+        aside = _exchange(staging, folder, parts, replaced)
     return RestoreReport(made=about.made, parts=parts, jobs=tuple(jobs), aside=aside)
 
 
@@ -93,7 +93,8 @@ def _scratch(folder: Path) -> Iterator[Path]:
         staging = Path(tempfile.mkdtemp(prefix=STAGING, dir=folder))
     except OSError as error:
         raise ConfigurationError(
-            f"can't restore to {folder}: {error.strerror}", hint="let this user write there, or give another --data-dir"
+            f"can't restore to {folder}: {error.strerror}",
+            hint="give this user write access, or use another --data-dir",
         ) from None
     try:
         yield staging
@@ -110,7 +111,9 @@ def _unpack(archive: Path, staging: Path) -> None:
         nonlocal left
         left -= size
         if left < 0:
-            raise ArchiveUnusable(archive, "it needs more space than the disk has", hint="free some space on that disk")
+            raise ArchiveUnusable(
+                archive, "it needs more space than the disk has free", hint="free some space on that disk"
+            )
         path = staging / path_of(name)
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         with raising_store_full(staging), path.open("xb") as file:
@@ -132,19 +135,19 @@ def _sync(staging: Path) -> None:
 def _check_free(
     folder: Path, parts: tuple[str, ...], existing: ExistingState, *, locks: ExitStack | None
 ) -> tuple[str, ...]:
-    """The parts that exist already; agents are locked out of them until `locks` is closed.
+    """The parts that already exist; agents can't open them until `locks` is closed.
 
     Raises `StateInUse`, and `StateExists` unless they should be set aside.
     """
-    there = tuple(part for part in parts if (folder / part).exists())
+    found = tuple(part for part in parts if (folder / part).exists())
     with ExitStack() as held:
-        for part in there:
+        for part in found:
             _lock(folder / part, held)
-        if there and existing is ExistingState.REFUSE:
-            raise StateExists(folder, there)
+        if found and existing is ExistingState.REFUSE:
+            raise StateExists(folder, found)
         if locks is not None:
             locks.enter_context(held.pop_all())
-    return there
+    return found
 
 
 def _lock(part: Path, held: ExitStack) -> None:
@@ -160,14 +163,14 @@ def _lock(part: Path, held: ExitStack) -> None:
             raise StateInUse(entry) from None
 
 
-def _exchange(staging: Path, folder: Path, parts: tuple[str, ...], there: tuple[str, ...]) -> Path | None:
-    """Move the old parts aside and the new ones into place. Transactions first, so that a ledger appears only when
-    everything else is there. Returns the folder of the old parts."""
-    aside = folder / f"{REPLACED}{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}" if there else None
+def _exchange(staging: Path, folder: Path, parts: tuple[str, ...], replaced: tuple[str, ...]) -> Path | None:
+    """Move the old parts aside and the new ones into place. Transactions go first, so that a ledger appears only after
+    everything else. Returns the folder of the old parts."""
+    aside = folder / f"{REPLACED}{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}" if replaced else None
     moved: list[tuple[Path, Path]] = []
     try:
         for part in sorted(parts, key=lambda part: not part.startswith(TRANSACTIONS)):
-            if aside is not None and part in there:
+            if aside is not None and part in replaced:
                 _move(folder / part, aside / part, moved)
             _move(staging / part, folder / part, moved)
     except BaseException:

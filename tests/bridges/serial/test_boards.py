@@ -24,7 +24,7 @@ def test_a_board_runs_from_the_command_line_until_quit() -> None:
     ) as process:
         output, _ = process.communicate("adc 0 2500\nunplug\nplug\nreset\nquit\n", timeout=SECONDS)
     assert process.returncode == 0
-    assert "use it with: aira edge /" in output
+    assert "connect it with: aira edge /" in output
 
 
 def test_a_line_that_is_no_command_is_reported_and_the_board_keeps_running() -> None:

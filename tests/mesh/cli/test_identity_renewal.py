@@ -42,7 +42,7 @@ def test_a_failed_renewal_does_not_prevent_the_others(tmp_path: Path, site: Path
     done = invoke("identity", "renew", tmp_path / "nobody", tmp_path / "arm", "--site", site, "--within", "30")
 
     assert done.returncode == 2
-    assert f"{tmp_path}/nobody/identity.pem: it can't be read" in done.stderr
+    assert f"{tmp_path}/nobody/identity.pem: can't read it" in done.stderr
     assert "89 days left" in done.stdout
 
 
@@ -60,7 +60,7 @@ def test_revoked_members_are_not_renewed_and_each_failure_is_printed(tmp_path: P
     done = invoke("identity", "renew", *folders, "--site", site, "--roster", roster, "--within", "30")
 
     assert done.returncode == 2
-    assert "nobody/identity.pem: it can't be read" in done.stderr
+    assert "nobody/identity.pem: can't read it" in done.stderr
     assert "member 'gone': it is revoked, so its certificate is not renewed" in done.stderr
     assert (tmp_path / "gone" / "identity.pem").read_bytes() == before
     assert "89 days left" in done.stdout

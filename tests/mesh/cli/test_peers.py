@@ -65,7 +65,7 @@ async def test_peers_are_listed_by_role_and_address(router: EmbeddedRouter, caps
             "role    address",
             f"agent   {ROBOT.address}",
             f"bridge  {STRANGER.address}",
-            f"2 on {MARKET}; on the IPFS side 3 nodes",
+            f"2 peers on {MARKET}; IPFS side: 3 nodes",
         ]
         await show_peers(settings, as_json=True)
         assert json.loads(capsys.readouterr().out) == {
@@ -85,7 +85,7 @@ async def test_of_several_bridges_the_one_that_carries_is_used(
     stands_by = msgspec.structs.replace(bridge_status(bridge=PERSON.address), ipfs_peers=NODES, carries=False)
     async with bridging(router, stands_by, carries) as settings:
         await show_peers(settings, as_json=False)
-    assert capsys.readouterr().out.endswith("on the IPFS side 1 node\n")
+    assert capsys.readouterr().out.endswith("IPFS side: 1 node\n")
 
 
 async def test_a_bridge_without_its_daemon_says_so(router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]) -> None:

@@ -82,7 +82,7 @@ async def test_a_revoked_member_is_disconnected_and_the_others_are_not(site: Sit
     thief = site.enlist(Member(name="thief", address=ANN, roles=("agent",)))
     screen = site.enlist(Member(name="screen", address="0x" + "03" * 20, roles=("watcher",)))
     key = "aira/agent/{}/device/arm/state"
-    with Serving(*AIRA, "router", *options(site), says="let in: 3 of the roster") as router:
+    with Serving(*AIRA, "router", *options(site), says="roster: 3 members admitted") as router:
         async with network(site, arm) as arms, network(site, thief) as thiefs, network(site, screen) as screens:
             heard: list[str] = []
             hear = screens.session.declare_subscriber("aira/agent/**", lambda one: heard.append(str(one.key_expr)))
@@ -94,7 +94,7 @@ async def test_a_revoked_member_is_disconnected_and_the_others_are_not(site: Sit
                 async with asyncio.timeout(SECONDS):
                     assert await change == NetworkChange.LOST
                     assert await anext(changes) == NetworkChange.REGAINED
-            await until(lambda: "let in: 2 of the roster" in router.log(), seconds=SECONDS)
+            await until(lambda: "roster: 2 members admitted" in router.log(), seconds=SECONDS)
 
             await until(lambda: thiefs.connected and arms.connected, seconds=SECONDS)
             heard.clear()
@@ -108,7 +108,7 @@ async def test_a_revoked_member_is_disconnected_and_the_others_are_not(site: Sit
 async def test_a_roster_that_becomes_invalid_changes_nothing(site: Site) -> None:
     arm = site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
     good = site.roster.read_text()
-    with Serving(*AIRA, "router", *options(site), says="let in: 1 of the roster") as router:
+    with Serving(*AIRA, "router", *options(site), says="roster: 1 member admitted") as router:
         async with network(site, arm) as arms, aclosing(arms.changes()) as changes:
             change = asyncio.ensure_future(anext(changes))
             site.roster.write_text("[[member]]\nname=")

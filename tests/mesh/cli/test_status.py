@@ -114,7 +114,7 @@ async def test_a_provider_reports_its_orders_and_earnings(place: Place, capsys: 
         shown = columns(capsys.readouterr().out)
     assert (found["role"], found["market"]["created"], found["market"]["openOrders"]) == ("provider", 1, 0)
     assert int(found["market"]["spent"]) > 0
-    assert shown["contracts"].startswith("1 made")
+    assert shown["contracts"].startswith("1 created")
     assert (shown["provider"], shown["listener"]) == (place.address("provider"), "alive")
 
 
@@ -129,7 +129,7 @@ async def test_each_peer_on_the_lighthouse_has_a_line(place: Place, capsys: pyte
         await until_found(all_there, what="three peers", seconds=30)
         await show_all(place.settings("watcher"), timeout=5.0, as_json=False)
     head, *rows = capsys.readouterr().out.splitlines()
-    assert head.split() == ["role", "address", "how", "it", "is"]
+    assert head.split() == ["role", "address", "status"]
     assert sorted(row.split()[0] for row in rows) == ["agent", "agent", "provider"]
     assert all("  alive, block " in row for row in rows)
 
@@ -189,7 +189,7 @@ def test_a_summary_begins_with_the_part_that_is_not_alive() -> None:
     assert summarize_status(msgspec.structs.replace(status(), market=MARKET_FACTS)) == (
         "alive, block 7, 7 open orders, 3 contracts"
     )
-    assert summarize_status(bridge_status()) == "alone, carries, 0 nodes on the IPFS side"
+    assert summarize_status(bridge_status()) == "alone, active, 0 nodes on the IPFS side"
 
 
 def test_control_characters_of_a_status_are_not_printed() -> None:

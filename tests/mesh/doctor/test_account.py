@@ -65,7 +65,7 @@ async def test_an_account_without_ether_is_reported_if_it_pays_gas(machine: Mach
     agent = await machine.examined("agent", "robot", **poor(machine))
 
     assert {"ether", "tokens", "allowance"} == set(person.failed)
-    assert "has 0 ETH: gas for no transaction" in person.one("ether").message
+    assert "has 0 ETH: not enough gas for a transaction" in person.one("ether").message
     assert "send it " in person.one("ether").hint
     assert agent.failed == []
     assert agent.one("ether").status is CheckStatus.WARN
@@ -88,10 +88,10 @@ async def test_a_missing_allowance_is_named_with_the_command_that_gives_it(machi
     finally:
         machine.town.ask("person", lambda chain: chain.tokens.approve(chain.factory, 1_000 * XRT))
 
-    assert person.one("allowance").message == "the factory may take 1,000 XRT"
+    assert person.one("allowance").message == "the factory may transfer 1,000 XRT"
     result = without.one("allowance")
     assert result.status is CheckStatus.WARN
-    assert "the factory may take no XRT from" in result.message
+    assert "the factory may not transfer XRT of" in result.message
     assert "`aira xrt approve factory AMOUNT`" in result.hint
 
 

@@ -62,7 +62,7 @@ async def test_an_unexpected_chain_is_reported_with_both_chain_ids(machine: Mach
     found = await machine.examined("agent", chain_id=1)
 
     cause = "; ".join(result.message for result in found["chain"])
-    assert cause.endswith(", and it should be 1")
+    assert cause.endswith(", not on 1")
     assert "chain" in found.failed
     assert "contracts" not in found
 
@@ -99,14 +99,14 @@ async def test_unregistered_names_are_reported(machine: Machine) -> None:
 async def test_an_address_that_is_no_lighthouse_of_the_factory_is_named(machine: Machine) -> None:
     found = await machine.examined("agent", "robot", lighthouse_contract=machine.town.deployment.xrt)
 
-    assert "is no lighthouse of this factory" in found.cause("lighthouse")
+    assert "is not a lighthouse of this factory" in found.cause("lighthouse")
 
 
 async def test_the_wrong_kind_of_contracts_fails(machine: Machine) -> None:
     found = await machine.examined("agent", contracts="original")
 
-    assert "not the original contracts, but this project's" in found.one("contracts").message
-    assert found.one("contracts").hint == "--contracts mesh"
+    assert "this project's contracts, not the originals" in found.one("contracts").message
+    assert found.one("contracts").hint == "give --contracts mesh"
 
 
 async def test_a_configured_websocket_must_answer(machine: Machine) -> None:
@@ -144,7 +144,7 @@ async def test_an_old_block_of_a_development_chain_says_nothing_about_the_clock(
         found = await machine.examined(None, web3_http_provider=old.url)
 
     assert found.one("node").ok
-    assert found.one("chain clock").message == "the newest block is 2 hours old, and says nothing about the clock"
+    assert found.one("chain clock").message == "the newest block is 2 hours old, too old to compare clocks"
 
 
 async def test_a_clock_behind_the_chain_s_is_named(machine: Machine, anvil: Anvil) -> None:
@@ -155,7 +155,7 @@ async def test_a_clock_behind_the_chain_s_is_named(machine: Machine, anvil: Anvi
 
     result = found.one("chain clock")
     assert not result.ok
-    assert "60 minutes behind the chain's" in result.message
+    assert "60 minutes behind the newest block" in result.message
     assert "set the clock" in result.hint
 
 

@@ -73,7 +73,7 @@ async def test_a_missing_package_is_named_with_the_extra_that_installs_it() -> N
     found = await made(failing("node", ModuleNotFoundError("no", name="web3.eth")))
 
     assert found["node"] == failed(
-        "this needs web3.eth, which is not installed here", hint="pip install 'aira-mesh[chain]'"
+        "the check needs web3.eth, which is not installed", hint="pip install 'aira-mesh[chain]'"
     )
 
 

@@ -26,7 +26,7 @@ def test_a_larger_difference_fails_with_its_size_and_direction(ahead: float, wor
 
 
 def test_a_block_from_the_future_means_a_clock_that_is_behind() -> None:
-    assert "2 days behind the chain's" in compare_chain_clock(NOW + 2 * 86_400, NOW).message
+    assert "2 days behind the newest block" in compare_chain_clock(NOW + 2 * 86_400, NOW).message
     assert not compare_chain_clock(NOW + 31, NOW).ok
     assert compare_chain_clock(NOW + 29, NOW).ok
 
@@ -34,7 +34,7 @@ def test_a_block_from_the_future_means_a_clock_that_is_behind() -> None:
 def test_an_old_block_is_no_evidence_about_the_clock() -> None:
     assert (
         compare_chain_clock(NOW - 7_200, NOW).message
-        == "the newest block is 2 hours old, and says nothing about the clock"
+        == "the newest block is 2 hours old, too old to compare clocks"
     )
 
 

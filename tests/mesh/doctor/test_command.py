@@ -74,7 +74,7 @@ def test_a_failure_prints_a_hint_and_the_skipped_checks_and_exits_with_1(tmp_pat
     assert (done.returncode, done.stderr) == (1, "")
     assert done.stdout.splitlines() == [
         f"FAIL  router        {endpoint}: no router listens there",
-        "                    -> start one there with `aira router`, or name another with --connect tcp/HOST:PORT",
+        "                    -> start one with `aira router`, or give another address with --connect tcp/HOST:PORT",
         "",
         "skipped because of an earlier failure: session, own write, denied write, router clock",
         "1 of 5 checks failed for the role operator: router",
@@ -159,7 +159,7 @@ def test_the_default_role_is_that_of_the_certificate(tmp_path: Path) -> None:
 
     assert done.returncode == 0, done.stdout
     assert "for the role operator" in done.stdout
-    assert "refused, as it should be: " in done.stdout
+    assert "denied as expected: " in done.stdout
 
 
 def shown(*roles: str) -> CertificateInfo:
@@ -212,12 +212,12 @@ def test_an_edge_machine_is_checked_without_the_packages_of_other_roles(tmp_path
     assert done.stderr == ""
     assert [name for name, each in found.items() if not each["ok"]] == ["serial port"]
     assert found["certificate"]["found"].startswith(f"lamp, edge, {ARM}: valid")
-    assert found["denied write"]["found"] == "refused, as it should be: a write in the jobs of its agent"
+    assert found["denied write"]["found"] == "denied as expected: a write to its agent's jobs"
 
 
 def test_a_missing_package_is_reported() -> None:
     done = run(sys.executable, "-c", SMALL, "doctor", "--json", "--role", "agent")
 
     (node,) = [each for each in objects(done) if each["name"] == "node"]
-    assert "which is not installed here" in node["found"]
+    assert "which is not installed" in node["found"]
     assert "pip install 'aira-mesh[chain" in node["do"]

@@ -32,14 +32,14 @@ def test_a_writable_folder_passes_and_is_left_empty(tmp_path: Path) -> None:
     result = check_data_folder(tmp_path, slow=60)
 
     assert result.status is CheckStatus.OK
-    assert result.message.startswith(f"{tmp_path} is written and synced in ")
+    assert result.message.startswith(f"{tmp_path} is writable ")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_for_a_missing_folder_its_nearest_parent_is_checked(tmp_path: Path) -> None:
     result = check_data_folder(tmp_path / "a" / "b", slow=60)
 
-    assert result.message == f"{tmp_path / 'a' / 'b'} will be created at the start; {tmp_path} is writable"
+    assert result.message == f"{tmp_path / 'a' / 'b'} will be created on start; {tmp_path} is writable"
     assert not (tmp_path / "a").exists()
 
 
@@ -52,7 +52,7 @@ def test_a_folder_of_another_user_is_reported_with_both_users_and_a_hint(tmp_pat
 
     status, found, do = done.stdout.splitlines()
     assert status == "CheckStatus.FAIL", done.stderr
-    assert f"{tmp_path} can't be written: Permission denied; it belongs to " in found
+    assert f"{tmp_path} is not writable: Permission denied; it belongs to " in found
     assert do.startswith("sudo chown -R ")
     assert "--data-dir" in do
 
@@ -66,9 +66,9 @@ def test_the_hint_never_changes_the_owner_of_a_parent_folder(tmp_path: Path) -> 
         tmp_path.chmod(mode)
         done = run(sys.executable, "-c", AS_NOBODY.format(look="check_data_folder(folder)"), folder)
         _, found, do = done.stdout.splitlines()
-        assert f"{tmp_path} can't be written: Permission denied" in found
+        assert f"{tmp_path} is not writable: Permission denied" in found
         assert do.startswith("sudo install -d -o ")
-        assert do.endswith(f" {folder}, or give another folder with --data-dir")
+        assert do.endswith(f" {folder}, or use another folder with --data-dir")
 
 
 def test_files_that_this_user_can_not_read_are_not_counted(tmp_path: Path) -> None:
@@ -92,8 +92,8 @@ async def test_a_data_dir_that_is_a_file_is_named(tmp_path: Path) -> None:
         found = await examined(DoctorContext(settings=settings, requested_role="bridge"))
 
     assert "data folder" in found.failed
-    assert found.one("data folder").message.endswith("can't be written: Not a directory")
-    assert found.one("data folder").hint == "give another folder with --data-dir"
+    assert found.one("data folder").message.endswith("is not writable: Not a directory")
+    assert found.one("data folder").hint == "use another folder with --data-dir"
     assert "disk space" not in found
 
 
@@ -120,7 +120,7 @@ def test_a_content_limit_beyond_the_disk_is_a_warning(tmp_path: Path) -> None:
     result = check_disk_space(tmp_path, content_limit=1024**5)
 
     assert result.status is CheckStatus.WARN
-    assert "3.0 GiB kept of at most 1,048,576.0 GiB" in result.message
+    assert "content uses 3.0 GiB of at most 1,048,576.0 GiB" in result.message
     assert "--content-limit" in result.hint
 
 

@@ -31,9 +31,9 @@ async def test_a_member_of_a_site_is_admitted_and_denied_forbidden_writes(site: 
     assert found.failed == []
     assert list(found) == ["certificate", "router", "session", "own write", "denied write", "router clock"]
     assert "arm-1, agent" in found.one("certificate").message
-    assert "takes our certificate and shows that of router" in found.one("router").message
-    assert found.one("own write").message.startswith("heard back through the router in ")
-    assert found.one("denied write").message == f"refused, as it should be: a write in the market {MARKET}"
+    assert "accepts our certificate and presents that of router" in found.one("router").message
+    assert found.one("own write").message.startswith("received through the router after ")
+    assert found.one("denied write").message == f"denied as expected: a write to the market {MARKET}"
     assert "from the router's clock" in found.one("router clock").message
 
 
@@ -44,8 +44,8 @@ async def test_every_role_passes_with_its_rights(site: Site, role: Role) -> None
         found = await examined(context_of_member(site, folder))
 
     assert found.failed == []
-    assert found.one("denied write").message.startswith("refused, as it should be: ")
-    assert ("the space of another" in found.one("denied write").message) is (role in ("operator", "watcher"))
+    assert found.one("denied write").message.startswith("denied as expected: ")
+    assert ("another agent's keys" in found.one("denied write").message) is (role in ("operator", "watcher"))
 
 
 async def test_an_edge_agent_is_checked_with_the_device_that_it_serves(site: Site) -> None:
@@ -56,7 +56,7 @@ async def test_an_edge_agent_is_checked_with_the_device_that_it_serves(site: Sit
         unnamed = await examined(DoctorContext(settings=settings, requested_role="edge"))
 
     assert named.failed == []
-    assert named.one("denied write").message == "refused, as it should be: a write in the jobs of its agent"
+    assert named.one("denied write").message == "denied as expected: a write to its agent's jobs"
     assert "own write" in unnamed.failed
 
 
@@ -66,7 +66,7 @@ async def test_an_edge_agent_s_own_device_need_not_be_named(site: Site) -> None:
         found = await examined(DoctorContext(settings=settings_of(site.client(folder))))
 
     assert found.failed == ["serial port"]
-    assert found.one("denied write").message == "refused, as it should be: a write in the jobs of its agent"
+    assert found.one("denied write").message == "denied as expected: a write to its agent's jobs"
 
 
 async def test_an_expired_certificate_is_named_and_the_router_is_not_blamed(site: Site) -> None:
@@ -113,7 +113,7 @@ async def test_a_market_that_the_site_does_not_carry_is_named(site: Site) -> Non
         found = await examined(context_of_member(site, arm, lighthouse_contract="other.lighthouse.3.robonomics.eth"))
 
     cause = found.cause("denied write")
-    assert "does not let this identity hear the market other.lighthouse.3.robonomics.eth" in cause
+    assert "does not let this identity read the market other.lighthouse.3.robonomics.eth" in cause
     assert "lighthouses" in cause
 
 

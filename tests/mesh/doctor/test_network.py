@@ -37,7 +37,7 @@ async def test_an_open_router_on_loopback_passes(router: EmbeddedRouter) -> None
 
     assert found.failed == []
     assert found.one("denied write").status is CheckStatus.OK
-    assert "open: everybody may write everything" in found.one("denied write").message
+    assert "open: every client may write everything" in found.one("denied write").message
 
 
 async def test_zenohd_passes(zenohd: Zenohd) -> None:
@@ -70,7 +70,7 @@ async def test_an_unknown_host_name_is_reported() -> None:
         DoctorContext(settings=Settings(connect=("tcp/no-such-host.invalid:7447",)), requested_role="operator")
     )
 
-    assert "the name no-such-host.invalid is not known here" in found.cause("router")
+    assert "can't resolve the name no-such-host.invalid" in found.cause("router")
 
 
 @pytest.fixture
@@ -102,7 +102,7 @@ async def test_the_router_of_a_foreign_site_is_named(site: Site, tmp_path: Path,
 
     cause = found.cause("router")
     assert "its certificate is not trusted" in cause
-    assert f"is this router of the site of {ours.ca}?" in cause
+    assert f"check that {ours.ca} is of this router's site" in cause
 
 
 def open_router(site: Site, kind: str) -> AbstractContextManager[object]:
@@ -121,7 +121,7 @@ async def test_a_router_that_forwards_denied_writes_fails(site: Site, kind: str)
         found = await examined(context_of_member(site, arm))
 
     cause = found.cause("denied write")
-    assert "the router lets anybody write anything" in cause
+    assert "the router allows any write" in cause
     assert "--roster FILE" in cause
 
 
@@ -140,8 +140,8 @@ async def test_each_router_of_a_site_is_checked_and_an_open_one_is_named(site: S
     with site.open_router("wheel"):
         found = await examined(DoctorContext(settings=settings, requested_role="operator"))
 
-    assert found.cause("denied write").startswith(f"{leaky}: the router lets anybody write anything")
-    assert found["denied write"][0].message.startswith(f"{site.endpoint}: refused, as it should be")
+    assert found.cause("denied write").startswith(f"{leaky}: the router allows any write")
+    assert found["denied write"][0].message.startswith(f"{site.endpoint}: denied as expected")
 
 
 async def test_a_router_open_to_other_machines_is_a_failure() -> None:
@@ -151,7 +151,7 @@ async def test_a_router_open_to_other_machines_is_a_failure() -> None:
         found = await examined(DoctorContext(settings=Settings(connect=(endpoint,)), requested_role="operator"))
 
     cause = found.cause("denied write")
-    assert "open to everybody who reaches it" in cause
+    assert "open to every client that can reach it" in cause
     assert "aira identity site" in cause
 
 

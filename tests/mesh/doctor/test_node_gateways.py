@@ -77,4 +77,4 @@ async def test_a_clock_ahead_is_not_reported_as_a_stalled_node(machine: Machine)
     with gateway(machine.town.url, behind=HOUR) as url:
         found = await machine.examined("agent", "robot", web3_http_provider=url)
 
-    assert "60 minutes ahead of that of the node's machine" in found.cause("node clock")
+    assert "60 minutes ahead of the clock of the node's machine" in found.cause("node clock")

@@ -41,7 +41,7 @@ async def test_a_router_on_every_address_passes(site: Site, hosts: tuple[str, ..
         session.close()  # type: ignore[no-untyped-call]
 
     assert found.failed == [], dict(found)
-    assert "takes our certificate and shows that of everywhere" in found.one("router").message
+    assert "accepts our certificate and presents that of everywhere" in found.one("router").message
 
 
 async def test_a_router_of_a_foreign_site_on_every_address_is_named(site: Site, tmp_path: Path) -> None:

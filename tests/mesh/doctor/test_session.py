@@ -73,5 +73,5 @@ async def test_denied_writes_are_not_checked_if_allowed_ones_do_not_arrive(
     router: EmbeddedRouter,
 ) -> None:
     async with pair(router.endpoint, router.endpoint) as both:
-        with pytest.raises(RemoteError, match="did not come back"):
+        with pytest.raises(RemoteError, match="no allowed write arrived"):
             await both.delivered(("aira/test/foreign",), own="aira/test/own", barrier="aira/test/unheard")

@@ -75,9 +75,9 @@ def test_an_edge_agent_serves_its_own_device_unless_another_is_named() -> None:
         (member(roles='["edge"]', device='"a/**"'), "the roster it, member 'arm': 'a/**' is not"),
         (member(roles='["edge"]', device='"*"'), "the roster it, member 'arm': '*' is not"),
         (member(name='"a\\nb"'), "the roster it, member 1, name: "),
-        (member() + member(name='"two"'), f"the roster it: the address '{ARM}' is there twice"),
-        (member() + member(name='"two"', address=f'"{CHECKSUMMED}"'), f"the address '{ARM}' is there twice"),
-        (member() + member(address=f'"{OTHER}"'), "the roster it: the name 'arm' is there twice"),
+        (member() + member(name='"two"'), f"the roster it: the address '{ARM}' occurs twice"),
+        (member() + member(name='"two"', address=f'"{CHECKSUMMED}"'), f"the address '{ARM}' occurs twice"),
+        (member() + member(address=f'"{OTHER}"'), "the roster it: the name 'arm' occurs twice"),
     ],
 )
 def test_errors_name_the_place_in_the_roster(text: str, said: str) -> None:
@@ -121,7 +121,7 @@ def test_adding_a_member_keeps_the_rest_of_the_file(tmp_path: Path) -> None:
     assert file.read_text().startswith("# ours\n[[member]]\n")
     assert [(one.name, one.fingerprint) for one in read_roster(file).member] == [("arm", "cd" * 32), ("two", "")]
     assert [path.name for path in file.parent.iterdir()] == ["roster.toml"]
-    with pytest.raises(RosterError, match="member 'arm': it has another certificate than the one"):
+    with pytest.raises(RosterError, match="member 'arm': its certificate has another fingerprint"):
         with_fingerprint(file, ARM, old="ab" * 32, new="ef" * 32)
 
 

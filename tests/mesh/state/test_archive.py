@@ -70,7 +70,7 @@ async def test_an_unexpected_file_name_is_refused(archive: Path, tmp_path: Path,
         members.insert(2, (header, b"evil"))
 
     said = await refused(forge(archive, tmp_path / "forged", change), tmp_path)
-    assert "which is no part of a state" in said
+    assert "which is not part of a state" in said
     assert "\n" not in said
 
 
@@ -81,7 +81,7 @@ async def test_only_plain_files_are_accepted(archive: Path, tmp_path: Path, kind
         header.type, header.linkname = kind, "/etc/passwd"
         members.insert(2, (header, b""))
 
-    assert "no plain file" in await refused(forge(archive, tmp_path / "forged", change), tmp_path)
+    assert "is not a regular file" in await refused(forge(archive, tmp_path / "forged", change), tmp_path)
 
 
 @pytest.mark.parametrize("kind", [tarfile.GNUTYPE_LONGNAME, tarfile.XHDTYPE])
@@ -94,7 +94,7 @@ async def test_a_huge_header_does_not_allocate_memory(archive: Path, tmp_path: P
     forged = forge(archive, tmp_path / "forged", change)
     tracemalloc.start()
     try:
-        assert "no plain file" in await refused(forged, tmp_path)
+        assert "is not a regular file" in await refused(forged, tmp_path)
         assert tracemalloc.get_traced_memory()[1] < 16 << 20
     finally:
         tracemalloc.stop()
@@ -102,7 +102,7 @@ async def test_a_huge_header_does_not_allocate_memory(archive: Path, tmp_path: P
 
 async def test_a_duplicate_file_is_refused(archive: Path, tmp_path: Path) -> None:
     forged = forge(archive, tmp_path / "forged", lambda members: members.insert(2, members[1]))
-    assert "no part of a state" in await refused(forged, tmp_path)
+    assert "not part of a state" in await refused(forged, tmp_path)
 
 
 async def test_a_file_larger_than_the_free_space_is_refused_at_its_header(
@@ -127,7 +127,7 @@ async def test_more_files_than_checksums_can_list_are_refused_early(
 
     forged = forge(archive, tmp_path / "forged", change)
     monkeypatch.setattr(archives, "LARGEST_TEXT", 10_000)
-    assert "more files than its checksums could list" in await refused(forged, tmp_path)
+    assert "more files than its checksums can list" in await refused(forged, tmp_path)
 
 
 async def test_a_backup_with_too_many_files_to_restore_is_not_made(
@@ -181,7 +181,7 @@ async def test_a_changed_file_is_detected_by_its_checksum(archive: Path, tmp_pat
         members[2] = (header, data.replace(b"so far", b"sO far"))
 
     said = await refused(forge(archive, tmp_path / "forged", change), tmp_path)
-    assert said.endswith(".mcap.part is not as it was written")
+    assert said.endswith(".mcap.part does not match")
 
 
 @pytest.mark.parametrize("place", [1, 2, -2])
@@ -189,7 +189,7 @@ async def test_a_missing_file_is_detected(archive: Path, tmp_path: Path, place: 
     def change(members: Members) -> None:
         del members[place]
 
-    assert "is not as it was written" in await refused(forge(archive, tmp_path / "forged", change), tmp_path)
+    assert "does not match" in await refused(forge(archive, tmp_path / "forged", change), tmp_path)
 
 
 def cut(archive: Path, cut: Path, part: float) -> Path:
@@ -240,7 +240,7 @@ async def test_parts_outside_the_folder_are_refused(archive: Path, tmp_path: Pat
 
 async def test_data_after_the_end_is_refused(archive: Path, tmp_path: Path) -> None:
     (tmp_path / "longer").write_bytes(zstandard.compress(unpacked(archive) + b"more"))
-    assert "something follows its end" in await refused(tmp_path / "longer", tmp_path)
+    assert "data after its end" in await refused(tmp_path / "longer", tmp_path)
 
 
 @pytest.mark.parametrize("data", [b"", b"{}", zstandard.compress(b""), zstandard.compress(bytes(2048))])
@@ -254,4 +254,4 @@ async def test_another_tar_is_no_backup(tmp_path: Path) -> None:
     with tarfile.open(fileobj=plain, mode="w", format=tarfile.USTAR_FORMAT) as tar:
         tar.addfile(tarfile.TarInfo("readme"))
     (tmp_path / "other").write_bytes(zstandard.compress(plain.getvalue()))
-    assert "no backup of a state" in await refused(tmp_path / "other", tmp_path)
+    assert "not a backup of a state" in await refused(tmp_path / "other", tmp_path)
