@@ -18,7 +18,7 @@ def command() -> None:
     """Run firmware on a simulated Arduino Uno."""
 
 
-@command.command("run")
+@command.command("run", short_help="run a firmware and show its pins")
 @click.argument("firmware", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @click.option("--reset-on-open", is_flag=True, help="opening the port resets the board, as on a real Uno")
 def run(firmware: Path, reset_on_open: bool) -> None:

@@ -60,7 +60,7 @@ def answering(answer: bytes) -> Iterator[str]:
 
 def test_a_healthy_router_ends_with_exit_code_0(listen: str) -> None:
     with Serving(
-        *AIRA, "router", "--listen", f"tcp/127.0.0.1:{free_port()}", "--metrics-listen", listen, says="without a roster"
+        *AIRA, "router", "--listen", f"tcp/127.0.0.1:{free_port()}", "--metrics-listen", listen, says="no roster: "
     ):
         done = invoke("health", "--url", f"http://{listen}")
         assert (done.returncode, done.stdout) == (0, "router  alive\n")

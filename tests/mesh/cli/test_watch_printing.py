@@ -72,7 +72,9 @@ def test_a_rejection_is_printed_as_json() -> None:
 def test_counters_are_printed_as_a_sentence() -> None:
     counters = MarketCounters(received=1_234, refused={"signature": 2, "event": 1}, duplicate=3, lost=0)
     assert format_counters(counters) == "1,234 messages received, 3 duplicate, 3 invalid (1 event, 2 signature)"
-    assert format_counters(msgspec.structs.replace(counters, lost=9)).endswith("), 9 lost because this reader was too slow")
+    assert format_counters(msgspec.structs.replace(counters, lost=9)).endswith(
+        "), 9 lost because this reader was too slow"
+    )
 
 
 def test_the_line_of_a_reading_is_short_and_has_no_control_characters() -> None:

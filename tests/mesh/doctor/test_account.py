@@ -119,7 +119,7 @@ async def test_the_turn_of_another_provider_is_reported(router: EmbeddedRouter, 
     found = await examined(DoctorContext(settings=settings, requested_role="provider"))
 
     assert found.failed == []
-    assert found.one("turn").message.startswith(f"{first.address}'s (1 of 2)")
+    assert found.one("turn").message.startswith(f"{first.address} (1 of 2)")
     assert found.one("turn").message.endswith("this account waits for its turn")
 
 

@@ -24,7 +24,7 @@ async def test_an_agent_with_an_account_passes(machine: Machine) -> None:
     assert found.failed == []
     assert {result.status for results in found.values() for result in results} == {CheckStatus.OK}
     assert f"{machine.town.url} answers: chain " in found.one("node").message
-    assert found.one("contracts").message.startswith("this project's: factory ")
+    assert found.one("contracts").message.startswith("contracts of this project: factory ")
     assert found.one("lighthouse").message.endswith("with 1 provider")
     assert machine.town.people["robot"].address in found.one("keyfile").message
     assert "1,000 XRT" in found.one("tokens").message
@@ -34,7 +34,7 @@ async def test_a_provider_with_a_stake_passes_and_sees_the_turn(machine: Machine
     found = await machine.examined("provider", "provider")
 
     assert found.failed == []
-    assert "100 XRT at airalab.lighthouse.3.robonomics.eth: 100 transactions a turn" in found.one("stake").message
+    assert "100 XRT at airalab.lighthouse.3.robonomics.eth: 100 transactions per turn" in found.one("stake").message
     assert found.one("turn").message.startswith("its own, ")
 
 

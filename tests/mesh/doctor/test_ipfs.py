@@ -35,7 +35,7 @@ async def test_a_daemon_with_pubsub_passes(js_ipfs: JsIpfs) -> None:
     found = await found_at(js_ipfs.api)
 
     assert found.failed == []
-    assert found.one("ipfs daemon").message == f"js-ipfs 0.18.1 at {js_ipfs.api}, speaks the multibase dialect"
+    assert found.one("ipfs daemon").message == f"js-ipfs 0.18.1 at {js_ipfs.api}, with the multibase API"
     assert found.one("ipfs pubsub").message.startswith("enabled; ")
 
 

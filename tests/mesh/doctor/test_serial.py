@@ -107,7 +107,7 @@ def test_an_answering_board_is_reported_with_its_protocol() -> None:
         result = check.check_board(SerialSettings(port=str(there.port)))
 
     assert result.ok, result
-    assert "speaks frames" in result.message
+    assert "answered in frames" in result.message
 
 
 def test_a_rosserial_board_answers_in_rosserial_only() -> None:
@@ -116,5 +116,5 @@ def test_a_rosserial_board_answers_in_rosserial_only() -> None:
         as_frames = check.check_board(SerialSettings(port=str(there.port)))
 
     assert as_rosserial.ok, as_rosserial
-    assert "speaks rosserial" in as_rosserial.message
+    assert "answered in rosserial" in as_rosserial.message
     assert not as_frames.ok

@@ -69,7 +69,7 @@ async def test_a_running_job_is_paid_while_one_member_is_revoked_and_another_ren
         folders["robot"].renew(site=site.authority, days=1)
         revoked = site.roster.read_text().replace('name = "thief"', 'name = "thief"\nrevoked = true')
         site.roster.write_text(revoked)
-        await until(lambda: "let in: 3 of the roster" in gateway.log(), what="the new rules", seconds=PATIENCE)
+        await until(lambda: "roster: 3 members admitted" in gateway.log(), what="the new rules", seconds=PATIENCE)
         may_work.set()
 
         assert (await order.outcome()).success
