@@ -12,7 +12,6 @@ from msgspec import Struct
 from mesh.content import ContentUnavailable
 from mesh.work.objectives import ObjectiveUnfit
 from schemas import Empty, cid_of_bytes, cid_of_file
-from tests.support.log_events import logged_facts
 from tests.support.market import Place, offering
 from tests.support.objectives import objective
 from tests.support.waiting import until
@@ -25,9 +24,10 @@ if TYPE_CHECKING:
 MISSING = cid_of_bytes(b"nobody has this objective")
 
 
-def refused_offers(caplog: pytest.LogCaptureFixture) -> list[dict[str, str]]:
-    """The times that the robot's handler refused to offer because the objective is unfit."""
-    return [facts for facts in logged_facts(caplog, "handler-failed") if facts["code"] == "objective-unfit"]
+def refused_offers(caplog: pytest.LogCaptureFixture) -> list[ObjectiveUnfit]:
+    """The errors with which the robot's handler refused to offer because the objective is unfit."""
+    failures = [vars(record) for record in caplog.records if vars(record).get("event") == "handler-failed"]
+    return [error for record in failures for error in record["args"] if isinstance(error, ObjectiveUnfit)]
 
 
 class Speed(Struct):
@@ -54,8 +54,8 @@ async def test_no_offer_is_made_for_an_objective_that_can_not_be_played(
     async with place.at_work(robot) as person:
         unfit = asyncio.create_task(person.demand(place.save(objective(("/fly", Empty())), "unfit.mcap")))
         await until(lambda: refused_offers(caplog), seconds=30)
-        assert "(unknown-topic)" in caplog.text
-        assert "/fly" in caplog.text
+        assert {error.reason for error in refused_offers(caplog)} == {"unknown-topic"}
+        assert "/fly" in str(refused_offers(caplog)[0])
         fit = await person.demand(place.save(objective(("/go", Empty()))))
         assert (await fit.outcome()).success
         assert not unfit.done()
@@ -77,8 +77,8 @@ async def test_no_offer_is_made_for_a_message_that_its_handler_can_not_take(
         said = objective(("/go", Speed(1.0)), ("/go", {"metres_per_second": "fast"}))
         unfit = asyncio.create_task(person.demand(place.save(said, "unfit.mcap")))
         await until(lambda: refused_offers(caplog), seconds=30)
-        assert "(unfit-message)" in caplog.text
-        assert "not a Speed" in caplog.text
+        assert {error.reason for error in refused_offers(caplog)} == {"unfit-message"}
+        assert "not a Speed" in str(refused_offers(caplog)[0])
         fit = await person.demand(place.save(objective(("/go", Speed(2.0)))))
         assert (await fit.outcome()).success
         assert speeds == [Speed(2.0)]

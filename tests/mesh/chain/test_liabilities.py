@@ -69,15 +69,15 @@ async def test_a_signature_for_another_liability_is_refused(market: DeployedMark
 
 
 async def test_only_liabilities_can_be_cancelled_and_watched(market: DeployedMarket) -> None:
-    nobody = Account.from_key(new_private_key()).address
-    signature = _signed(market.promisee, nobody)
+    unused = Account.from_key(new_private_key()).address
+    signature = _signed(market.promisee, unused)
     async with market.chain(market.stranger) as chain:
-        with raises_with(NotALiability, address=nobody):
-            await chain.liabilities.cancel(nobody, promisee_signature=signature, promisor_signature=signature)
-        with raises_with(NotALiability, address=nobody):
-            await chain.liabilities.watch(nobody)
-        with raises_with(NotALiability, address=nobody):
-            await chain.liabilities.refund_state(nobody)
+        with raises_with(NotALiability, address=unused):
+            await chain.liabilities.cancel(unused, promisee_signature=signature, promisor_signature=signature)
+        with raises_with(NotALiability, address=unused):
+            await chain.liabilities.watch(unused)
+        with raises_with(NotALiability, address=unused):
+            await chain.liabilities.refund_state(unused)
 
 
 @pytest.mark.parametrize("generation", [3, 5])

@@ -24,7 +24,7 @@ from tests.support.ports import answers, free_port
 if TYPE_CHECKING:
     from pathlib import Path
 
-NOBODY = "0x00000000000000000000000000000000000000AA"
+NEW_ACCOUNT = "0x00000000000000000000000000000000000000AA"
 
 
 @pytest.fixture
@@ -139,13 +139,13 @@ async def test_a_kept_state_has_the_market_and_its_history(program: Path, tmp_pa
         settings, host="127.0.0.1", port=port, block_time=None, anvil=program, state=state
     ) as served:
         async with served.market.chain(served.url, "person") as chain:
-            await chain.tokens.transfer(NOBODY, 7 * XRT)
+            await chain.tokens.transfer(NEW_ACCOUNT, 7 * XRT)
             head = await chain.node.latest_header()
         first = served
     async with serve_chain(settings, host="127.0.0.1", port=port, block_time=None, anvil=program, state=state) as again:
         assert again.facts() == first.facts()
         async with Chain(again.url) as chain:
-            assert await chain.tokens.balance(NOBODY) == 7 * XRT
+            assert await chain.tokens.balance(NEW_ACCOUNT) == 7 * XRT
             assert await chain.tokens.balance(again.market.accounts["person"].address) == ALLOWANCE - 7 * XRT
             assert await chain.node.header(head.number) == head
             assert list((await chain.lighthouses.get("airalab")).stakes) == [again.market.accounts["provider"].address]
@@ -157,7 +157,7 @@ async def test_a_kept_chain_without_a_market_is_an_error(program: Path, tmp_path
         serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=state) as node,
         Node(node.url) as client,
     ):
-        await TransactionSender(client, Account.from_key(node.funded_keys[0])).send(to=NOBODY, data=b"", value=1)
+        await TransactionSender(client, Account.from_key(node.funded_keys[0])).send(to=NEW_ACCOUNT, data=b"", value=1)
     with pytest.raises(MarketMissing) as caught:
         async with serve_chain(
             Settings(data_dir=str(tmp_path)), host="127.0.0.1", port=0, block_time=None, anvil=program, state=state

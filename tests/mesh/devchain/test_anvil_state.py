@@ -19,7 +19,7 @@ from tests.support.waiting import until
 if TYPE_CHECKING:
     from pathlib import Path
 
-NOBODY = "0x00000000000000000000000000000000000000AA"
+NEW_ACCOUNT = "0x00000000000000000000000000000000000000AA"
 
 
 async def test_a_damaged_state_is_replaced_by_the_last_whole_copy(
@@ -30,9 +30,9 @@ async def test_a_damaged_state_is_replaced_by_the_last_whole_copy(
         serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=state) as node,
         Node(node.url) as client,
     ):
-        await TransactionSender(client, Account.from_key(node.funded_keys[0])).send(to=NOBODY, data=b"", value=7)
+        await TransactionSender(client, Account.from_key(node.funded_keys[0])).send(to=NEW_ACCOUNT, data=b"", value=7)
         await until(
-            lambda: state_copy(state).exists() and NOBODY[2:].lower() in state_copy(state).read_text().lower(),
+            lambda: state_copy(state).exists() and NEW_ACCOUNT[2:].lower() in state_copy(state).read_text().lower(),
             what="a copy with the payment in it",
             seconds=30,
         )
@@ -42,7 +42,7 @@ async def test_a_damaged_state_is_replaced_by_the_last_whole_copy(
         serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=state) as node,
         Node(node.url) as client,
     ):
-        assert await client.eth_balance(NOBODY) == 7
+        assert await client.eth_balance(NEW_ACCOUNT) == 7
     assert "chain-state-restored" in logged_events(caplog)
 
 
@@ -55,7 +55,7 @@ async def test_a_chain_that_was_killed_while_deploying_is_discarded(
         serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=state) as node,
         Node(node.url) as client,
     ):
-        await TransactionSender(client, Account.from_key(node.funded_keys[0])).send(to=NOBODY, data=b"", value=7)
+        await TransactionSender(client, Account.from_key(node.funded_keys[0])).send(to=NEW_ACCOUNT, data=b"", value=7)
         with pytest.raises(RuntimeError, match="killed"), deploying(state):
             raise RuntimeError("killed")
     async with serve_chain(settings, host="127.0.0.1", port=0, block_time=None, anvil=program, state=state) as chain:
