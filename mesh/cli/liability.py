@@ -41,7 +41,7 @@ command = LazyGroup(
 
 @command.command("list", short_help="list the liabilities of an account, or all")
 @click.option("--account", help="address or ENS name of a promisee or promisor [the settings' account]")
-@click.option("--all", "everybody", is_flag=True, help="list the liabilities of all accounts")
+@click.option("--all", "all_accounts", is_flag=True, help="list the liabilities of all accounts")
 @click.option(
     "--state",
     type=click.Choice(["any", "open", "finalized"]),
@@ -68,11 +68,13 @@ def list_liabilities(settings: Settings, **what: Any) -> None:
 
 
 async def _list(
-    settings: Settings, *, account: str | None, everybody: bool, state: str, from_block: int, as_json: bool
+    settings: Settings, *, account: str | None, all_accounts: bool, state: str, from_block: int, as_json: bool
 ) -> None:
     own = await asyncio.to_thread(own_address, settings)
     async with open_chain(settings) as chain:
-        whose = None if everybody or (account is None and own is None) else await account_of(chain, settings, account)
+        whose = (
+            None if all_accounts or (account is None and own is None) else await account_of(chain, settings, account)
+        )
         found = await _liabilities_of(chain, whose, from_block)
         if state != "any":
             found = [liability for liability in found if liability.is_finalized == (state == "finalized")]

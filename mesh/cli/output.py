@@ -153,7 +153,7 @@ def progress(label: str) -> Iterator[Callable[[int, int | None], None]]:
 
 
 async def wait_for_broken_pipe() -> None:
-    """Raise `BrokenPipeError`, which ends the program quietly, when stdout is a pipe that nobody reads any more.
+    """Raise `BrokenPipeError`, which ends the program quietly, when stdout is a pipe whose reader has closed it.
 
     A command that waits for events runs this beside its work; otherwise it would notice only when it prints. Returns at
     once if stdout is not a file of the system.

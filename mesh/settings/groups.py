@@ -59,7 +59,9 @@ class NetworkSettings:
     tls_ca: str = option(
         "", "the site's CA certificate (PEM); routers and clients on tls/ endpoints are checked with it"
     )
-    tls_certificate: str = option("", "this client's certificate for tls/ endpoints (PEM), made by `aira identity new`")
+    tls_certificate: str = option(
+        "", "this client's certificate for tls/ endpoints (PEM), created by `aira identity new`"
+    )
     tls_key: str = option("", "the key of tls_certificate (PEM)")
 
 
@@ -98,7 +100,7 @@ class ChainSettings(StorageSettings):
     """Which chain is used, and how."""
 
     web3_http_provider: str = option(
-        "http://127.0.0.1:8545", "JSON-RPC of the EVM node; several nodes of one chain (http or ws) are split by commas"
+        "http://127.0.0.1:8545", "JSON-RPC of the EVM node; separate several nodes of one chain (http or ws) by commas"
     )
     web3_ws_provider: str = option(
         "ws://127.0.0.1:8546", "JSON-RPC of the EVM node over WebSocket; used when web3_http_provider is empty"
@@ -121,7 +123,7 @@ class ChainSettings(StorageSettings):
 
     @property
     def node(self) -> str:
-        """The node's URL, or several split by commas. Raises `NodeNotSet`."""
+        """The node's URL, or several separated by commas. Raises `NodeNotSet`."""
         found = self.web3_http_provider.strip() or self.web3_ws_provider.strip()
         if not found:
             raise NodeNotSet(
@@ -162,7 +164,8 @@ class ContentSettings:
     """Limits for files behind CIDs."""
 
     content_limit: PositiveInt = option(
-        10 * 1024**3, "most bytes of content to keep; beyond that the least recently used go, never those of open jobs"
+        10 * 1024**3,
+        "most bytes of content to keep; the least recently used files are evicted first, never those of open jobs",
     )
     objective_size_limit: PositiveInt = option(256 * 1024 * 1024, "largest objective to fetch, bytes")
     objective_expanded_limit: PositiveInt = option(1024 * 1024 * 1024, "largest objective once decompressed, bytes")
@@ -173,8 +176,8 @@ class ContentSettings:
 class ExecutionSettings(ContentSettings):
     """How jobs are done."""
 
-    enable_executor: bool = option(True, "do the jobs; false only listens")
-    recording_topics: str = option("", "topics to record, split by commas (empty: all topics of the liability)")
+    enable_executor: bool = option(True, "run jobs; false only listens")
+    recording_topics: str = option("", "topics to record, separated by commas (empty: all topics of the liability)")
     playback: Literal["recorded", "at-once"] = option(
         "recorded", "play an objective's messages at their recorded times, or all at once"
     )
