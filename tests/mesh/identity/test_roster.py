@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from typing import TYPE_CHECKING
 
 import pytest
@@ -51,40 +53,38 @@ def test_an_edge_agent_serves_its_own_device_unless_another_is_named() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "where", "value"),
     [
-        ("x =", "the roster it: it is not TOML: "),
-        ("nobody = 1", "the roster it: there is no field `nobody`"),
-        ('lighthouses = ["a b"]', "a lighthouse is named by an ENS name or an address"),
-        ('lighthouses = ["aira/**"]', "a lighthouse is named by an ENS name or an address"),
-        (member(roles='["king"]'), "the roster it, member 1, roles 1: there is no role 'king'"),
-        (
-            member() + member(name='"two"', roles='["agent", "king"]'),
-            "the roster it, member 2, roles 2: there is no role",
-        ),
-        (member(roles="[]"), "the roster it, member 'arm': it has no role"),
-        (member(roles='"agent"'), "the roster it, member 1, roles: Expected `array`"),
-        (member(address=""), "the roster it, member 1: it has no `address`"),
-        (member(address='"0x12"'), "the roster it, member 'arm': '0x12' is not an address"),
-        (member(address='"*"'), "the roster it, member 'arm': '*' is not an address"),
-        (member(address=f'"{CHECKSUMMED.replace("c", "C")}"'), "its EIP-55 checksum does not hold"),
-        (member(fingerprint='"12"'), "the roster it, member 'arm': its fingerprint is not SHA-256"),
-        (member(revoked='"yes"'), "the roster it, member 1, revoked: Expected `bool`"),
-        (member(adress='"x"'), "the roster it, member 1: there is no field `adress`"),
-        (member(agent=f'"{OTHER}"'), "the roster it, member 'arm': only a member with the role edge serves a device"),
-        (member(roles='["edge"]', device='"a/**"'), "the roster it, member 'arm': 'a/**' is not"),
-        (member(roles='["edge"]', device='"*"'), "the roster it, member 'arm': '*' is not"),
-        (member(name='"a\\nb"'), "the roster it, member 1, name: "),
-        (member() + member(name='"two"'), f"the roster it: the address '{ARM}' occurs twice"),
-        (member() + member(name='"two"', address=f'"{CHECKSUMMED}"'), f"the address '{ARM}' occurs twice"),
-        (member() + member(address=f'"{OTHER}"'), "the roster it: the name 'arm' occurs twice"),
+        ("x =", "it", "TOML"),
+        ("nobody = 1", "it", "`nobody`"),
+        ('lighthouses = ["a b"]', "it", "a lighthouse "),
+        ('lighthouses = ["aira/**"]', "it", "a lighthouse "),
+        (member(roles='["king"]'), "it, member 1, roles 1", "'king'"),
+        (member() + member(name='"two"', roles='["agent", "king"]'), "it, member 2, roles 2", "'king'"),
+        (member(roles="[]"), "it, member 'arm'", "no role"),
+        (member(roles='"agent"'), "it, member 1, roles", "`array`"),
+        (member(address=""), "it, member 1", "`address`"),
+        (member(address='"0x12"'), "it, member 'arm'", "'0x12'"),
+        (member(address='"*"'), "it, member 'arm'", "'*'"),
+        (member(address=f'"{CHECKSUMMED.replace("c", "C")}"'), "it, member 'arm'", "EIP-55"),
+        (member(fingerprint='"12"'), "it, member 'arm'", "SHA-256"),
+        (member(revoked='"yes"'), "it, member 1, revoked", "`bool`"),
+        (member(adress='"x"'), "it, member 1", "`adress`"),
+        (member(agent=f'"{OTHER}"'), "it, member 'arm'", "role edge"),
+        (member(roles='["edge"]', device='"a/**"'), "it, member 'arm'", "'a/**'"),
+        (member(roles='["edge"]', device='"*"'), "it, member 'arm'", "'*'"),
+        (member(name='"a\\nb"'), "it, member 1, name", ""),
+        (member() + member(name='"two"'), "it", f"address '{ARM}'"),
+        (member() + member(name='"two"', address=f'"{CHECKSUMMED}"'), "it", f"address '{ARM}'"),
+        (member() + member(address=f'"{OTHER}"'), "it", "name 'arm'"),
     ],
 )
-def test_errors_name_the_place_in_the_roster(text: str, said: str) -> None:
+def test_errors_name_the_place_in_the_roster(text: str, where: str, value: str) -> None:
     with pytest.raises(RosterError) as error:
         roster_from(text, where="it")
 
-    assert said in str(error.value)
+    assert error.value.where == where
+    assert value in str(error.value)
     assert "\n" not in str(error.value)
 
 
@@ -96,11 +96,13 @@ def test_an_unknown_role_lists_the_roles() -> None:
 
 
 def test_unreadable_files_are_named(tmp_path: Path) -> None:
-    with pytest.raises(RosterError, match="No such file or directory"):
+    with pytest.raises(RosterError, match=os.strerror(errno.ENOENT)) as missing:
         read_roster(tmp_path / "none.toml")
+    assert missing.value.where == str(tmp_path / "none.toml")
     (tmp_path / "bytes.toml").write_bytes(b"\xff")
-    with pytest.raises(RosterError, match="it is not UTF-8 text"):
+    with pytest.raises(RosterError, match="UTF-8") as unreadable:
         read_roster(tmp_path / "bytes.toml")
+    assert unreadable.value.where == str(tmp_path / "bytes.toml")
 
 
 def test_an_entry_reads_back_as_its_member() -> None:
@@ -121,8 +123,9 @@ def test_adding_a_member_keeps_the_rest_of_the_file(tmp_path: Path) -> None:
     assert file.read_text().startswith("# ours\n[[member]]\n")
     assert [(one.name, one.fingerprint) for one in read_roster(file).member] == [("arm", "cd" * 32), ("two", "")]
     assert [path.name for path in file.parent.iterdir()] == ["roster.toml"]
-    with pytest.raises(RosterError, match="member 'arm': its certificate has another fingerprint"):
+    with pytest.raises(RosterError, match="ab" * 32) as outdated:
         with_fingerprint(file, ARM, old="ab" * 32, new="ef" * 32)
+    assert outdated.value.where == f"{file}, member 'arm'"
 
 
 def test_a_fingerprint_is_replaced_in_any_spelling(tmp_path: Path) -> None:
@@ -141,11 +144,13 @@ def test_a_member_without_a_fingerprint_is_renewed_and_a_revoked_one_or_a_strang
     before = file.read_text()
 
     assert with_fingerprint(file, ARM, old="ab" * 32, new="cd" * 32) == before
-    with pytest.raises(RosterError, match=f"no member has the address {OTHER}"):
+    with pytest.raises(RosterError, match=OTHER) as unknown:
         with_fingerprint(file, OTHER, old="ab" * 32, new="cd" * 32)
+    assert unknown.value.where == str(file)
     file.write_text(before + "revoked = true\n")
-    with pytest.raises(RosterError, match="member 'arm': it is revoked, so its certificate is not renewed"):
+    with pytest.raises(RosterError, match="revoked") as revoked:
         with_fingerprint(file, ARM, old="ab" * 32, new="cd" * 32)
+    assert revoked.value.where == f"{file}, member 'arm'"
 
 
 def test_revoked_members_are_not_admitted() -> None:
