@@ -27,7 +27,7 @@ UNITS: Final = ROOT / "deploy" / "systemd"
 SERVICES: Final = sorted(path.name.replace("@.", "@here.") for path in UNITS.glob("*.service"))
 TIMERS: Final = sorted(path.name for path in UNITS.glob("*.timer"))
 MOST_EXPOSED: Final = 2.0
-"""On systemd's scale from 0 to 10; what is left is mostly the network, which is what these services are for."""
+"""On systemd's scale from 0 to 10; the rest is mostly the network, which these services need."""
 
 
 @pytest.fixture(scope="module")

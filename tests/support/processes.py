@@ -36,7 +36,7 @@ class Server(ABC):
     """One process with its state folder. Use it in `with` or `async with`, which also removes the folder at the end.
 
     `start` and `stop` may be called again and again in between: the state folder and the ports stay, as for a machine
-    that is switched off and on. A subclass says what is run and when it is ready.
+    that is switched off and on. A subclass defines the command and when it is ready.
     """
 
     name: str

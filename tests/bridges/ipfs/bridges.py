@@ -81,7 +81,7 @@ async def on_mesh(endpoint: str, topic: str) -> AsyncIterator[Mesh]:
 
 
 async def until_seen(mesh: Mesh, *addresses: str) -> None:
-    """Return when these bridges (or any one) are present, after which they receive what is published."""
+    """Return when these bridges (or any one) are present, after which they receive published messages."""
 
     async def are_there() -> bool:
         present = {key.agent for key in await mesh.channel.present() if key.role == "bridge"}

@@ -42,7 +42,7 @@ def test_a_deployment_prints_all_addresses_and_the_settings_to_use_it(bare: Serv
     facts, _, options = done.stdout.partition("\nsettings to use these contracts:\n\n")
     said = columns(facts)
     gas = int(said["gas used"].replace(",", ""))
-    assert 0.8 * DEPLOYMENT_GAS < gas < DEPLOYMENT_GAS, "what is asked for before the beginning is right"
+    assert 0.8 * DEPLOYMENT_GAS < gas < DEPLOYMENT_GAS, "the balance required before the deployment matches its gas"
     (tmp_path / "aira.toml").write_text(options)
     settings = tomllib.loads(options)
     assert settings["ens_contract"] == said["ENS registry"]

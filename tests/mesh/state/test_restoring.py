@@ -122,7 +122,7 @@ async def test_the_old_state_can_be_set_aside_and_restored_by_hand(archive: Path
     async with Ledger(done.aside / ADDRESS / CHAIN / "ledger.sqlite") as ledger:
         assert await ledger.jobs_by_phase() == {"finalized": 1}
     assert (done.aside / NONCE).exists()
-    assert all(secret.exists() for secret in secrets), "what is no part of a state stays where it is"
+    assert all(secret.exists() for secret in secrets), "files that are not part of a state stay in place"
 
 
 @pytest.mark.parametrize("existing", list(ExistingState))
