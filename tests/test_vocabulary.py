@@ -68,14 +68,45 @@ def test_a_class_name_is_defined_in_one_module() -> None:
     assert {name: sorted(paths) for name, paths in homes.items() if len(paths) > 1 and name not in SHARED} == {}
 
 
-def test_every_error_class_has_a_code_of_its_own() -> None:
+def import_everything() -> None:
     for path, _ in sources():
         if "__main__" not in path:
             import_module(path.removesuffix(".py").removesuffix("/__init__").replace("/", "."))
-    codes = {kind: kind.__dict__.get("code") for kind in error_classes() if kind.__module__.startswith(PACKAGES)}
+
+
+def codes_of_errors() -> dict[type[AiraError], str | None]:
+    import_everything()
+    return {kind: kind.__dict__.get("code") for kind in error_classes() if kind.__module__.startswith(PACKAGES)}
+
+
+def documented(heading: str) -> set[str]:
+    """The names in the first column of a table of docs/codes.md."""
+    section = (ROOT / "docs" / "codes.md").read_text().split(f"## {heading}\n")[1].split("\n## ")[0]
+    return set(re.findall(r"^\| `([\w-]+)` \|", section, re.MULTILINE))
+
+
+def test_every_error_class_has_a_code_of_its_own() -> None:
+    codes = codes_of_errors()
 
     assert all(code and KEBAB.fullmatch(code) for code in codes.values()), codes
     assert len(set(codes.values())) == len(codes)
+
+
+def test_the_documented_error_codes_are_those_of_the_source() -> None:
+    assert documented("Errors") == set(codes_of_errors().values())
+
+
+def test_the_documented_log_events_are_those_of_the_source() -> None:
+    names = set()
+    for _, tree in sources():
+        for node in ast.walk(tree):
+            match node:
+                case ast.Call(func=ast.Name(id="log_event"), args=[ast.Constant(value=str(name)), *_]):
+                    names.add(name)
+                case ast.Call(func=ast.Name(id="OutageLog"), args=[_, ast.Constant(value=str(name))]):
+                    names |= {f"{name}-outage", f"{name}-recovered"}
+
+    assert documented("Log events") == names
 
 
 @pytest.mark.parametrize(("path", "tree"), [pytest.param(path, tree, id=path) for path, tree in sources()])
