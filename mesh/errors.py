@@ -5,22 +5,16 @@ from __future__ import annotations
 from schemas.errors import AiraError, InputError, InvalidAddress, InvalidCid, InvalidKey, InvalidMessage
 
 
-class ConfigurationError(AiraError):
+class ConfigurationError(AiraError, code="configuration-error"):
     """The settings can't work as they are: an unknown option, a missing keyfile, a value out of range."""
 
-    code = "configuration-error"
 
-
-class RemoteError(AiraError):
+class RemoteError(AiraError, code="remote-error"):
     """The other side failed or is not there; trying again later may help."""
 
-    code = "remote-error"
 
-
-class NetworkUnavailable(RemoteError):
+class NetworkUnavailable(RemoteError, code="network-unavailable"):
     """No Zenoh router answers at the configured endpoints."""
-
-    code = "network-unavailable"
 
     def __init__(self, endpoints: tuple[str, ...], why: str) -> None:
         super().__init__(
@@ -30,22 +24,16 @@ class NetworkUnavailable(RemoteError):
         self.endpoints = endpoints
 
 
-class ContentError(RemoteError):
+class ContentError(RemoteError, code="content-error"):
     """A file behind a CID can't be had."""
 
-    code = "content-error"
 
-
-class ChainError(RemoteError):
+class ChainError(RemoteError, code="chain-error"):
     """The chain, or what runs on it, refused or did not answer."""
 
-    code = "chain-error"
 
-
-class ClosedError(AiraError):
+class ClosedError(AiraError, code="closed-error"):
     """An object was used after it was closed (by you; a broken world raises `RemoteError`)."""
-
-    code = "closed-error"
 
 
 __all__ = [

@@ -28,20 +28,16 @@ STARTUP: Final = RetryPolicy(initial=0.5, ceiling=5.0)
 T = TypeVar("T")
 
 
-class FilesMissing(ConfigurationError):
+class FilesMissing(ConfigurationError, code="files-missing"):
     """Files that the settings name do not exist."""
-
-    code = "files-missing"
 
     def __init__(self, files: Sequence[str]) -> None:
         super().__init__(f"missing files: {', '.join(files)}")
         self.files = tuple(files)
 
 
-class FilesNotReadable(ConfigurationError):
+class FilesNotReadable(ConfigurationError, code="files-not-readable"):
     """The user has no permission to read files that the settings name."""
-
-    code = "files-not-readable"
 
     def __init__(self, files: Sequence[str]) -> None:
         user = os.geteuid()

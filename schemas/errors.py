@@ -6,7 +6,7 @@ content are in `mesh.errors`.
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 
 class AiraError(Exception):
@@ -18,21 +18,23 @@ class AiraError(Exception):
 
     code: ClassVar[str] = "error"
 
+    def __init_subclass__(cls, *, code: str = "", **options: Any) -> None:
+        """A class has a code of its own: `class FeeTooHigh(ChainError, code="fee-too-high")`."""
+        super().__init_subclass__(**options)
+        if code:
+            cls.code = code
+
     def __init__(self, message: str, *, hint: str = "") -> None:
         super().__init__(message)
         self.hint = hint
 
 
-class InputError(AiraError, ValueError):
+class InputError(AiraError, ValueError, code="input-error"):
     """The input is wrong: a message, a key, a name, a file. Trying again does not help."""
 
-    code = "input-error"
 
-
-class InvalidAddress(InputError):
+class InvalidAddress(InputError, code="invalid-address"):
     """A text is not an Ethereum address, or it is in mixed case with a wrong EIP-55 checksum."""
-
-    code = "invalid-address"
 
     def __init__(self, text: str, why: str) -> None:
         super().__init__(f"{text[:80]!r} is not an address: {why}")
@@ -40,20 +42,16 @@ class InvalidAddress(InputError):
         self.why = why
 
 
-class InvalidCid(InputError):
+class InvalidCid(InputError, code="invalid-cid"):
     """A text or bytes are not a CIDv0 (base58 of a 34-byte sha2-256 multihash), or not the block that a CID names."""
-
-    code = "invalid-cid"
 
     def __init__(self, text: str, why: str) -> None:
         super().__init__(f"{text[:80]!r} is not a CIDv0: {why}")
         self.text = text
 
 
-class InvalidKey(InputError):
+class InvalidKey(InputError, code="invalid-key"):
     """A key is outside the keyspace, or a text can't be part of a key."""
-
-    code = "invalid-key"
 
     def __init__(self, text: str, why: str) -> None:
         super().__init__(f"{text[:160]!r} is not a key of the mesh: {why}")
@@ -61,14 +59,12 @@ class InvalidKey(InputError):
         self.why = why
 
 
-class InvalidMessage(InputError):
+class InvalidMessage(InputError, code="invalid-message"):
     """A message is not valid.
 
     `reason` is a short word for programs, by which channels count such messages (`not-json`, `field`, `signature`, …);
     `detail` is for people.
     """
-
-    code = "invalid-message"
 
     def __init__(self, reason: str, detail: str) -> None:
         super().__init__(f"invalid message ({reason}): {detail}")
@@ -76,10 +72,8 @@ class InvalidMessage(InputError):
         self.detail = detail
 
 
-class InvalidRecord(InputError):
+class InvalidRecord(InputError, code="invalid-record"):
     """A request, a reply or a liability record is not valid."""
-
-    code = "invalid-record"
 
     def __init__(self, kind: str, why: str) -> None:
         super().__init__(f"not a {kind}: {why}")
@@ -87,10 +81,8 @@ class InvalidRecord(InputError):
         self.why = why
 
 
-class InvalidPayload(InputError):
+class InvalidPayload(InputError, code="invalid-payload"):
     """The payload of a topic is not of its type."""
-
-    code = "invalid-payload"
 
     def __init__(self, type_name: str, why: str) -> None:
         super().__init__(f"not a {type_name}: {why}")

@@ -10,10 +10,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-class IpfsError(RemoteError):
+class IpfsError(RemoteError, code="ipfs-error"):
     """An IPFS daemon or gateway failed or is unreachable; `api` is its address, `why` the cause."""
-
-    code = "ipfs-error"
 
     def __init__(self, api: str, why: str, *, hint: str = "") -> None:
         super().__init__(f"IPFS at {api}: {why}", hint=hint)
@@ -21,29 +19,23 @@ class IpfsError(RemoteError):
         self.why = why
 
 
-class DaemonUnreachable(IpfsError):
+class DaemonUnreachable(IpfsError, code="daemon-unreachable"):
     """The daemon does not answer, or the connection broke; it may be back later."""
-
-    code = "daemon-unreachable"
 
     def __init__(self, api: str, why: str) -> None:
         super().__init__(api, why, hint="is the daemon running, and is this the address of its RPC?")
 
 
-class DaemonRefused(IpfsError):
+class DaemonRefused(IpfsError, code="daemon-refused"):
     """The daemon answered a call with an error: `status` is the HTTP status, `why` the daemon's message."""
-
-    code = "daemon-refused"
 
     def __init__(self, api: str, status: int, why: str, *, hint: str = "") -> None:
         super().__init__(api, why, hint=hint)
         self.status = status
 
 
-class AccessDenied(DaemonRefused):
+class AccessDenied(DaemonRefused, code="access-denied"):
     """The daemon requires other credentials."""
-
-    code = "access-denied"
 
     def __init__(self, api: str, status: int, why: str) -> None:
         super().__init__(
@@ -55,10 +47,8 @@ class AccessDenied(DaemonRefused):
         )
 
 
-class PubSubDisabled(DaemonRefused):
+class PubSubDisabled(DaemonRefused, code="pubsub-disabled"):
     """The daemon runs without PubSub."""
-
-    code = "pubsub-disabled"
 
     def __init__(self, api: str, status: int, why: str) -> None:
         super().__init__(
@@ -66,22 +56,16 @@ class PubSubDisabled(DaemonRefused):
         )
 
 
-class NoPeers(DaemonRefused):
+class NoPeers(DaemonRefused, code="no-peers"):
     """The daemon knows no other subscriber of the topic. Keep the message and publish it later."""
 
-    code = "no-peers"
 
-
-class PublishedOutOfOrder(DaemonRefused):
+class PublishedOutOfOrder(DaemonRefused, code="published-out-of-order"):
     """The daemon validated a later message of its own first and dropped this one as a replay. Publish it again."""
 
-    code = "published-out-of-order"
 
-
-class JournalFailed(AiraError):
+class JournalFailed(AiraError, code="journal-failed"):
     """A bridge can't read or write its journal."""
-
-    code = "journal-failed"
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(

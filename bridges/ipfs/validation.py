@@ -167,10 +167,8 @@ def _is_key_of(message: Message, key: str, own_key: str) -> bool:
     return key == own_key
 
 
-class ChainAwaited(ChainError):
+class ChainAwaited(ChainError, code="chain-awaited"):
     """The chain's node was not reached yet."""
-
-    code = "chain-awaited"
 
 
 class ChainView:

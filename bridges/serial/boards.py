@@ -30,10 +30,8 @@ AVR: Final = 83
 """The number of the processor in ELF files (EM_AVR)."""
 
 
-class InvalidFirmware(InputError):
+class InvalidFirmware(InputError, code="invalid-firmware"):
     """A file is not an ELF file for an AVR."""
-
-    code = "invalid-firmware"
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(
@@ -43,10 +41,8 @@ class InvalidFirmware(InputError):
         self.path = path
 
 
-class BoardFailed(RemoteError):
+class BoardFailed(RemoteError, code="board-failed"):
     """The simulated board stopped, or did not do what was expected; the text has its last output."""
-
-    code = "board-failed"
 
 
 @dataclass(frozen=True)

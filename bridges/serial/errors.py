@@ -10,44 +10,32 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
-class LineError(RemoteError):
+class LineError(RemoteError, code="line-error"):
     """A serial port can't be opened, read or written."""
 
-    code = "line-error"
 
-
-class PortMissing(LineError):
+class PortMissing(LineError, code="port-missing"):
     """The port does not exist now; the board may be plugged in later."""
-
-    code = "port-missing"
 
     def __init__(self, port: str, why: str) -> None:
         super().__init__(f"no serial port {port}: {why}", hint="is the board plugged in?")
         self.port = port
 
 
-class PortForbidden(LineError):
+class PortForbidden(LineError, code="port-forbidden"):
     """This user has no permission to open the port."""
 
-    code = "port-forbidden"
 
-
-class PortBusy(LineError):
+class PortBusy(LineError, code="port-busy"):
     """Another process uses the port."""
 
-    code = "port-busy"
 
-
-class InvalidPort(LineError):
+class InvalidPort(LineError, code="invalid-port"):
     """The path is not a serial port."""
 
-    code = "invalid-port"
 
-
-class UnknownDialect(InputError):
+class UnknownDialect(InputError, code="unknown-dialect"):
     """No installed package provides a dialect of that name."""
-
-    code = "unknown-dialect"
 
     def __init__(self, name: str, known: Sequence[str]) -> None:
         super().__init__(
@@ -58,10 +46,8 @@ class UnknownDialect(InputError):
         self.known = tuple(known)
 
 
-class BrokenDialect(ConfigurationError):
+class BrokenDialect(ConfigurationError, code="dialect-broken"):
     """A dialect that an installed package registers can't be imported."""
-
-    code = "dialect-broken"
 
     def __init__(self, name: str, package: str, error: Exception) -> None:
         super().__init__(
@@ -72,20 +58,16 @@ class BrokenDialect(ConfigurationError):
         self.package = package
 
 
-class InvalidBoardMessage(InputError):
+class InvalidBoardMessage(InputError, code="invalid-board-message"):
     """A message can't be sent to the board: wrong type, unknown topic, or too long for its buffer or the line."""
-
-    code = "invalid-board-message"
 
     def __init__(self, topic: str, why: str) -> None:
         super().__init__(f"a message for {topic} can't be sent: {why}")
         self.topic = topic
 
 
-class BoardBusy(RemoteError):
+class BoardBusy(RemoteError, code="board-busy"):
     """The queue of commands for the board is full."""
-
-    code = "board-busy"
 
     def __init__(self, topic: str, waiting: int) -> None:
         super().__init__(f"a message for {topic} was not sent: {waiting} commands are already waiting for the board")
@@ -93,10 +75,8 @@ class BoardBusy(RemoteError):
         self.waiting = waiting
 
 
-class CallFailed(AiraError):
+class CallFailed(AiraError, code="call-failed"):
     """A call to a device failed; `reason` is a short word for programs, a key of `CALL_ERRORS`."""
-
-    code = "call-failed"
 
     def __init__(self, topic: str, reason: str, detail: str) -> None:
         super().__init__(f"{topic}: {detail} ({reason})")
@@ -105,22 +85,16 @@ class CallFailed(AiraError):
         self.detail = detail
 
 
-class CallRefused(CallFailed):
+class CallRefused(CallFailed, code="call-refused"):
     """The device or its edge agent refused the call, and would refuse it again."""
 
-    code = "call-refused"
 
-
-class CallNotDone(CallFailed):
+class CallNotDone(CallFailed, code="call-not-done"):
     """The device certainly did not do it: it was absent, or busy with earlier calls. It is safe to try again."""
 
-    code = "call-not-done"
 
-
-class CallInDoubt(CallFailed):
+class CallInDoubt(CallFailed, code="call-in-doubt"):
     """It is not known whether the device did it: it was restarted or unplugged before it answered."""
-
-    code = "call-in-doubt"
 
 
 CALL_ERRORS: Final[dict[str, type[CallFailed]]] = {

@@ -39,10 +39,8 @@ FUNCTION: Final = re.compile(r"^(?!static|inline)([A-Za-z_][\w:<>*& ]*\s[*&]?\w+
 """The head of a function at the beginning of a line; the Arduino IDE generates a prototype for it."""
 
 
-class CompilationFailed(InputError):
+class CompilationFailed(InputError, code="compilation-failed"):
     """A sketch does not compile; the text has the compiler's output."""
-
-    code = "compilation-failed"
 
 
 def compile_sketch(sketch: Path, elf: Path, *, libraries: Sequence[Path] = (), defines: Sequence[str] = ()) -> Path:

@@ -10,10 +10,8 @@ if TYPE_CHECKING:
     from schemas.signing import Rejection
 
 
-class OrderRejected(AiraError):
+class OrderRejected(AiraError, code="order-rejected"):
     """A provider can't use the order. `rejection` has the reason, a word for programs, and the detail."""
-
-    code = "order-rejected"
 
     def __init__(self, rejection: Rejection) -> None:
         super().__init__(
@@ -23,10 +21,8 @@ class OrderRejected(AiraError):
         self.rejection = rejection
 
 
-class OrderExpired(AiraError):
+class OrderExpired(AiraError, code="order-expired"):
     """No offer matched the order before its deadline, the block `deadline`. `order` is its hash."""
-
-    code = "order-expired"
 
     def __init__(self, order: str, deadline: int) -> None:
         super().__init__(
@@ -37,10 +33,8 @@ class OrderExpired(AiraError):
         self.deadline = deadline
 
 
-class LiabilityReverted(AiraError):
+class LiabilityReverted(AiraError, code="liability-reverted"):
     """A reorganisation reverted the contract `liability`, and it was not created again by its orders' deadline."""
-
-    code = "liability-reverted"
 
     def __init__(self, liability: str, deadline: int) -> None:
         super().__init__(
@@ -51,10 +45,8 @@ class LiabilityReverted(AiraError):
         self.deadline = deadline
 
 
-class FundsShort(AiraError):
+class FundsShort(AiraError, code="funds-short"):
     """The account has less of a token than its open orders may cost: `balance` and `needed`, in the smallest unit."""
-
-    code = "funds-short"
 
     def __init__(self, account: str, token: str, *, balance: int, needed: int) -> None:
         super().__init__(
@@ -65,10 +57,8 @@ class FundsShort(AiraError):
         self.needed = needed
 
 
-class ServiceClosed(AiraError):
+class ServiceClosed(AiraError, code="service-closed"):
     """A service that the agent's settings don't open to others: it signs, spends or drives jobs."""
-
-    code = "service-closed"
 
     def __init__(self, service: str) -> None:
         super().__init__(

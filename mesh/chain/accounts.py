@@ -23,32 +23,24 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 
-class KeyfileError(ConfigurationError):
+class KeyfileError(ConfigurationError, code="keyfile-error"):
     """A keyfile or its password file can't be read or written, or is not Web3 secret storage."""
-
-    code = "keyfile-error"
 
     def __init__(self, path: object, why: str, *, hint: str = "") -> None:
         super().__init__(f"{path}: {why}", hint=hint)
         self.path = str(path)
 
 
-class KeyfileExists(KeyfileError):
+class KeyfileExists(KeyfileError, code="keyfile-exists"):
     """A keyfile of that name exists; none is ever overwritten."""
 
-    code = "keyfile-exists"
 
-
-class NotAKeyfile(KeyfileError):
+class NotAKeyfile(KeyfileError, code="not-a-keyfile"):
     """The content of a file is not Web3 secret storage."""
 
-    code = "not-a-keyfile"
 
-
-class WrongPassword(KeyfileError):
+class WrongPassword(KeyfileError, code="wrong-password"):
     """The password does not open the keyfile."""
-
-    code = "wrong-password"
 
     def __init__(self, keyfile: object, password_file: object) -> None:
         super().__init__(

@@ -39,10 +39,8 @@ REVERT_HINTS: Final[Mapping[str, str]] = MappingProxyType(
 """What to do when a contract refuses, by the name of its custom error (`Reverted.reason`)."""
 
 
-class NodeUnreachable(ChainError):
+class NodeUnreachable(ChainError, code="node-unreachable"):
     """No Ethereum node answers at the endpoint. Trying again later may help."""
-
-    code = "node-unreachable"
 
     def __init__(self, endpoint: str, why: str) -> None:
         super().__init__(
@@ -53,10 +51,8 @@ class NodeUnreachable(ChainError):
         self.why = why
 
 
-class InvalidEndpoint(ConfigurationError):
+class InvalidEndpoint(ConfigurationError, code="invalid-endpoint"):
     """A text is not the address of an Ethereum node."""
-
-    code = "invalid-endpoint"
 
     def __init__(self, endpoint: str) -> None:
         super().__init__(
@@ -66,10 +62,8 @@ class InvalidEndpoint(ConfigurationError):
         self.endpoint = endpoint
 
 
-class WrongChain(ConfigurationError):
+class WrongChain(ConfigurationError, code="wrong-chain"):
     """One of several nodes is on another chain; `found` and `expected` are EIP-155 numbers."""
-
-    code = "wrong-chain"
 
     def __init__(self, endpoint: str, *, found: int, expected: int) -> None:
         super().__init__(
@@ -81,10 +75,8 @@ class WrongChain(ConfigurationError):
         self.expected = expected
 
 
-class RequestRefused(ChainError):
+class RequestRefused(ChainError, code="request-refused"):
     """The node answered with an error that has no class of its own here. `rpc_code` is JSON-RPC's."""
-
-    code = "request-refused"
 
     def __init__(self, method: str, code: int, message: str) -> None:
         super().__init__(f"the node refused {method}: {message} (code {code})")
@@ -93,10 +85,8 @@ class RequestRefused(ChainError):
         self.detail = message
 
 
-class NoContracts(ChainError):
+class NoContracts(ChainError, code="no-contracts"):
     """The chain does not hold the contracts: another network, or nothing deployed yet."""
-
-    code = "no-contracts"
 
     def __init__(self, what: str, chain_id: int) -> None:
         super().__init__(
@@ -107,30 +97,24 @@ class NoContracts(ChainError):
         self.chain_id = chain_id
 
 
-class UnknownName(ChainError):
+class UnknownName(ChainError, code="unknown-name"):
     """An ENS name that no resolver on this chain knows."""
-
-    code = "unknown-name"
 
     def __init__(self, name: str) -> None:
         super().__init__(f"the ENS name {name!r} is not known on this chain", hint="check its spelling and the network")
         self.name = name
 
 
-class NotALiability(ChainError):
+class NotALiability(ChainError, code="not-a-liability"):
     """The factory did not create the contract at an address: its terms can't be trusted."""
-
-    code = "not-a-liability"
 
     def __init__(self, address: str) -> None:
         super().__init__(f"{address} is not a liability of this factory")
         self.address = address
 
 
-class NotOffered(ChainError):
+class NotOffered(ChainError, code="not-offered"):
     """The original contracts lack a function that ours have."""
-
-    code = "not-offered"
 
     def __init__(self, what: str, generation: int) -> None:
         super().__init__(
@@ -141,10 +125,8 @@ class NotOffered(ChainError):
         self.generation = generation
 
 
-class InsufficientFunds(ChainError):
+class InsufficientFunds(ChainError, code="insufficient-funds"):
     """The account can't pay for the transaction's gas (and value). Amounts are wei."""
-
-    code = "insufficient-funds"
 
     def __init__(self, address: str, *, balance: int, needed: int) -> None:
         super().__init__(
@@ -156,10 +138,8 @@ class InsufficientFunds(ChainError):
         self.needed = needed
 
 
-class InsufficientTokens(ChainError):
+class InsufficientTokens(ChainError, code="insufficient-tokens"):
     """The account has less of a token than is needed. Amounts are the token's smallest unit (wn for XRT)."""
-
-    code = "insufficient-tokens"
 
     def __init__(self, account: str, token: str, *, balance: int, needed: int) -> None:
         super().__init__(
@@ -172,10 +152,8 @@ class InsufficientTokens(ChainError):
         self.needed = needed
 
 
-class StakeTooSmall(InputError):
+class StakeTooSmall(InputError, code="stake-too-small"):
     """The stake is below the lighthouse's minimum. Amounts are wn."""
-
-    code = "stake-too-small"
 
     def __init__(self, stake: int, minimal_stake: int) -> None:
         super().__init__(
@@ -186,10 +164,8 @@ class StakeTooSmall(InputError):
         self.minimal_stake = minimal_stake
 
 
-class FeeTooHigh(ChainError):
+class FeeTooHigh(ChainError, code="fee-too-high"):
     """Gas costs more than the ceiling; nothing was sent. Prices are wei per unit of gas."""
-
-    code = "fee-too-high"
 
     def __init__(self, price: int, ceiling: int) -> None:
         super().__init__(
@@ -200,15 +176,13 @@ class FeeTooHigh(ChainError):
         self.ceiling = ceiling
 
 
-class Reverted(ChainError):
+class Reverted(ChainError, code="reverted"):
     """A contract reverted.
 
     `reason` is the name of its custom error (`CostMismatch`), or the text of a plain revert, `Panic`, `OutOfGas`, or
     empty when it gave none; `arguments` are the custom error's; `data` is what it reverted with. `gas_used` and `wei`
     are what that has cost: nothing, unless the transaction was mined.
     """
-
-    code = "reverted"
 
     def __init__(
         self, reason: str, *, arguments: tuple[object, ...] = (), data: bytes = b"", gas_used: int = 0, wei: int = 0
@@ -223,10 +197,8 @@ class Reverted(ChainError):
         self.wei = wei
 
 
-class TransactionTimeout(ChainError):
+class TransactionTimeout(ChainError, code="transaction-timeout"):
     """A sent transaction was not mined in time; it may still be. Sending the same again waits on for this one."""
-
-    code = "transaction-timeout"
 
     def __init__(self, tx: str, seconds: float) -> None:
         super().__init__(
@@ -237,10 +209,8 @@ class TransactionTimeout(ChainError):
         self.seconds = seconds
 
 
-class ChainWentBack(ChainError):
+class ChainWentBack(ChainError, code="chain-went-back"):
     """The chain is shorter than what was already read of it: it was started afresh, or the node is still syncing."""
-
-    code = "chain-went-back"
 
     def __init__(self, cursor: int, head: int) -> None:
         super().__init__(
@@ -251,13 +221,11 @@ class ChainWentBack(ChainError):
         self.head = head
 
 
-class ReorganisedTooDeep(ChainWentBack):
+class ReorganisedTooDeep(ChainWentBack, code="reorganised-too-deep"):
     """None of the blocks that are remembered of the chain is on it any more: it is another chain, or started afresh.
 
     `cursor` is the oldest block that is remembered.
     """
-
-    code = "reorganised-too-deep"
 
     def __init__(self, cursor: int, head: int) -> None:
         ChainError.__init__(
@@ -269,19 +237,15 @@ class ReorganisedTooDeep(ChainWentBack):
         self.head = head
 
 
-class NoAccount(ConfigurationError):
+class NoAccount(ConfigurationError, code="no-account"):
     """A transaction needs an account, and none was given."""
-
-    code = "no-account"
 
     def __init__(self) -> None:
         super().__init__("this needs an account", hint="set keyfile and keyfile_password_file")
 
 
-class TransactionsNotKept(ConfigurationError):
+class TransactionsNotKept(ConfigurationError, code="transactions-not-kept"):
     """The disk refuses the sent transactions in `folder`."""
-
-    code = "transactions-not-kept"
 
     def __init__(self, folder: Path, why: str) -> None:
         super().__init__(
@@ -292,26 +256,20 @@ class TransactionsNotKept(ConfigurationError):
         self.why = why
 
 
-class TransactionDamaged(ConfigurationError):
+class TransactionDamaged(ConfigurationError, code="transaction-damaged"):
     """The file of a sent transaction is damaged."""
-
-    code = "transaction-damaged"
 
     def __init__(self, path: Path) -> None:
         super().__init__(f"{path} holds no sent transaction", hint="it is damaged; move it away")
         self.path = path
 
 
-class UnknownContracts(ConfigurationError):
+class UnknownContracts(ConfigurationError, code="unknown-contracts"):
     """The settings name contracts, or a generation of them, that do not exist."""
 
-    code = "unknown-contracts"
 
-
-class InvalidName(InputError):
+class InvalidName(InputError, code="invalid-name"):
     """A text that is not an ENS name."""
-
-    code = "invalid-name"
 
     def __init__(self, text: str, why: str) -> None:
         super().__init__(f"{text[:80]!r} is not an ENS name: {why}")

@@ -5,235 +5,157 @@ from __future__ import annotations
 from mesh.errors import AiraError, ChainError, ConfigurationError, InputError, RemoteError
 
 
-class InvalidOptions(InputError):
+class InvalidOptions(InputError, code="invalid-options"):
     """Options or arguments that can't be used together, or one that is missing."""
 
-    code = "invalid-options"
 
-
-class InvalidAmount(InputError):
+class InvalidAmount(InputError, code="invalid-amount"):
     """A text is not an amount of the token."""
 
-    code = "invalid-amount"
 
-
-class FileUnreadable(InputError):
+class FileUnreadable(InputError, code="file-unreadable"):
     """The named file can't be read."""
 
-    code = "file-unreadable"
 
-
-class FileExists(InputError):
+class FileExists(InputError, code="file-exists"):
     """A file would be overwritten."""
 
-    code = "file-exists"
 
-
-class FolderMissing(InputError):
+class FolderMissing(InputError, code="folder-missing"):
     """The folder of a file to write does not exist."""
 
-    code = "folder-missing"
 
-
-class FileUnwritable(ConfigurationError):
+class FileUnwritable(ConfigurationError, code="file-unwritable"):
     """The operating system refuses to write a file."""
 
-    code = "file-unwritable"
 
-
-class NotAFileOrCid(InputError):
+class NotAFileOrCid(InputError, code="not-a-file-or-cid"):
     """A text is neither the name of a file nor a CID."""
 
-    code = "not-a-file-or-cid"
 
-
-class OutputFailed(AiraError):
+class OutputFailed(AiraError, code="output-failed"):
     """The output of a command can't be printed or written to a file."""
 
-    code = "output-failed"
 
-
-class PackageMissing(ConfigurationError):
+class PackageMissing(ConfigurationError, code="package-missing"):
     """A package that the command needs is not installed."""
 
-    code = "package-missing"
 
-
-class NoAnswer(RemoteError):
+class NoAnswer(RemoteError, code="no-answer"):
     """No agent, provider or bridge answers for an address."""
 
-    code = "no-answer"
 
-
-class InvalidPrivateKey(InputError):
+class InvalidPrivateKey(InputError, code="invalid-private-key"):
     """A text is not a private key, or a private key was given as a file's name. The error never contains it."""
 
-    code = "invalid-private-key"
 
-
-class PasswordFileUnusable(ConfigurationError):
+class PasswordFileUnusable(ConfigurationError, code="password-file-unusable"):
     """A file with a password or a key can't be read or created, or is empty."""
 
-    code = "password-file-unusable"
 
-
-class AccountMissing(ConfigurationError):
+class AccountMissing(ConfigurationError, code="account-missing"):
     """The command needs an address, and neither an argument nor the settings name one."""
 
-    code = "account-missing"
 
-
-class AlreadyDeployed(ConfigurationError):
+class AlreadyDeployed(ConfigurationError, code="already-deployed"):
     """The chain already has the contracts."""
 
-    code = "already-deployed"
 
-
-class BalanceTooLow(ChainError):
+class BalanceTooLow(ChainError, code="balance-too-low"):
     """An account has less of a token than the command needs."""
 
-    code = "balance-too-low"
 
-
-class NotAToken(ChainError):
+class NotAToken(ChainError, code="not-a-token"):
     """An address or name is not an ERC-20 token."""
 
-    code = "not-a-token"
 
-
-class NotALighthouse(ChainError):
+class NotALighthouse(ChainError, code="not-a-lighthouse"):
     """An address is not a lighthouse of the factory."""
 
-    code = "not-a-lighthouse"
 
-
-class NameTaken(ChainError):
+class NameTaken(ChainError, code="name-taken"):
     """A lighthouse of that name already exists."""
 
-    code = "name-taken"
 
-
-class InvalidLighthouse(InputError):
+class InvalidLighthouse(InputError, code="invalid-lighthouse"):
     """The factory would reject the name or the minimal stake."""
 
-    code = "invalid-lighthouse"
 
-
-class InvalidStake(InputError):
+class InvalidStake(InputError, code="invalid-stake"):
     """The stake can't be changed by that amount."""
 
-    code = "invalid-stake"
 
-
-class NotAProvider(ChainError):
+class NotAProvider(ChainError, code="not-a-provider"):
     """The account has no stake at the lighthouse."""
 
-    code = "not-a-provider"
 
-
-class LiabilityEnded(ChainError):
+class LiabilityEnded(ChainError, code="liability-ended"):
     """The liability is finalized, so it can't be cancelled or refunded."""
 
-    code = "liability-ended"
 
-
-class NotRefundable(ChainError):
+class NotRefundable(ChainError, code="not-refundable"):
     """The refund delay of a liability has not passed."""
 
-    code = "not-refundable"
 
-
-class NotAParty(ChainError):
+class NotAParty(ChainError, code="not-a-party"):
     """The account is neither promisee nor promisor of the liability."""
 
-    code = "not-a-party"
 
-
-class SignatureMissing(ChainError):
+class SignatureMissing(ChainError, code="signature-missing"):
     """The other party has not signed the cancellation."""
 
-    code = "signature-missing"
 
-
-class InvalidSignature(InputError):
+class InvalidSignature(InputError, code="invalid-signature"):
     """A text is not a party's signature of the cancellation."""
 
-    code = "invalid-signature"
 
-
-class JobNotDone(RemoteError):
+class JobNotDone(RemoteError, code="job-not-done"):
     """The promisor did not do the work; the promisee got the cost back."""
 
-    code = "job-not-done"
 
-
-class HealthUnavailable(RemoteError):
+class HealthUnavailable(RemoteError, code="health-unavailable"):
     """No server reports its health at an address."""
 
-    code = "health-unavailable"
 
-
-class InvalidServerAddress(ConfigurationError):
+class InvalidServerAddress(ConfigurationError, code="invalid-server-address"):
     """The address of a server is missing, or is not HOST:PORT."""
 
-    code = "invalid-server-address"
 
-
-class IdentityMissing(ConfigurationError):
+class IdentityMissing(ConfigurationError, code="identity-missing"):
     """The settings name no certificate."""
 
-    code = "identity-missing"
 
-
-class RosterMissing(ConfigurationError):
+class RosterMissing(ConfigurationError, code="roster-missing"):
     """The settings name no roster."""
 
-    code = "roster-missing"
 
-
-class NothingRecorded(RemoteError):
+class NothingRecorded(RemoteError, code="nothing-recorded"):
     """No message arrived on the recorded keys."""
 
-    code = "nothing-recorded"
 
-
-class InvalidDestination(InputError):
+class InvalidDestination(InputError, code="invalid-destination"):
     """A recording can't be replayed to the named keys."""
 
-    code = "invalid-destination"
 
-
-class NoRecording(InputError):
+class NoRecording(InputError, code="no-recording"):
     """The liability has no recording."""
 
-    code = "no-recording"
 
-
-class UnknownTopic(InputError):
+class UnknownTopic(InputError, code="unknown-topic"):
     """A recording has no topic of that name."""
 
-    code = "unknown-topic"
 
-
-class UnknownService(InputError):
+class UnknownService(InputError, code="unknown-service"):
     """Agents have no service of that name."""
 
-    code = "unknown-service"
 
-
-class InvalidArgument(InputError):
+class InvalidArgument(InputError, code="invalid-argument"):
     """An argument of a service is unknown, missing, given twice, or of another type."""
 
-    code = "invalid-argument"
 
-
-class UnknownJob(InputError):
+class UnknownJob(InputError, code="unknown-job"):
     """The agent has no job for that liability."""
 
-    code = "unknown-job"
 
-
-class AnvilMissing(ConfigurationError):
+class AnvilMissing(ConfigurationError, code="anvil-missing"):
     """The chain needs the program anvil, which was not found."""
-
-    code = "anvil-missing"

@@ -27,10 +27,8 @@ HELP_WIDTH: Final = 100
 """Most characters of the short help of an installed command."""
 
 
-class BrokenCommand(ConfigurationError):
+class BrokenCommand(ConfigurationError, code="command-broken"):
     """A command that an installed package registers can't be imported."""
-
-    code = "command-broken"
 
     def __init__(self, name: str, entry: EntryPoint, error: Exception) -> None:
         package = entry.package

@@ -11,10 +11,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-class ContentUnavailable(ContentError):
+class ContentUnavailable(ContentError, code="content-unavailable"):
     """None of the sources asked has the file, or one of its blocks."""
-
-    code = "content-unavailable"
 
     def __init__(self, cid: str, why: str) -> None:
         super().__init__(
@@ -24,10 +22,8 @@ class ContentUnavailable(ContentError):
         self.why = why
 
 
-class ContentTooLarge(ContentError):
+class ContentTooLarge(ContentError, code="content-too-large"):
     """A file is larger than the caller, or the store, allows. Sizes are in bytes."""
-
-    code = "content-too-large"
 
     def __init__(self, cid: str, *, size: int, limit: int) -> None:
         super().__init__(
@@ -39,15 +35,13 @@ class ContentTooLarge(ContentError):
         self.limit = limit
 
 
-class ContentCorrupt(ContentError):
+class ContentCorrupt(ContentError, code="content-corrupt"):
     """Bytes do not have the hash that their CID says, or are not a file.
 
     `reason` is machine-readable: `wrong-hash` or, for blocks with the right hash, `not-a-file`, `wrong-size`,
     `empty-part`, `oversized-block`, `too-deep`, `too-many-blocks`, `not-indexed`. `holders` are the Zenoh ids of the
     sessions that sent them (empty if they came from our disk, or from elsewhere).
     """
-
-    code = "content-corrupt"
 
     def __init__(self, cid: str, why: str, *, reason: str = "wrong-hash", holders: Iterable[str] = ()) -> None:
         self.holders = tuple(holders)
@@ -58,10 +52,8 @@ class ContentCorrupt(ContentError):
         self.reason = reason
 
 
-class ContentPinned(AiraError):
+class ContentPinned(AiraError, code="content-pinned"):
     """A file can't be removed because it is pinned, with these `labels`."""
-
-    code = "content-pinned"
 
     def __init__(self, cid: str, labels: Iterable[str]) -> None:
         self.labels = tuple(sorted(labels))
@@ -69,10 +61,8 @@ class ContentPinned(AiraError):
         self.cid = cid
 
 
-class StoreFull(AiraError):
+class StoreFull(AiraError, code="store-full"):
     """The store has no space for a file: its disk is full, or its quota is reached."""
-
-    code = "store-full"
 
     def __init__(self, path: Path, *, why: str = "", hint: str = "") -> None:
         super().__init__(
@@ -81,13 +71,11 @@ class StoreFull(AiraError):
         self.path = path
 
 
-class QuotaReached(StoreFull):
+class QuotaReached(StoreFull, code="quota-reached"):
     """A file does not fit the store's quota: `missing` bytes are too many even after evicting all that may be evicted.
 
     `kept` bytes can't be evicted: they are pinned, or being written.
     """
-
-    code = "quota-reached"
 
     def __init__(self, path: Path, *, missing: int, quota: int, kept: int) -> None:
         super().__init__(
@@ -100,10 +88,8 @@ class QuotaReached(StoreFull):
         self.kept = kept
 
 
-class StoreDamaged(AiraError):
+class StoreDamaged(AiraError, code="store-damaged"):
     """The store's index can't be read or written. The files themselves may be whole."""
-
-    code = "store-damaged"
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(

@@ -40,16 +40,12 @@ TIMEOUT: Final = 60.0
 """Seconds for the demand to become a contract, and for the job, in addition to its objective's duration."""
 
 
-class DemoStalled(RemoteError):
+class DemoStalled(RemoteError, code="demo-stalled"):
     """The demo did not finish in time."""
 
-    code = "demo-stalled"
 
-
-class OutputNotWritable(ConfigurationError):
+class OutputNotWritable(ConfigurationError, code="output-not-writable"):
     """A file or folder can't be written."""
-
-    code = "output-not-writable"
 
 
 class Demo:

@@ -35,10 +35,8 @@ PR_SET_PDEATHSIG: Final = 1
 """From `linux/prctl.h`."""
 
 
-class NodeEnded(RemoteError):
+class NodeEnded(RemoteError, code="node-ended"):
     """The node's process ended without being asked to. `exit_code` is negative for a signal."""
-
-    code = "node-ended"
 
     def __init__(self, program: Path, code: int, said: str) -> None:
         super().__init__(

@@ -10,10 +10,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-class PortUnavailable(ConfigurationError):
+class PortUnavailable(ConfigurationError, code="port-unavailable"):
     """The node can't listen on its port: it is taken, or this user may not have it."""
-
-    code = "port-unavailable"
 
     def __init__(self, host: str, port: int, why: str) -> None:
         super().__init__(
@@ -24,40 +22,32 @@ class PortUnavailable(ConfigurationError):
         self.why = why
 
 
-class NotAProgram(ConfigurationError):
+class NotAProgram(ConfigurationError, code="not-a-program"):
     """The file that is named as anvil can't be run."""
-
-    code = "not-a-program"
 
     def __init__(self, program: Path) -> None:
         super().__init__(f"{program} is not a program that can be run", hint="--anvil names the file `anvil`")
         self.program = program
 
 
-class InvalidChainState(ConfigurationError):
+class InvalidChainState(ConfigurationError, code="invalid-chain-state"):
     """The file holds no chain of anvil."""
-
-    code = "invalid-chain-state"
 
     def __init__(self, state: Path) -> None:
         super().__init__(f"{state} holds no chain of anvil", hint="name another file, or remove it")
         self.state = state
 
 
-class MarketMissing(ConfigurationError):
+class MarketMissing(ConfigurationError, code="market-missing"):
     """The chain in the file is not new, but has no market."""
-
-    code = "market-missing"
 
     def __init__(self, state: Path | None) -> None:
         super().__init__(f"the chain in {state} is not new, but has no market", hint="name another file, or remove it")
         self.state = state
 
 
-class KeyfilesNotWritable(ConfigurationError):
+class KeyfilesNotWritable(ConfigurationError, code="keyfiles-not-writable"):
     """The keyfiles of the development accounts can't be written to their folder."""
-
-    code = "keyfiles-not-writable"
 
     def __init__(self, folder: Path, why: str) -> None:
         super().__init__(f"can't write keyfiles to {folder}: {why}", hint="name another folder with --data-dir")

@@ -25,10 +25,8 @@ if TYPE_CHECKING:
 ENTRY_POINTS: Final = "aira.doctor_checks"
 
 
-class NoRouter(ConfigurationError):
+class NoRouter(ConfigurationError, code="router-missing"):
     """The settings name no router, or no address on which a router listens."""
-
-    code = "router-missing"
 
     def __init__(self, role: str) -> None:
         option = "--listen" if role == "router" else "--connect"

@@ -93,10 +93,8 @@ def zenohd_configuration(endpoints: Endpoints) -> str:
     return heading + json.dumps(nested, indent=2) + "\n"
 
 
-class IdentityDenied(RemoteError):
+class IdentityDenied(RemoteError, code="identity-denied"):
     """A router accepts this identity's certificate but denies all its operations."""
-
-    code = "identity-denied"
 
     def __init__(self, address: str) -> None:
         super().__init__(

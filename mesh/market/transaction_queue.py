@@ -43,10 +43,8 @@ LEAST_GAS: Final = 200_000
 WAITS: Final = "a transaction waits"
 
 
-class NoStake(ChainError):
+class NoStake(ChainError, code="no-stake"):
     """A provider has no stake at its lighthouse, which refuses all its transactions. The minimal stake is in wn."""
-
-    code = "no-stake"
 
     def __init__(self, provider: str, lighthouse: str, *, minimal_stake: int) -> None:
         super().__init__(

@@ -24,10 +24,8 @@ CAUSE: Final = re.compile(r"\[\S+?: (?P<cause>.+?) at /")
 """The cause in Zenoh's error about a listener."""
 
 
-class NotAdmitted(RemoteError):
+class NotAdmitted(RemoteError, code="not-admitted"):
     """A router answers, but it and this identity do not accept each other."""
-
-    code = "not-admitted"
 
     def __init__(self, *refusals: str) -> None:
         super().__init__(

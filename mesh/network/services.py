@@ -48,10 +48,8 @@ class Failure(Record, frozen=True):
 BUSY: Final = Failure("the agent is handling too many requests", "try again later").encode()
 
 
-class ServiceFailed(RemoteError):
+class ServiceFailed(RemoteError, code="service-failed"):
     """The agent replied to a call of `service` with an error, or did not reply; `reason` tells which."""
-
-    code = "service-failed"
 
     def __init__(self, service: str, why: str, *, hint: str = "", reason: FailureReason = "agent-error") -> None:
         super().__init__(f"{service}: {why}", hint=hint)

@@ -10,10 +10,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-class RecordingError(InputError):
+class RecordingError(InputError, code="recording-error"):
     """A file is not usable as a recording. `reason` is machine-readable, `why` is for people."""
-
-    code = "recording-error"
 
     def __init__(self, path: Path, why: str, *, reason: str, hint: str = "") -> None:
         super().__init__(f"{path.name}: {why}", hint=hint)
@@ -22,19 +20,15 @@ class RecordingError(InputError):
         self.reason = reason
 
 
-class NotARecording(RecordingError):
+class NotARecording(RecordingError, code="not-a-recording"):
     """A file is neither MCAP nor a ROS 1 bag, or can't be read at all."""
-
-    code = "not-a-recording"
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(path, why, reason="not-a-recording", hint="an objective is an MCAP file or a ROS 1 bag")
 
 
-class CorruptRecording(RecordingError):
+class CorruptRecording(RecordingError, code="corrupt-recording"):
     """A file begins as a recording, but is cut off or damaged."""
-
-    code = "corrupt-recording"
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(
@@ -42,13 +36,11 @@ class CorruptRecording(RecordingError):
         )
 
 
-class RecordingTooLarge(RecordingError):
+class RecordingTooLarge(RecordingError, code="recording-too-large"):
     """A recording is over a limit; `limit` is the field of `Limits`.
 
     `reason` is `too-large` for the size of the file, `expands-too-much` for any other limit.
     """
-
-    code = "recording-too-large"
 
     def __init__(self, path: Path, why: str, *, limit: str) -> None:
         reason = "too-large" if limit == "size" else "expands-too-much"
@@ -56,26 +48,20 @@ class RecordingTooLarge(RecordingError):
         super().__init__(path, why, reason=reason, hint="raise the limits, or use a smaller recording")
 
 
-class Unrecordable(InputError):
+class Unrecordable(InputError, code="unrecordable"):
     """No recording can hold this message; nothing of it was written."""
 
-    code = "unrecordable"
 
-
-class RecordingExists(InputError):
+class RecordingExists(InputError, code="recording-exists"):
     """A recording of that name exists; none is ever overwritten."""
-
-    code = "recording-exists"
 
     def __init__(self, path: Path) -> None:
         super().__init__(f"{path} already exists", hint="choose another name, or move it away")
         self.path = path
 
 
-class RecordingFailed(AiraError):
+class RecordingFailed(AiraError, code="recording-failed"):
     """The disk refused the recording; what was written before can be recovered."""
-
-    code = "recording-failed"
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(f"can't record to {path}: {why}", hint="free space on the disk, then recover the file")

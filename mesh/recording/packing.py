@@ -44,10 +44,8 @@ _LONGEST: Final = 16 << 20
 """Bytes of the longest line."""
 
 
-class InvalidLine(InputError):
+class InvalidLine(InputError, code="invalid-line"):
     """A line is not a valid message of an objective. `number` counts from 1."""
-
-    code = "invalid-line"
 
     def __init__(self, number: int, why: str) -> None:
         super().__init__(

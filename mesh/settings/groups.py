@@ -34,16 +34,12 @@ def option(default: T, meaning: str) -> T:
     return field(default=default, metadata={"meaning": meaning})
 
 
-class NodeNotSet(ConfigurationError):
+class NodeNotSet(ConfigurationError, code="node-not-set"):
     """The settings name no EVM node."""
 
-    code = "node-not-set"
 
-
-class AccountNotSet(ConfigurationError):
+class AccountNotSet(ConfigurationError, code="account-not-set"):
     """The settings name no keyfile, or no password file."""
-
-    code = "account-not-set"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -30,10 +30,8 @@ NOT_OPTIONS: Final = frozenset({"AIRA_CONFIG", "AIRA_REQUIRE_PEERS", "AIRA_KUBO"
 """`AIRA_*` variables that belong to the command line or to the tests, not to the settings."""
 
 
-class UnknownOption(ConfigurationError):
+class UnknownOption(ConfigurationError, code="unknown-option"):
     """A file, the environment or the flags (`where`) set an option that does not exist; `nearest` is a similar one."""
-
-    code = "unknown-option"
 
     def __init__(self, name: str, where: str, nearest: str) -> None:
         super().__init__(f"unknown option {name!r} in {where}", hint=f"did you mean {nearest!r}?")
@@ -42,30 +40,24 @@ class UnknownOption(ConfigurationError):
         self.nearest = nearest
 
 
-class InvalidOption(ConfigurationError):
+class InvalidOption(ConfigurationError, code="invalid-option"):
     """The value of the option `name` has the wrong type or is out of range."""
-
-    code = "invalid-option"
 
     def __init__(self, name: str, why: str) -> None:
         super().__init__(f"the setting {name} is invalid: {why}", hint=f"{name}: {MEANING[name]}")
         self.name = name
 
 
-class SettingsUnreadable(ConfigurationError):
+class SettingsUnreadable(ConfigurationError, code="settings-unreadable"):
     """The settings file at `path` can't be read."""
-
-    code = "settings-unreadable"
 
     def __init__(self, path: Path, why: str | None) -> None:
         super().__init__(f"can't read the settings {path}: {why}")
         self.path = path
 
 
-class SettingsNotToml(ConfigurationError):
+class SettingsNotToml(ConfigurationError, code="settings-not-toml"):
     """The settings file at `path` is not TOML."""
-
-    code = "settings-not-toml"
 
     def __init__(self, path: Path, why: object) -> None:
         super().__init__(f"{path} is not TOML: {why}")

@@ -42,30 +42,24 @@ _ADDRESS_NAME: Final = re.compile(_ADDRESS)
 _CHAIN_NAME: Final = re.compile(_CHAIN)
 
 
-class ArchiveUnusable(InputError):
+class ArchiveUnusable(InputError, code="archive-unusable"):
     """A file is not a backup, is damaged, or contains unexpected files. Nothing of it was used."""
-
-    code = "archive-unusable"
 
     def __init__(self, path: Path, why: str, *, hint: str = "use another backup; nothing was changed") -> None:
         super().__init__(f"{path} can't be used: {why}", hint=hint)
         self.path = path
 
 
-class StateInUse(ConfigurationError):
+class StateInUse(ConfigurationError, code="state-in-use"):
     """An agent is using the state that should be replaced."""
-
-    code = "state-in-use"
 
     def __init__(self, path: Path) -> None:
         super().__init__(f"{path} is in use", hint="stop the agent first")
         self.path = path
 
 
-class StateExists(ConfigurationError):
+class StateExists(ConfigurationError, code="state-exists"):
     """The data folder already has a state."""
-
-    code = "state-exists"
 
     def __init__(self, folder: Path, parts: Sequence[str]) -> None:
         super().__init__(
@@ -76,20 +70,16 @@ class StateExists(ConfigurationError):
         self.parts = tuple(parts)
 
 
-class NoState(ConfigurationError):
+class NoState(ConfigurationError, code="state-missing"):
     """The data folder has no state."""
-
-    code = "state-missing"
 
     def __init__(self, folder: Path) -> None:
         super().__init__(f"{folder} has no state of an agent", hint="give the data folder with --data-dir")
         self.folder = folder
 
 
-class StateChanging(ConfigurationError):
+class StateChanging(ConfigurationError, code="state-changing"):
     """Jobs started and ended faster than they could be copied."""
-
-    code = "state-changing"
 
     def __init__(self, path: Path) -> None:
         super().__init__(f"the jobs of {path} change too fast to be copied", hint="try again, or stop the agent")

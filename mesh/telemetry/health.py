@@ -18,10 +18,8 @@ STARTING: Final = "still waits"
 """The state of a role's part `start` until the role has started."""
 
 
-class InvalidListenAddress(ConfigurationError):
+class InvalidListenAddress(ConfigurationError, code="invalid-listen-address"):
     """The setting `metrics_listen` is not HOST:PORT."""
-
-    code = "invalid-listen-address"
 
 
 class Health(msgspec.Struct, frozen=True):

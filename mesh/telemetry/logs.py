@@ -38,10 +38,8 @@ MAX_REPLY: Final = MAX_RECORD_SIZE - 4_096
 """Bytes of events in a reply; the rest of the record is for its other fields."""
 
 
-class NoLog(AiraError):
+class NoLog(AiraError, code="log-not-kept"):
     """The process keeps no log: a program embeds the role and logs in its own way."""
-
-    code = "log-not-kept"
 
 
 class _BufferedEvent(NamedTuple):

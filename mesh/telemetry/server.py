@@ -39,10 +39,8 @@ TEXT: Final = "text/plain; charset=utf-8"
 PROMETHEUS_TYPES: Final = {"counter": CounterMetricFamily, "gauge": GaugeMetricFamily}
 
 
-class MetricsNotServed(ConfigurationError):
+class MetricsNotServed(ConfigurationError, code="metrics-not-served"):
     """The address of metrics and health can't be used; `where` is its HOST:PORT."""
-
-    code = "metrics-not-served"
 
     def __init__(self, where: str, why: object) -> None:
         super().__init__(

@@ -46,10 +46,8 @@ CREATE TABLE IF NOT EXISTS cursors (name TEXT PRIMARY KEY, block INTEGER NOT NUL
 """
 
 
-class LedgerUnusable(ConfigurationError):
+class LedgerUnusable(ConfigurationError, code="ledger-unusable"):
     """The ledger can't be read or written: the disk is full, the folder belongs to another user, or it is no ledger."""
-
-    code = "ledger-unusable"
 
     def __init__(self, path: Path, why: object) -> None:
         hint = "free space on the disk, let this user write there, or give another folder with --data-dir"
@@ -58,10 +56,8 @@ class LedgerUnusable(ConfigurationError):
         self.why = str(why)
 
 
-class LedgerTooNew(ConfigurationError):
+class LedgerTooNew(ConfigurationError, code="ledger-too-new"):
     """A newer version wrote the ledger. `found` and `known` are versions of its format."""
-
-    code = "ledger-too-new"
 
     def __init__(self, path: Path, *, found: int, known: int) -> None:
         super().__init__(

@@ -22,26 +22,20 @@ ANY_TOPIC: Final = "*"
 """The topic of the handler for topics without a handler of their own."""
 
 
-class JobFailed(AiraError):
+class JobFailed(AiraError, code="job-failed"):
     """Raise it in a handler to end the job without success, which refunds the promisee. The text says why."""
 
-    code = "job-failed"
 
-
-class DuplicateHandler(ConfigurationError):
+class DuplicateHandler(ConfigurationError, code="duplicate-handler"):
     """A topic has two handlers."""
-
-    code = "duplicate-handler"
 
     def __init__(self, topic: str) -> None:
         super().__init__(f"two handlers for topic {topic}", hint="give each topic one handler")
         self.topic = topic
 
 
-class HandlerCancelled(AiraError):
+class HandlerCancelled(AiraError, code="handler-cancelled"):
     """A handler ended because something that it waited for was cancelled, so it has not done its work."""
-
-    code = "handler-cancelled"
 
 
 class Job:

@@ -41,10 +41,8 @@ STARTABLE: Final = (Phase.READY, Phase.RUNNING)
 """Phases in which a job's playback may begin, continue or be restarted."""
 
 
-class WrongPhase(AiraError):
+class WrongPhase(AiraError, code="wrong-phase"):
     """The job's phase does not allow the operation. `phase` is its phase, None if the agent has no such job."""
-
-    code = "wrong-phase"
 
     def __init__(self, liability: str, *, asked: str, phase: Phase | None) -> None:
         where = f"is {phase.value}" if phase else "is not a job of this agent"

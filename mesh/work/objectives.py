@@ -21,10 +21,8 @@ PREFLIGHTS: Final = 1
 """Objectives checked at once: a check uses one core, and up to 256 MiB of memory for a malicious file."""
 
 
-class ObjectiveUnfit(InputError):
+class ObjectiveUnfit(InputError, code="objective-unfit"):
     """An objective can't be played here. `reason` is the word for programs that the check gave."""
-
-    code = "objective-unfit"
 
     def __init__(self, cid: str, reason: str, detail: str) -> None:
         super().__init__(f"objective {cid} can't be played ({reason}): {detail}")
