@@ -57,12 +57,7 @@ def site(folder: Path, name: str, days: float) -> None:
 @click.option("--address", help="the account's address [not needed for a router]")
 @click.option("--keyfile", type=FILE, help="the account's keyfile, instead of its address")
 @click.option(
-    "--role",
-    "roles",
-    multiple=True,
-    required=True,
-    type=click.Choice(list(ROLES)),
-    help="a role of the member (may be repeated)",
+    "--role", "roles", multiple=True, required=True, type=click.Choice(list(ROLES)), help="a role (repeatable)"
 )
 @click.option("--host", "hosts", multiple=True, help="for a router: a host name or IP address (may be repeated)")
 @click.option("--agent", default="", help="for an edge agent: address of the agent that its device belongs to")
