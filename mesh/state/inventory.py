@@ -16,11 +16,10 @@ import msgspec
 
 from mesh.content import Store
 from mesh.content.recovery import is_in_use
-from mesh.errors import ConfigurationError
 from mesh.state.archive import read_archive
 from mesh.state.layout import LEDGER, PINS, RECORDINGS, NoState, StateInUse, account_folders, parts_in, transactions_in
 from mesh.work import Ledger
-from mesh.work.database import VERSION, LedgerUnusable
+from mesh.work.database import VERSION, LedgerTooNew, LedgerUnusable
 from mesh.work.lifecycle import UNFINISHED
 from schemas import Demand, Offer, decode
 
@@ -99,7 +98,7 @@ class ArchiveContents(msgspec.Struct, frozen=True, kw_only=True, rename="camel")
 def copy_ledger(ledger: Path, copy: Path) -> None:
     """Copy a ledger as it is at this moment, even while an agent writes it. Replaces an earlier copy.
 
-    Raises `LedgerUnusable`, and `ConfigurationError` if a newer version wrote it.
+    Raises `LedgerUnusable`, and `LedgerTooNew` if a newer version wrote it.
     """
     try:
         with closing(sqlite3.connect(f"{ledger.resolve().as_uri()}?mode=ro", uri=True)) as source:
@@ -113,7 +112,7 @@ def copy_ledger(ledger: Path, copy: Path) -> None:
 
 
 def check_ledger(ledger: Path) -> None:
-    """Raise `LedgerUnusable` for a ledger that is damaged or has more than tables, `ConfigurationError` if a newer
+    """Raise `LedgerUnusable` for a ledger that is damaged or has more than tables, `LedgerTooNew` if a newer
     version wrote it."""
     try:
         with closing(sqlite3.connect(ledger)) as database:
@@ -159,10 +158,7 @@ def locked_ledger(ledger: Path) -> Iterator[None]:
 def _check_version(database: sqlite3.Connection, ledger: Path) -> None:
     (version,) = database.execute("PRAGMA user_version").fetchone()
     if version > VERSION:
-        raise ConfigurationError(
-            f"the ledger {ledger} was written by a newer version (format {version}, this one knows {VERSION})",
-            hint="upgrade aira-mesh",
-        )
+        raise LedgerTooNew(ledger, found=version, known=VERSION)
 
 
 async def take_inventory(folder: Path) -> Inventory:

@@ -159,7 +159,7 @@ def test_a_signal_ends_it_also_without_a_board(router: EmbeddedRouter, how: sign
         (("/dev/ttyACM0", "--agent", "0x" + "11" * 20, "--name", "a/b"), "[invalid-key]"),
         (("/dev/ttyACM0", "--agent", "0x" + "11" * 20, "--baud", "9"), "--baud"),
         (("/dev/ttyACM0", "--agent", "0x" + "11" * 20, "--protocol", "morse"), "'frames', 'rosserial'"),
-        (("/dev/ttyACM0", "--agent", "0x" + "11" * 20, "--map", "led=/lamp"), "TOPIC=NAME"),
+        (("/dev/ttyACM0", "--agent", "0x" + "11" * 20, "--map", "led=/lamp"), "TOPIC=/NAME"),
         (("/dev/ttyACM0", "--agent", "0x" + "11" * 20, "--map", "/a=/b", "--map", "/a=/c"), "[input-error]"),
     ],
 )
