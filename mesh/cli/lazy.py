@@ -6,7 +6,6 @@ Installed packages add commands by entry points of the group `aira.commands`: th
 
 from __future__ import annotations
 
-import difflib
 import sys
 from functools import cached_property
 from importlib import import_module
@@ -92,6 +91,8 @@ class LazyGroup(click.Group):
         if name and not name.startswith("-") and name not in self.commands and name not in self._lazy:
             known = self.list_commands(ctx)
             if name not in known:
+                import difflib  # here, as an edge agent must stay small and rarely needs it
+
                 near = difflib.get_close_matches(name, known, n=1)
                 ctx.fail(f"no such command {name!r}" + (f"; did you mean {near[0]!r}?" if near else ""))
         return super().resolve_command(ctx, args)

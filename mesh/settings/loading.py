@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import logging
 import os
 import tomllib
@@ -121,6 +120,8 @@ def _checked(options: dict[str, Any], *, where: str) -> dict[str, Any]:
         elif name in OPTIONS:
             kept[name] = value
         else:
+            import difflib  # here, as an edge agent must stay small and rarely needs it
+
             nearest = difflib.get_close_matches(name, OPTIONS, n=1, cutoff=0)[0]
             raise UnknownOption(name, where, nearest)
     return kept
