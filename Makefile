@@ -8,6 +8,8 @@ SHELL := bash
 PYTHON ?= $(shell for python in python3 python3.13 python3.12 python3.11; do \
 	$$python -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$python && break; done)
 BIN := .venv/bin
+# Where this is set, as in many containers, every command compiles all its modules again when it starts.
+unexport PYTHONDONTWRITEBYTECODE
 INSTALLED := .venv/.installed
 LOCK := requirements/lock.txt
 TYPED := schemas mesh bridges peers tests bench examples

@@ -80,12 +80,16 @@ def _with_subclasses(error: type[AiraError]) -> Iterator[type[AiraError]]:
 
 
 class Interrupted:
-    """`aira` with these arguments, which gets a signal `after` so many seconds from when it printed `at`."""
+    """`aira` with these arguments, which gets a signal `after` so many seconds from when it printed `at`.
+
+    With `loads` it gets it when it has loaded that module.
+    """
 
     def __init__(
         self,
         *arguments: str | Path,
         at: str = "",
+        loads: str = "",
         after: float = 0.0,
         by: signal.Signals = signal.SIGINT,
         variables: Mapping[str, str] | None = None,
@@ -95,13 +99,17 @@ class Interrupted:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            env=environment(variables or {}),
+            env=environment({"PYTHONPROFILEIMPORTTIME": "1" if loads else "", **(variables or {})}),
         ) as process:
             assert process.stdout is not None
+            assert process.stderr is not None
             said = ""
+            while loads and said.rpartition("|")[2].strip() != loads:
+                said = process.stderr.readline()
+                assert said, f"it ended without loading {loads}"
             while at not in said:
                 said = process.stdout.readline()
-                assert said, f"it ended without saying {at!r}: {process.stderr.read() if process.stderr else ''}"
+                assert said, f"it ended without saying {at!r}: {process.stderr.read()}"
             time.sleep(after)
             process.send_signal(by)
             sent = time.monotonic()
