@@ -45,14 +45,7 @@ if TYPE_CHECKING:
         RejectKey,
         ResultKey,
         RpcKey,
-        device_selector,
-        event_selector,
-        lighthouse_selector,
-        market_selector,
-        objective_selector,
         parse_key,
-        presence_selector,
-        topic_selector,
     )
     from schemas.messages import (
         MAX_UINT256,
@@ -69,6 +62,15 @@ if TYPE_CHECKING:
     )
     from schemas.payloads import EMPTY, JSON, RAW, STRING, Empty, PayloadType, String, payload_type
     from schemas.records import Liability, Record, UInt256
+    from schemas.selectors import (
+        device_selector,
+        event_selector,
+        lighthouse_selector,
+        market_selector,
+        objective_selector,
+        presence_selector,
+        topic_selector,
+    )
     from schemas.signing import Signer, Verified, recover, verify, verify_hashed, verify_message
     from schemas.unixfs import (
         CHUNK_SIZE,
@@ -93,8 +95,7 @@ _NAMES: Final = {
     "keys": (
         "AgentKey CidKey DemandKey DeviceTopicKey EthEventKey EventKey FeedbackKey Key LiabilityTopicKey "
         "MarketKey ObjectiveTopicKey OfferKey PendingKey PresenceKey RejectKey ResultKey RpcKey "
-        "device_selector event_selector lighthouse_selector market_selector objective_selector parse_key "
-        "presence_selector topic_selector"
+        "parse_key"
     ),
     "messages": (
         "Demand MAX_UINT256 Message Offer Order OrderFeedback Result SignedMessage TransactionFeedback "
@@ -102,6 +103,10 @@ _NAMES: Final = {
     ),
     "payloads": ("EMPTY Empty JSON PayloadType RAW STRING String payload_type"),
     "records": ("Liability Record UInt256"),
+    "selectors": (
+        "device_selector event_selector lighthouse_selector market_selector objective_selector presence_selector "
+        "topic_selector"
+    ),
     "signing": ("Signer Verified recover verify verify_hashed verify_message"),
     "unixfs": (
         "CHUNK_SIZE MAX_LINKS UnixfsBlock UnixfsLink UnixfsNode blocks_of_stream cid_of_bytes cid_of_file "

@@ -1,12 +1,12 @@
 """The keyspace: all keys and their meaning.
 
 `str(key)` is the text of a key, `parse_key` parses one; both make the same checks, because Zenoh itself accepts blanks,
-line ends and NUL in a key. Each key has exactly one text.
+line ends and NUL in a key. Each key has exactly one text. `schemas.selectors` has the selectors for subscribers and
+queries.
 
 A lighthouse is given by its ENS name in lower case, or by its address if it has none. Addresses are in lower case (the
 classes accept any case), hashes are 64 hexadecimal digits in lower case without `0x`. A topic is written as in ROS,
-`/a/b`, and becomes the chunks `a/b`. Selectors are key expressions with wildcards, for subscribers and queries.
-To add a family of keys, add its class, its pattern in `_parse`, and a selector.
+`/a/b`, and becomes the chunks `a/b`. To add a family of keys, add its class, its pattern in `_parse`, and a selector.
 """
 
 from __future__ import annotations
@@ -17,22 +17,13 @@ from msgspec import Struct
 from msgspec.structs import force_setattr
 
 from schemas.errors import InvalidKey
-from schemas.key_chunks import CANONICAL, address_chunk, check_event, cid_chunk, lighthouse_chunk, name_chunk
+from schemas.key_chunks import CANONICAL, check_event
 
 LiabilityEvent: TypeAlias = Literal["incoming", "ready", "complete", "finalized"]
 EthEvent: TypeAlias = Literal["transfer", "approval"]
 MarketKind: TypeAlias = Literal["demand", "offer", "result", "feedback", "pending", "reject"]
 
 MAX_KEY_LENGTH: Final = 512
-
-_MARKET_PATTERNS: Final = {
-    "demand": "demand/{model}/*",
-    "offer": "offer/{model}/*",
-    "result": "result/*/*",
-    "feedback": "feedback/*/*",
-    "pending": "pending/*",
-    "reject": "reject/*/*",
-}
 
 
 class _Key(Struct, frozen=True, gc=False):
@@ -208,6 +199,16 @@ AgentKey: TypeAlias = EventKey | ObjectiveTopicKey | LiabilityTopicKey | DeviceT
 Key: TypeAlias = MarketKey | AgentKey | PresenceKey | CidKey
 
 
+def market_key(lighthouse: str, kind: MarketKind, chunk: str, digest: str) -> str:
+    """The key of a message whose parts are canonical already, without the checks. `chunk` is its model or liability."""
+    return f"aira/{lighthouse}/{kind}/{chunk}/{digest}"
+
+
+def market_kind(text: str) -> str:
+    """The kind that a key on a lighthouse names; any text, because this checks nothing."""
+    return text.split("/", 3)[2] if text.count("/") > 1 else ""
+
+
 def parse_key(text: str) -> Key:
     """The key with this text. Raises `InvalidKey` if there is none, or if it is not in the canonical form."""
     if len(text) > MAX_KEY_LENGTH:
@@ -255,46 +256,3 @@ def _parse_of_agent(text: str, agent: str, path: list[str]) -> AgentKey:
         case ["eth", "event", event]:
             return EthEventKey(agent, event)  # type: ignore[arg-type]
     raise InvalidKey(text, "there is no such family under an agent")
-
-
-def market_selector(lighthouse: str, kind: MarketKind, model: str = "*") -> str:
-    """All messages of a kind on a lighthouse; with `model` (CID), only the demands or offers of that model."""
-    pattern = _MARKET_PATTERNS.get(kind)
-    if pattern is None:
-        raise InvalidKey(kind, f"it is not one of the kinds {', '.join(_MARKET_PATTERNS)}")
-    if model != "*" and "{model}" not in pattern:
-        raise InvalidKey(model, f"the keys of a {kind} have no model")
-    chunk = model if model == "*" else cid_chunk(model)
-    return f"aira/{lighthouse_chunk(lighthouse)}/{pattern.format(model=chunk)}"
-
-
-def lighthouse_selector(lighthouse: str) -> str:
-    """All messages on a lighthouse's market; presence tokens are not matched by wildcards."""
-    return f"aira/{lighthouse_chunk(lighthouse)}/**"
-
-
-def presence_selector(lighthouse: str, role: str = "*") -> str:
-    """The presence tokens of all agents on a lighthouse, or of those in one role."""
-    chunk = role if role == "*" else name_chunk(role)
-    return f"aira/{lighthouse_chunk(lighthouse)}/@agent/{chunk}/*"
-
-
-def event_selector(agent: str) -> str:
-    """All events of all liabilities of an agent."""
-    return f"aira/agent/{address_chunk(agent)}/liability/*/*"
-
-
-def objective_selector(agent: str, liability: str) -> str:
-    """All topics of a liability's objective."""
-    return f"aira/agent/{address_chunk(agent)}/liability/{address_chunk(liability)}/objective/**"
-
-
-def topic_selector(agent: str, liability: str) -> str:
-    """All topics that a device publishes for a liability."""
-    return f"aira/agent/{address_chunk(agent)}/liability/{address_chunk(liability)}/topic/**"
-
-
-def device_selector(agent: str, device: str = "*") -> str:
-    """All topics outside any job of one device of an agent, or of all its devices."""
-    chunk = device if device == "*" else name_chunk(device)
-    return f"aira/agent/{address_chunk(agent)}/device/{chunk}/**"

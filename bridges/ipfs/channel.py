@@ -22,6 +22,7 @@ from mesh.log_context import log_event
 from mesh.network import Pump, call_in_loop
 from mesh.role import Role
 from schemas import lighthouse_selector
+from schemas.keys import market_kind
 from schemas.status import BridgeStatus, bridge_status_key
 
 if TYPE_CHECKING:
@@ -250,7 +251,7 @@ class ChannelBridge(Role):
 def _convert(sample: zenoh.Sample) -> MeshMessage | None:
     """Convert a sample on the pump's thread. Rejections by providers do not exist on the legacy channel."""
     key = str(sample.key_expr)
-    if sample.kind != zenoh.SampleKind.PUT or key.split("/")[2:3] == ["reject"]:
+    if sample.kind != zenoh.SampleKind.PUT or market_kind(key) == "reject":
         return None
     attachment = sample.attachment
     return MeshMessage(key, sample.payload.to_bytes(), attachment is not None and attachment.to_bytes() == BRIDGE_MARK)

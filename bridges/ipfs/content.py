@@ -13,12 +13,12 @@ from bridges.ipfs.errors import IpfsError
 from bridges.ipfs.transfers import add_file
 from mesh.content import ContentUnavailable
 from mesh.content.download import HOLDER
-from mesh.content.exchange import CID_SELECTOR
 from mesh.errors import AiraError, ClosedError, InvalidKey
 from mesh.log_context import log_event
 from mesh.network import call_in_loop
 from mesh.retry import Backoff, RetryPolicy
 from schemas import CidKey, InputError, parse_block, parse_key
+from schemas.selectors import CID_SELECTOR
 from schemas.status import ContentMetrics
 
 if TYPE_CHECKING:

@@ -32,6 +32,7 @@ from schemas import (
     resolve_names,
     verify_hashed,
 )
+from schemas.keys import market_kind
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -89,7 +90,7 @@ class RelayMessage(NamedTuple):
     @property
     def kind(self) -> str:
         """The kind in its key: demand, offer, result, feedback or pending."""
-        return self.key.split("/", 3)[2]
+        return market_kind(self.key)
 
 
 class RelayValidator:

@@ -29,8 +29,9 @@ from bridges.serial.naming import ABOUT, PRESENT, DeviceId, TopicNames
 from mesh.errors import InvalidKey
 from mesh.log_context import liability_context, log_event
 from schemas.key_chunks import topic_chunks
-from schemas.keys import DeviceTopicKey, LiabilityTopicKey, event_selector, parse_key
+from schemas.keys import DeviceTopicKey, LiabilityTopicKey, parse_key
 from schemas.payloads import STRING, String, payload_type
+from schemas.selectors import event_selector
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 from mesh.errors import InputError
 from schemas.key_chunks import topic_chunks
 from schemas.keys import DeviceTopicKey, LiabilityTopicKey
+from schemas.selectors import topic_selector
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -39,7 +40,7 @@ class DeviceId:
 
     def command_keys(self, topic: str) -> tuple[str, str]:
         """The keys of a topic outside any job and in every job: puts and queries there are for the device."""
-        return self.key(topic), f"aira/agent/{self.agent.lower()}/liability/*/topic{topic}"
+        return self.key(topic), topic_selector(self.agent, topic=topic)
 
     def connection_key(self, liability: str) -> str:
         """The key on which a job's recording gets the device's losses and returns."""

@@ -51,7 +51,7 @@ class Rejections:
             if rejection is not None and rejection.order == order:
                 call_in_loop(loop, _put, queue, rejection)
 
-        selector = market_selector(self._parts.channel.lighthouse, "reject").replace("/*/*", f"/{order}/*")
+        selector = market_selector(self._parts.channel.lighthouse, "reject", order)
         subscriber: Any = self._session.declare_subscriber(selector, receive)
         try:
             async with Background() as tasks:

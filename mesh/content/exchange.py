@@ -17,6 +17,7 @@ from mesh.content.download import HOLDER, BlockRequester, Download, DownloadTimi
 from mesh.errors import AiraError, ClosedError, InvalidKey
 from mesh.log_context import log_event
 from schemas.keys import CidKey, parse_key
+from schemas.selectors import CID_SELECTOR
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -29,7 +30,6 @@ log = logging.getLogger(__name__)
 
 DEFAULT_TIMEOUT: Final = 30.0
 """Seconds without a new block after which a fetch fails."""
-CID_SELECTOR: Final = "aira/cid/*"
 
 _QUEUED: Final = 256
 """Queries that may wait. Beyond it the oldest is dropped: its sender gets an empty reply at once, and asks again."""

@@ -23,7 +23,6 @@ from schemas import (
     encode,
     lighthouse_selector,
     market_selector,
-    parse_address,
     presence_selector,
 )
 from schemas.keys import PresenceKey, parse_key
@@ -106,9 +105,9 @@ class Channel:
         network filters at the source.
         """
         self._check_open()
-        selector = market_selector(self.lighthouse, kind.kind, model)
-        if liability != "*":
-            selector = self._result_selector(kind, liability)
+        if liability != "*" and kind is not Result:
+            raise InputError(f"a {kind.kind} has no liability to select by")
+        selector = market_selector(self.lighthouse, kind.kind, model if liability == "*" else liability)
         validator: MessageValidator[M] = MessageValidator(
             kind, lighthouse=self.lighthouse, address=self.address, head=self._head
         )
@@ -155,11 +154,6 @@ class Channel:
         replies = self._session.liveliness().get(presence_selector(self.lighthouse), handler, timeout=RECALL_TIMEOUT)
         texts = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
         return list(_presence_keys(sorted(texts)))
-
-    def _result_selector(self, kind: type[Any], liability: str) -> str:
-        if kind is not Result:
-            raise InputError(f"a {kind.kind} has no liability to select by")
-        return market_selector(self.lighthouse, "result").replace("*", parse_address(liability).lower(), 1)
 
     def _check_open(self) -> None:
         if not self._open:

@@ -16,6 +16,7 @@ import msgspec
 
 from mesh.errors import InvalidMessage
 from schemas import Result, SignedMessage, Verified, decode, message_hash, names_in, resolve_names
+from schemas.keys import market_key
 from schemas.signing import verify_hashed
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ def verified_key(lighthouse: str, verified: Verified[Any]) -> str:
 
 def key_of(lighthouse: str, message: SignedMessage, digest: bytes) -> str:
     """Like `message_key`, given the message's hash. Constructing a message validates its fields, so this does not."""
-    return f"aira/{lighthouse}/{message.kind}/{message.key_chunk}/{digest.hex()}"
+    return market_key(lighthouse, message.kind, message.key_chunk, digest.hex())
 
 
 class Unresolved(NamedTuple, Generic[M]):

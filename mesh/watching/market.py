@@ -25,6 +25,7 @@ from schemas import (
     RejectKey,
     Result,
     Verified,
+    event_selector,
     market_selector,
     parse_address,
     parse_cid,
@@ -44,7 +45,6 @@ WAITING: Final = 256
 """Events that wait for the consumer; beyond, the oldest incoming messages are dropped and counted."""
 RECENT: Final = 65_536
 """Texts that a `RecentSet` keeps."""
-EVENTS: Final = "aira/agent/*/liability/*/*"
 
 
 class JobEvent(NamedTuple):
@@ -156,7 +156,7 @@ class MarketWatch:
             self._event_reader = ClaimReader(read_event, reason="event")
             selector = market_selector(channel.lighthouse, "reject")
             self._rejected = await stack.enter_async_context(Pump(self._session, selector, self._rejection_reader))
-            self._events = await stack.enter_async_context(Pump(self._session, EVENTS, self._event_reader))
+            self._events = await stack.enter_async_context(Pump(self._session, event_selector(), self._event_reader))
             tasks = await stack.enter_async_context(Background())
             for name, items in (
                 ("demands", self._seen_orders(self._demands)),

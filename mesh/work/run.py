@@ -14,8 +14,9 @@ import zenoh
 from mesh.log_context import log_event
 from mesh.recording import AtOnce, Unrecordable, play
 from mesh.work.job import HandlerCancelled, Job
-from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey, parse_key, topic_selector
+from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey, parse_key
 from schemas.payloads import STRING, PayloadType, String, payload_type
+from schemas.selectors import topic_selector
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -27,6 +29,9 @@ def test_market_selectors() -> None:
     assert market_selector(NAME, "demand") == f"aira/{NAME}/demand/*/*"
     assert market_selector(NAME.upper(), "offer", MODEL) == f"aira/{NAME}/offer/{MODEL}/*"
     assert market_selector(NAME, "result") == f"aira/{NAME}/result/*/*"
+    assert market_selector(NAME, "result", LIGHTHOUSE) == f"aira/{NAME}/result/{L}/*"
+    assert market_selector(NAME, "reject", "ab" * 32) == f"aira/{NAME}/reject/{'ab' * 32}/*"
+    assert market_selector(NAME, "pending", "ab" * 32) == f"aira/{NAME}/pending/{'ab' * 32}"
     assert market_selector(NAME, "pending") == f"aira/{NAME}/pending/*"
 
 
@@ -45,6 +50,8 @@ def test_selectors_of_an_agent_find_their_keys() -> None:
         (event_selector(SENDER), 7),
         (objective_selector(SENDER, LIGHTHOUSE), 8),
         (topic_selector(SENDER, LIGHTHOUSE), 9),
+        (topic_selector(SENDER, topic="/blink"), 9),
+        (event_selector(), 7),
         (device_selector(SENDER), 10),
         (device_selector(SENDER, "tty-0"), 10),
     ):
@@ -76,3 +83,23 @@ def test_selectors_are_checked() -> None:
         device_selector(A, "a/b")
     with pytest.raises(InvalidKey):
         topic_selector("*", L)
+
+
+NOT_FROM_SCHEMAS = {
+    "mesh/identity/access_rules.py": "rights on everything",
+    "mesh/identity/roster.py": "the shapes of keys on which roles have rights",
+    "mesh/doctor/session.py": "keys that no family has, which a router must refuse",
+    "mesh/work/run.py": "an encoding",
+}
+
+
+def test_keys_and_selectors_are_built_here_only() -> None:
+    root = Path(__file__).parents[2]
+    paths = [path for folder in ("mesh", "bridges", "schemas") for path in (root / folder).rglob("*.py")]
+    building = {
+        str(path.relative_to(root))
+        for path in paths
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.startswith("aira/")
+    }
+    assert building == {"schemas/keys.py", "schemas/selectors.py", *NOT_FROM_SCHEMAS}

@@ -1,0 +1,88 @@
+"""Selectors: key expressions with wildcards, for subscribers and queries. `schemas.keys` has the keys.
+
+Each function raises `InvalidKey` for a text that is not valid in a key.
+"""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final
+
+from schemas.errors import InvalidKey
+from schemas.key_chunks import (
+    address_chunk,
+    cid_chunk,
+    hash_chunk,
+    lighthouse_chunk,
+    name_chunk,
+    topic_chunks,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from schemas.keys import MarketKind
+
+CID_SELECTOR: Final = "aira/cid/*"
+"""All blocks and files."""
+
+_SUBJECTS: Final[Mapping[str, Callable[[str], str]]] = MappingProxyType(
+    {
+        "demand": cid_chunk,
+        "offer": cid_chunk,
+        "result": address_chunk,
+        "feedback": hash_chunk,
+        "pending": hash_chunk,
+        "reject": hash_chunk,
+    }
+)
+"""The check of the chunk behind each kind of message."""
+
+
+def market_selector(lighthouse: str, kind: MarketKind, subject: str = "*") -> str:
+    """All messages of a kind on a lighthouse, or those of one subject.
+
+    The subject is the model of a demand or offer, the liability of a result, the order of feedback or a rejection,
+    the transaction of a pending note.
+    """
+    check = _SUBJECTS.get(kind)
+    if check is None:
+        raise InvalidKey(kind, f"it is not one of the kinds {', '.join(_SUBJECTS)}")
+    rest = "" if kind == "pending" else "/*"
+    return f"aira/{lighthouse_chunk(lighthouse)}/{kind}/{_any_or(check, subject)}{rest}"
+
+
+def lighthouse_selector(lighthouse: str) -> str:
+    """All messages on a lighthouse's market; presence tokens are not matched by wildcards."""
+    return f"aira/{lighthouse_chunk(lighthouse)}/**"
+
+
+def presence_selector(lighthouse: str, role: str = "*") -> str:
+    """The presence tokens of all agents on a lighthouse, or of those in one role."""
+    return f"aira/{lighthouse_chunk(lighthouse)}/@agent/{_any_or(name_chunk, role)}/*"
+
+
+def event_selector(agent: str = "*") -> str:
+    """All events of all liabilities of an agent, or of all agents."""
+    return f"aira/agent/{_any_or(address_chunk, agent)}/liability/*/*"
+
+
+def objective_selector(agent: str, liability: str) -> str:
+    """All topics of a liability's objective."""
+    return f"aira/agent/{address_chunk(agent)}/liability/{address_chunk(liability)}/objective/**"
+
+
+def topic_selector(agent: str, liability: str = "*", topic: str = "/**") -> str:
+    """The topics that a device publishes for one liability of an agent or for any: all of them, or one."""
+    of_topic = topic if topic == "/**" else topic_chunks(topic)
+    return f"aira/agent/{address_chunk(agent)}/liability/{_any_or(address_chunk, liability)}/topic{of_topic}"
+
+
+def device_selector(agent: str, device: str = "*") -> str:
+    """All topics outside any job of one device of an agent, or of all its devices."""
+    return f"aira/agent/{address_chunk(agent)}/device/{_any_or(name_chunk, device)}/**"
+
+
+def _any_or(check: Callable[[str], str], text: str) -> str:
+    """The wildcard for one chunk, or a checked chunk."""
+    return text if text == "*" else check(text)
