@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from mesh.recording import Objective, Played, Recorder, RecordingAbout, open_objective, pack
     from mesh.running import fail, run_to_end
     from mesh.settings import Settings
-    from mesh.work.lifecycle import WrongPhase
-    from mesh.work.objectives import ObjectiveUnfit
+    from mesh.work.ledger import WrongPhase
+    from mesh.work.playbacks import ObjectiveUnfit
     from schemas import (
         STRING,
         ZERO_ADDRESS,
@@ -74,12 +74,12 @@ _HOMES = {
     "NodeUnreachable": "mesh.chain",
     "NotALiability": "mesh.chain",
     "Objective": "mesh.recording",
-    "ObjectiveUnfit": "mesh.work.objectives",
+    "ObjectiveUnfit": "mesh.work.playbacks",
     "Offer": "schemas",
     "OrderExpired": "mesh.agent.errors",
     "OrderRejected": "mesh.agent.errors",
     "Outcome": "mesh.agent.contract",
-    "Phase": "mesh.work.lifecycle",
+    "Phase": "mesh.work.ledger",
     "Played": "mesh.recording",
     "Recorder": "mesh.recording",
     "RecordingAbout": "mesh.recording",
@@ -89,7 +89,7 @@ _HOMES = {
     "Settings": "mesh.settings",
     "String": "schemas",
     "Verified": "schemas",
-    "WrongPhase": "mesh.work.lifecycle",
+    "WrongPhase": "mesh.work.ledger",
     "ZERO_ADDRESS": "schemas",
     "cid_of_file": "schemas",
     "fail": "mesh.running",

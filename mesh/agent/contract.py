@@ -1,19 +1,25 @@
-"""A contract (liability) whose end is waited for."""
+"""Contracts (liabilities) whose end is waited for."""
 
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from mesh.agent.errors import LiabilityReverted
 from mesh.content import ContentUnavailable
+from mesh.log_context import log_event
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.agent.components import AgentComponents
     from schemas import Liability
+
+log = logging.getLogger(__name__)
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
@@ -57,3 +63,101 @@ class Contract:
         return await self._parts.exchange.fetch(
             outcome.result, size_limit=settings.objective_expanded_limit, timeout=settings.fetch_timeout
         )
+
+
+@dataclass
+class _WatchedContract:
+    """A contract whose end somebody may wait for."""
+
+    ended: asyncio.Future[Outcome]
+    demand: str = ""
+    """The demand of ours that it was created from, if any, and what its caller holds."""
+    contract: Contract | None = None
+    reverted_until: int | None = None
+    """While a reorganisation has reverted it: the block by which it must be created again."""
+
+
+class WatchedContracts:
+    """The contracts whose end is waited for, by address."""
+
+    def __init__(self, parts: AgentComponents) -> None:
+        self._parts = parts
+        self._watched: dict[str, _WatchedContract] = {}
+
+    @property
+    def addresses(self) -> frozenset[str]:
+        """The addresses of these contracts."""
+        return frozenset(self._watched)
+
+    async def read(self, address: str) -> Contract:
+        """The contract at `address`, read from the chain. Raises `NotALiability`."""
+        is_new = address not in self._watched
+        self._watch(address)  # before it is read: it may end in between
+        try:
+            return self.watch(await self._parts.chain.liabilities.get(address))
+        except BaseException:
+            if is_new:
+                self._watched.pop(address, None)
+            raise
+
+    def watch(self, liability: Liability, *, demand: str = "") -> Contract:
+        """The contract of `liability`, which was created from our `demand` (hash), if from any."""
+        watched = self._watch(liability.address)
+        contract = Contract(liability, watched.ended, self._parts)
+        if demand:
+            watched.demand, watched.contract = demand, contract
+        if liability.is_finalized:
+            self.finalized(liability.address, Outcome(success=liability.is_success, result=liability.result))
+        return contract
+
+    def created(self, liability: Liability, demand: str) -> bool:
+        """The contract exists, perhaps again. False if our `demand` (hash) was not the one of a watched contract.
+
+        After a reorganisation the contract of a demand may be at another address.
+        """
+        if (watched := self._watched.get(liability.address)) is not None:
+            watched.reverted_until = None
+        again = next((one for one in self._watched.values() if demand and one.demand == demand), None)
+        if again is None or again.contract is None:
+            return False
+        again.reverted_until = None
+        self._watched[liability.address] = self._watched.pop(again.contract.address)
+        again.contract.liability = liability
+        return True
+
+    def reverted(self, address: str, deadline: int) -> None:
+        """A reorganisation reverted the contract at `address`, whose orders are valid until block `deadline`."""
+        if address in self._watched:
+            self._watched[address].reverted_until = deadline
+
+    def finalized(self, address: str, outcome: Outcome) -> None:
+        """The contract at `address` has ended."""
+        watched = self._watched.pop(address, None)
+        if watched is not None and not watched.ended.done():
+            facts = log_event("contract-ended", success=outcome.success, result=outcome.result)
+            log.info("the contract has ended, %s", "paid" if outcome.success else "refunded", extra=facts)
+            watched.ended.set_result(outcome)
+
+    def expire(self, block: int) -> None:
+        """The chain has `block`: reverted contracts whose orders' deadline has passed are given up."""
+        for address, watched in list(self._watched.items()):
+            if watched.reverted_until is not None and watched.reverted_until <= block:
+                del self._watched[address]
+                fail_future(watched.ended, LiabilityReverted(address, watched.reverted_until))
+
+    def fail(self, error: Exception) -> None:
+        """Fail everything that is waited for."""
+        for watched in self._watched.values():
+            fail_future(watched.ended, error)
+
+    def _watch(self, address: str) -> _WatchedContract:
+        if address not in self._watched:
+            self._watched[address] = _WatchedContract(asyncio.get_running_loop().create_future())
+        return self._watched[address]
+
+
+def fail_future(future: asyncio.Future[Any] | None, error: Exception) -> None:
+    """Fail what somebody may be waiting for."""
+    if future is not None and not future.done():
+        future.set_exception(error)
+        future.exception()  # marks it as retrieved: perhaps nobody waits

@@ -16,7 +16,7 @@ from schemas import Demand, Liability, Offer, Result, Verified
 if TYPE_CHECKING:
     from mesh.network import Subscription
     from mesh.work.job import Job
-    from mesh.work.lifecycle import Phase
+    from mesh.work.ledger import Phase
 
 log = logging.getLogger(__name__)
 

@@ -29,7 +29,7 @@ from mesh.chain import (
     Transfer,
 )
 from mesh.log_context import liability_context, log_event, with_liability_context
-from mesh.work.lifecycle import TO_BE_DONE, Phase, advance
+from mesh.work.ledger import TO_BE_DONE, Phase, advance
 from mesh.work.outbox import result_identity
 from schemas.keys import EthEventKey
 from schemas.rpc import ApprovalEvent, TransferEvent
@@ -194,7 +194,7 @@ class ChainListener:
             log.info("finalized, %s", "paid" if success else "refunded", extra=facts)
             ended = replace(job.liability, is_finalized=True, is_success=success, result=job.result or "")
             await self._on_phase(Phase.FINALIZED, ended)
-        self._trader.finalized(address, Outcome(success=success, result=result))
+        self._trader.contracts.finalized(address, Outcome(success=success, result=result))
 
     @with_liability_context
     async def finalization_reverted(self, address: str) -> None:

@@ -13,9 +13,8 @@ from mesh.agent.trade import Trader
 from mesh.role import Role
 from mesh.telemetry.logs import LogService
 from mesh.work.executor import Executor
-from mesh.work.lifecycle import Phase
-from mesh.work.objectives import Objectives
-from mesh.work.playbacks import Playbacks
+from mesh.work.ledger import Phase
+from mesh.work.playbacks import Objectives, Playbacks
 from schemas.keys import EventKey, LiabilityEvent
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from mesh.agent.errors import ServiceClosed
 from mesh.errors import InputError
 from mesh.log_context import log_event
-from mesh.work.lifecycle import WrongPhase
+from mesh.work.ledger import WrongPhase
 from schemas import Result, SignedMessage, message_hash, names_in, parse_address, resolve_names, verify_message
 from schemas.message_requests import Published
 from schemas.rpc import (

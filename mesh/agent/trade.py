@@ -10,10 +10,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from mesh.agent.allowances import Allowances
-from mesh.agent.contract import Contract, Outcome
-from mesh.agent.errors import LiabilityReverted, OrderExpired, OrderRejected
-from mesh.agent.rejections import Rejections
+from mesh.agent.contract import Contract, WatchedContracts, fail_future
+from mesh.agent.errors import OrderExpired, OrderRejected
+from mesh.agent.orders import Allowances, Rejections
 from mesh.errors import AiraError, ClosedError
 from mesh.log_context import log_event
 from mesh.market.book import Refusal
@@ -53,18 +52,6 @@ class _OpenOrder:
         return int(self.signed.nonce) if self.signed.generation == 5 else None
 
 
-@dataclass
-class _WatchedContract:
-    """A contract whose end somebody may wait for."""
-
-    ended: asyncio.Future[Outcome]
-    demand: str = ""
-    """The demand of ours that it was created from, if any, and what its caller holds."""
-    contract: Contract | None = None
-    reverted_until: int | None = None
-    """While a reorganisation has reverted it: the block by which it must be created again."""
-
-
 class Trader(Lifecycle):
     """Trades for one account: `async with Trader(components) as trader`.
 
@@ -80,26 +67,23 @@ class Trader(Lifecycle):
         self._allowances = Allowances(parts.chain, self._address)
         self._rejections = Rejections(parts)
         self._orders: dict[str, _OpenOrder] = {}
-        self._watched: dict[str, _WatchedContract] = {}
+        self.contracts = WatchedContracts(parts)
+        """The contracts whose end is waited for."""
 
     @property
     def open_orders(self) -> frozenset[str]:
         """The hashes (hexadecimal) of the open orders."""
         return frozenset(self._orders)
 
-    @property
-    def watched(self) -> frozenset[str]:
-        """The addresses of the contracts whose end is waited for."""
-        return frozenset(self._watched)
-
     async def _open(self, stack: AsyncExitStack) -> None:
         stack.push_async_callback(self._close)
 
     async def _close(self) -> None:
+        ended = ClosedError("the agent has ended", hint="run it again and ask for the contract")
         demands = {identity: order.created for identity, order in self._orders.items() if order.created is not None}
-        futures: list[asyncio.Future[Any]] = [*demands.values(), *(one.ended for one in self._watched.values())]
-        for future in futures:
-            _fail(future, ClosedError("the agent has ended", hint="run it again and ask for the contract"))
+        for created in demands.values():
+            fail_future(created, ended)
+        self.contracts.fail(ended)
         for identity in demands:
             await self._parts.outbox.settle(identity)
 
@@ -160,15 +144,7 @@ class Trader(Lifecycle):
 
     async def contract(self, address: str) -> Contract:
         """The contract at `address`, to be waited for. Raises `NotALiability`."""
-        address = await self._chain.names.address(address)
-        is_new = address not in self._watched
-        self._watch(address)  # before it is read: it may end in between
-        try:
-            return self._contract(await self._chain.liabilities.get(address))
-        except BaseException:
-            if is_new:
-                self._watched.pop(address, None)
-            raise
+        return await self.contracts.read(await self._chain.names.address(address))
 
     async def matched(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
         """A contract was created from these orders: stop sending ours.
@@ -181,42 +157,31 @@ class Trader(Lifecycle):
         for identity in filter(None, (demand, offer)):
             self._close_order(identity)
             await self._parts.outbox.spend(identity, liability.address)
-        if (watched := self._watched.get(liability.address)) is not None:
-            watched.reverted_until = None
-        if demand:
-            self._created(demand, taken, liability)
+        is_known = self.contracts.created(liability, demand)
+        if not is_known and taken is not None and taken.created is not None and not taken.created.done():
+            log.info("created from the demand %s", demand, extra=log_event("contract-created", order=demand))
+            taken.created.set_result(self.contracts.watch(liability, demand=demand))
         for identity, order in list(self._orders.items()):
             if order.nonce is not None and isinstance(order.signed, Offer):
                 await self._renew_offer(identity, order.signed)
         used = None if taken is None else taken.nonce
         for order in self._orders.values():
             if used is not None and order.nonce is not None and order.nonce <= used:
-                _fail(order.created, _Overtaken())
+                fail_future(order.created, _Overtaken())
 
     async def liability_reverted(self, address: str) -> None:
         """A reorganisation reverted the contract at `address`: send its orders again, until their deadline."""
         deadline = await self._parts.outbox.unspend(address)
-        if deadline is not None and address in self._watched:
-            self._watched[address].reverted_until = deadline
-
-    def finalized(self, address: str, outcome: Outcome) -> None:
-        """The contract at `address` has ended."""
-        watched = self._watched.pop(address, None)
-        if watched is not None and not watched.ended.done():
-            facts = log_event("contract-ended", success=outcome.success, result=outcome.result)
-            log.info("the contract has ended, %s", "paid" if outcome.success else "refunded", extra=facts)
-            watched.ended.set_result(outcome)
+        if deadline is not None:
+            self.contracts.reverted(address, deadline)
 
     def new_head(self, block: int) -> None:
         """The chain has block `block`: orders, and reverted contracts, with an earlier deadline have expired."""
         for identity, order in list(self._orders.items()):
             if order.signed.deadline <= block:
                 self._close_order(identity)
-                _fail(order.created, OrderExpired(identity, order.signed.deadline))
-        for address, watched in list(self._watched.items()):
-            if watched.reverted_until is not None and watched.reverted_until <= block:
-                del self._watched[address]
-                _fail(watched.ended, LiabilityReverted(address, watched.reverted_until))
+                fail_future(order.created, OrderExpired(identity, order.signed.deadline))
+        self.contracts.expire(block)
 
     async def _contract_of(self, signed: Demand, costs: Mapping[str, int]) -> Contract:
         """Post a signed demand and wait for its contract."""
@@ -232,31 +197,6 @@ class Trader(Lifecycle):
             self._close_order(identity)
             if self.is_open:
                 await self._parts.outbox.settle(identity)
-
-    def _created(self, demand: str, order: _OpenOrder | None, liability: Liability) -> None:
-        """A demand of ours became a contract; after a reorganisation perhaps again, at another address."""
-        again = next((one for one in self._watched.values() if one.demand == demand), None)
-        if again is not None and again.contract is not None:
-            again.reverted_until = None
-            self._watched[liability.address] = self._watched.pop(again.contract.address)
-            again.contract.liability = liability
-        elif order is not None and order.created is not None and not order.created.done():
-            log.info("created from the demand %s", demand, extra=log_event("contract-created", order=demand))
-            order.created.set_result(self._contract(liability, demand))
-
-    def _contract(self, liability: Liability, demand: str = "") -> Contract:
-        watched = self._watch(liability.address)
-        contract = Contract(liability, watched.ended, self._parts)
-        if demand:
-            watched.demand, watched.contract = demand, contract
-        if liability.is_finalized:
-            self.finalized(liability.address, Outcome(success=liability.is_success, result=liability.result))
-        return contract
-
-    def _watch(self, address: str) -> _WatchedContract:
-        if address not in self._watched:
-            self._watched[address] = _WatchedContract(asyncio.get_running_loop().create_future())
-        return self._watched[address]
 
     async def _renew_offer(self, identity: str, offer: Offer) -> None:
         """Sign an offer of generation 5 again: another order of the account was taken first, and used the nonce."""
@@ -289,11 +229,4 @@ class Trader(Lifecycle):
         is_overtaken = order.nonce is not None and order.nonce < await self._chain.liabilities.next_nonce(self._address)
         await self._parts.chain_head.reached(await self._chain.block_number())
         if identity in self._orders:
-            _fail(order.created, _Overtaken() if is_overtaken else OrderRejected(rejection))
-
-
-def _fail(future: asyncio.Future[Any] | None, error: Exception) -> None:
-    """Fail what somebody may be waiting for."""
-    if future is not None and not future.done():
-        future.set_exception(error)
-        future.exception()  # marks it as retrieved: perhaps nobody waits
+            fail_future(order.created, _Overtaken() if is_overtaken else OrderRejected(rejection))

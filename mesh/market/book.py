@@ -12,26 +12,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
 
-from mesh.market.queues import QueueNode, Queues
 from schemas import Demand, address_bytes
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Hashable, Iterable, Iterator, Sequence
 
     from schemas import Offer, Verified
 
     Order = Demand | Offer
     Terms = tuple[str, str, str, int, str, int]
 
+K = TypeVar("K", bound="Hashable")
+T = TypeVar("T")
+
 HASH_SIZE: Final = 32
 STALE: Final = 4096
 """Keys of orders that left the book which may stay in the lists, in addition to as many as are open."""
 LIMIT: Final = 1_000_000
 """Open orders that a book holds by default."""
-
-
 ORDER_USED: Final = "OrderUsed"
 """The contracts' error for an order that became a liability before."""
 UNNAMED_ERROR: Final = "Reverted"
@@ -183,6 +183,62 @@ class OrderBook:
 
     def _side(self, message: Order) -> Queues[Terms, Verified[Order]]:
         return self._demands if isinstance(message, Demand) else self._offers
+
+
+class QueueNode(Generic[T]):
+    """An item in a queue. A queue is a ring: the last node's `after` is the first.
+
+    Outside a queue a node has no neighbours, not even itself: a cycle would keep the item until the next garbage
+    collection.
+    """
+
+    __slots__ = ("after", "before", "item")
+
+    def __init__(self, item: T) -> None:
+        self.item = item
+        self.before: QueueNode[T]
+        self.after: QueueNode[T]
+
+
+class Queues(Generic[K, T]):
+    """A first-in-first-out queue for each key, with removal from the middle in constant time.
+
+    An empty queue takes no memory.
+    """
+
+    def __init__(self) -> None:
+        self._first: dict[K, QueueNode[T]] = {}
+
+    def __len__(self) -> int:
+        """The number of keys with a queue."""
+        return len(self._first)
+
+    def __iter__(self) -> Iterator[K]:
+        return iter(self._first)
+
+    def first(self, key: K) -> QueueNode[T] | None:
+        """The node that has waited longest at `key`."""
+        return self._first.get(key)
+
+    def append(self, key: K, node: QueueNode[T]) -> None:
+        """Append a node, which is in no queue, to the queue at `key`."""
+        first = self._first.get(key)
+        if first is None:
+            self._first[key] = node.before = node.after = node
+        else:
+            last = first.before
+            last.after = first.before = node
+            node.before, node.after = last, first
+
+    def remove(self, key: K, node: QueueNode[T]) -> None:
+        """Remove a node from the queue at `key`, which it must be in."""
+        if node.after is node:
+            del self._first[key]
+        else:
+            node.before.after, node.after.before = node.after, node.before
+            if self._first[key] is node:
+                self._first[key] = node.after
+        del node.before, node.after
 
 
 def at_fault(match: Match, error: str, arguments: Sequence[Any]) -> tuple[Verified[Order], ...]:

@@ -14,8 +14,7 @@ from mesh.chain.metrics import ChainMetrics
 from mesh.log_context import LogSource, source_context
 from mesh.market.book import LIMIT, Match, OrderBook, Refusal
 from mesh.market.earnings import Earnings, EarningsLedger
-from mesh.market.order_book_service import OrderBookService
-from mesh.market.provider_status import ProviderStatusService
+from mesh.market.services import OrderBookService, ProviderStatusService
 from mesh.market.settlement import OPEN_LIABILITIES, Settlement
 from mesh.market.transaction_queue import LEAST_GAS, RETRY, NoStake, TransactionQueue
 from mesh.network.channel import Channel

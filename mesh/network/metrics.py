@@ -10,8 +10,8 @@ from schemas.status import ALIVE
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
+    from mesh.network.channel import Subscription
     from mesh.network.session import Network
-    from mesh.network.subscription import Subscription
     from mesh.network.validation import ValidationStatistics
 
 

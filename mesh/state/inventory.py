@@ -20,7 +20,7 @@ from mesh.state.archive import read_archive
 from mesh.state.layout import LEDGER, PINS, RECORDINGS, NoState, StateInUse, account_folders, parts_in, transactions_in
 from mesh.work import Ledger
 from mesh.work.database import VERSION, LedgerTooNew, LedgerUnusable
-from mesh.work.lifecycle import UNFINISHED
+from mesh.work.ledger import UNFINISHED
 from schemas import Demand, Offer, decode
 
 if TYPE_CHECKING:

@@ -1,6 +1,5 @@
 """Work: from a liability that names an agent to a signed Result, and the memory that outlives a crash."""
 
-from mesh.work.ledger import JobRecord, Ledger, Outgoing
-from mesh.work.lifecycle import Phase, WrongPhase
+from mesh.work.ledger import JobRecord, Ledger, Outgoing, Phase, WrongPhase
 
 __all__ = ["JobRecord", "Ledger", "Outgoing", "Phase", "WrongPhase"]

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from mesh.errors import AiraError, ClosedError, ContentError, InputError
 from mesh.log_context import liability_context, log_event, with_liability_context
 from mesh.work.database import LedgerUnusable
-from mesh.work.lifecycle import STARTABLE, TO_BE_DONE, Phase, WrongPhase, advance
+from mesh.work.ledger import STARTABLE, TO_BE_DONE, Phase, WrongPhase, advance
 from mesh.work.outbox import outgoing
 from schemas import Result
 
@@ -28,9 +28,8 @@ if TYPE_CHECKING:
     from mesh.recording import Objective
     from mesh.work.job import TopicHandlers
     from mesh.work.ledger import JobRecord, Ledger
-    from mesh.work.objectives import Objectives
     from mesh.work.outbox import Outbox
-    from mesh.work.playbacks import Playbacks
+    from mesh.work.playbacks import Objectives, Playbacks
     from mesh.work.run import JobRun
     from schemas import Liability, Signer
 

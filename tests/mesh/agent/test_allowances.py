@@ -9,7 +9,7 @@ import pytest
 from web3.providers.async_base import AsyncBaseProvider
 
 from mesh.agent import FundsShort
-from mesh.agent.allowances import Allowances
+from mesh.agent.orders import Allowances
 from mesh.chain import Chain
 from schemas import Demand, Offer
 from tests.support.market import QUICK

@@ -254,14 +254,14 @@ async def test_a_contract_that_has_ended_has_its_outcome_at_once(place: Place) -
     async with place.agent("provider") as later, asyncio.timeout(10):
         contract = await later.contract(address)
         assert await contract.outcome() == outcome
-        assert later.runtime.trader.watched == frozenset()
+        assert later.runtime.trader.contracts.addresses == frozenset()
 
 
 async def test_waiting_for_an_address_that_is_not_a_contract_raises(place: Place) -> None:
     async with place.agent("person") as person:
         with pytest.raises(NotALiability):
             await person.contract(place.address("robot"))
-        assert person.runtime.trader.watched == frozenset()
+        assert person.runtime.trader.contracts.addresses == frozenset()
 
 
 async def test_cancelling_one_wait_for_an_outcome_does_not_affect_others(place: Place) -> None:
@@ -281,7 +281,7 @@ async def test_a_contract_refunded_without_a_result_has_no_recording(place: Plac
     async with place.provider(), robot, place.agent("person") as person:
         contract = await person.demand(job(place))
         await known(robot, contract.address)
-        person.runtime.trader.finalized(contract.address, Outcome(success=False, result=""))
+        person.runtime.trader.contracts.finalized(contract.address, Outcome(success=False, result=""))
         with pytest.raises(ContentUnavailable):
             await contract.recording()
         await robot.finish(contract.address, success=False)

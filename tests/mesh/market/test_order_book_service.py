@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 from mesh.market import OrderBook
-from mesh.market.order_book_service import THREADS, OrderBookService
+from mesh.market.services import THREADS, OrderBookService
 from mesh.network import Endpoints, Network, message_key
 from tests.support.orders import LIGHTHOUSE, MARKET, MODEL, OTHER_MODEL, verified_demand, verified_offer
 from tests.support.waiting import at_most, until, until_answered
