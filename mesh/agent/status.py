@@ -43,12 +43,9 @@ class AgentStatus:
     """The metrics, the health and the service `status` of an agent with an account. Nothing here asks the network."""
 
     def __init__(self, parts: AgentComponents, executor: Executor, recorders: Recorders) -> None:
-        from mesh.chain.metrics import ChainMetrics
-
         self._parts = parts
         self._executor = executor
         self._recorders = recorders
-        self._chain = ChainMetrics(parts.chain)
         self._started = time.monotonic()
 
     async def status(self, _request: Nothing) -> Status:
@@ -99,7 +96,7 @@ class AgentStatus:
             *reading_families(head=self._parts.chain_head.head, read_at=self._parts.chain_head.advanced_at),
         )
         own = labelled(families, lighthouse=self._parts.channel.lighthouse)
-        return (*own, *network_families(self._parts.network), *await self._chain.measure())
+        return (*own, *network_families(self._parts.network), *await self._parts.chain.measure())
 
     async def _jobs(self) -> tuple[MetricFamily, ...]:
         now, phases = time.time(), await self._parts.ledger.phases()

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import asyncio
 from contextlib import AsyncExitStack
 from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 from mesh.chain.artifacts import is_code_of
-from mesh.chain.contracts import Contracts
+from mesh.chain.contracts import Contracts, contract_version
 from mesh.chain.errors import NoContracts, UnknownName
 from mesh.chain.following import NODE_ERRORS, follow, retrying
 from mesh.chain.liabilities import Liabilities
 from mesh.chain.lighthouses import Lighthouses
+from mesh.chain.metrics import CachedMetrics
 from mesh.chain.names import Names, find_registry
 from mesh.chain.node import Node
 from mesh.chain.reader import EventSources, read_events
 from mesh.chain.tokens import Tokens
 from mesh.chain.transactions import TransactionSender
-from mesh.chain.versions import contract_version
 from mesh.errors import ClosedError
+from mesh.telemetry.metrics import gauge
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Awaitable, Callable, Iterable
@@ -26,12 +28,13 @@ if TYPE_CHECKING:
     from typing import Self
 
     from mesh.chain.accounts import Account
+    from mesh.chain.contracts import ContractKind
     from mesh.chain.following import BlockEvents, History
     from mesh.chain.policy import FeePolicy, Timing
-    from mesh.chain.versions import ContractKind
     from mesh.chain.web3_provider import Endpoint
     from mesh.errors import AiraError
     from mesh.outage_log import OutageLog
+    from mesh.telemetry.metrics import MetricFamily
 
 T = TypeVar("T")
 
@@ -83,6 +86,7 @@ class Chain:
         self._kind = contracts
         self._stack = AsyncExitStack()
         self._contracts: Contracts | None = None
+        self._balances = CachedMetrics(self._ask_balances)
 
     async def __aenter__(self) -> Self:
         async with AsyncExitStack() as stack:
@@ -185,6 +189,19 @@ class Chain:
         The outage is logged to `outages`. Other errors are raised.
         """
         return await retrying(self.node, question, outages=outages, errors=errors)
+
+    async def measure(self) -> tuple[MetricFamily, ...]:
+        """The metrics of the node, and of the account if there is one."""
+        return (*self.node.metrics.families(), *await self._balances.measure())
+
+    async def _ask_balances(self) -> Iterable[MetricFamily]:
+        if self.account is None:
+            return ()
+        eth, xrt = await asyncio.gather(self.tokens.eth_balance(), self.tokens.balance())
+        return (
+            gauge("aira_account_eth_wei", "What the account has to pay gas with, wei", eth),
+            gauge("aira_account_xrt_wn", "What the account has of XRT, wn", xrt),
+        )
 
     async def _find_contracts(self) -> Contracts:
         names = Names(self.node, await find_registry(self.node, self._ens), self.generation)

@@ -11,7 +11,7 @@ import logging
 from typing import TYPE_CHECKING, Final
 
 from mesh.chain.errors import NodeUnreachable, RequestRefused, TransactionTimeout
-from mesh.chain.node_metrics import TransactionOutcome
+from mesh.chain.metrics import TransactionOutcome
 from mesh.chain.policy import Fees
 from mesh.log_context import log_event
 from mesh.retry import Backoff

@@ -1,25 +1,248 @@
-"""The contracts on one chain, and the sender of transactions to them."""
+"""The contracts on the chain: ours, which serve both generations at once, or the originals of one generation.
+
+They share most functions. `ContractVersion` and `OriginalContracts` hold the differences: how a result is finalized,
+the names of a lighthouse's getters, how a liability is recognised. The versions of the originals are tested against
+our contracts, which have both sets of names. `Contracts` is what the parts of an open `Chain` share.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
-from mesh.chain.errors import NoAccount
+from mesh.chain.errors import NoAccount, NotOffered, UnknownContracts
+from mesh.errors import InvalidMessage
+from schemas.address import ZERO_ADDRESS, parse_address
+from schemas.cid import parse_cid
 
 if TYPE_CHECKING:
     from web3.contract import AsyncContract
-    from web3.contract.async_contract import AsyncContractFunction
+    from web3.contract.async_contract import AsyncContractFunction, AsyncContractFunctions
 
     from mesh.chain.names import Names
     from mesh.chain.node import Node
     from mesh.chain.transactions import Receipt, TransactionSender
-    from mesh.chain.versions import ContractVersion
+    from schemas.messages import Order, Result
+
+ContractKind = Literal["mesh", "original"]
+"""Ours, or the legacy ones."""
+
+AGREE: Final = True
+"""A provider always agrees with a result; only a validator, who finalizes on its own, can disagree."""
+
+
+class LighthouseGetters(NamedTuple):
+    """The names of a lighthouse's getters, and how its turns are counted."""
+
+    length: str
+    at: str
+    stake: str
+    minimal_stake: str
+    timeout_blocks: str
+    keep_alive_block: str
+    first: int
+    """The marker of the first provider."""
+
+
+GETTERS: Final = {
+    3: LighthouseGetters(
+        "membersLength", "members", "balances", "minimalFreeze", "timeoutBlocks", "keepaliveBlock", first=0
+    ),
+    5: LighthouseGetters(
+        "providersLength", "providers", "stakes", "minimalStake", "timeoutInBlocks", "keepAliveBlock", first=1
+    ),
+}
+GAS_OF: Final = {3: "gasUtilizing", 5: "gasConsumedOf"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LighthouseState:
+    """The state of a lighthouse. Stakes are wn, `timeout_blocks` and `keep_alive_block` count blocks."""
+
+    address: str
+    minimal_stake: int
+    timeout_blocks: int
+    keep_alive_block: int
+    """The last block in which the current provider sent a transaction."""
+
+    quota: int
+    """How many transactions are left in the turn."""
+
+    current: str
+    """The provider that has the turn; the zero address if there is none."""
+
+    stakes: dict[str, int]
+    """Providers and their stakes, in the order of their turns."""
+
+
+class ContractVersion:
+    """Our own contracts. `factory` is the address of the factory; `generation` names the root of its names."""
+
+    def __init__(self, node: Node, factory: str, generation: int) -> None:
+        self.generation = generation
+        self._node = node
+        self._factory = node.contract("Factory", factory).functions
+        self._liabilities: set[str] = set()
+
+    def check_order(self, order: Order) -> None:
+        """Raise `InvalidMessage` for an order that the contracts can't read."""
+
+    def finalization(self, lighthouse: AsyncContractFunctions, result: Result) -> AsyncContractFunction:
+        """The call by which a provider finalizes a liability with its result."""
+        return lighthouse.finalizeLiability(result.liability, *result_arguments(result))
+
+    def validation(self, result: Result, *, agree: bool) -> AsyncContractFunction:
+        """The call by which a generation-3 validator finalizes. Raises `NotOffered`."""
+        call: AsyncContractFunction = self._liability(result.liability).finalize(*result_arguments(result), agree)
+        return call
+
+    def cancellation(self, liability: str, promisee: bytes, promisor: bytes) -> AsyncContractFunction:
+        """The call that ends a liability by the signatures of both parties. Raises `NotOffered`."""
+        return self._factory.cancel(liability, promisee, promisor)
+
+    def refund(self, liability: str) -> AsyncContractFunction:
+        """The call that pays a promisee back. Raises `NotOffered`."""
+        return self._factory.refund(liability)
+
+    async def refundable_from(self, liability: str) -> int:
+        """The first block in which the refund is possible. Raises `NotOffered`."""
+        return int(await self._node.read(self._liability(liability).refundableFrom()))
+
+    async def nonce_of(self, address: str) -> int:
+        """The nonce of an account's next generation-5 order. Raises `NotOffered`."""
+        return int(await self._node.read(self._factory.nonceOf(address)))
+
+    async def is_order_used(self, order_hash: bytes, signer: str) -> bool:
+        """Whether the generation-3 order that `signer` signed has created its liability."""
+        return bool(await self._node.read(self._factory.isOrderUsed(order_hash, signer)))
+
+    def recognise(self, liability: str) -> None:
+        """Remember an address as a liability, because the factory named it in an event."""
+        self._liabilities.add(liability)
+
+    async def is_liability(self, address: str) -> bool:
+        """Whether the factory created the contract at an address."""
+        if address not in self._liabilities and await self._asked_is_liability(address):
+            self._liabilities.add(address)
+        return address in self._liabilities
+
+    async def state(self, lighthouse: str) -> LighthouseState:
+        """The state of a lighthouse, as of one block. Raises `NoContracts` if there is none."""
+        return await lighthouse_state(self._node, lighthouse, GETTERS[5], current="current")
+
+    async def is_turn(self, lighthouse: str, provider: str) -> bool:
+        """Whether a provider may send in the next block."""
+        functions = self._node.contract("Lighthouse", lighthouse).functions
+        return bool(await self._node.read(functions.isTurnOf(provider), block="pending"))
+
+    async def _asked_is_liability(self, address: str) -> bool:
+        return bool(await self._node.read(self._factory.isLiability(address)))
+
+    def _liability(self, address: str) -> Any:
+        return self._node.contract("Liability", address).functions
+
+
+class OriginalContracts(ContractVersion):
+    """The original contracts of one generation, which understand the orders of that generation only.
+
+    They give no reasons when they refuse, pay nobody back, and don't say whose liability a contract is: recognised
+    are those that an event of the factory told of, and those whose gas the factory has counted.
+    """
+
+    def check_order(self, order: Order) -> None:
+        if order.generation != self.generation:
+            raise InvalidMessage(
+                reason="generation",
+                detail=f"the contracts are of generation {self.generation}, the order of {order.generation}",
+            )
+
+    def finalization(self, lighthouse: AsyncContractFunctions, result: Result) -> AsyncContractFunction:
+        if self.generation == 5:
+            return super().finalization(lighthouse, result)
+        call = super().validation(result, agree=AGREE)
+        return lighthouse.to(result.liability, bytes.fromhex(call._encode_transaction_data()[2:]))
+
+    def validation(self, result: Result, *, agree: bool) -> AsyncContractFunction:
+        if self.generation == 5:
+            raise NotOffered("finalization by a validator's own account", self.generation)
+        return super().validation(result, agree=agree)
+
+    def cancellation(self, liability: str, promisee: bytes, promisor: bytes) -> AsyncContractFunction:
+        raise NotOffered("cancellation", self.generation)
+
+    def refund(self, liability: str) -> AsyncContractFunction:
+        raise NotOffered("refund", self.generation)
+
+    async def refundable_from(self, liability: str) -> int:
+        raise NotOffered("refund", self.generation)
+
+    async def nonce_of(self, address: str) -> int:
+        if self.generation == 3:
+            raise NotOffered("nonceOf", self.generation)
+        return await super().nonce_of(address)
+
+    async def is_order_used(self, order_hash: bytes, signer: str) -> bool:
+        """By any signer: the originals accept the same terms only once, whoever signed them."""
+        return bool(await self._node.read(self._factory.isHashConsumed(order_hash)))
+
+    async def state(self, lighthouse: str) -> LighthouseState:
+        return await lighthouse_state(self._node, lighthouse, GETTERS[self.generation], current="marker")
+
+    async def is_turn(self, lighthouse: str, provider: str) -> bool:
+        """By the rule of the originals: the provider at the marker, or any provider after a timeout of silence."""
+        state = await self.state(lighthouse)
+        silence = await self._node.block_number() + 1 - state.keep_alive_block
+        return provider in state.stakes and (provider == state.current or silence > state.timeout_blocks)
+
+    async def _asked_is_liability(self, address: str) -> bool:
+        gas_of = self._factory[GAS_OF[self.generation]]
+        return int(await self._node.read(gas_of(address))) > 0
+
+
+def contract_version(kind: ContractKind, node: Node, factory: str, generation: int) -> ContractVersion:
+    """The version for a kind and a generation. Raises `UnknownContracts` if there is none."""
+    if generation not in GETTERS or kind not in ("mesh", "original"):
+        raise UnknownContracts(
+            f"there are no {kind} contracts of generation {generation}",
+            hint='contracts are "mesh" or "original", generations 3 or 5',
+        )
+    return (OriginalContracts if kind == "original" else ContractVersion)(node, factory, generation)
+
+
+def result_arguments(result: Result) -> tuple[bytes, bool, bytes]:
+    """A signed result as arguments of the contracts."""
+    return parse_cid(result.result), result.success, bytes.fromhex(result.signature)
+
+
+async def lighthouse_state(node: Node, address: str, names: LighthouseGetters, *, current: str) -> LighthouseState:
+    """The state of a lighthouse, as of one block. Raises `NoContracts` if there is none, `NodeUnreachable`.
+
+    `current` is the getter for the current provider: of its address, or of its index (`marker`).
+    """
+    block = await node.block_number()
+    functions = node.contract("Lighthouse", address).functions
+    count = await node.read(functions[names.length](), block=block)
+    found = await node.read_all((functions[names.at](index) for index in range(count)), block=block)
+    stakes = await node.read_all((functions[names.stake](provider) for provider in found), block=block)
+    getters = (names.minimal_stake, names.timeout_blocks, names.keep_alive_block, "quota", current)
+    values = await node.read_all((functions[getter]() for getter in getters), block=block)
+    minimal_stake, timeout_blocks, keep_alive_block, quota, whose = values
+    if current == "marker":
+        whose = found[(whose - names.first) % count] if count else ZERO_ADDRESS
+    return LighthouseState(
+        address=address,
+        minimal_stake=minimal_stake,
+        timeout_blocks=timeout_blocks,
+        keep_alive_block=keep_alive_block,
+        quota=quota,
+        current=parse_address(whose),
+        stakes={parse_address(provider): stake for provider, stake in zip(found, stakes, strict=True)},
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contracts:
-    """The parts that an open `Chain` shares. `factory` and `xrt` are addresses; `sender` is None for reading only."""
+    """What the parts of an open `Chain` share. `factory` and `xrt` are addresses; `sender` is None for reading only."""
 
     node: Node
     names: Names

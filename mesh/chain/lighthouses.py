@@ -15,8 +15,7 @@ from mesh.chain.tokens import Tokens
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Sequence
 
-    from mesh.chain.contracts import Contracts
-    from mesh.chain.versions import LighthouseState
+    from mesh.chain.contracts import Contracts, LighthouseState
 
 
 class Lighthouses:

@@ -1,11 +1,16 @@
-"""Prometheus metrics of a chain for one account: its transactions, their cost, its balances."""
+"""What is measured of a chain: the transactions of this process, their cost, and how well the node answers."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 import time
+from collections import Counter
+from collections.abc import Mapping  # msgspec reads the annotations
+from enum import StrEnum
 from typing import TYPE_CHECKING, Final
+
+import msgspec
 
 from mesh.errors import AiraError
 from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge
@@ -13,14 +18,100 @@ from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
 
-    from mesh.chain import Chain
-
 log = logging.getLogger(__name__)
 
 MAX_AGE: Final = 10.0
 """Seconds for which an answer of the node is reused."""
 ASK_TIMEOUT: Final = 1.0
 """Seconds that the node may take; metrics that it does not answer by then are left out."""
+
+
+class TransactionOutcome(StrEnum):
+    """The outcome of a transaction. A transaction that is mined was also sent, and counts as both."""
+
+    SENT = "sent"
+    """Given to the node for the first time."""
+    REPLACED = "replaced"
+    """Replaced by one with higher fees because it was stuck."""
+    MINED = "mined"
+    """Mined, and successful."""
+    FAILED = "failed"
+    """Mined and paid for, but reverted."""
+    REFUSED = "refused"
+    """Never sent, because the contracts would revert it."""
+    LOST = "lost"
+    """Another transaction was mined with its nonce."""
+
+
+class NodeStatistics(msgspec.Struct, frozen=True, kw_only=True):
+    """Transactions by outcome, the gas that they used and what it cost (wei), and how well the node answers.
+
+    `failures` are requests that no node answered in any attempt; `losses` is how often outages began.
+    """
+
+    transactions: Mapping[TransactionOutcome, int]
+    gas_used: int
+    wei: int
+    failures: int
+    losses: int
+
+
+class NodeMetrics:
+    """The counters of one node. Used by one event loop."""
+
+    def __init__(self) -> None:
+        self._transactions = Counter(dict.fromkeys(TransactionOutcome, 0))
+        self._gas_used = 0
+        self._wei = 0
+        self._failures = 0
+        self._losses = 0
+        self._answers = True
+
+    def count(self, outcome: TransactionOutcome) -> None:
+        """Count the outcome of a transaction."""
+        self._transactions[outcome] += 1
+
+    def paid(self, *, gas_used: int, wei: int) -> None:
+        """Add the cost of a mined transaction."""
+        self._gas_used += gas_used
+        self._wei += wei
+
+    def answered(self) -> None:
+        """Note that the node answered."""
+        self._answers = True
+
+    def failed(self) -> None:
+        """Count a request that no attempt got answered."""
+        self._failures += 1
+        self._losses += self._answers
+        self._answers = False
+
+    def statistics(self) -> NodeStatistics:
+        """The counters now."""
+        return NodeStatistics(
+            transactions=dict(self._transactions),
+            gas_used=self._gas_used,
+            wei=self._wei,
+            failures=self._failures,
+            losses=self._losses,
+        )
+
+    def families(self) -> tuple[MetricFamily, ...]:
+        """The counters in Prometheus terms."""
+        outcomes = {outcome.value: float(count) for outcome, count in self._transactions.items()}
+        return (
+            by_label(
+                "aira_transactions_total",
+                "counter",
+                "Transactions of this account, by what became of them",
+                "outcome",
+                outcomes,
+            ),
+            counter("aira_gas_used_total", "Gas that transactions on the chain have used", self._gas_used),
+            counter("aira_gas_spent_wei_total", "What that gas has cost, wei", self._wei),
+            counter("aira_node_failures_total", "Questions that no node of the chain answered", self._failures),
+            counter("aira_node_losses_total", "How often the nodes of the chain fell silent", self._losses),
+        )
 
 
 class CachedMetrics:
@@ -42,44 +133,6 @@ class CachedMetrics:
                 log.debug("metrics of the chain are left out: %s", error)
                 self._families = ()
         return self._families
-
-
-class ChainMetrics:
-    """The metrics of an open chain, and of its account if it has one."""
-
-    def __init__(self, chain: Chain) -> None:
-        self._chain = chain
-        self._balances = CachedMetrics(self._ask_balances)
-
-    async def measure(self) -> tuple[MetricFamily, ...]:
-        """The metrics now."""
-        counted = self._chain.node.metrics.statistics()
-        outcomes = {outcome.value: float(count) for outcome, count in counted.transactions.items()}
-        return (
-            by_label(
-                "aira_transactions_total",
-                "counter",
-                "Transactions of this account, by what became of them",
-                "outcome",
-                outcomes,
-            ),
-            counter("aira_gas_used_total", "Gas that transactions on the chain have used", counted.gas_used),
-            counter("aira_gas_spent_wei_total", "What that gas has cost, wei", counted.wei),
-            counter("aira_node_failures_total", "Questions that no node of the chain answered", counted.failures),
-            counter("aira_node_losses_total", "How often the nodes of the chain fell silent", counted.losses),
-            *await self._balances.measure(),
-        )
-
-    async def _ask_balances(self) -> Iterable[MetricFamily]:
-        if self._chain.account is None:
-            return ()
-        eth, xrt = await asyncio.gather(
-            self._chain.tokens.eth_balance(), self._chain.tokens.balance(self._chain.account.address)
-        )
-        return (
-            gauge("aira_account_eth_wei", "What the account has to pay gas with, wei", eth),
-            gauge("aira_account_xrt_wn", "What the account has of XRT, wn", xrt),
-        )
 
 
 def reading_families(*, head: int, read_at: float) -> tuple[MetricFamily, ...]:

@@ -11,7 +11,7 @@ from web3.exceptions import BadFunctionCallOutput, BlockNotFound, TransactionNot
 
 from mesh.chain.artifacts import load_artifact
 from mesh.chain.errors import METHOD_NOT_FOUND, NoContracts, NodeUnreachable, RequestRefused
-from mesh.chain.node_metrics import NodeMetrics
+from mesh.chain.metrics import NodeMetrics
 from mesh.chain.pending import PendingTransactions
 from mesh.chain.policy import FeePolicy, Fees, GasMarket, Timing
 from mesh.chain.transaction_store import TransactionStore

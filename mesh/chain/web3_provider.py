@@ -14,7 +14,7 @@ from web3.exceptions import Web3Exception
 from web3.providers.async_base import AsyncBaseProvider
 
 from mesh.chain.errors import InvalidEndpoint, NodeUnreachable, RequestRefused, WrongChain
-from mesh.chain.node_metrics import NodeMetrics
+from mesh.chain.metrics import NodeMetrics
 from mesh.chain.reverts import decode_revert
 from mesh.chain.transports import HttpTransport, WebSocketTransport
 from mesh.errors import AiraError, ClosedError

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from web3.providers.async_base import AsyncBaseProvider
 
-from mesh.chain.recursion import restrain_recursion
+from mesh.chain import restrain_recursion
 from mesh.devchain.jsonrpc import RpcError
 from mesh.devchain.rpc_server import JsonRpcServer
 from mesh.errors import ClosedError, ConfigurationError

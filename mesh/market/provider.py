@@ -10,7 +10,6 @@ import asyncio
 from typing import TYPE_CHECKING, Any
 
 from mesh.chain import InsufficientFunds
-from mesh.chain.metrics import ChainMetrics
 from mesh.log_context import LogSource, source_context
 from mesh.market.book import LIMIT, Match, OrderBook, Refusal
 from mesh.market.earnings import Earnings, EarningsLedger
@@ -162,7 +161,7 @@ class ProviderProcess:
 
     def __init__(self, network: Network, chain: Chain, providers: Sequence[Provider]) -> None:
         self._network = network
-        self._chain = ChainMetrics(chain)
+        self._chain = chain
         self._providers = providers
 
     async def measure(self) -> tuple[MetricFamily, ...]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.chain import XRT, Account, Chain, Node, NodeUnreachable, TransactionSender, deploy
-from mesh.chain.node_metrics import TransactionOutcome
+from mesh.chain.metrics import TransactionOutcome
 from mesh.devchain import EmbeddedChain
 from mesh.devchain.embedded import EmbeddedProvider
 from tests.mesh.chain.conftest import QUICK, reverted
