@@ -45,10 +45,11 @@ if TYPE_CHECKING:
         RejectKey,
         ResultKey,
         RpcKey,
+        WithdrawalKey,
         parse_key,
     )
+    from schemas.message_fields import MAX_UINT256
     from schemas.messages import (
-        MAX_UINT256,
         Demand,
         Message,
         Offer,
@@ -57,6 +58,7 @@ if TYPE_CHECKING:
         Result,
         SignedMessage,
         TransactionFeedback,
+        Withdrawal,
         names_in,
         resolve_names,
     )
@@ -94,12 +96,13 @@ _NAMES: Final = {
     "errors": ("AiraError InputError InvalidAddress InvalidCid InvalidKey InvalidMessage InvalidPayload InvalidRecord"),
     "keys": (
         "AgentKey CidKey DemandKey DeviceTopicKey EthEventKey EventKey FeedbackKey Key LiabilityTopicKey "
-        "MarketKey ObjectiveTopicKey OfferKey PendingKey PresenceKey RejectKey ResultKey RpcKey "
-        "parse_key"
+        "MarketKey ObjectiveTopicKey OfferKey PendingKey PresenceKey RejectKey ResultKey RpcKey  "
+        "WithdrawalKey parse_key"
     ),
+    "message_fields": ("MAX_UINT256"),
     "messages": (
-        "Demand MAX_UINT256 Message Offer Order OrderFeedback Result SignedMessage TransactionFeedback "
-        "names_in resolve_names"
+        "Demand Message Offer Order OrderFeedback Result SignedMessage TransactionFeedback "
+        "Withdrawal names_in resolve_names"
     ),
     "payloads": ("EMPTY Empty JSON PayloadType RAW STRING String payload_type"),
     "records": ("Liability Record UInt256"),
@@ -175,6 +178,8 @@ __all__ = [
     "UnixfsLink",
     "UnixfsNode",
     "Verified",
+    "Withdrawal",
+    "WithdrawalKey",
     "address_bytes",
     "blocks_of_stream",
     "cancellation_hash",

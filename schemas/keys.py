@@ -21,7 +21,7 @@ from schemas.key_chunks import CANONICAL, check_event
 
 LiabilityEvent: TypeAlias = Literal["incoming", "ready", "complete", "finalized"]
 EthEvent: TypeAlias = Literal["transfer", "approval"]
-MarketKind: TypeAlias = Literal["demand", "offer", "result", "feedback", "pending", "reject"]
+MarketKind: TypeAlias = Literal["demand", "offer", "withdrawal", "result", "feedback", "pending", "reject"]
 
 MAX_KEY_LENGTH: Final = 512
 
@@ -57,6 +57,17 @@ class OfferKey(_Key, frozen=True):
 
     def __str__(self) -> str:
         return f"aira/{self.lighthouse}/offer/{self.model}/{self.hash}"
+
+
+class WithdrawalKey(_Key, frozen=True):
+    """A Withdrawal of the order with the hash `order`; `hash` is its own. Put by the order's maker."""
+
+    lighthouse: str
+    order: str
+    hash: str
+
+    def __str__(self) -> str:
+        return f"aira/{self.lighthouse}/withdrawal/{self.order}/{self.hash}"
 
 
 class ResultKey(_Key, frozen=True):
@@ -194,13 +205,16 @@ class CidKey(_Key, frozen=True):
         return f"aira/cid/{self.cid}"
 
 
-MarketKey: TypeAlias = DemandKey | OfferKey | ResultKey | FeedbackKey | PendingKey | RejectKey
+MarketKey: TypeAlias = DemandKey | OfferKey | WithdrawalKey | ResultKey | FeedbackKey | PendingKey | RejectKey
 AgentKey: TypeAlias = EventKey | ObjectiveTopicKey | LiabilityTopicKey | DeviceTopicKey | RpcKey | EthEventKey
 Key: TypeAlias = MarketKey | AgentKey | PresenceKey | CidKey
 
 
 def market_key(lighthouse: str, kind: MarketKind, chunk: str, digest: str) -> str:
-    """The key of a message whose parts are canonical already, without the checks. `chunk` is its model or liability."""
+    """The key of a message whose parts are canonical already, without the checks.
+
+    `chunk` is its model, order or liability.
+    """
     return f"aira/{lighthouse}/{kind}/{chunk}/{digest}"
 
 
@@ -224,6 +238,8 @@ def _parse(text: str) -> Key:
             return DemandKey(lighthouse, model, digits)
         case ["aira", lighthouse, "offer", model, digits]:
             return OfferKey(lighthouse, model, digits)
+        case ["aira", lighthouse, "withdrawal", order, digits]:
+            return WithdrawalKey(lighthouse, order, digits)
         case ["aira", lighthouse, "result", liability, digits]:
             return ResultKey(lighthouse, liability, digits)
         case ["aira", "agent", agent, *path]:

@@ -11,7 +11,8 @@ from typing import Any, Final, Self
 import msgspec
 
 from schemas.errors import InvalidMessage
-from schemas.messages import MAX_UINT256, Demand, Offer, Result
+from schemas.message_fields import MAX_UINT256
+from schemas.messages import Demand, Offer, Result
 from schemas.records import Record, UInt256
 
 _MAX_DIGITS: Final = len(str(MAX_UINT256))

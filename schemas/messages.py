@@ -1,4 +1,4 @@
-"""The messages of a market: Demand, Offer and Result, and the feedback of generation 5.
+"""The messages of a market: Demand, Offer, Withdrawal and Result, and the feedback of generation 5.
 
 Every message object is well-formed: the constructors check each field, bring it to its canonical form (addresses in
 EIP-55, ENS names and hexadecimal digits in lower case and without `0x`) and raise `InvalidMessage` for what is wrong.
@@ -6,7 +6,7 @@ They don't verify the signature; `schemas.signing` does. A message is hashed wit
 with `names_in`, look them up on a chain, and replace them with `resolve_names`.
 
 To add a kind of message: its class here, in `MESSAGE_TYPES`; what its hash covers in `schemas.wire`; its key in
-`schemas.keys`.
+`schemas.keys`; its selector in `schemas.selectors`; who may publish it in `mesh.identity.roster`.
 
 Amounts are integers of at most 256 bits: `cost` in the token's smallest unit, fees in wn (10^-9 XRT), `deadline` is a
 block number (the order is valid while `block.number < deadline`). Source: the wire format of the legacy network.
@@ -20,17 +20,14 @@ from typing import TYPE_CHECKING, ClassVar, Final, Literal, NoReturn, TypeAlias,
 from msgspec import Struct
 from msgspec.structs import force_setattr, replace
 
-from schemas.address import parse_address, parse_address_or_name
+from schemas.address import parse_address
 from schemas.cid import parse_cid
 from schemas.errors import InvalidAddress, InvalidCid, InvalidMessage
 from schemas.keys import MarketKind  # msgspec reads the annotations
+from schemas.message_fields import check_uint256, hex_digits, set_address, set_hash, set_signature
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-MAX_UINT256: Final = 2**256 - 1
-
-SIGNATURE_SIZE: Final = 65
 
 _NO_NAMES: Final[frozenset[str]] = frozenset()
 
@@ -82,26 +79,26 @@ class _Order(_Message, frozen=True, kw_only=True, rename="camel"):
             parse_cid(self.model)
             force_setattr(self, "model", intern(self.model))
             parse_cid(self.objective)
-            _set_address(self, "token", self.token)
-            _set_address(self, "lighthouse", self.lighthouse)
-            _set_address(self, "validator", self.validator)
+            set_address(self, "token", self.token)
+            set_address(self, "lighthouse", self.lighthouse)
+            set_address(self, "validator", self.validator)
             if self.sender is not None:
-                _set_address(self, "sender", self.sender)
+                set_address(self, "sender", self.sender)
         except (InvalidCid, InvalidAddress) as error:
             _raise_invalid(self, error)
-        _check_uint256("cost", self.cost)
-        _check_uint256("deadline", self.deadline)
+        check_uint256("cost", self.cost)
+        check_uint256("deadline", self.deadline)
         self._set_nonce()
-        _set_signature(self, self.signature)
+        set_signature(self, self.signature)
 
     def _set_nonce(self) -> None:
         nonce = self.nonce
         if self.sender is not None:
             if type(nonce) is not int:
                 raise InvalidMessage("nonce", "the nonce of a generation-5 order is an integer")
-            _check_uint256("nonce", nonce)
+            check_uint256("nonce", nonce)
             return
-        digits = _hex_digits(nonce, 32) if type(nonce) is str else None
+        digits = hex_digits(nonce, 32) if type(nonce) is str else None
         if digits is None:
             raise InvalidMessage("nonce", "the nonce of a generation-3 order is 64 hexadecimal digits")
         if digits != nonce:
@@ -122,7 +119,7 @@ class Demand(_Order, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         _Order.__post_init__(self)
-        _check_uint256("validatorFee", self.validator_fee)
+        check_uint256("validatorFee", self.validator_fee)
 
 
 class Offer(_Order, frozen=True, kw_only=True):
@@ -138,7 +135,39 @@ class Offer(_Order, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         _Order.__post_init__(self)
-        _check_uint256("lighthouseFee", self.lighthouse_fee)
+        check_uint256("lighthouseFee", self.lighthouse_fee)
+
+
+class Withdrawal(_Message, frozen=True, kw_only=True, rename={"order": "withdraws"}):
+    """A maker's statement that its order must not become a contract any more.
+
+    `order` is the order's hash (64 hexadecimal digits); `lighthouse` and `deadline` are those of the order. It concerns
+    only an order that its own signer has signed: other accounts can sign equal terms. Keep it until `deadline`: the
+    order may still be sent, or sent again, by others. On the wire `order` is called `withdraws`.
+    """
+
+    kind: ClassVar[MarketKind] = "withdrawal"
+    mark: ClassVar[str] = "withdraws"
+    address_fields: ClassVar[tuple[str, ...]] = ("lighthouse",)
+
+    order: str
+    lighthouse: str
+    deadline: int
+    signature: str = ""
+
+    @property
+    def key_chunk(self) -> str:
+        """The order's hash."""
+        return self.order
+
+    def __post_init__(self) -> None:
+        set_hash(self, "order", self.order)
+        try:
+            set_address(self, "lighthouse", self.lighthouse)
+        except InvalidAddress as error:
+            _raise_invalid(self, error)
+        check_uint256("deadline", self.deadline)
+        set_signature(self, self.signature)
 
 
 class Result(_Message, frozen=True, kw_only=True):
@@ -164,13 +193,13 @@ class Result(_Message, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         try:
-            _set_address(self, "liability", self.liability)
+            set_address(self, "liability", self.liability)
             parse_cid(self.result)
         except (InvalidCid, InvalidAddress) as error:
             _raise_invalid(self, error)
         if type(self.success) is not bool:
             raise InvalidMessage("field", "success: expected a boolean")
-        _set_signature(self, self.signature)
+        set_signature(self, self.signature)
 
 
 class OrderFeedback(_Message, frozen=True, kw_only=True):
@@ -192,9 +221,9 @@ class OrderFeedback(_Message, frozen=True, kw_only=True):
         return self.order
 
     def __post_init__(self) -> None:
-        _set_hash(self, "order", self.order)
-        _check_uint256("accepted", self.accepted)
-        _set_signature(self, self.signature)
+        set_hash(self, "order", self.order)
+        check_uint256("accepted", self.accepted)
+        set_signature(self, self.signature)
 
 
 class TransactionFeedback(_Message, frozen=True, kw_only=True):
@@ -211,14 +240,21 @@ class TransactionFeedback(_Message, frozen=True, kw_only=True):
         return self.tx
 
     def __post_init__(self) -> None:
-        _set_hash(self, "tx", self.tx)
+        set_hash(self, "tx", self.tx)
 
 
 Order: TypeAlias = Demand | Offer
-SignedMessage: TypeAlias = Demand | Offer | Result
-Message: TypeAlias = Demand | Offer | Result | OrderFeedback | TransactionFeedback
+SignedMessage: TypeAlias = Demand | Offer | Withdrawal | Result
+Message: TypeAlias = SignedMessage | OrderFeedback | TransactionFeedback
 
-MESSAGE_TYPES: Final[tuple[type[Message], ...]] = (Demand, Offer, OrderFeedback, TransactionFeedback, Result)
+MESSAGE_TYPES: Final[tuple[type[Message], ...]] = (
+    Demand,
+    Offer,
+    OrderFeedback,
+    TransactionFeedback,
+    Result,
+    Withdrawal,
+)
 """Every kind of message, in the order in which a reader looks for their marks: the first that is present decides."""
 
 
@@ -245,52 +281,6 @@ def resolve_names(message: _AnyMessage, addresses: Mapping[str, str]) -> _AnyMes
         raise InvalidMessage("unresolved-name", f"no address is known for {', '.join(sorted(missing))}")
     texts = {field: getattr(message, field) for field in message.__struct_fields__}
     return replace(message, **{field: parse_address(addresses[text]) for field, text in texts.items() if text in names})
-
-
-def _set_address(message: Struct, field: str, text: str) -> None:
-    # The cached text replaces the equal one, so that an address in a million open orders is in memory once.
-    canonical = parse_address_or_name(text)
-    if canonical is not text:
-        force_setattr(message, field, canonical)
-
-
-def _check_uint256(field: str, value: int) -> None:
-    if type(value) is not int:
-        raise InvalidMessage("field", f"{field}: expected an integer")
-    if not 0 <= value <= MAX_UINT256:
-        raise InvalidMessage("range", f"{field}: expected an integer from 0 to 2^256-1")
-
-
-def _set_signature(message: Struct, text: str) -> None:
-    if not text:
-        return
-    digits = _hex_digits(text, SIGNATURE_SIZE)
-    if digits is None:
-        raise InvalidMessage("signature", "a signature is 130 hexadecimal digits, r, s and v")
-    if digits != text:
-        force_setattr(message, "signature", digits)
-
-
-def _set_hash(message: Struct, field: str, text: str) -> None:
-    digits = _hex_digits(text, 32)
-    if digits is None:
-        raise InvalidMessage("hash", f"{field}: expected 64 hexadecimal digits")
-    if digits != text:
-        force_setattr(message, field, digits)
-
-
-def _hex_digits(text: str, size: int) -> str | None:
-    """The canonical hexadecimal digits of `size` bytes, or None if `text` is something else."""
-    if text[:2] == "0x":
-        text = text[2:]
-    if len(text) != 2 * size:
-        return None
-    try:
-        raw = bytes.fromhex(text)
-    except ValueError:
-        return None
-    # bytes.fromhex() skips blanks, so a text with blanks among its characters is too short here.
-    return raw.hex() if len(raw) == size else None
 
 
 def _raise_invalid(message: Struct, error: InvalidCid | InvalidAddress) -> NoReturn:

@@ -13,7 +13,7 @@ import msgspec
 from msgspec.structs import force_setattr
 
 from schemas.errors import InvalidRecord
-from schemas.messages import MAX_UINT256
+from schemas.message_fields import MAX_UINT256
 
 MAX_RECORD_SIZE: Final = 65_536
 """The longest record, in bytes, that is decoded."""

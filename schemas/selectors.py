@@ -30,6 +30,7 @@ _SUBJECTS: Final[Mapping[str, Callable[[str], str]]] = MappingProxyType(
     {
         "demand": cid_chunk,
         "offer": cid_chunk,
+        "withdrawal": hash_chunk,
         "result": address_chunk,
         "feedback": hash_chunk,
         "pending": hash_chunk,
@@ -42,8 +43,8 @@ _SUBJECTS: Final[Mapping[str, Callable[[str], str]]] = MappingProxyType(
 def market_selector(lighthouse: str, kind: MarketKind, subject: str = "*") -> str:
     """All messages of a kind on a lighthouse, or those of one subject.
 
-    The subject is the model of a demand or offer, the liability of a result, the order of feedback or a rejection,
-    the transaction of a pending note.
+    The subject is the model of a demand or offer, the liability of a result, the order of a withdrawal, of
+    feedback or of a rejection, the transaction of a pending note.
     """
     check = _SUBJECTS.get(kind)
     if check is None:

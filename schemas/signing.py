@@ -18,13 +18,8 @@ from msgspec.structs import replace
 
 from schemas.address import ZERO_ADDRESS, checksum_address, keccak256
 from schemas.errors import InputError, InvalidMessage
-from schemas.messages import (
-    SIGNATURE_SIZE,
-    OrderFeedback,
-    Result,
-    SignedMessage,
-    TransactionFeedback,
-)
+from schemas.message_fields import SIGNATURE_SIZE
+from schemas.messages import Demand, Offer, OrderFeedback, SignedMessage, TransactionFeedback
 from schemas.records import Record
 from schemas.wire import decode, message_hash
 
@@ -169,7 +164,7 @@ class Rejection(Record, frozen=True, kw_only=True):
 
 
 def _check_sender(message: SignedMessage, signer: str) -> None:
-    if not isinstance(message, Result) and message.sender is not None and message.sender != signer:
+    if isinstance(message, (Demand, Offer)) and message.sender is not None and message.sender != signer:
         raise InvalidMessage(
             "sender", f"the order names {message.sender} as its sender, but the key is that of {signer}"
         )

@@ -14,7 +14,7 @@ import msgspec
 from schemas.address import address_bytes, keccak256
 from schemas.cid import parse_cid
 from schemas.errors import InvalidAddress, InvalidMessage
-from schemas.messages import MESSAGE_TYPES, Demand, Message, Offer, Order, Result, TransactionFeedback
+from schemas.messages import MESSAGE_TYPES, Demand, Message, Offer, Order, Result, TransactionFeedback, Withdrawal
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -33,6 +33,8 @@ _ENCODER: Final = msgspec.json.Encoder()
 _WORD: Final = 32
 _ABI_HEAD: Final = 10 * _WORD
 _TWELVE_ZEROS: Final = bytes(12)
+_WITHDRAWAL_TYPE: Final = keccak256(b"Withdrawal(bytes32 order,address lighthouse,uint256 deadline)")
+"""The first word of what a withdrawal's signature covers; no order and no Result begins like this."""
 
 
 def decode(payload: bytes) -> Message:
@@ -203,9 +205,15 @@ def _pack_result(message: Result) -> bytes:
     return address_bytes(message.liability) + parse_cid(message.result) + (b"\1" if message.success else b"\0")
 
 
+def _pack_withdrawal(message: Withdrawal) -> bytes:
+    lighthouse = _padded(address_bytes(message.lighthouse))
+    return b"".join((_WITHDRAWAL_TYPE, bytes.fromhex(message.order), lighthouse, _word(message.deadline)))
+
+
 _PACKERS: Final[dict[type[Message], Callable[[Any], bytes]]] = {
     Demand: _pack_order,
     Offer: _pack_order,
+    Withdrawal: _pack_withdrawal,
     Result: _pack_result,
 }
 """What the hash of a message covers, by its type; for the feedback messages it is not defined."""

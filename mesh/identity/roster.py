@@ -80,8 +80,7 @@ def _grant(rights: str, *keys: str) -> Grant:
 
 def _orders(*kinds: str) -> Grant:
     """Publish messages of these kinds; their signatures identify the author."""
-    shapes = {"demand": "*/*", "offer": "*/*", "result": "*/*", "feedback": "*/*", "pending": "*"}
-    return _grant("put", *(f"aira/{{market}}/{kind}/{shapes[kind]}" for kind in kinds))
+    return _grant("put", *(f"aira/{{market}}/{kind}/{'*' if kind == 'pending' else '*/*'}" for kind in kinds))
 
 
 def _presence(*roles: str) -> Grant:
@@ -98,9 +97,21 @@ _HOLD_CONTENT: Final = _grant("get serve", "aira/cid/*")
 
 ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
     {
-        "agent": (_OWN_SPACE, *_READ_MARKET, _orders("offer", "result"), _presence("agent"), _HOLD_CONTENT),
+        "agent": (
+            _OWN_SPACE,
+            *_READ_MARKET,
+            _orders("offer", "withdrawal", "result"),
+            _presence("agent"),
+            _HOLD_CONTENT,
+        ),
         # A person who orders work also runs an agent.
-        "person": (_OWN_SPACE, *_READ_MARKET, _orders("demand"), _presence("agent", "person"), _HOLD_CONTENT),
+        "person": (
+            _OWN_SPACE,
+            *_READ_MARKET,
+            _orders("demand", "withdrawal"),
+            _presence("agent", "person"),
+            _HOLD_CONTENT,
+        ),
         "provider": (
             _OWN_SPACE,
             *_READ_MARKET,
@@ -126,7 +137,7 @@ ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
         "bridge": (
             _OWN_SPACE,
             *_READ_MARKET,
-            _orders("demand", "offer", "result", "feedback", "pending"),
+            _orders("demand", "offer", "withdrawal", "result", "feedback", "pending"),
             _presence("bridge", "bridge-turn-$*"),
             _HOLD_CONTENT,
         ),

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
 import msgspec
 
 from mesh.errors import InvalidMessage
-from schemas import Result, SignedMessage, Verified, decode, message_hash, names_in, resolve_names
+from schemas import Demand, Offer, Result, SignedMessage, Verified, decode, message_hash, names_in, resolve_names
 from schemas.keys import market_key
 from schemas.signing import verify_hashed
 
@@ -151,7 +151,7 @@ class MessageValidator(Generic[M]):
     def _check_order(self, order: SignedMessage) -> None:
         if isinstance(order, Result):
             return
-        if order.generation == 3 and str(order.nonce).startswith(AMBIGUOUS_NONCE):
+        if isinstance(order, Demand | Offer) and order.generation == 3 and str(order.nonce).startswith(AMBIGUOUS_NONCE):
             raise InvalidMessage("nonce", "the contracts would take it for the sender of a generation-5 order")
         if order.deadline <= self._head():
             raise InvalidMessage("deadline", f"block {order.deadline} has passed")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 from mesh.log_context import log_event
 from mesh.retry import Backoff, RetryPolicy
 from mesh.work.ledger import Outgoing
-from schemas import Demand, Offer, Result, decode, encode, message_hash
+from schemas import Demand, Offer, Result, SignedMessage, Withdrawal, decode, encode, message_hash
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -27,10 +27,12 @@ RESEND: Final = RetryPolicy(initial=3.0, ceiling=60.0)
 """How long to wait for the effect of a message before it is sent again."""
 
 
-def outgoing_identity(message: Demand | Offer | Result) -> str:
-    """The key of a message in the outbox: an order's hash, or a Result's liability."""
+def outgoing_identity(message: SignedMessage) -> str:
+    """The key of a message in the outbox: an order's hash, a Withdrawal's order, a Result's liability."""
     if isinstance(message, Result):
         return result_identity(message.liability)
+    if isinstance(message, Withdrawal):
+        return withdrawal_identity(message.order)
     return message_hash(message).hex()
 
 
@@ -39,7 +41,12 @@ def result_identity(liability: str) -> str:
     return f"result {liability}"
 
 
-def outgoing(message: Demand | Offer | Result) -> Outgoing:
+def withdrawal_identity(order: str) -> str:
+    """The key of the Withdrawal of the order with that hash."""
+    return f"withdrawal {order}"
+
+
+def outgoing(message: SignedMessage) -> Outgoing:
     """The outbox's entry for a signed message."""
     deadline = None if isinstance(message, Result) else message.deadline
     return Outgoing(
@@ -88,7 +95,7 @@ class Outbox:
         self._attempts: dict[str, _Attempts] = {}
         self._changed = asyncio.Event()
 
-    async def post(self, message: Demand | Offer | Result) -> None:
+    async def post(self, message: SignedMessage) -> None:
         """Keep a signed message until `settle`, and send it now."""
         await self._ledger.post(outgoing(message))
         await self.send_new()
@@ -149,7 +156,7 @@ class Outbox:
         for one in unsent:
             if is_due(one.identity):
                 message = decode(one.payload)
-                assert isinstance(message, Demand | Offer | Result)
+                assert isinstance(message, Demand | Offer | Withdrawal | Result)
                 self._channel.publish(message)
                 self._schedule(one)
         self._attempts = {

@@ -18,6 +18,7 @@ from schemas import (
     RejectKey,
     ResultKey,
     RpcKey,
+    WithdrawalKey,
 )
 from tests.schemas.samples import LIGHTHOUSE, MODEL, SENDER
 from tests.schemas.samples import LIGHTHOUSE_NAME as NAME
@@ -29,6 +30,7 @@ L = LIGHTHOUSE.lower()
 KEYS: list[tuple[Key, str]] = [
     (DemandKey(NAME, MODEL, HASH), f"aira/{NAME}/demand/{MODEL}/{HASH}"),
     (OfferKey(NAME, MODEL, HASH), f"aira/{NAME}/offer/{MODEL}/{HASH}"),
+    (WithdrawalKey(NAME, HASH, HASH), f"aira/{NAME}/withdrawal/{HASH}/{HASH}"),
     (ResultKey(NAME, LIGHTHOUSE, HASH), f"aira/{NAME}/result/{L}/{HASH}"),
     (FeedbackKey(NAME, HASH, HASH), f"aira/{NAME}/feedback/{HASH}/{HASH}"),
     (PendingKey(NAME, HASH), f"aira/{NAME}/pending/{HASH}"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any, Final
 
-from schemas import ZERO_ADDRESS, Demand, Offer, Result
+from schemas import ZERO_ADDRESS, Demand, Offer, Result, Withdrawal
 
 MODEL: Final = "Qmb5yQNrh7KqQT3ZRU8VBfYTobF9yCLqS3UTwxAH99aE3v"
 OBJECTIVE: Final = "QmXLdQvVSs5JaXoctCKQiXfbnexk6z9mFDu7sd9NFspKNK"
@@ -32,6 +32,7 @@ OFFER: Final = Offer(**TERMS, lighthouse_fee=7)
 DEMAND_5: Final = Demand(**{**TERMS, "nonce": 3, "sender": SENDER}, validator_fee=7)
 OFFER_5: Final = Offer(**{**TERMS, "nonce": 3, "sender": SENDER}, lighthouse_fee=7)
 RESULT: Final = Result(liability=LIGHTHOUSE, result=MODEL, success=True, signature=SIGNATURE)
+WITHDRAWAL: Final = Withdrawal(order=NONCE, lighthouse=LIGHTHOUSE, deadline=44058, signature=SIGNATURE)
 
 DEMAND_JSON: Final[dict[str, Any]] = {**TERMS, "validatorFee": 7}
 OFFER_JSON: Final[dict[str, Any]] = {**TERMS, "lighthouseFee": 7}
@@ -40,6 +41,12 @@ RESULT_JSON: Final[dict[str, Any]] = {
     "liability": LIGHTHOUSE,
     "result": MODEL,
     "success": True,
+    "signature": SIGNATURE,
+}
+WITHDRAWAL_JSON: Final[dict[str, Any]] = {
+    "withdraws": NONCE,
+    "lighthouse": LIGHTHOUSE,
+    "deadline": 44058,
     "signature": SIGNATURE,
 }
 FEEDBACK_JSON: Final[dict[str, Any]] = {"order": NONCE, "accepted": 1, "signature": SIGNATURE}

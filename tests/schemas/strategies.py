@@ -14,6 +14,7 @@ from schemas import (
     OrderFeedback,
     Result,
     TransactionFeedback,
+    Withdrawal,
     checksum_address,
     cid_of_digest,
 )
@@ -65,10 +66,16 @@ def results(party: SearchStrategy[str] = parties) -> SearchStrategy[Result]:
     return st.builds(Result, liability=party, result=cids, success=st.booleans(), signature=signatures)
 
 
+def withdrawals(party: SearchStrategy[str] = parties) -> SearchStrategy[Withdrawal]:
+    """Withdrawals, with some signature."""
+    return st.builds(Withdrawal, order=hashes, lighthouse=party, deadline=amounts, signature=signatures)
+
+
 def messages() -> SearchStrategy[Message]:
     """Messages of every kind, with some signature."""
     return st.one_of(
         orders(),
+        withdrawals(),
         results(),
         st.builds(OrderFeedback, order=hashes, accepted=amounts, signature=signatures),
         st.builds(TransactionFeedback, tx=hashes),

@@ -40,6 +40,7 @@ from tests.schemas.samples import (
     SIGNATURE,
     TERMS,
     TOKEN,
+    WITHDRAWAL,
     payload,
 )
 from tests.schemas.strategies import messages
@@ -165,6 +166,20 @@ def test_result_is_checked() -> None:
         assert caught.value.reason == reason
 
 
+def test_withdrawal_is_checked() -> None:
+    assert msgspec.structs.replace(WITHDRAWAL, order="0x" + NONCE.upper()) == WITHDRAWAL
+    assert names_in(msgspec.structs.replace(WITHDRAWAL, lighthouse=LIGHTHOUSE_NAME.upper())) == {LIGHTHOUSE_NAME}
+    for field, value, reason in (
+        ("order", NONCE[2:], "hash"),
+        ("lighthouse", "", "address"),
+        ("deadline", -1, "range"),
+        ("signature", "1b", "signature"),
+    ):
+        with pytest.raises(InvalidMessage) as caught:
+            msgspec.structs.replace(WITHDRAWAL, **{field: value})
+        assert caught.value.reason == reason
+
+
 def test_feedback_is_checked() -> None:
     assert OrderFeedback(order="0x" + NONCE.upper(), accepted=1, signature=SIGNATURE).order == NONCE
     assert TransactionFeedback(tx="0x" + NONCE).tx == NONCE
@@ -185,7 +200,7 @@ def test_a_replaced_field_is_checked_as_well() -> None:
 
 def test_message_with_addresses_only_has_no_names() -> None:
     feedback = (OrderFeedback(order=NONCE, accepted=1, signature=SIGNATURE), TransactionFeedback(tx=NONCE))
-    for message in (DEMAND, DEMAND_5, RESULT, *feedback):
+    for message in (DEMAND, DEMAND_5, WITHDRAWAL, RESULT, *feedback):
         assert names_in(message) == frozenset()
 
 

@@ -30,12 +30,13 @@ def test_market_selectors() -> None:
     assert market_selector(NAME.upper(), "offer", MODEL) == f"aira/{NAME}/offer/{MODEL}/*"
     assert market_selector(NAME, "result") == f"aira/{NAME}/result/*/*"
     assert market_selector(NAME, "result", LIGHTHOUSE) == f"aira/{NAME}/result/{L}/*"
+    assert market_selector(NAME, "withdrawal", "ab" * 32) == f"aira/{NAME}/withdrawal/{'ab' * 32}/*"
     assert market_selector(NAME, "reject", "ab" * 32) == f"aira/{NAME}/reject/{'ab' * 32}/*"
     assert market_selector(NAME, "pending", "ab" * 32) == f"aira/{NAME}/pending/{'ab' * 32}"
     assert market_selector(NAME, "pending") == f"aira/{NAME}/pending/*"
 
 
-@pytest.mark.parametrize(("key", "text"), KEYS[:6], ids=lambda value: value if isinstance(value, str) else "")
+@pytest.mark.parametrize(("key", "text"), KEYS[:7], ids=lambda value: value if isinstance(value, str) else "")
 def test_market_selector_finds_its_kind(key: Key, text: str) -> None:
     kind: Any = text.split("/")[2]
     found = zenoh.KeyExpr(market_selector(NAME, kind))
@@ -47,20 +48,20 @@ def test_market_selector_finds_its_kind(key: Key, text: str) -> None:
 
 def test_selectors_of_an_agent_find_their_keys() -> None:
     for selector, index in (
-        (event_selector(SENDER), 7),
-        (objective_selector(SENDER, LIGHTHOUSE), 8),
-        (topic_selector(SENDER, LIGHTHOUSE), 9),
-        (topic_selector(SENDER, topic="/blink"), 9),
-        (event_selector(), 7),
-        (device_selector(SENDER), 10),
-        (device_selector(SENDER, "tty-0"), 10),
+        (event_selector(SENDER), 8),
+        (objective_selector(SENDER, LIGHTHOUSE), 9),
+        (topic_selector(SENDER, LIGHTHOUSE), 10),
+        (topic_selector(SENDER, topic="/blink"), 10),
+        (event_selector(), 8),
+        (device_selector(SENDER), 11),
+        (device_selector(SENDER, "tty-0"), 11),
     ):
         found = [zenoh.KeyExpr(selector).intersects(zenoh.KeyExpr(text)) for _, text in KEYS]
         assert found == [position == index for position in range(len(KEYS))]
 
 
 def test_presence_is_found_by_its_own_selector_only() -> None:
-    presence = zenoh.KeyExpr(KEYS[6][1])
+    presence = zenoh.KeyExpr(KEYS[7][1])
     assert zenoh.KeyExpr(presence_selector(NAME)).includes(presence)
     assert zenoh.KeyExpr(presence_selector(NAME, "provider")).includes(presence)
     assert not zenoh.KeyExpr(presence_selector(NAME, "agent")).intersects(presence)

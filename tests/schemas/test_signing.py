@@ -15,10 +15,12 @@ from msgspec.structs import replace
 
 from schemas import (
     AiraError,
+    Demand,
     InputError,
     InvalidMessage,
-    Order,
+    Offer,
     Result,
+    SignedMessage,
     Signer,
     encode,
     keccak256,
@@ -41,7 +43,7 @@ from tests.schemas.samples import (
     TRANSACTION_JSON,
     payload,
 )
-from tests.schemas.strategies import addresses, orders, results
+from tests.schemas.strategies import addresses, orders, results, withdrawals
 from tests.schemas.vectors import VECTORS
 
 KEY = bytes(31) + b"\7"
@@ -62,10 +64,10 @@ def test_address_is_that_of_the_key() -> None:
     assert Signer(bytes(31) + b"\1").address == "0x7E5F4552091A69125d5DfCb7b8C2659029395Bdf"
 
 
-@given(orders(addresses) | results(addresses), st.integers(1, CURVE_ORDER - 1))
-def test_a_signed_message_verifies(message: Order | Result, secret: int) -> None:
+@given(orders(addresses) | withdrawals(addresses) | results(addresses), st.integers(1, CURVE_ORDER - 1))
+def test_a_signed_message_verifies(message: SignedMessage, secret: int) -> None:
     signer = Signer(secret.to_bytes(32, "big"))
-    if not isinstance(message, Result) and message.sender is not None:
+    if isinstance(message, Demand | Offer) and message.sender is not None:
         message = msgspec.structs.replace(message, sender=signer.address)
     signed = signer.sign(message)
     verified = verify(encode(signed))

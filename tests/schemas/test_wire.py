@@ -39,6 +39,8 @@ from tests.schemas.samples import (
     SIGNATURE,
     TERMS,
     TRANSACTION_JSON,
+    WITHDRAWAL,
+    WITHDRAWAL_JSON,
     payload,
 )
 from tests.schemas.strategies import messages
@@ -69,6 +71,7 @@ def test_the_fields_determine_the_kind() -> None:
     assert decode(payload(DEMAND_JSON)) == DEMAND
     assert decode(payload(DEMAND_5_JSON)) == DEMAND_5
     assert decode(payload(OFFER_JSON)) == OFFER
+    assert decode(payload(WITHDRAWAL_JSON)) == WITHDRAWAL
     assert decode(payload(RESULT_JSON)) == RESULT
     assert decode(payload(FEEDBACK_JSON)) == OrderFeedback(order=NONCE, accepted=1, signature=SIGNATURE)
     assert decode(payload(TRANSACTION_JSON)) == TransactionFeedback(tx=NONCE)

@@ -19,6 +19,7 @@ from schemas import (
     OrderFeedback,
     Result,
     TransactionFeedback,
+    Withdrawal,
     address_bytes,
     cancellation_hash,
     keccak256,
@@ -27,7 +28,7 @@ from schemas import (
     parse_cid,
 )
 from tests.schemas.samples import DEMAND, DEMAND_5, LIGHTHOUSE_NAME, NONCE, OFFER, RESULT, SIGNATURE
-from tests.schemas.strategies import addresses, orders, results
+from tests.schemas.strategies import addresses, orders, results, withdrawals
 
 
 def typed_terms(order: Order) -> list[tuple[str, Any]]:
@@ -104,6 +105,28 @@ def test_a_named_sender_or_liability_must_be_resolved_first() -> None:
             message_hash(named)
         assert "robot.eth" in caught.value.detail
         assert caught.value.reason == "unresolved-name"
+
+
+@given(withdrawals(addresses))
+def test_hash_of_a_withdrawal_is_that_of_its_type_and_encoded_fields(withdrawal: Withdrawal) -> None:
+    kind = keccak256(b"Withdrawal(bytes32 order,address lighthouse,uint256 deadline)")
+    values = (kind, bytes.fromhex(withdrawal.order), withdrawal.lighthouse, withdrawal.deadline)
+    assert message_hash(withdrawal) == keccak256(encode(["bytes32", "bytes32", "address", "uint256"], values))
+
+
+@given(withdrawals(addresses), orders(addresses) | results(addresses))
+def test_a_withdrawal_is_no_other_message_under_any_reading(withdrawal: Withdrawal, other: Order | Result) -> None:
+    """Contracts take texts of any length for a CID. An order's other fields alone are longer than a withdrawal; a
+    Result of that length would have to name a liability whose address is the beginning of a hash."""
+    shortest_order = [kind for kind, _ in (*typed_terms(DEMAND), *tail(DEMAND)) if kind != "bytes"]
+    sizes = {"address": 20, "uint256": 32, "bytes32": 32}
+    covered = encode(
+        ["bytes32", "bytes32", "address", "uint256"],
+        [bytes(32), bytes.fromhex(withdrawal.order), withdrawal.lighthouse, withdrawal.deadline],
+    )
+    assert len(covered) == 128 < sum(sizes[kind] for kind in shortest_order)
+    assert message_hash(withdrawal) != message_hash(other)
+    assert message_hash(withdrawal) != cancellation_hash(withdrawal.lighthouse)
 
 
 def test_feedback_has_no_hash() -> None:

@@ -23,6 +23,7 @@ from schemas import (
     RejectKey,
     ResultKey,
     RpcKey,
+    WithdrawalKey,
 )
 from tests.support.sites import MARKET
 
@@ -70,6 +71,7 @@ def keys_of(who: str) -> dict[str, str]:
     keys: dict[str, Any] = {
         "demand": DemandKey(MARKET, MODEL, HASH),
         "offer": OfferKey(MARKET, MODEL, HASH),
+        "withdrawal": WithdrawalKey(MARKET, HASH, HASH),
         "result": ResultKey(MARKET, LIABILITY, HASH),
         "feedback": FeedbackKey(MARKET, HASH, HASH),
         "pending": PendingKey(MARKET, HASH),
@@ -92,17 +94,17 @@ def keys_of(who: str) -> dict[str, str]:
 KEYS = {who: keys_of(who) for who in WHO}
 OWN = {"own event", "own objective", "own topic", "own device", "own rpc", "own eth"}
 OTHER = {"other event", "other objective", "other topic", "other device", "other rpc", "other eth"}
-MARKETS = {"demand", "offer", "result", "feedback", "pending", "reject", "other reject"}
+MARKETS = {"demand", "offer", "withdrawal", "result", "feedback", "pending", "reject", "other reject"}
 PRESENCES = {name for name in KEYS["arm"] if name.startswith("as ")} | {"other presence"}
 NOBODY: dict[str, set[str]] = {who: set() for who in WHO}
 
 PUT = NOBODY | {
-    "arm": OWN | {"offer", "result"},
-    "ann": OWN | {"demand"},
+    "arm": OWN | {"offer", "withdrawal", "result"},
+    "ann": OWN | {"demand", "withdrawal"},
     "miner": OWN | {"feedback", "pending", "reject"},
     "boss": OWN,
     "board": {"robot topic", "robot device"},
-    "bridge": OWN | {"demand", "offer", "result", "feedback", "pending"},
+    "bridge": OWN | {"demand", "offer", "withdrawal", "result", "feedback", "pending"},
 }
 DELETE = NOBODY | dict.fromkeys(("arm", "ann", "miner", "boss", "bridge"), OWN)
 SERVE = NOBODY | {

@@ -31,7 +31,7 @@ def test_every_role_has_its_grants_and_every_grant_names_keys_of_the_mesh() -> N
 def test_every_family_of_keys_may_be_written_by_somebody() -> None:
     """The families with a `put` or a `serve` of their own; a new family must be thought of here."""
     written = {str(one) for one in get_args(Key)}
-    assert len(written) == 14
+    assert len(written) == 15
     grants = {
         key for role, grants in ROLES.items() if role != "router" for grant in grants for key in grant.keys
         if grant.rights & {Right.PUT, Right.SERVE, Right.TOKEN}
@@ -39,6 +39,7 @@ def test_every_family_of_keys_may_be_written_by_somebody() -> None:
     for chunk in (
         "demand",
         "offer",
+        "withdrawal",
         "result",
         "feedback",
         "pending",
@@ -82,7 +83,8 @@ def test_only_the_markets_of_the_roster_are_open() -> None:
 
     puts = next(one.keys for one in access_of(two) if one.right is Right.PUT)
 
-    assert puts == (f"aira/agent/{ARM}/**", f"aira/{MARKET}/demand/*/*", "aira/b.eth/demand/*/*")
+    markets = [f"aira/{market}/{kind}/*/*" for kind in ("demand", "withdrawal") for market in (MARKET, "b.eth")]
+    assert set(puts) == {f"aira/agent/{ARM}/**", *markets}
 
 
 def test_zenoh_denies_by_default_and_knows_both_spellings_of_an_address() -> None:
