@@ -67,9 +67,9 @@ class ChannelBridge(Role):
     `reconnect` and `publish_retry` are the delays after failures of the daemon. The caller closes network, daemon and
     journal.
 
-    An accepted message is sent exactly once: it waits in the journal until the daemon has accepted it, even if `run`
-    is cancelled. Exceptions: if the daemon dies during a call, the message may have gone out and is published again; a
-    message that the daemon accepted just before it died may be lost until its sender repeats it.
+    An accepted message waits in the journal, even if `run` is cancelled, until the daemon has accepted it and names a
+    listener. If the daemon dies during a call, the message may have gone out and is published again. What the daemon or
+    other nodes lose after that is lost until its sender repeats it: then it is relayed again (`journal.REPETITION`).
     """
 
     title = "bridge"

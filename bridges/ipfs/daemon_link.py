@@ -94,12 +94,13 @@ class DaemonLink:
             await backoff.wait()
 
     async def refresh_listeners(self, *, max_age: float = 0.0) -> bool:
-        """Ask the daemon for listeners, unless it was asked less than `max_age` seconds ago; whether there are any.
+        """Whether there are listeners. Asks the daemon, unless it named some less than `max_age` seconds ago.
 
+        That nobody listens is never believed later: a message published in the meantime would be heard and sent again.
         Raises `IpfsError`.
         """
         now = asyncio.get_running_loop().time()
-        if not self._listeners_at or now - self._listeners_at >= max_age:
+        if not self.listeners or now - self._listeners_at >= max_age:
             before, self.listeners = self.listeners, tuple(await self.daemon.listeners(self.topic))
             self._listeners_at = now
             if bool(before) != bool(self.listeners):
@@ -121,7 +122,7 @@ class DaemonLink:
         version = await self.daemon.detect_version()
         self.identity = (await self.daemon.identity()).id
         async with asyncio.TaskGroup() as tasks, self.daemon.subscribe(self.topic) as messages:
-            self._listeners_at = self._swarm_checked_at = 0.0
+            self._swarm_checked_at = 0.0
             await self.refresh_listeners()
             self.error = ""
             self._up.set()

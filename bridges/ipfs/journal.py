@@ -14,14 +14,17 @@ from bridges.ipfs.errors import JournalFailed
 from bridges.ipfs.publish_queue import QueuedMessage
 from bridges.ipfs.validation import RelayMessage
 from mesh.errors import ConfigurationError
+from mesh.retry import RetryPolicy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
 DEDUPLICATION_WINDOW: Final = 600.0
-"""Seconds for which a message that is on both sides is not relayed again. After that a repeated message is relayed: its
-sender still waits for an effect, and a legacy peer that joined meanwhile has not received it."""
+"""Seconds for which a message that was seen on a side is known to be there."""
+REPETITION: Final = RetryPolicy(initial=60.0, ceiling=DEDUPLICATION_WINDOW)
+"""How long after a message was relayed a copy from its own side is relayed again: its sender still waits for an effect,
+so the message may have been lost on the way, or nobody who could use it had joined yet."""
 DEDUPLICATION_LIMIT: Final = 131_072
 """Messages remembered per side, at most; the oldest are forgotten first."""
 _TABLES: Final = """
@@ -69,6 +72,31 @@ class SeenMessages:
     def __len__(self) -> int:
         """The number of messages remembered, on the side with more."""
         return max(len(seen) for seen in self._seen.values())
+
+
+class RelayedMessages:
+    """The fingerprints of messages relayed to one side: how often, and when last. `clock` returns seconds."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._relayed: OrderedDict[bytes, tuple[int, float]] = OrderedDict()
+
+    def add(self, fingerprint: bytes) -> None:
+        """The message was relayed now."""
+        times, _ = self._relayed.pop(fingerprint, (0, 0.0))
+        self._relayed[fingerprint] = (times + 1, self._clock())
+        if len(self._relayed) > DEDUPLICATION_LIMIT:
+            self._relayed.popitem(last=False)
+
+    def is_due(self, fingerprint: bytes) -> bool | None:
+        """Whether a copy from the side of its sender is to be relayed again; None for a message that never was."""
+        if fingerprint not in self._relayed:
+            return None
+        times, at = self._relayed[fingerprint]
+        return self._clock() - at >= REPETITION.delay(times)
+
+    def __len__(self) -> int:
+        return len(self._relayed)
 
 
 class RelayJournal:

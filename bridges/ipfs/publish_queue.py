@@ -120,17 +120,14 @@ class PublishQueue:
         """Remove a message that can't be sent."""
         self._own.pop(fingerprint, None)
 
-    def keep_unheard(self, queued: QueuedMessage) -> bool:
-        """Keep a message that was sent while there were no listeners; False if the oldest such one was dropped."""
+    def keep_unheard(self, queued: QueuedMessage) -> QueuedMessage | None:
+        """Keep a message that was sent while there were no listeners; returns the oldest such one if it is dropped."""
         self._unheard[queued.message.fingerprint] = queued
-        if len(self._unheard) <= self._limit:
-            return True
-        self._unheard.popitem(last=False)
-        return False
+        return None if len(self._unheard) <= self._limit else self._unheard.popitem(last=False)[1]
 
-    def heard(self, fingerprint: bytes) -> None:
-        """Another node has published the message, so it need not be sent again."""
-        self._unheard.pop(fingerprint, None)
+    def heard(self, fingerprint: bytes) -> bool:
+        """Another node has published the message: it need not be sent again. False if it need not be anyway."""
+        return self._unheard.pop(fingerprint, None) is not None
 
     def requeue_unheard(self) -> int:
         """There are listeners now: put the unheard messages before all others. Returns their number."""

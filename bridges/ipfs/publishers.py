@@ -32,8 +32,8 @@ log = logging.getLogger(__name__)
 
 BRIDGE_MARK: Final = b"ipfs"
 """The attachment of messages that a bridge puts on the mesh; other bridges do not send those back."""
-LISTENERS_MAX_AGE: Final = 0.5
-"""Seconds for which the last answer about listeners is trusted."""
+LISTENERS_MAX_AGE: Final = 0.1
+"""Seconds for which the daemon's answer that somebody listens is believed."""
 PUBLISH_RETRY: Final = RetryPolicy(initial=0.5, factor=1.0, ceiling=0.5)
 """A steady, short delay: a failed message blocks those behind it, and an unreachable daemon is awaited elsewhere."""
 REFUSALS: Final = 5

@@ -1,7 +1,8 @@
-"""The relay between the two channels: each message once, by one bridge, and no accepted message is lost.
+"""The relay between the two channels: each message is sent by one bridge, and again only if its sender repeats it.
 
 A message that is seen on one side and not known on the other waits in the publish queue to the other. This bridge sends
-it or, when another bridge is active, leaves it to that one until it is seen to have arrived.
+it or, when another bridge is active, leaves it to that one until it is seen to have arrived. IPFS nodes drop messages
+without a report; so what its sender repeats is relayed again after a while, by `REPETITION`.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from collections import Counter
 from enum import Enum
 from typing import TYPE_CHECKING, Final
 
-from bridges.ipfs.journal import SeenMessages, Side
+from bridges.ipfs.journal import RelayedMessages, SeenMessages, Side
 from bridges.ipfs.publish_queue import PublishQueue, QueuedMessage, Rank, active_bridge
 from schemas.status import DirectionStatus
 
@@ -45,6 +46,7 @@ class MessageRelay:
         self._clock = clock
         self._journal = journal
         self._seen = SeenMessages(clock)
+        self._relayed = {side: RelayedMessages(clock) for side in Side}
         self.queues: Final = {side: PublishQueue(limit=limit) for side in Side}
         """The queue towards each side."""
         self.counts: Final = {side: Counter[str]() for side in Side}
@@ -66,7 +68,7 @@ class MessageRelay:
         """
         fingerprint, to = message.fingerprint, side.other
         self._record_arrival(fingerprint, side, echo=echo)
-        if self._seen.contains(fingerprint, to) or fingerprint in self.queues[to] or by_bridge:
+        if by_bridge or fingerprint in self.queues[to] or self._is_known(fingerprint, to):
             self.counts[to]["known"] += 1
             return RelayOutcome.KNOWN
         active = active_bridge(self.own, self._others)
@@ -84,10 +86,10 @@ class MessageRelay:
         message = queued.message
         self.counts[side]["carried"] += 1
         self.counts[side]["bytes"] += len(message.legacy if side is Side.IPFS else message.payload)
-        self.queues[side].arrived(message.fingerprint, now=self._clock())
-        self._record(message.fingerprint, side)
-        if not heard and not self.queues[side].keep_unheard(queued):
-            self.dropped[side]["unheard"] += 1
+        waited = self.queues[side].arrived(message.fingerprint, now=self._clock())
+        self._record(message.fingerprint, side, relayed=waited)
+        if not heard:
+            self._keep_unheard(queued, side)
 
     def refused(self, queued: QueuedMessage, side: Side) -> None:
         """The destination will never accept the message: drop it."""
@@ -169,19 +171,33 @@ class MessageRelay:
             bytes=counts["bytes"],
         )
 
+    def _is_known(self, fingerprint: bytes, to: Side) -> bool:
+        is_due = self._relayed[to].is_due(fingerprint)
+        return self._seen.contains(fingerprint, to) if is_due is None else not is_due
+
     def _record_arrival(self, fingerprint: bytes, side: Side, *, echo: bool) -> None:
         queue = self.queues[side]
-        if queue.arrived(fingerprint, now=self._clock()):
+        arrived = queue.arrived(fingerprint, now=self._clock())
+        if arrived:
             self.counts[side]["left"] += 1
-        if not echo:
-            queue.heard(fingerprint)
-        self._record(fingerprint, side)
+        if not echo and queue.heard(fingerprint):
+            self._journal.remove_waiting(fingerprint)
+        self._record(fingerprint, side, relayed=arrived)
 
-    def _record(self, fingerprint: bytes, side: Side) -> None:
+    def _record(self, fingerprint: bytes, side: Side, *, relayed: bool) -> None:
+        """The message is on `side`; `relayed` if it waited to be sent there."""
         is_new = not self._seen.contains(fingerprint, side)
         self._seen.add(fingerprint, side)
-        if is_new and self._seen.contains(fingerprint, side.other):
+        if relayed:
+            self._relayed[side].add(fingerprint)
+        if relayed or (is_new and self._seen.contains(fingerprint, side.other)):
             self._journal.mark_relayed(fingerprint)
+
+    def _keep_unheard(self, queued: QueuedMessage, side: Side) -> None:
+        self._journal.add_waiting(side, queued)
+        if (dropped := self.queues[side].keep_unheard(queued)) is not None:
+            self.dropped[side]["unheard"] += 1
+            self._journal.remove_waiting(dropped.message.fingerprint)
 
     def _trust_others(self, side: Side) -> None:
         for fingerprint in self.queues[side].forget_left():

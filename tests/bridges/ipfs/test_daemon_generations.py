@@ -145,6 +145,30 @@ async def test_a_flood_reaches_nodes_that_validate_out_of_order(
         assert bob.heard == [legacy_json(order) for order in orders]
 
 
+async def test_messages_are_not_sent_again_to_a_listener_that_heard_them(
+    router: EmbeddedRouter, topic: str, tmp_path: Path
+) -> None:
+    orders = [demand(cost=number) for number in range(40)]
+    async with (
+        RecentDaemon() as one,
+        RecentDaemon() as two,
+        LegacyClient(two.api) as bob,
+        on_mesh(router.endpoint, topic) as mesh,
+        bridging(router.endpoint, one.api, topic, tmp_path / "journal.sqlite") as bridge,
+    ):
+        one.others, two.others = [two], [one]
+        await until_seen(mesh, bridge.address)
+        await until(lambda: bridge.status().state == "alone", seconds=SECONDS)
+        for order in orders:
+            mesh.channel.publish(order)
+        await until(lambda: bridge.status().to_ipfs.unheard >= 3, seconds=SECONDS)
+        await bob.listen(topic)
+        await until(lambda: set(bob.heard) == set(map(legacy_json, orders)), seconds=SECONDS)
+        await until(lambda: bridge.status().to_ipfs.unheard == bridge.status().to_ipfs.waiting == 0, seconds=SECONDS)
+    # One message may be on its way while the listener appears.
+    assert len(bob.heard) - len(orders) <= 1
+
+
 async def test_a_message_published_out_of_order_is_published_again(
     router: EmbeddedRouter, topic: str, tmp_path: Path
 ) -> None:

@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from bridges.ipfs.journal import DEDUPLICATION_LIMIT, DEDUPLICATION_WINDOW, RelayJournal, SeenMessages, Side
+from bridges.ipfs.journal import (
+    DEDUPLICATION_LIMIT,
+    DEDUPLICATION_WINDOW,
+    RelayedMessages,
+    RelayJournal,
+    SeenMessages,
+    Side,
+)
 from bridges.ipfs.publish_queue import TAKEOVER_AFTER, QueuedMessage, Rank, active_bridge, rank_of
 from bridges.ipfs.relay import MessageRelay, RelayOutcome
 from bridges.ipfs.validation import RelayMessage
@@ -91,14 +98,49 @@ def test_an_echo_before_the_daemons_answer_does_not_send_it_again(time: Time, jo
     assert send_all(relay, Side.IPFS) == []
 
 
-def test_a_message_repeated_after_the_window_is_relayed_again(time: Time, journal: RelayJournal) -> None:
+@pytest.mark.parametrize("by_this_bridge", [True, False])
+def test_a_message_that_its_sender_repeats_is_relayed_again_and_its_echo_is_not(
+    time: Time, journal: RelayJournal, by_this_bridge: bool
+) -> None:
+    relay, one = bridge(time, journal, SENIOR if by_this_bridge else JUNIOR), message()
+    if not by_this_bridge:
+        relay.bridge_joined(SENIOR)
+    relayed_at = []
+    for _ in range(1500):
+        relay.receive(one, Side.MESH)
+        if relay.queues[Side.IPFS].left:
+            relay.receive(one, Side.IPFS)
+            relayed_at.append(time.now)
+        elif send_all(relay, Side.IPFS):
+            relayed_at.append(time.now)
+        assert relay.receive(one, Side.IPFS) is RelayOutcome.KNOWN
+        assert waiting(journal) == set()
+        time.now += 1
+    assert relayed_at == [1000, 1060, 1180, 1420, 1900]
+
+
+def test_a_message_whose_sender_repeats_it_is_relayed_again_after_the_window(time: Time, journal: RelayJournal) -> None:
     relay, one = bridge(time, journal, SENIOR), message()
-    relay.receive(one, Side.MESH)
-    send_all(relay, Side.IPFS)
+    relay.receive(one, Side.IPFS)
+    relay.receive(one, Side.MESH)  # known on both sides without having been relayed
     time.now += DEDUPLICATION_WINDOW - 1
     assert relay.receive(one, Side.MESH) is RelayOutcome.KNOWN
     time.now += 2
     assert relay.receive(one, Side.MESH) is RelayOutcome.ACCEPTED
+
+
+def test_unheard_messages_survive_a_restart(time: Time, journal: RelayJournal) -> None:
+    relay, one, two, three = bridge(time, journal, Rank(True, 1, ONE), limit=2), message(), message(), message()
+    for each in (one, two, three):
+        relay.receive(each, Side.MESH)
+        send_all(relay, Side.IPFS, heard=False)
+    assert relay.status(Side.IPFS, per_second=0).dropped == {"unheard": 1}
+    relay.receive(two, Side.IPFS)  # from another node
+    assert waiting(journal) == {three.fingerprint}
+    restarted = bridge(time, journal, SENIOR)
+    restarted.restore()
+    assert send_all(restarted, Side.IPFS) == [three.fingerprint]
+    assert waiting(journal) == set()
 
 
 def test_messages_of_another_bridge_are_not_sent_back(time: Time, journal: RelayJournal) -> None:
@@ -222,6 +264,10 @@ def test_the_deduplication_memory_is_bounded(time: Time) -> None:
         seen.add(number.to_bytes(16, "big"), Side.MESH)
     assert len(seen) == DEDUPLICATION_LIMIT
     assert not seen.contains((0).to_bytes(16, "big"), Side.MESH)
+    relayed = RelayedMessages(time)
+    for number in range(DEDUPLICATION_LIMIT + 1):
+        relayed.add(number.to_bytes(16, "big"))
+    assert len(relayed) == DEDUPLICATION_LIMIT
 
 
 @pytest.mark.parametrize("rank", [SENIOR, Rank(True, 2**63, TWO)])

@@ -83,9 +83,9 @@ async def test_no_accepted_message_is_lost_by_outages_of_the_daemon(
 
         await bob.publish(topic, legacy_json(answer := offer()))
         await until(lambda: encode(answer) in mesh.payloads, seconds=SECONDS)
-    # Messages in flight when the daemon died, and those sent before it knew its listeners again, may arrive twice:
-    # receivers drop duplicates. Every other message arrives once.
-    assert len(bob.heard) - 1 - len(set(bob.heard[:-1])) <= 10
+    # The message in flight when the daemon died may arrive twice, and at each of its two starts the one that was being
+    # published while the first listener appeared. Every other message arrives once.
+    assert len(bob.heard) - 1 - len(set(bob.heard[:-1])) <= 3
 
 
 async def test_a_frozen_daemon_is_detected_and_used_again_afterwards(
