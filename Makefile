@@ -86,7 +86,7 @@ COMPILE := uv pip compile pyproject.toml --universal --python-version 3.11 --gen
 	--no-header --no-annotate --no-emit-index-url --no-emit-find-links
 
 # Of the same versions, what the images need.
-lock: ## choose the exact versions anew (needs uv)
+lock: ## update the locked versions (needs uv)
 	@$(COMPILE) --extra dev --output-file $(LOCK)
 	@$(COMPILE) --constraint $(LOCK) --extra serial --extra metrics --output-file requirements/edge.txt
 	@$(COMPILE) --constraint $(LOCK) --extra chain --extra identity --extra ipfs --extra metrics \

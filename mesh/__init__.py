@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from mesh.agent import (
         Agent,
         Contract,
-        FundsShort,
         Job,
         JobFailed,
         LiabilityReverted,
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
         Outcome,
         Phase,
     )
-    from mesh.chain import NodeUnreachable, NotALiability
+    from mesh.chain import InsufficientTokens, NodeUnreachable, NotALiability
     from mesh.content import ContentUnavailable
     from mesh.errors import (
         AiraError,
@@ -63,8 +62,8 @@ _HOMES = {
     "Contract": "mesh.agent.contract",
     "Demand": "schemas",
     "Empty": "schemas",
-    "FundsShort": "mesh.agent.errors",
     "InputError": "mesh.errors",
+    "InsufficientTokens": "mesh.chain",
     "InvalidPayload": "schemas",
     "Job": "mesh.work.job",
     "JobFailed": "mesh.work.job",
@@ -129,8 +128,8 @@ __all__ = [
     "Contract",
     "Demand",
     "Empty",
-    "FundsShort",
     "InputError",
+    "InsufficientTokens",
     "InvalidPayload",
     "Job",
     "JobFailed",

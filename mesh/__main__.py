@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 def main() -> None:
     """Load the command line and run it."""
     # Until the command listens to signals itself there is nothing to tidy up, but an interrupted import may print a
-    # traceback, swallow the interrupt, or make Python end otherwise than it was told to.
+    # traceback, swallow the interrupt, or make Python exit with another code.
     signal.signal(signal.SIGINT, _leave)
     from mesh.cli import main as command_line
 

@@ -33,7 +33,7 @@ class RetryPolicy:
             raise ConfigurationError(f"not a retry policy: {self}")
 
     def delay(self, failures: int) -> float:
-        """The longest delay after so many failures in a row, before jitter."""
+        """The longest delay after `failures` failures in a row, before jitter."""
         return min(self.initial * self.factor ** min(failures - 1, 64), self.ceiling)
 
 

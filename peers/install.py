@@ -1,4 +1,4 @@
-"""`python -m peers.install`: install the missing peers, go on when one fails, and say at the end what there is.
+"""`python -m peers.install`: install the missing peers, go on when one fails, and list at the end what is installed.
 
 It may be run any number of times, and by several people at once. It exits with 1 only where `AIRA_REQUIRE_PEERS=1`
 asks for all peers and one that a recipe should have given is missing.

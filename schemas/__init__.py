@@ -16,6 +16,15 @@ if TYPE_CHECKING:
         parse_address,
         parse_address_or_name,
     )
+    from schemas.agent_keys import (
+        AgentKey,
+        DeviceTopicKey,
+        EthEventKey,
+        EventKey,
+        LiabilityTopicKey,
+        ObjectiveTopicKey,
+        RpcKey,
+    )
     from schemas.cid import cid_of_digest, format_cid, parse_cid
     from schemas.errors import (
         AiraError,
@@ -28,23 +37,16 @@ if TYPE_CHECKING:
         InvalidRecord,
     )
     from schemas.keys import (
-        AgentKey,
         CidKey,
         DemandKey,
-        DeviceTopicKey,
-        EthEventKey,
-        EventKey,
         FeedbackKey,
         Key,
-        LiabilityTopicKey,
         MarketKey,
-        ObjectiveTopicKey,
         OfferKey,
         PendingKey,
         PresenceKey,
         RejectKey,
         ResultKey,
-        RpcKey,
         WithdrawalKey,
         parse_key,
     )
@@ -92,11 +94,11 @@ _NAMES: Final = {
     "address": (
         "ZERO_ADDRESS address_bytes checksum_address is_ens_name keccak256 parse_address parse_address_or_name"
     ),
+    "agent_keys": ("AgentKey DeviceTopicKey EthEventKey EventKey LiabilityTopicKey ObjectiveTopicKey RpcKey"),
     "cid": ("cid_of_digest format_cid parse_cid"),
     "errors": ("AiraError InputError InvalidAddress InvalidCid InvalidKey InvalidMessage InvalidPayload InvalidRecord"),
     "keys": (
-        "AgentKey CidKey DemandKey DeviceTopicKey EthEventKey EventKey FeedbackKey Key LiabilityTopicKey "
-        "MarketKey ObjectiveTopicKey OfferKey PendingKey PresenceKey RejectKey ResultKey RpcKey  "
+        "CidKey DemandKey FeedbackKey Key MarketKey OfferKey PendingKey PresenceKey RejectKey ResultKey "
         "WithdrawalKey parse_key"
     ),
     "message_fields": ("MAX_UINT256"),

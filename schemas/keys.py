@@ -1,4 +1,4 @@
-"""The keyspace: all keys and their meaning.
+"""The keyspace: all keys and their meaning. Those of agents are in `schemas.agent_keys`.
 
 `str(key)` is the text of a key, `parse_key` parses one; both make the same checks, because Zenoh itself accepts blanks,
 line ends and NUL in a key. Each key has exactly one text. `schemas.selectors` has the selectors for subscribers and
@@ -11,30 +11,73 @@ classes accept any case), hashes are 64 hexadecimal digits in lower case without
 
 from __future__ import annotations
 
-from typing import Final, Literal, TypeAlias
+from functools import lru_cache
+from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias
 
-from msgspec import Struct
-from msgspec.structs import force_setattr
+from schemas.address import parse_address_or_name
+from schemas.agent_keys import (
+    CACHED,
+    AgentKey,
+    BaseKey,
+    address_chunk,
+    check_canonical,
+    check_length,
+    name_chunk,
+    parse_agent_key,
+)
+from schemas.cid import parse_cid
+from schemas.errors import InvalidAddress, InvalidCid, InvalidKey
 
-from schemas.errors import InvalidKey
-from schemas.key_chunks import CANONICAL, check_event
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
 
-LiabilityEvent: TypeAlias = Literal["incoming", "ready", "complete", "finalized"]
-EthEvent: TypeAlias = Literal["transfer", "approval"]
 MarketKind: TypeAlias = Literal["demand", "offer", "withdrawal", "result", "feedback", "pending", "reject"]
 
-MAX_KEY_LENGTH: Final = 512
+
+@lru_cache(maxsize=CACHED)
+def lighthouse_chunk(text: str) -> str:
+    """A lighthouse: its ENS name, or its address if it has none; in lower case."""
+    try:
+        return parse_address_or_name(text).lower()
+    except InvalidAddress:
+        raise InvalidKey(text, "a lighthouse is named by an ENS name or an address") from None
 
 
-class _Key(Struct, frozen=True, gc=False):
-    """The base of all keys. Constructing one raises `InvalidKey` if a field is not valid in a key."""
+def cid_chunk(text: str) -> str:
+    """A CIDv0."""
+    try:
+        parse_cid(text)
+    except InvalidCid as error:
+        raise InvalidKey(text, str(error)) from None
+    return text
 
-    def __post_init__(self) -> None:
-        for field in self.__struct_fields__:
-            text = getattr(self, field)
-            canonical = CANONICAL[field](text)
-            if canonical != text:
-                force_setattr(self, field, canonical)
+
+def hash_chunk(text: str) -> str:
+    """A 32-byte hash: 64 hexadecimal digits in lower case, without `0x`."""
+    try:
+        # This also rejects upper case and the blanks that bytes.fromhex() skips.
+        if len(text) == 64 and bytes.fromhex(text).hex() == text:
+            return text
+    except ValueError:
+        pass
+    raise InvalidKey(text, "a hash is 64 hexadecimal digits in lower case, without 0x")
+
+
+class _Key(BaseKey, frozen=True, gc=False):
+    """The base of the keys that are not an agent's."""
+
+    checks: ClassVar[Mapping[str, Callable[[str], str]]] = {
+        "lighthouse": lighthouse_chunk,
+        "agent": address_chunk,
+        "liability": address_chunk,
+        "provider": address_chunk,
+        "model": cid_chunk,
+        "cid": cid_chunk,
+        "hash": hash_chunk,
+        "order": hash_chunk,
+        "tx": hash_chunk,
+        "role": name_chunk,
+    }
 
 
 class DemandKey(_Key, frozen=True):
@@ -124,78 +167,6 @@ class PresenceKey(_Key, frozen=True):
         return f"aira/{self.lighthouse}/@agent/{self.role}/{self.agent}"
 
 
-class EventKey(_Key, frozen=True):
-    """What happened to `liability`: `incoming`, `ready`, `complete` or `finalized`; put by the agent."""
-
-    agent: str
-    liability: str
-    event: LiabilityEvent
-
-    def __post_init__(self) -> None:
-        _Key.__post_init__(self)
-        check_event(self.event, "incoming", "ready", "complete", "finalized")
-
-    def __str__(self) -> str:
-        return f"aira/agent/{self.agent}/liability/{self.liability}/{self.event}"
-
-
-class ObjectiveTopicKey(_Key, frozen=True):
-    """A topic of the objective of `liability`, as the agent plays it."""
-
-    agent: str
-    liability: str
-    topic: str
-
-    def __str__(self) -> str:
-        return f"aira/agent/{self.agent}/liability/{self.liability}/objective{self.topic}"
-
-
-class LiabilityTopicKey(_Key, frozen=True):
-    """A topic of the job for `liability`, on which the device publishes; it is recorded."""
-
-    agent: str
-    liability: str
-    topic: str
-
-    def __str__(self) -> str:
-        return f"aira/agent/{self.agent}/liability/{self.liability}/topic{self.topic}"
-
-
-class DeviceTopicKey(_Key, frozen=True):
-    """A topic of a device outside any job."""
-
-    agent: str
-    device: str
-    topic: str
-
-    def __str__(self) -> str:
-        return f"aira/agent/{self.agent}/device/{self.device}{self.topic}"
-
-
-class RpcKey(_Key, frozen=True):
-    """A service of the agent, a queryable: `start`, `finish`, `eth/accounts`, …"""
-
-    agent: str
-    service: str
-
-    def __str__(self) -> str:
-        return f"aira/agent/{self.agent}/rpc/{self.service}"
-
-
-class EthEventKey(_Key, frozen=True):
-    """An event of the token that concerns the agent: `transfer` or `approval`."""
-
-    agent: str
-    event: EthEvent
-
-    def __post_init__(self) -> None:
-        _Key.__post_init__(self)
-        check_event(self.event, "transfer", "approval")
-
-    def __str__(self) -> str:
-        return f"aira/agent/{self.agent}/eth/event/{self.event}"
-
-
 class CidKey(_Key, frozen=True):
     """A block or a file by its CID; answered by every store that has it."""
 
@@ -206,7 +177,6 @@ class CidKey(_Key, frozen=True):
 
 
 MarketKey: TypeAlias = DemandKey | OfferKey | WithdrawalKey | ResultKey | FeedbackKey | PendingKey | RejectKey
-AgentKey: TypeAlias = EventKey | ObjectiveTopicKey | LiabilityTopicKey | DeviceTopicKey | RpcKey | EthEventKey
 Key: TypeAlias = MarketKey | AgentKey | PresenceKey | CidKey
 
 
@@ -225,11 +195,8 @@ def market_kind(text: str) -> str:
 
 def parse_key(text: str) -> Key:
     """The key with this text. Raises `InvalidKey` if there is none, or if it is not in the canonical form."""
-    if len(text) > MAX_KEY_LENGTH:
-        raise InvalidKey(text, f"it is longer than {MAX_KEY_LENGTH} characters")
-    if str(key := _parse(text)) != text:
-        raise InvalidKey(text, f"its canonical form is {key}")
-    return key
+    check_length(text)
+    return check_canonical(text, _parse(text))
 
 
 def _parse(text: str) -> Key:
@@ -242,8 +209,8 @@ def _parse(text: str) -> Key:
             return WithdrawalKey(lighthouse, order, digits)
         case ["aira", lighthouse, "result", liability, digits]:
             return ResultKey(lighthouse, liability, digits)
-        case ["aira", "agent", agent, *path]:
-            return _parse_of_agent(text, agent, path)
+        case ["aira", "agent", *_]:
+            return parse_agent_key(text)
         case ["aira", "cid", cid]:
             return CidKey(cid)
         case ["aira", lighthouse, "feedback", order, digits]:
@@ -255,20 +222,3 @@ def _parse(text: str) -> Key:
         case ["aira", lighthouse, "@agent", role, agent]:
             return PresenceKey(lighthouse, role, agent)
     raise InvalidKey(text, "there is no such family")
-
-
-def _parse_of_agent(text: str, agent: str, path: list[str]) -> AgentKey:
-    match path:
-        case ["liability", liability, "objective", *topic] if topic:
-            return ObjectiveTopicKey(agent, liability, "/" + "/".join(topic))
-        case ["liability", liability, "topic", *topic] if topic:
-            return LiabilityTopicKey(agent, liability, "/" + "/".join(topic))
-        case ["liability", liability, event]:
-            return EventKey(agent, liability, event)  # type: ignore[arg-type]
-        case ["device", device, *topic] if topic:
-            return DeviceTopicKey(agent, device, "/" + "/".join(topic))
-        case ["rpc", *service]:
-            return RpcKey(agent, "/".join(service))
-        case ["eth", "event", event]:
-            return EthEventKey(agent, event)  # type: ignore[arg-type]
-    raise InvalidKey(text, "there is no such family under an agent")

@@ -8,15 +8,9 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
+from schemas.agent_keys import address_chunk, name_chunk, topic_chunks
 from schemas.errors import InvalidKey
-from schemas.key_chunks import (
-    address_chunk,
-    cid_chunk,
-    hash_chunk,
-    lighthouse_chunk,
-    name_chunk,
-    topic_chunks,
-)
+from schemas.keys import cid_chunk, hash_chunk, lighthouse_chunk
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

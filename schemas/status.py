@@ -11,7 +11,7 @@ from typing import Final
 
 import msgspec
 
-from schemas.keys import RpcKey
+from schemas.agent_keys import RpcKey
 from schemas.records import Record, UInt256
 
 ALIVE: Final = "alive"

@@ -1,62 +1,76 @@
-"""Calls from the mesh to a device: their parameters and payloads, their replies, and the job they belong to."""
+"""Calls from the mesh to a device: their parameters, payloads and replies; and the topics of an edge agent itself."""
 
 from __future__ import annotations
 
 import logging
+import time
 from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from bridges.serial.dialect import CallStatus
-from bridges.serial.errors import CALL_ERRORS
-from mesh.errors import InvalidKey
+from bridges.serial.dialect import CallStatus, Command
+from bridges.serial.errors import CALL_ERRORS, BoardBusy, InvalidBoardMessage
 from mesh.log_context import log_event
 from schemas.errors import InvalidPayload
-from schemas.keys import EventKey, parse_key
 from schemas.payloads import EMPTY, JSON, STRING, PayloadType, String
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     import zenoh
 
-    from bridges.serial.dialect import CommandFinished
+    from bridges.serial.dialect import BoardTopic, CommandFinished, Dialect
+    from bridges.serial.metrics import EdgeCounters
 
 log = logging.getLogger(__name__)
 
+PRESENT: Final = "/present"
+"""The topic of the liveliness token, which exists as long as the board answers."""
+ABOUT: Final = "/about"
+"""The topic on which the edge agent reports which device it serves."""
+LOG: Final = "/log"
+"""The topic on which the edge agent answers as the service `logs` does."""
 PATIENCE: Final = 30.0
 """Seconds that a command waits for a board that is absent or busy, by default."""
 MAX_PATIENCE: Final = 3600.0
 
 
-class JobTracker:
-    """The agent's jobs that are ready and not complete, in order, as its edge agent sees them."""
+class PendingCalls:
+    """The queries that wait for the board to finish their commands, each of which gets one reply. For one thread."""
 
-    def __init__(self) -> None:
-        self._open: list[str] = []
+    def __init__(self, counters: EdgeCounters) -> None:
+        self._counters = counters
+        self._queries: dict[Command, zenoh.Query] = {}
 
-    @property
-    def current(self) -> str:
-        """The liability (address) that the device works for now: the first one; empty for none."""
-        return self._open[0] if self._open else ""
-
-    def begin(self, liability: str) -> None:
-        """Make this job the current one: a command named it."""
-        if liability in self._open:
-            self._open.remove(liability)
-        self._open.insert(0, liability)
-
-    def handle_event(self, key: str) -> None:
-        """Update the jobs by an event of the agent, given its key."""
+    def submit(self, query: zenoh.Query, topic: BoardTopic, payload: bytes, dialect: Dialect, patience: float) -> bool:
+        """Submit a call as a command; `finish` replies to it. False if it is refused, which is its reply."""
+        now = time.monotonic()
+        command = Command(topic.name, payload, now + timeout_of(query, patience))
         try:
-            event = parse_key(key)
-        except InvalidKey as error:
-            log.info("%s", error, extra=log_event("key-ignored", key=key))
-            return
-        if not isinstance(event, EventKey):
-            return
-        if event.event == "ready" and event.liability not in self._open:
-            self._open.append(event.liability)
-        elif event.event in ("complete", "finalized") and event.liability in self._open:
-            self._open.remove(event.liability)
+            dialect.submit(command, now)
+        except (InvalidBoardMessage, BoardBusy) as error:
+            reason = "full" if isinstance(error, BoardBusy) else "unfit"
+            self._counters.count_outcome(reason)
+            reply_failure(query, reason, str(error))
+            return False
+        self._queries[command] = query
+        return True
+
+    def finish(self, finished: CommandFinished) -> None:
+        """Count the outcome of a command, and reply to its call, if it was one."""
+        query = self._queries.pop(finished.command, None)
+        self._counters.count_outcome(finished.reason or finished.status.value)
+        if finished.status is CallStatus.FAILED:
+            failed = log_event("command-failed", topic=finished.command.topic, reason=finished.reason)
+            log.warning("%s: %s (%s)", finished.command.topic, finished.detail, finished.reason, extra=failed)
+        if query is not None:
+            reply(query, finished)
+
+    def drop(self) -> None:
+        """Drop all queries; their callers get no reply."""
+        for query in self._queries.values():
+            query.drop()  # type: ignore[no-untyped-call]
+        self._queries.clear()
 
 
 def is_for_device(query: zenoh.Query, device: str) -> bool:
@@ -102,3 +116,22 @@ def reply_failure(query: zenoh.Query, reason: str, detail: str) -> None:
     assert reason in CALL_ERRORS
     with query:
         query.reply_err(msgspec.json.encode({"reason": reason, "detail": detail}), encoding="application/json")
+
+
+def reply_about(query: zenoh.Query, dialect: Dialect, names: Mapping[BoardTopic, str], *, port: str, job: str) -> None:
+    """Reply with what is known of the board, its topics (with their names in the mesh), and the line."""
+    info = dialect.info
+    facts = {
+        "name": info.name if info is not None else "",
+        "version": info.version if info is not None else "",
+        "present": info is not None,
+        "port": port,
+        "job": job,
+        "topics": [
+            {"name": name, "flow": topic.flow.value, "type": topic.type.schema_name or topic.type.encoding}
+            for topic, name in names.items()
+        ],
+        "counters": vars(dialect.counters),
+    }
+    with query:
+        query.reply(str(query.key_expr), msgspec.json.encode(facts), encoding="application/json")

@@ -8,12 +8,15 @@ import click
 
 from bridges.serial.dialect import dialect_names
 from mesh.cli.options import with_settings
-from mesh.errors import AiraError
+from mesh.errors import AiraError, InputError
 from mesh.running import fail
 from mesh.settings import NetworkSettings, TelemetrySettings, options_of
 from mesh.telemetry.logs import configure_logging_from
+from schemas.agent_keys import topic_chunks
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from mesh.settings import Settings
 
 
@@ -24,6 +27,38 @@ def _renaming(context: click.Context, option: click.Parameter, given: tuple[str,
         if not topic.startswith("/") or not name.startswith("/"):
             raise click.BadParameter(f"{text!r} is not /TOPIC=/NAME")
     return pairs
+
+
+class TopicNames:
+    """Maps a board's topics to their names in the mesh; `renamed` are pairs of the board's name and the mesh's.
+
+    A pair also renames all topics below it, and `/` stands for all topics: `("/", "/left")` maps `/led` to `/left/led`.
+    If several pairs match, the longest one applies. Raises `InvalidKey` for a text that is no topic, and `InputError`
+    for one that is renamed twice.
+    """
+
+    def __init__(self, renamed: Iterable[tuple[str, str]] = ()) -> None:
+        self._renamed: dict[str, str] = {}
+        for name, other in renamed:
+            prefix = _prefix(name)
+            if prefix in self._renamed:
+                raise InputError(f"{name} is given two names")
+            self._renamed[prefix] = _prefix(other)
+
+    def of(self, name: str) -> str:
+        """The name in the mesh of the board's topic `name`."""
+        prefix = name
+        while True:
+            if prefix in self._renamed:
+                return self._renamed[prefix] + name[len(prefix) :] or name
+            if not prefix:
+                return name
+            prefix = prefix.rpartition("/")[0]
+
+
+def _prefix(name: str) -> str:
+    """The beginning of the names of a topic and of all topics below it; empty for `/`."""
+    return "" if name == "/" else topic_chunks(name)
 
 
 def _parameter(context: click.Context, option: click.Parameter, given: tuple[str, ...]) -> dict[str, object]:
@@ -102,20 +137,24 @@ def command(
     A command on a topic of a job reaches all devices of the agent that have a topic of that name. Use --map to rename
     the topics of this device.
     """
-    from bridges.serial.naming import DeviceId, TopicNames
     from bridges.serial.process import EdgeOptions, run_edge, serve_metrics, wait_for_files
     from mesh.network.endpoints import Endpoints
 
     configure_logging_from(settings, "edge")
-    device = DeviceId(agent=agent, name=name)
     endpoints = Endpoints.from_settings(settings)
     try:
         with serve_metrics(settings.metrics_listen) as metrics:
             wait_for_files(settings)
-            names = TopicNames(renamed)
             options = EdgeOptions(
-                port=port, protocol=protocol, baud=baud, patience=patience, parameters=parameters, names=names
+                agent=agent,
+                name=name,
+                port=port,
+                protocol=protocol,
+                baud=baud,
+                patience=patience,
+                parameters=parameters,
+                rename=TopicNames(renamed).of,
             )
-            run_edge(device, options, endpoints=endpoints, metrics=metrics)
+            run_edge(options, endpoints=endpoints, metrics=metrics)
     except AiraError as error:
         fail(error)

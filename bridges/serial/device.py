@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import msgspec
 import zenoh
 
-from bridges.serial.calls import PATIENCE
+from bridges.serial.calls import PATIENCE, PRESENT
 from bridges.serial.dialect import CallStatus
 from bridges.serial.errors import CALL_ERRORS, CallFailed, CallInDoubt, CallNotDone
-from bridges.serial.naming import PRESENT, DeviceId
 from mesh.network import Pump
 from mesh.retry import Backoff, RetryPolicy
-from schemas import LiabilityTopicKey, payload_type
+from schemas import DeviceTopicKey, LiabilityTopicKey, payload_type
 from schemas.errors import InvalidPayload
 from schemas.payloads import Empty, decode_value, encode_value
 
@@ -101,23 +100,19 @@ class Device:
 
         Messages are decoded; those that are not of their type are left out.
         """
-        return Pump(self._session, self._device_id.key(topic), _decode)
-
-    @property
-    def _device_id(self) -> DeviceId:
-        return DeviceId(agent=self._agent.address, name=self.name)
+        return Pump(self._session, self._key(topic), _decode)
 
     @property
     def _session(self) -> zenoh.Session:
         return self._agent.parts.network.session
 
-    def _key(self, topic: str, job: Job | None) -> str:
+    def _key(self, topic: str, job: Job | None = None) -> str:
         if job is None:
-            return self._device_id.key(topic)
+            return str(DeviceTopicKey(self._agent.address, self.name, topic))
         return str(LiabilityTopicKey(self._agent.address, job.liability.address, topic))
 
     def _has_token(self) -> bool:
-        replies = self._session.liveliness().get(self._device_id.key(PRESENT), timeout=GRACE)
+        replies = self._session.liveliness().get(self._key(PRESENT), timeout=GRACE)
         return any(reply.ok is not None for reply in replies)
 
     async def _wait_until_present(self, topic: str, deadline: float) -> None:

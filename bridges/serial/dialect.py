@@ -194,9 +194,9 @@ class Dialect(ABC):
     def submit(self, command: Command, now: float) -> None:
         """Queue a command; `CommandFinished` reports its end. Raises `InvalidBoardMessage`, `BoardBusy`."""
 
-    @abstractmethod
     def respond(self, topic: BoardTopic, payload: bytes, now: float) -> None:
-        """Answer a request of the board."""
+        """Answer a request of the board (`Flow.REQUESTS`), if the boards of this dialect send any."""
+        raise NotImplementedError(f"boards of this dialect send no requests: {topic.name}")
 
     def outgoing(self) -> bytes:
         """The bytes to send now; each is returned once."""

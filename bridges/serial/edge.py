@@ -16,25 +16,28 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-import msgspec
 import zenoh
 
 from bridges.serial import dialect as events
-from bridges.serial.calls import PATIENCE, JobTracker, convert, is_for_device, reply, reply_failure, timeout_of
-from bridges.serial.dialect import BoardTopic, CallStatus, Command, Flow
+from bridges.serial.calls import ABOUT, PATIENCE, PRESENT, PendingCalls, convert, is_for_device, reply_about
+from bridges.serial.dialect import BoardTopic, Command, Flow
 from bridges.serial.errors import BoardBusy, InvalidBoardMessage
 from bridges.serial.line import SerialLine
 from bridges.serial.metrics import EdgeCounters
-from bridges.serial.naming import ABOUT, PRESENT, DeviceId, TopicNames
 from mesh.errors import InvalidKey
 from mesh.log_context import liability_context, log_event
-from schemas.key_chunks import topic_chunks
-from schemas.keys import DeviceTopicKey, LiabilityTopicKey, parse_key
+from schemas.agent_keys import (
+    DeviceTopicKey,
+    EventKey,
+    LiabilityTopicKey,
+    parse_agent_key,
+    topic_chunks,
+)
 from schemas.payloads import STRING, String, payload_type
-from schemas.selectors import event_selector
+from schemas.selectors import event_selector, topic_selector
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from bridges.serial.dialect import DeviceInfo, Dialect, LineEvent
     from bridges.serial.line import PortName
@@ -42,14 +45,48 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-PUT_BY_EDGE: Final = b"told"
+PUT_BY_EDGE: Final = b"edge"
 """The attachment of everything that an edge agent puts."""
+CONNECTION: Final = "/aira/device"
+"""The topic of a job, followed by the device's name, that records when the device was absent and present."""
+
+
+class JobTracker:
+    """The agent's jobs that are ready and not complete, in order, as its edge agent sees them."""
+
+    def __init__(self) -> None:
+        self._open: list[str] = []
+
+    @property
+    def current(self) -> str:
+        """The liability (address) that the device works for now: the first one; empty for none."""
+        return self._open[0] if self._open else ""
+
+    def begin(self, liability: str) -> None:
+        """Make this job the current one: a command named it."""
+        if liability in self._open:
+            self._open.remove(liability)
+        self._open.insert(0, liability)
+
+    def handle_event(self, key: str) -> None:
+        """Update the jobs by an event of the agent, given its key."""
+        try:
+            event = parse_agent_key(key)
+        except InvalidKey as error:
+            log.info("%s", error, extra=log_event("key-ignored", key=key))
+            return
+        if not isinstance(event, EventKey):
+            return
+        if event.event == "ready" and event.liability not in self._open:
+            self._open.append(event.liability)
+        elif event.event in ("complete", "finalized") and event.liability in self._open:
+            self._open.remove(event.liability)
 
 
 class Edge:
-    """A board in the mesh, on an open session: `Edge(session, device, port, dialect, baud=57600).run()`.
+    """A board in the mesh, on an open session, as the device `name` of the agent with the address `agent`.
 
-    A command waits at most `patience` seconds for a board that is absent or busy; `names` maps the board's topics to
+    A command waits at most `patience` seconds for a board that is absent or busy; `rename` maps the board's topics to
     their names in the mesh. `run` blocks its thread until `stop` is called from another one; it needs no event loop.
     Raises `InvalidKey` for a device whose name or agent is invalid.
     """
@@ -57,37 +94,38 @@ class Edge:
     def __init__(
         self,
         session: zenoh.Session,
-        device: DeviceId,
         port: PortName,
         dialect: Dialect,
         *,
+        agent: str,
+        name: str,
         baud: int,
         patience: float = PATIENCE,
-        names: TopicNames | None = None,
+        rename: Callable[[str], str] = str,
     ) -> None:
         self._session = session
-        self._device = device
-        self._names = names or TopicNames()
+        self._agent = agent
+        self._name = name
+        self._rename = rename
         self._patience = patience
         self._jobs = JobTracker()
         self._line = SerialLine(port, dialect, baud=baud, on_event=self._on_event)
         self.counters = EdgeCounters(self._line)
-        self._queries: dict[Command, zenoh.Query] = {}
+        self._calls = PendingCalls(self.counters)
         self._declared: dict[str, list[Any]] = {}
         self._token: Any = None
         self._name_of: dict[BoardTopic, str] = {}
         self._commandable: dict[str, BoardTopic] = {}
-        device.key(PRESENT)
+        self._key(PRESENT)
 
     def run(self) -> None:
         """Serve until `stop`."""
-        subscriber: Any = self._session.declare_subscriber(event_selector(self._device.agent), self._on_job_event)
-        about: Any = self._session.declare_queryable(self._device.key(ABOUT), self._on_about_query)
+        subscriber: Any = self._session.declare_subscriber(event_selector(self._agent), self._on_job_event)
+        about: Any = self._session.declare_queryable(self._key(ABOUT), self._on_about_query)
         try:
             self._line.run()
         finally:
-            for query in self._queries.values():
-                query.drop()  # type: ignore[no-untyped-call]
+            self._calls.drop()
             if not self._session.is_closed():
                 for declared in (subscriber, about, *(each for several in self._declared.values() for each in several)):
                     declared.undeclare()
@@ -110,7 +148,7 @@ class Edge:
                 case events.MessageReceived(topic, payload):
                     self._publish(topic, payload)
                 case events.CommandFinished():
-                    self._finish(event)
+                    self._calls.finish(event)
                 case events.BoardLogged(level, text):
                     log.log(level, "the board says: %s", text, extra=log_event("board-logged"))
 
@@ -132,7 +170,7 @@ class Edge:
             self._declared[name] = self._declare(name)
         self._record_connection("present")
         if self._token is None:
-            self._token = self._session.liveliness().declare_token(self._device.key(PRESENT))
+            self._token = self._session.liveliness().declare_token(self._key(PRESENT))
         topics = ", ".join(self._name_of.values()) or "no topics"
         ready = log_event("board-ready", name=info.name, version=info.version, topics=topics)
         log.info("the board %s %s is present: %s", info.name, info.version, topics, extra=ready)
@@ -141,14 +179,14 @@ class Edge:
         """The board's topics with their names in the mesh; those without a valid one are left out."""
         for topic in info.topics:
             try:
-                yield topic, topic_chunks(self._names.of(topic.name))
+                yield topic, topic_chunks(self._rename(topic.name))
             except InvalidKey as error:
                 rejected = log_event("topic-rejected", topic=topic.name)
                 log.warning("topic %s of the board is not used: %s", topic.name, error, extra=rejected)
 
     def _declare(self, name: str) -> list[Any]:
         """Subscribe to commands and calls on a topic, in jobs and outside."""
-        keys = self._device.command_keys(name)
+        keys = (self._key(name), topic_selector(self._agent, topic=name))
         return [
             *(self._session.declare_subscriber(key, self._on_command) for key in keys),
             *(self._session.declare_queryable(key, self._on_call) for key in keys),
@@ -189,31 +227,21 @@ class Edge:
                 log.warning("%s", error, extra=log_event("command-rejected", topic=topic.name, code=error.code))
 
     def _call(self, query: zenoh.Query) -> None:
-        """Submit a call; `_finish` replies to it."""
+        """Submit a call; it is also put into its job's recording."""
         key = str(query.key_expr)
-        topic, job = self._topic_of(key) if is_for_device(query, self._device.name) else (None, "")
+        topic, job = self._topic_of(key) if is_for_device(query, self._name) else (None, "")
         if topic is None:
             query.drop()  # type: ignore[no-untyped-call]
             return
         payload = b"" if query.payload is None else query.payload.to_bytes()
         payload = convert(payload, payload_type(str(query.encoding or "")), topic.type)
-        now = time.monotonic()
-        command = Command(topic.name, payload, now + timeout_of(query, self._patience))
-        try:
-            self._line.dialect.submit(command, now)
-        except (InvalidBoardMessage, BoardBusy) as error:
-            reason = "full" if isinstance(error, BoardBusy) else "unfit"
-            self.counters.count_outcome(reason)
-            reply_failure(query, reason, str(error))
-            return
-        self._queries[command] = query
-        if job:
+        if self._calls.submit(query, topic, payload, self._line.dialect, self._patience) and job:
             self._put(key, payload, topic.type)
 
     def _topic_of(self, key: str) -> tuple[BoardTopic | None, str]:
         """The topic that a key names, and its job if it has one; that job becomes the current one."""
         try:
-            parsed = parse_key(key)
+            parsed = parse_agent_key(key)
         except InvalidKey as error:
             log.info("%s", error, extra=log_event("key-ignored", key=key))
             return None, ""
@@ -230,11 +258,10 @@ class Edge:
         if (name := self._name_of.get(topic)) is None:
             return
         if topic.flow is Flow.REQUESTS:
-            self._request(topic, self._device.key(name), payload)
+            self._request(topic, self._key(name), payload)
             return
         job = self._jobs.current
-        key = self._device.job_key(job, name) if job else self._device.key(name)
-        self._put(key, payload, topic.type)
+        self._put(self._job_key(job, name) if job else self._key(name), payload, topic.type)
 
     def _request(self, topic: BoardTopic, key: str, payload: bytes) -> None:
         """Query the mesh for the board, which gets each answer."""
@@ -248,34 +275,19 @@ class Edge:
 
     def _record_connection(self, text: str) -> None:
         """Add a loss or return of the device to the recording of the current job, if there is one."""
-        if self._jobs.current:
-            self._put(self._device.connection_key(self._jobs.current), String(text).encode(), STRING)
-
-    def _finish(self, finished: events.CommandFinished) -> None:
-        query = self._queries.pop(finished.command, None)
-        self.counters.count_outcome(finished.reason or finished.status.value)
-        if finished.status is CallStatus.FAILED:
-            failed = log_event("command-failed", topic=finished.command.topic, reason=finished.reason)
-            log.warning("%s: %s (%s)", finished.command.topic, finished.detail, finished.reason, extra=failed)
-        if query is not None:
-            reply(query, finished)
+        if job := self._jobs.current:
+            self._put(self._job_key(job, f"{CONNECTION}/{self._name}"), String(text).encode(), STRING)
 
     def _reply_about(self, query: zenoh.Query) -> None:
-        info = self._line.dialect.info
-        facts = {
-            "name": info.name if info is not None else "",
-            "version": info.version if info is not None else "",
-            "present": info is not None,
-            "port": str(self._line.name),
-            "job": self._jobs.current,
-            "topics": [
-                {"name": name, "flow": topic.flow.value, "type": topic.type.schema_name or topic.type.encoding}
-                for topic, name in self._name_of.items()
-            ],
-            "counters": vars(self._line.dialect.counters),
-        }
-        with query:
-            query.reply(str(query.key_expr), msgspec.json.encode(facts), encoding="application/json")
+        reply_about(query, self._line.dialect, self._name_of, port=str(self._line.name), job=self._jobs.current)
+
+    def _key(self, topic: str) -> str:
+        """The key of a topic outside any job. Raises `InvalidKey`."""
+        return str(DeviceTopicKey(self._agent, self._name, topic))
+
+    def _job_key(self, liability: str, topic: str) -> str:
+        """The key of a topic of the job at `liability` (address), which all devices of the agent share."""
+        return str(LiabilityTopicKey(self._agent, liability, topic))
 
     def _put(self, key: str, payload: bytes, kind: PayloadType) -> None:
         drop = zenoh.CongestionControl.DROP

@@ -18,8 +18,8 @@ from cobs import cobs  # type: ignore[import-untyped]
 from bridges.serial.dialect import BoardTopic, Flow
 from bridges.serial.errors import InvalidBoardMessage
 from mesh.log_context import log_event
+from schemas.agent_keys import topic_chunks
 from schemas.errors import InvalidKey, InvalidPayload
-from schemas.key_chunks import topic_chunks
 from schemas.payloads import EMPTY, JSON, RAW, STRING, Empty, PayloadType, String
 
 if TYPE_CHECKING:

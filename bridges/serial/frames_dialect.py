@@ -8,7 +8,7 @@ until the host has opened a new session, so the host always learns of the restar
 from __future__ import annotations
 
 import logging
-import secrets
+import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -81,7 +81,7 @@ class FramesDialect(Dialect):
         self, *, baud: int, parameters: Mapping[str, object] | None = None, session: int | None = None
     ) -> None:
         super().__init__(baud=baud, parameters=parameters)
-        self._session = session if session is not None else secrets.randbelow(MAX_SESSION) + 1
+        self._session = session or int.from_bytes(os.urandom(2), "little") or MAX_SESSION
         self._decoder = FrameDecoder(self.counters)
         self._board: BoardDescription | None = None
         self._topics: list[BoardTopic] = []
@@ -143,9 +143,6 @@ class FramesDialect(Dialect):
             raise InvalidBoardMessage(command.topic, "the board has no such topic to call")
         self._enqueue(command)
         self._call_next(now)
-
-    def respond(self, topic: BoardTopic, payload: bytes, now: float) -> None:
-        """Do nothing: these boards send no requests."""
 
     def _handle(self, frame: Frame, now: float) -> None:
         if frame.kind is FrameKind.EVENT:
@@ -266,7 +263,7 @@ class FramesDialect(Dialect):
         if self._event_sequence is not None:
             self.counters.missed += (frame.sequence - self._event_sequence - 1) % SEQUENCES
         self._event_sequence = frame.sequence
-        topics = self._known.topics if self._known is not None else ()
+        topics = self._known.topics if self._known else ()
         topic = next((each for each in topics if each.id == frame.id and each.flow is Flow.PUBLISHES), None)
         if topic is None:
             self.counters.stray += 1

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from bridges.serial.calls import LOG
 from bridges.serial.dialect import load_dialect
 from bridges.serial.edge import Edge
 from bridges.serial.line import PortName
-from bridges.serial.naming import LOG, PRESENT
 from mesh.cli.output import announce
 from mesh.errors import AiraError
 from mesh.log_context import LogSource
@@ -24,15 +24,15 @@ from mesh.running import INTERRUPTED
 from mesh.starting import file_delays
 from mesh.telemetry.logs import LogService, set_process_source
 from schemas.address import parse_address
+from schemas.agent_keys import DeviceTopicKey
 from schemas.logs import ReadLogs
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     import zenoh
 
     from bridges.serial.metrics import EdgeMetrics
-    from bridges.serial.naming import DeviceId, TopicNames
     from mesh.network.endpoints import Endpoints
     from mesh.settings import Settings
 
@@ -41,17 +41,20 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class EdgeOptions:
-    """How a board is reached, and the protocol that it speaks.
+    """A board: its agent's address and its name in the mesh, how it is reached, and the protocol that it speaks.
 
-    `baud` is in bits per second, `patience` in seconds; `parameters` are values that firmware may request.
+    `baud` is in bits per second, `patience` in seconds; `parameters` are values that firmware may request; `rename`
+    returns the name in the mesh of a topic of the board.
     """
 
+    agent: str
+    name: str
     port: str
     protocol: str
     baud: int
     patience: float
     parameters: Mapping[str, object]
-    names: TopicNames
+    rename: Callable[[str], str]
 
 
 def wait_for_files(settings: Settings) -> None:
@@ -78,35 +81,42 @@ def serve_metrics(listen: str) -> Iterator[EdgeMetrics | None]:
         yield metrics
 
 
-def run_edge(
-    device: DeviceId, options: EdgeOptions, *, endpoints: Endpoints, metrics: EdgeMetrics | None = None
-) -> None:
+def run_edge(options: EdgeOptions, *, endpoints: Endpoints, metrics: EdgeMetrics | None = None) -> None:
     """Serve a board until Ctrl-C or SIGTERM. On the main thread of a process of its own.
 
     Raises `NetworkUnavailable`, `UnknownDialect`, `InputError` for an invalid port name, `InvalidKey` for an invalid
     device.
     """
-    name = PortName(options.port)
+    agent, name, port = options.agent, options.name, PortName(options.port)
     dialect = load_dialect(options.protocol)(baud=options.baud, parameters=options.parameters)
-    device.key(PRESENT)
+    log_key = str(DeviceTopicKey(agent, name, LOG))
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(INTERRUPTED))
     with SessionOpening(endpoints).run() as session:
-        edge = Edge(session, device, name, dialect, baud=options.baud, patience=options.patience, names=options.names)
+        edge = Edge(
+            session,
+            port,
+            dialect,
+            agent=agent,
+            name=name,
+            baud=options.baud,
+            patience=options.patience,
+            rename=options.rename,
+        )
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda number, frame: edge.stop())
-        words = f"edge of {device.agent}: {device.name} on {name}, {options.protocol}, Zenoh id {session.zid()}"
+        words = f"edge of {agent}: {name} on {port}, {options.protocol}, Zenoh id {session.zid()}"
         if metrics is not None:
             metrics.attach(edge.counters, session)
-        set_process_source(LogSource("edge", parse_address(device.agent)))
-        announce(log, "edge-started", words, device=device.name)
-        with answer_log_queries(session, device):
+        set_process_source(LogSource("edge", parse_address(agent)))
+        announce(log, "edge-started", words, device=name)
+        with answer_log_queries(session, log_key):
             edge.run()
 
 
 @contextmanager
-def answer_log_queries(session: zenoh.Session, device: DeviceId) -> Iterator[None]:
-    """Answer queries for this process's log on a topic of the device, as an edge agent has no services of its own."""
-    key, service = device.key(LOG), LogService("edge", "")
+def answer_log_queries(session: zenoh.Session, key: str) -> Iterator[None]:
+    """Answer queries for this process's log on a key of the device, as an edge agent has no services of its own."""
+    service = LogService("edge", "")
 
     def on_query(query: zenoh.Query) -> None:  # on a thread of Zenoh's; the log is in memory
         with query:

@@ -76,7 +76,7 @@ ASK_TOPICS: Final = b"\xff\xfe\x00\x00\xff\x00\x00\xff"
 
 
 def frame_size(data: int) -> int:
-    """The length of a frame with so many bytes of data."""
+    """The length of a frame with `data` bytes of data."""
     return _HEAD + data + 1
 
 

@@ -15,8 +15,8 @@ from bridges.serial import rosserial
 from bridges.serial.dialect import BoardTopic, DeviceInfo, Flow
 from bridges.serial.errors import InvalidBoardMessage
 from mesh.log_context import log_event
+from schemas.agent_keys import topic_chunks
 from schemas.errors import InvalidKey, InvalidPayload
-from schemas.key_chunks import topic_chunks
 from schemas.payloads import EMPTY, STRING, Empty, PayloadType, String
 
 if TYPE_CHECKING:

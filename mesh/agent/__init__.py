@@ -2,14 +2,13 @@
 
 from mesh.agent.agent import Agent
 from mesh.agent.contract import Contract, Outcome
-from mesh.agent.errors import FundsShort, LiabilityReverted, OrderExpired, OrderRejected
+from mesh.agent.errors import LiabilityReverted, OrderExpired, OrderRejected
 from mesh.work.job import Job, JobFailed
 from mesh.work.ledger import Phase
 
 __all__ = [
     "Agent",
     "Contract",
-    "FundsShort",
     "Job",
     "JobFailed",
     "LiabilityReverted",

@@ -132,7 +132,7 @@ class Agent(HandlerDecorators, Lifecycle):
         (the token's smallest unit), `token` and `validator` (names or addresses) are the terms, valid for `lifetime`
         blocks. `lighthouse_fee` is in wn, and paid to the provider.
 
-        Raises `ObjectiveUnfit` and branches of `ContentError` for an objective that can't be played, and `FundsShort`.
+        Raises `InsufficientTokens`, and for an objective that can't be played `ObjectiveUnfit` or a `ContentError`.
         """
         trader = self.runtime.trader
         if demand is not None:
@@ -166,7 +166,7 @@ class Agent(HandlerDecorators, Lifecycle):
         """Demand a job and wait for the contract: `contract = await agent.demand(…); await contract.outcome()`.
 
         `objective` is a CID, or the path of a file, which the agent then serves. The other terms are as for `offer`.
-        The factory gets the allowance that they need. Raises `OrderExpired`, `OrderRejected` and `FundsShort`.
+        The factory gets the allowance that they need. Raises `OrderExpired`, `OrderRejected` and `InsufficientTokens`.
         """
         trader = self.runtime.trader
         cid = objective if isinstance(objective, str) else await self.add(objective)
@@ -176,7 +176,7 @@ class Agent(HandlerDecorators, Lifecycle):
         return await trader.demand(terms, validator_fee=validator_fee)
 
     async def contract(self, address: str) -> Contract:
-        """The contract at `address`, of whatever account, to be waited for. Raises `NotALiability`."""
+        """The contract at `address`, of any account; `outcome` waits for its end. Raises `NotALiability`."""
         return await self.runtime.trader.contract(address)
 
     async def finish(self, address: str, *, success: bool) -> str:

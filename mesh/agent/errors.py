@@ -45,18 +45,6 @@ class LiabilityReverted(AiraError, code="liability-reverted"):
         self.deadline = deadline
 
 
-class FundsShort(AiraError, code="funds-short"):
-    """The account has less of a token than its open orders may cost: `balance` and `needed`, in the smallest unit."""
-
-    def __init__(self, account: str, token: str, *, balance: int, needed: int) -> None:
-        super().__init__(
-            f"account {account} has {balance} of token {token} and needs {needed}",
-            hint="send it the missing tokens, or lower the cost",
-        )
-        self.balance = balance
-        self.needed = needed
-
-
 class ServiceClosed(AiraError, code="service-closed"):
     """A service that the agent's settings don't open to others: it signs, spends or drives jobs."""
 
@@ -68,4 +56,4 @@ class ServiceClosed(AiraError, code="service-closed"):
         self.service = service
 
 
-__all__ = ["FundsShort", "LiabilityReverted", "OrderExpired", "OrderRejected", "ServiceClosed"]
+__all__ = ["LiabilityReverted", "OrderExpired", "OrderRejected", "ServiceClosed"]

@@ -98,7 +98,7 @@ class HandlerDecorators:
         return handler
 
     def every(self, seconds: float) -> Callable[[P], P]:
-        """Call the handler, which takes no argument, at the start and then every so many seconds."""
+        """Call the handler, which takes no argument, at the start and then every `seconds` seconds."""
 
         def register(handler: P) -> P:
             self._handlers.periodic.append((seconds, handler))

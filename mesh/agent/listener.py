@@ -31,7 +31,7 @@ from mesh.chain import (
 from mesh.log_context import liability_context, log_event, with_liability_context
 from mesh.work.ledger import TO_BE_DONE, Phase, advance
 from mesh.work.outbox import result_identity
-from schemas.keys import EthEventKey
+from schemas.agent_keys import EthEventKey
 from schemas.rpc import ApprovalEvent, TransferEvent
 
 if TYPE_CHECKING:
@@ -200,7 +200,7 @@ class ChainListener:
     async def finalization_reverted(self, address: str) -> None:
         """A reorganisation reverted the end of a contract: the Result of its job is sent again.
 
-        A job without a Result stays ended: whoever refunded it will do so again.
+        A job without a Result stays ended: it was refunded, and will be refunded again.
         """
         async with self._executor.halted(address) as job:
             if job is not None and job.phase is Phase.FINALIZED and job.result is not None:

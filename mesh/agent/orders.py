@@ -8,9 +8,8 @@ from contextlib import asynccontextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from mesh.agent.errors import FundsShort
 from mesh.background import Background
-from mesh.chain import Reverted
+from mesh.chain import InsufficientTokens, Reverted
 from mesh.log_context import log_event
 from mesh.network import call_in_loop
 from schemas import InvalidRecord, market_selector
@@ -44,7 +43,7 @@ class Allowances:
     async def ensure(self, order: str, amounts: Mapping[str, int]) -> None:
         """Make sure that the factory may take `amounts` (by token) for `order` and what the other open orders cost.
 
-        Raises `FundsShort`; the order is then not counted.
+        Raises `InsufficientTokens`; the order is then not counted.
         """
         async with self._approving:
             for token, amount in amounts.items():
@@ -65,7 +64,7 @@ class Allowances:
     async def _ensure(self, token: str, needed: int) -> None:
         balance = await self._chain.tokens.balance(self._account, token=token)
         if balance < needed:
-            raise FundsShort(self._account, token, balance=balance, needed=needed)
+            raise InsufficientTokens(self._account, token, balance=balance, needed=needed)
         factory = self._chain.factory
         while await self._chain.tokens.allowance(self._account, factory, token=token) < needed:
             facts = log_event("allowance-approved", token=token, amount=needed)

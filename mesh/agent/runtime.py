@@ -15,7 +15,7 @@ from mesh.telemetry.logs import LogService
 from mesh.work.executor import Executor
 from mesh.work.ledger import Phase
 from mesh.work.playbacks import Objectives, Playbacks
-from schemas.keys import EventKey, LiabilityEvent
+from schemas.agent_keys import EventKey, LiabilityEvent
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -116,8 +116,8 @@ class Trader(Lifecycle):
     async def demand(self, terms: Terms, *, validator_fee: int) -> Contract:
         """Sign and post a demand, and wait for the contract that is created from it.
 
-        Approves the allowance that it needs. Raises `FundsShort`, `OrderRejected` and `OrderExpired`. Cancelling stops
-        the waiting and the resending; a demand that was sent may still become a contract.
+        Approves the allowance that it needs. Raises `InsufficientTokens`, `OrderRejected` and `OrderExpired`.
+        Cancelling stops the waiting and the resending; a demand that was sent may still become a contract.
         """
         costs = Counter({terms["token"]: terms["cost"]})
         costs[self._chain.xrt] += validator_fee
@@ -133,7 +133,7 @@ class Trader(Lifecycle):
     async def offer(self, terms: Terms, *, lighthouse_fee: int) -> str:
         """Sign and post an offer; returns its hash (hexadecimal). It is resent until it is matched or expires.
 
-        Raises `FundsShort`.
+        Raises `InsufficientTokens`.
         """
         signed = await self.sign(Offer, terms, lighthouse_fee=lighthouse_fee)
         identity = message_hash(signed).hex()

@@ -145,8 +145,8 @@ class ContractVersion:
 class OriginalContracts(ContractVersion):
     """The original contracts of one generation, which understand the orders of that generation only.
 
-    They give no reasons when they refuse, pay nobody back, and don't say whose liability a contract is: recognised
-    are those that an event of the factory told of, and those whose gas the factory has counted.
+    They give no reasons when they refuse, pay nobody back, and don't say whose liability a contract is: a liability is
+    recognised by an event of the factory that names it, or by the gas that the factory has counted for it.
     """
 
     def check_order(self, order: Order) -> None:
@@ -182,7 +182,7 @@ class OriginalContracts(ContractVersion):
         return await super().nonce_of(address)
 
     async def is_order_used(self, order_hash: bytes, signer: str) -> bool:
-        """By any signer: the originals accept the same terms only once, whoever signed them."""
+        """By any signer: the originals accept the same terms only once, even if another account signs them."""
         return bool(await self._node.read(self._factory.isHashConsumed(order_hash)))
 
     async def state(self, lighthouse: str) -> LighthouseState:

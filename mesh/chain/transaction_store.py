@@ -1,7 +1,7 @@
 """Sent transactions on disk: a file for each nonce of an account, locked by the process that waits for it.
 
 The name of a file is the nonce: creating it reserves the nonce among all processes of the account. It is locked
-(flock) while its process lives and waits, which tells what another process is busy with from what it left behind.
+(flock) while its process lives and waits: a file that is not locked was left behind.
 Each line is one version of the transaction, written before it is sent.
 """
 

@@ -13,7 +13,7 @@ from mesh.cli.output import plural, print_line, printable, wait_for_broken_pipe
 from mesh.running import run_to_end
 from mesh.settings import NetworkSettings, options_of
 from schemas import parse_address
-from schemas.keys import DeviceTopicKey, RpcKey
+from schemas.agent_keys import DeviceTopicKey, RpcKey
 from schemas.logs import LEVELS
 
 if TYPE_CHECKING:

@@ -23,7 +23,8 @@ from mesh.recording import GENEROUS, Recorder, RecordingAbout, bag_to_mcap, mess
 from mesh.running import run_until_stopped
 from mesh.settings import NetworkSettings, options_of
 from schemas import cid_of_file
-from schemas.keys import DeviceTopicKey, LiabilityTopicKey, ObjectiveTopicKey, parse_key
+from schemas.agent_keys import DeviceTopicKey, LiabilityTopicKey, ObjectiveTopicKey
+from schemas.keys import parse_key
 from schemas.payloads import payload_type
 
 if TYPE_CHECKING:

@@ -100,6 +100,8 @@ def _given(value: str | tuple[str, ...] | None) -> str | tuple[str, ...] | None:
 def _flag(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     default = getattr(Settings(), name)
     shown = ", ".join(default) if isinstance(default, tuple) else str(default)
+    metavar = name.split("_")[-1].upper()
+    if isinstance(default, bool):
+        shown, metavar = shown.lower(), "true|false"
     text = MEANING[name] + (f" [{shown}]" if shown else "")
-    flag = f"--{name.replace('_', '-')}"
-    return click.option(flag, name, multiple=name in LISTS, metavar=name.split("_")[-1].upper(), help=text)
+    return click.option(f"--{name.replace('_', '-')}", name, multiple=name in LISTS, metavar=metavar, help=text)

@@ -19,8 +19,7 @@ from mesh.cli.output import format_duration, plural, print_json, progress
 from mesh.recording import GENEROUS, AtOnce, RecordedTimes, open_objective, play
 from mesh.running import run_to_end
 from mesh.settings import ChainSettings, options_of
-from schemas.key_chunks import topic_chunks
-from schemas.keys import DeviceTopicKey, LiabilityTopicKey, ObjectiveTopicKey
+from schemas.agent_keys import DeviceTopicKey, LiabilityTopicKey, ObjectiveTopicKey, topic_chunks
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -1,7 +1,7 @@
 """The tree of blocks behind a CID: checking it, and reading a stored file through it.
 
-A tree is checked from the root down. The root gives the length of the file, each link that of the part below it. A
-block that contradicts the link it was reached by makes the file corrupt, whoever sent it, since its hash was right.
+A tree is checked from the root down. The root gives the length of the file, each link that of the part below it. If a
+block contradicts the link that led to it, the file is corrupt: the block's hash is right, so no peer has a better one.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ class Readable(Protocol):
 class TemporaryFile:
     """An open file under a temporary name in the directory of its final one, locked while it is open.
 
-    Leaving the `with` block closes the file and deletes it, unless it was kept or renamed. The lock tells other
+    Leaving the `with` block closes the file and deletes it, unless it was kept or renamed. The lock shows other
     processes that its writer is still alive.
     """
 

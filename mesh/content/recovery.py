@@ -34,7 +34,7 @@ _PART_SECONDS: Final = 7 * 24 * 3600
 def open_directory(directory: Path) -> tuple[BlockIndex, int]:
     """Delete what crashes left in the directory, and hash files that the index does not know.
 
-    Returns the index, and a descriptor to close after it: its lock tells other processes that the directory is in use.
+    Returns the index, and a descriptor to close after it: its lock shows other processes that the directory is in use.
     Processes open a directory one at a time. Raises `StoreDamaged`, and `OSError` if the directory can't be used.
     """
     with directory_lock(directory):

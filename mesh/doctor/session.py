@@ -22,7 +22,8 @@ from mesh.errors import RemoteError
 from mesh.identity.routers import IdentityDenied, is_loopback
 from mesh.network import Endpoints, Network, call_in_loop
 from mesh.network.endpoints import TLS_PREFIXES
-from schemas.key_chunks import address_chunk, lighthouse_chunk, name_chunk
+from schemas.agent_keys import address_chunk, name_chunk
+from schemas.keys import lighthouse_chunk
 
 if TYPE_CHECKING:
     from collections.abc import Callable

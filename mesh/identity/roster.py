@@ -33,7 +33,8 @@ from msgspec import Meta, Struct
 from mesh.errors import InvalidAddress, InvalidKey
 from mesh.identity.errors import RosterError
 from schemas.address import parse_address
-from schemas.key_chunks import lighthouse_chunk, name_chunk
+from schemas.agent_keys import name_chunk
+from schemas.keys import lighthouse_chunk
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

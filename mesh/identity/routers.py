@@ -15,7 +15,7 @@ from mesh.identity.access_rules import access_control
 from mesh.identity.roster import read_roster
 from mesh.network import Network, Tls, call_in_loop
 from mesh.network.endpoints import Endpoints, check_locators
-from schemas.keys import DeviceTopicKey
+from schemas.agent_keys import DeviceTopicKey
 
 if TYPE_CHECKING:
     import zenoh

@@ -125,7 +125,7 @@ class Settlement:
     def add(self, order: Verified[Order]) -> Refusal | None:
         """Add an order to the book, and settle the match that it completes.
 
-        Where the book refuses the order, returns why, and tells its sender unless the order is in the book already.
+        If the book refuses the order, returns why, and publishes a rejection unless the order is in the book already.
         """
         outcome = self._book.add(order)
         if isinstance(outcome, Match):

@@ -1,6 +1,6 @@
 """A provider's transactions: one at a time, each in the provider's turn, and again after failures that may pass.
 
-Whether a failure is the transaction's own fault can't be told from one attempt: an overloaded node refuses anything,
+One attempt does not show whether a failure is the transaction's own fault: an overloaded node refuses anything,
 while a token contract can keep a node busy until the request times out, or revert with the lighthouse's own errors. So
 such a transaction is tried again, but only a few times, and not for much of the time that others wait for.
 """

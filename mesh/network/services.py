@@ -49,7 +49,7 @@ BUSY: Final = Failure("the agent is handling too many requests", "try again late
 
 
 class ServiceFailed(RemoteError, code="service-failed"):
-    """The agent replied to a call of `service` with an error, or did not reply; `reason` tells which."""
+    """The agent replied to a call of `service` with an error, or did not reply; `reason` says why."""
 
     def __init__(self, service: str, why: str, *, hint: str = "", reason: FailureReason = "agent-error") -> None:
         super().__init__(f"{service}: {why}", hint=hint)

@@ -140,7 +140,7 @@ class TopicRates(Struct, frozen=True):
 
 
 def rates_of(messages: Iterable[Played], *, start_ns: int, duration_ns: int, spans: int) -> TopicRates:
-    """Count the messages from `start_ns` to `duration_ns` later in so many spans."""
+    """Count the messages from `start_ns` to `duration_ns` later, in each of `spans` equal spans."""
     span = max(1, -(-(duration_ns + 1) // spans))
     counts: dict[str, list[int]] = {}
     for message in messages:

@@ -28,8 +28,8 @@ from mesh.recording.limits import Limits
 from mesh.recording.mcap_writer import MAX_TIME, McapWriter
 from mesh.recording.objective import Played, open_source
 from mesh.recording.partial import copy_content
+from schemas.agent_keys import topic_chunks
 from schemas.errors import InvalidPayload
-from schemas.key_chunks import topic_chunks
 from schemas.payloads import EMPTY, JSON, STRING, Empty, PayloadType, String, encode_value, payload_type
 
 if TYPE_CHECKING:

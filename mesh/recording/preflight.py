@@ -9,8 +9,8 @@ from mesh.errors import InvalidKey
 from mesh.recording.errors import RecordingError
 from mesh.recording.limits import Limits
 from mesh.recording.objective import Objective, open_source
+from schemas.agent_keys import topic_chunks
 from schemas.errors import InvalidPayload
-from schemas.key_chunks import topic_chunks
 from schemas.payloads import decode_value
 
 if TYPE_CHECKING:

@@ -179,8 +179,9 @@ class ExecutionSettings(ContentSettings):
     )
     open_services: bool = option(
         False,
-        "let anyone on the router make this agent sign, send messages and spend"
-        " (rpc/sign, rpc/send, rpc/eth/transfer, transfer_from, approve)",
+        "let anyone on the router make this agent sign, send messages and spend (rpc/sign, rpc/send,"
+        " rpc/eth/transfer, transfer_from, approve), and drive the jobs of its handlers (rpc/start, finish, restart,"
+        " resume)",
     )
 
 

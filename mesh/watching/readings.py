@@ -56,7 +56,7 @@ class SensorReading(msgspec.Struct, frozen=True):
 class ReadingFetcher:
     """Fetches the results without a liability among the events given to `handle`, and passes each reading to `deliver`.
 
-    Use with `async with`; files are in a temporary folder meanwhile. Agents' job events tell which results have a
+    Use with `async with`; files are in a temporary folder meanwhile. Agents' job events show which results have a
     liability. Results that can't be fetched or read are logged.
     """
 

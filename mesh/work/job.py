@@ -10,8 +10,8 @@ import zenoh
 
 from mesh.errors import AiraError, ClosedError, ConfigurationError
 from mesh.recording import json_type
+from schemas.agent_keys import LiabilityTopicKey
 from schemas.errors import InvalidPayload
-from schemas.keys import LiabilityTopicKey
 from schemas.payloads import JSON, PayloadType, decode_value, encode_value
 
 if TYPE_CHECKING:

@@ -44,7 +44,7 @@ class Phase(StrEnum):
 NEXT: Final = {
     Phase.INCOMING: frozenset({Phase.READY, Phase.COMPLETE, Phase.FINALIZED}),
     Phase.READY: frozenset({Phase.RUNNING, Phase.COMPLETE, Phase.FINALIZED}),
-    Phase.RUNNING: frozenset({Phase.READY, Phase.COMPLETE, Phase.FINALIZED}),
+    Phase.RUNNING: frozenset({Phase.COMPLETE, Phase.FINALIZED}),
     Phase.COMPLETE: frozenset({Phase.FINALIZED}),
     Phase.FINALIZED: frozenset(),
 }

@@ -14,7 +14,7 @@ import zenoh
 from mesh.log_context import log_event
 from mesh.recording import AtOnce, Unrecordable, play
 from mesh.work.job import HandlerCancelled, Job
-from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey, parse_key
+from schemas.agent_keys import LiabilityTopicKey, ObjectiveTopicKey, parse_agent_key
 from schemas.payloads import STRING, PayloadType, String, payload_type
 from schemas.selectors import topic_selector
 
@@ -154,7 +154,7 @@ class JobRun(Job):
             self._flushed.set()
             return
         try:
-            key = parse_key(str(sample.key_expr))
+            key = parse_agent_key(str(sample.key_expr))
             if isinstance(key, LiabilityTopicKey) and self._is_recorded(key.topic):
                 kind = self._type_of(key.topic, encoding)
                 self._recorder.record(key.topic, sample.payload.to_bytes(), kind, role="device")

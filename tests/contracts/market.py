@@ -38,7 +38,7 @@ class Market:
         self._nonces = count(1)
 
     def demand(self, *, by: Person | None = None, ahead: int = 0, **changes: Any) -> Demand:
-        """The promisee's signed order; `ahead` orders of the same signer are to be used before it."""
+        """The promisee's signed order; `ahead` orders of the same signer are used before it."""
         person = by or self.promisee
         fields = {**self._work(person, ahead), "validator_fee": 0, **changes}
         return person.signer.sign(Demand(**fields))

@@ -3,7 +3,7 @@
 Histories are made up by Hypothesis: orders of both generations, paid in XRT and in another token, that are taken,
 finished well or badly, judged, refunded, cancelled and sent again, while providers come and go. Each call must be
 refused for the reason that the books give, or change what they change and nothing else. `AIRA_MONEY_HISTORIES` says
-how many histories there are to be.
+how many histories to play.
 """
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ def _with_subclasses(error: type[AiraError]) -> Iterator[type[AiraError]]:
 
 
 class Interrupted:
-    """`aira` with these arguments, which gets a signal `after` so many seconds from when it printed `at`.
+    """`aira` with these arguments, which gets a signal `after` seconds after it printed `at`.
 
     With `loads` it gets it when it has loaded that module.
     """

@@ -132,7 +132,7 @@ async def until_matched(session: zenoh.Session) -> None:
 
 
 async def until_held(session: zenoh.Session, cid: str, *, holders: int) -> None:
-    """Return once so many holders answer a query of `session` for the block."""
+    """Return once that many holders answer a query of `session` for the block."""
 
     def answers() -> int:
         replies = session.get(

@@ -131,7 +131,7 @@ class ComposeDeployment(Project):
 
 
 async def passed(seconds: float) -> None:
-    """Return after so many seconds: how long a failure lasts is part of the test."""
+    """Return after `seconds`: how long a failure lasts is part of the test."""
     began = time.monotonic()
     await until(lambda: time.monotonic() - began > seconds, what="the end of the failure", seconds=2 * seconds)
 
@@ -147,7 +147,7 @@ class Job:
     lamps: int
 
     async def is_played(self, messages: int = 2) -> None:
-        """Return when the robot has played so many of its messages: the job is under way."""
+        """Return when the robot has played that many of its messages: the job is under way."""
         played = self.lamps + messages
         await self.market.until(lambda: self.market.lamps() >= played, what="its messages", seconds=JOB_SECONDS)
 

@@ -1,9 +1,9 @@
-// An Arduino Uno without hardware: firmware in simavr, its serial line on a pseudo-terminal, told by lines of text.
+// An Arduino Uno without hardware: firmware in simavr, its serial line on a pseudo-terminal, controlled by lines of text.
 //
 //   board FIRMWARE.elf LINK [reset]
 //
 // LINK is made to point to the terminal; with `reset` each opening of the terminal resets the board, as a real one does.
-// Told on stdin:  adc CHANNEL MILLIVOLTS | noise RATE SEED | unplug | plug | reset | quit
+// Lines on stdin: adc CHANNEL MILLIVOLTS | noise RATE SEED | unplug | plug | reset | quit
 // Says on stdout: port PATH | pin NUMBER LEVEL MICROSECONDS | opened | closed | unplugged | crashed | unknown LINE
 #define _GNU_SOURCE
 #include <errno.h>
@@ -74,7 +74,7 @@ static avr_cycle_count_t byte_time(const struct board *board) {
   return (avr_cycle_count_t)BITS * (data[UCSR0A] & U2X ? 8 : 16) * divider;
 }
 
-// simavr counts eleven bits a byte, and sets that anew whenever the firmware sets the baud rate.
+// simavr counts eleven bits a byte, and resets that whenever the firmware sets the baud rate.
 static void keep_time(struct board *board) {
   board->uart->cycles_per_byte = byte_time(board);
 }

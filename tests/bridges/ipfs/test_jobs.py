@@ -100,7 +100,7 @@ async def test_a_provider_on_zenoh_serves_promisee_and_robot_on_ipfs(place: Plac
         await all_meet(bridged, person, robot)
         await place.chains["person"].tokens.approve(place.chains["person"].factory, COST)
         before = await place.balance("robot")
-        await person.send(person.demand(**await terms(place, await person.add(b"what is to be done"))))
+        await person.send(person.demand(**await terms(place, await person.add(b"what to do"))))
         await robot.send(robot.offer(await robot.receive("validatorFee")))
         liability = await liability_of(place, since, promisee=person.address, promisor=robot.address)
         await robot.send(robot.result(liability.address, await robot.add(b"what was done")))

@@ -11,7 +11,7 @@ import pytest
 from mesh.agent import Phase
 from mesh.network import Endpoints, Network, call
 from schemas import String
-from schemas.keys import LiabilityTopicKey
+from schemas.agent_keys import LiabilityTopicKey
 from schemas.rpc import Done, FinishLiability, LiabilityRead, Nothing, ReadLiability, StartLiability
 from tests.support.market import in_phase, offering
 from tests.support.objectives import objective
@@ -61,7 +61,7 @@ class Control:
         await self.position(address, len(WORDS))
 
     async def position(self, address: str, count: int) -> None:
-        """Wait until the robot has played so many messages of the objective."""
+        """Wait until the robot has played that many messages of the objective."""
 
         def reached() -> bool:
             run = self.robot.runtime.playbacks.run(address)

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from web3.providers.async_base import AsyncBaseProvider
 
-from mesh.agent import FundsShort
 from mesh.agent.orders import Allowances
-from mesh.chain import Chain
+from mesh.chain import Chain, InsufficientTokens
 from schemas import Demand, Offer
 from tests.support.market import QUICK
 from tests.support.orders import terms
@@ -94,7 +93,7 @@ async def test_an_order_without_cost_needs_no_allowance(chain: Chain, allowances
 async def test_a_released_order_no_longer_counts(chain: Chain, allowances: Allowances) -> None:
     balance = await chain.tokens.balance()
     await allowances.ensure("one", {chain.xrt: balance})
-    with pytest.raises(FundsShort) as caught:
+    with pytest.raises(InsufficientTokens) as caught:
         await allowances.ensure("other", {chain.xrt: 1})
     assert caught.value.needed == balance + 1
     allowances.release("one")

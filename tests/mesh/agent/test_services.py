@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from mesh.agent import Phase
 from mesh.recording import open_objective
 from schemas import Liability, String
-from schemas.keys import LiabilityTopicKey, ObjectiveTopicKey
+from schemas.agent_keys import LiabilityTopicKey, ObjectiveTopicKey
 from schemas.rpc import Done, LiabilityRead, RestartLiability, ResumeLiability
 from tests.mesh.agent.controls import WORDS, Control, control, controlled, person, ready
 from tests.support.market import in_phase, offering

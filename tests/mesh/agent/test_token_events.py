@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from mesh.agent.listener import TokenEvents
 from mesh.chain import Account, Approval, Transfer, new_private_key
 from mesh.network import Endpoints, Network
-from schemas.keys import EthEventKey
+from schemas.agent_keys import EthEventKey
 from schemas.rpc import ApprovalEvent, TransferEvent
 from tests.mesh.agent.conftest import other_token
 from tests.support.waiting import until, until_heard

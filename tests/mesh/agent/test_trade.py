@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.agent import FundsShort, Outcome
-from mesh.chain import NotALiability
+from mesh.agent import Outcome
+from mesh.chain import InsufficientTokens, NotALiability
 from mesh.content import ContentUnavailable
 from mesh.errors import ClosedError
 from schemas import ZERO_ADDRESS, Demand, cid_of_bytes, cid_of_file, message_hash
@@ -96,7 +96,7 @@ async def test_the_allowance_of_the_factory_covers_all_open_demands(place: Place
 async def test_short_funds_raise_before_anything_is_sent(place: Place) -> None:
     balance = await place.balance("person")
     async with place.agent("person") as person:
-        with pytest.raises(FundsShort) as caught:
+        with pytest.raises(InsufficientTokens) as caught:
             await person.demand(OBJECTIVE, cost=balance + 1)
         assert (caught.value.balance, caught.value.needed) == (balance, balance + 1)
         assert await waiting(person) == []
@@ -107,7 +107,7 @@ async def test_open_demands_reserve_tokens_until_they_are_cancelled(place: Place
     async with place.agent("person") as person:
         first = asyncio.create_task(person.demand(OBJECTIVE, cost=balance))
         await posted(person)
-        with pytest.raises(FundsShort):
+        with pytest.raises(InsufficientTokens):
             await person.demand(OBJECTIVE, cost=1)
         first.cancel()
         await asyncio.wait([first])
@@ -120,7 +120,7 @@ async def test_open_demands_reserve_tokens_until_they_are_cancelled(place: Place
 async def test_a_refused_demand_does_not_count(place: Place) -> None:
     balance = await place.balance("person")
     async with place.agent("person") as person:
-        with pytest.raises(FundsShort):
+        with pytest.raises(InsufficientTokens):
             await person.demand(OBJECTIVE, cost=balance - 10, validator_fee=11)
         demand = asyncio.create_task(person.demand(OBJECTIVE, cost=balance - 10, validator_fee=10))
         await posted(person)
@@ -184,7 +184,7 @@ async def test_an_offer_is_forgotten_at_its_deadline(place: Place) -> None:
     fee = await place.balance("robot")
     async with place.agent("robot") as robot:
         await robot.offer(objective=OBJECTIVE, lighthouse_fee=fee, lifetime=4)
-        with pytest.raises(FundsShort):
+        with pytest.raises(InsufficientTokens):
             await robot.offer(objective=OBJECTIVE, lighthouse_fee=1)
         await place.node.mine(4)
         await until_found(lambda: all_posted(robot, 0))

@@ -13,7 +13,6 @@ from mesh.chain import (
     InsufficientFunds,
     InvalidName,
     NoAccount,
-    NoContracts,
     NotALiability,
     Reverted,
     UnknownName,
@@ -284,15 +283,6 @@ async def test_two_clients_of_one_account_do_not_lose_a_transaction(market: Depl
     async with market.chain(market.promisee) as one, market.chain(market.promisee) as other:
         await asyncio.gather(*(chain.tokens.transfer(friend, 1) for chain in (one, other) * 5))
         assert await one.tokens.balance(friend) == 10
-
-
-async def test_an_address_that_is_not_a_lighthouse_is_an_error(market: DeployedMarket) -> None:
-    async with market.chain() as chain:
-        with no_contracts("providersLength"):
-            await chain.lighthouses.get(market.promisee.address)
-        functions = chain.node.contract("Liability", market.promisee.address).functions
-        with pytest.raises(NoContracts):
-            await chain.node.read_all((functions.model(), functions.cost()), block="latest")
 
 
 async def test_a_closed_chain_raises(market: DeployedMarket) -> None:

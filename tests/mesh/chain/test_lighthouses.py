@@ -16,6 +16,7 @@ from mesh.chain import (
     Chain,
     InsufficientTokens,
     NewLighthouse,
+    NoContracts,
     NodeUnreachable,
     Online,
     StakeTooSmall,
@@ -27,7 +28,7 @@ from mesh.chain import (
 from mesh.devchain import EmbeddedChain
 from mesh.errors import InputError
 from schemas.address import ZERO_ADDRESS
-from tests.mesh.chain.conftest import QUICK, Flaky, events_of, prepare, read_to
+from tests.mesh.chain.conftest import QUICK, Flaky, events_of, no_contracts, prepare, read_to
 from tests.support.nodes import Anvil
 
 if TYPE_CHECKING:
@@ -199,3 +200,12 @@ async def test_creating_a_lighthouse_returns_its_event(market: DeployedMarket) -
     assert isinstance(made, NewLighthouse)
     assert made.name == "far"
     assert made.tx.startswith("0x")
+
+
+async def test_an_address_that_is_not_a_lighthouse_is_an_error(market: DeployedMarket) -> None:
+    async with market.chain() as chain:
+        with no_contracts("providersLength"):
+            await chain.lighthouses.get(market.promisee.address)
+        functions = chain.node.contract("Liability", market.promisee.address).functions
+        with pytest.raises(NoContracts):
+            await chain.node.read_all((functions.model(), functions.cost()), block="latest")

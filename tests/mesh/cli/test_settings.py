@@ -34,6 +34,12 @@ def test_without_anything_it_shows_the_defaults_as_one_object() -> None:
     assert in_force() == Settings()
 
 
+def test_the_help_of_a_switch_shows_its_two_values_and_the_default() -> None:
+    shown = " ".join(settings("--help").output.split())
+    assert "--enable-executor true|false run jobs; false only listens [true]" in shown
+    assert "--open-services true|false" in shown
+
+
 def test_the_plain_form_is_a_settings_file(tmp_path: Path) -> None:
     done = settings("--connect", "tcp/robots.example:7447", "--poll-interval", "0.5", "--enable-executor", "false")
     (tmp_path / "aira.toml").write_text(done.stdout)

@@ -24,7 +24,7 @@ GETH = "Geth/v1.14.0-stable"
 
 @contextmanager
 def gateway(node: str, *, behind: float = 0.0, refused: tuple[str, ...] = ()) -> Iterator[str]:
-    """A gateway to `node` that claims to be Geth, `behind` by so many seconds; `refused` methods fail."""
+    """A gateway to `node` that claims to be Geth, `behind` seconds late; `refused` methods fail."""
 
     class Gateway(http.server.BaseHTTPRequestHandler):
         def do_POST(self) -> None:

@@ -25,7 +25,7 @@ __all__ = ["founded", "place"]
 
 ADDRESS = "0x3C44CdDdB6a900fa2b585dd299e03d12FA4293BC"
 CHAIN = "1337-0badcafe"
-OBJECTIVE = b"what is to be done"
+OBJECTIVE = b"what to do"
 UNUSED = b"what nobody needs"
 PASSING = ("-wal", "-shm")
 NONCE = f"transactions/{CHAIN}/{ADDRESS.lower()}/000000000007.jsonl"

@@ -76,7 +76,7 @@ async def test_missing_content_of_jobs_is_reported(folder: Folder, tmp_path: Pat
 async def test_damaged_content_is_left_out_and_reported(folder: Folder, tmp_path: Path) -> None:
     held = folder.home / "content" / cid_of_bytes(OBJECTIVE)
     held.chmod(0o644)
-    held.write_bytes(b"what is to be Done")
+    held.write_bytes(b"What to do")
     done = await back_up(folder.path, tmp_path / "it", content=ContentScope.ALL)
     assert cid_of_bytes(OBJECTIVE) in done.missing
     assert done.files == 1

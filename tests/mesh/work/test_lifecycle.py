@@ -24,6 +24,7 @@ def test_the_chain_can_end_a_job_in_any_phase(phase: Phase) -> None:
     ("phase", "to"),
     [
         (Phase.INCOMING, Phase.RUNNING),
+        (Phase.RUNNING, Phase.READY),
         (Phase.COMPLETE, Phase.RUNNING),
         (Phase.COMPLETE, Phase.COMPLETE),
         (Phase.FINALIZED, Phase.COMPLETE),

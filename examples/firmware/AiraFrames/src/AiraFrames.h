@@ -242,7 +242,7 @@ class Link {
     }
   }
 
-  // In a handler, instead of delay(): tells the host that it is being done when it asks again.
+  // In a handler, instead of delay(): when the host asks again, it gets the answer that the call is still being done.
   void wait(unsigned long milliseconds) {
     const unsigned long begun = millis();
     do {

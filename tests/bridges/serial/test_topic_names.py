@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bridges.serial.naming import TopicNames
+from bridges.serial.cli import TopicNames
 from mesh.errors import InputError, InvalidKey
 
 
