@@ -30,12 +30,16 @@ interface OrderErrors is TokenErrors {
     error DeadlineReached(uint256 deadline);
     /// A generation-3 order makes one liability only.
     error OrderUsed(bytes32 hash);
+    /// The nonce of the caller's next generation-5 order is another one.
+    error WrongNonce(uint256 given, uint256 next);
     /// Not 65 bytes, `v` not 27 or 28, `s` in the upper half of the curve order, or nobody's signature.
     error InvalidSignature();
     /// The signed fields (in generation 5 also sender and nonce) are not those that were sent.
     error WrongSigner(address expected, address recovered);
     /// A generation-5 validator is asked by a call, so it has to be a contract.
     error ValidatorWithoutCode(address validator);
+    /// An offer whose validator is a lighthouse is also a demand: the two have these addresses in swapped places.
+    error ValidatorIsLighthouse(address validator);
     /// Only lighthouses made by this factory may call.
     error NotALighthouse(address caller);
     /// The token refused a transfer without giving a reason.

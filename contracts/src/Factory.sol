@@ -45,6 +45,10 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission, ILighthouseFact
     event NewLighthouse(address indexed lighthouse, string name);
     /// @notice An order has made its liability.
     event HashConsumed(bytes32 indexed hash);
+    /// @notice Generation 3: no order with this hash and this signer can make a liability any more.
+    event OrderWithdrawn(bytes32 indexed hash, address indexed signer);
+    /// @notice Generation 5: no order with this nonce and this sender can make a liability any more.
+    event NonceWithdrawn(uint256 indexed nonce, address indexed sender);
 
     /// @param ens_ registry in which this factory owns the parents of the lighthouses' names.
     /// @param xrt_ token that has, or will have, this factory as its minter.
@@ -83,6 +87,22 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission, ILighthouseFact
         address liability = Clone.create(liabilityCode, LIABILITY, TermsCode.pack(terms, address(xrt)));
         // slither-disable-next-line reentrancy-events (nobody but the token was called, and it changes nothing here)
         emit NewLiability(liability);
+    }
+
+    /// @notice Generation 3: makes an order of the caller's unusable, whatever a provider does with it.
+    /// @param hash what the caller has signed.
+    function withdrawOrder(bytes32 hash) external {
+        _useHash(hash, msg.sender);
+        emit OrderWithdrawn(hash, msg.sender);
+    }
+
+    /// @notice Generation 5: makes all orders that the caller has signed with its current nonce unusable.
+    /// @param nonce the current one; an order that makes its liability first must not cost the next one its nonce.
+    function withdrawNonce(uint256 nonce) external {
+        uint256 next = nonceOf[msg.sender];
+        if (nonce != next) revert WrongNonce(nonce, next);
+        nonceOf[msg.sender] = next + 1;
+        emit NonceWithdrawn(nonce, msg.sender);
     }
 
     /// @notice Ends a liability; for its lighthouse, which adds the provider's address behind the arguments.
@@ -150,13 +170,13 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission, ILighthouseFact
         (isClone,) = Clone.read(account, LIABILITY);
     }
 
-    /// @notice Generation 3: whether an order with this hash has made its liability, whoever has signed it. Generation 5
-    /// is guarded by nonces: always false.
+    /// @notice Generation 3: whether an order with this hash has made its liability or was withdrawn, whoever has signed
+    /// it. Generation 5 is guarded by nonces: always false.
     function isHashConsumed(bytes32 hash) external view returns (bool) {
         return _firstUser[hash] != address(0);
     }
 
-    /// @notice Generation 3: whether the order of `signer` with this hash has made its liability.
+    /// @notice Generation 3: whether the order of `signer` with this hash has made its liability or was withdrawn.
     function isOrderUsed(bytes32 hash, address signer) external view returns (bool) {
         return _firstUser[hash] == signer ? signer != address(0) : _isUsed[keccak256(abi.encode(hash, signer))];
     }
@@ -178,9 +198,7 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission, ILighthouseFact
         if (terms.lighthouse != msg.sender) revert WrongLighthouse(terms.lighthouse, msg.sender);
         terms.validator = address(uint160(demand.secondAccount));
         terms.generation = demand.isFifth() ? 5 : 3;
-        if (terms.generation == 5 && terms.validator != address(0) && terms.validator.code.length == 0) {
-            revert ValidatorWithoutCode(terms.validator);
-        }
+        if (terms.validator != address(0)) _checkValidator(terms);
         terms.model = demand.model();
         terms.objective = demand.objective();
         terms.token = address(uint160(demand.token));
@@ -192,6 +210,13 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission, ILighthouseFact
         terms.offerDeadline = offer.deadline;
         (terms.promisee, terms.demandHash, terms.demandNonce) = _use(demand);
         (terms.promisor, terms.offerHash, terms.offerNonce) = _use(offer);
+    }
+
+    /// An Offer (lighthouse L, validator V) is, with the same signature, a Demand (lighthouse V, validator L). So no
+    /// validator may be a lighthouse: else a robot's offer could take the robot's tokens.
+    function _checkValidator(Terms memory terms) private view {
+        if (terms.generation == 5 && terms.validator.code.length == 0) revert ValidatorWithoutCode(terms.validator);
+        if (isLighthouse(terms.validator)) revert ValidatorIsLighthouse(terms.validator);
     }
 
     /// Checks an order's deadline and signature and makes sure that it is used once.

@@ -14,6 +14,7 @@ from mesh.chain.errors import NoAccount, NotOffered, UnknownContracts
 from mesh.errors import InvalidMessage
 from schemas.address import ZERO_ADDRESS, parse_address
 from schemas.cid import parse_cid
+from schemas.wire import message_hash
 
 if TYPE_CHECKING:
     from web3.contract import AsyncContract
@@ -100,6 +101,12 @@ class ContractVersion:
         """The call that ends a liability by the signatures of both parties. Raises `NotOffered`."""
         return self._factory.cancel(liability, promisee, promisor)
 
+    def withdrawal(self, order: Order) -> AsyncContractFunction:
+        """The call by which an order's maker makes it unusable. Raises `NotOffered`."""
+        if order.generation == 5:
+            return self._factory.withdrawNonce(int(order.nonce))
+        return self._factory.withdrawOrder(message_hash(order))
+
     def refund(self, liability: str) -> AsyncContractFunction:
         """The call that pays a promisee back. Raises `NotOffered`."""
         return self._factory.refund(liability)
@@ -113,7 +120,7 @@ class ContractVersion:
         return int(await self._node.read(self._factory.nonceOf(address)))
 
     async def is_order_used(self, order_hash: bytes, signer: str) -> bool:
-        """Whether the generation-3 order that `signer` signed has created its liability."""
+        """Whether the generation-3 order that `signer` signed has created its liability or was withdrawn."""
         return bool(await self._node.read(self._factory.isOrderUsed(order_hash, signer)))
 
     def recognise(self, liability: str) -> None:
@@ -169,6 +176,9 @@ class OriginalContracts(ContractVersion):
 
     def cancellation(self, liability: str, promisee: bytes, promisor: bytes) -> AsyncContractFunction:
         raise NotOffered("cancellation", self.generation)
+
+    def withdrawal(self, order: Order) -> AsyncContractFunction:
+        raise NotOffered("withdrawal of orders", self.generation)
 
     def refund(self, liability: str) -> AsyncContractFunction:
         raise NotOffered("refund", self.generation)

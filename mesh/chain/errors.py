@@ -20,7 +20,9 @@ REVERT_HINTS: Final[Mapping[str, str]] = MappingProxyType(
         "ERC20InsufficientBalance": "send the account the missing tokens, or lower the amount",
         "ERC20InvalidReceiver": "check the address that the tokens are to go to",
         "DeadlineReached": "the order has expired; sign a new one with a later deadline",
-        "OrderUsed": "an order makes one contract only; sign a new one",
+        "OrderUsed": "an order makes one contract only, and none when it is withdrawn; sign a new one",
+        "WrongNonce": "of several orders, withdraw the one with the lowest nonce first",
+        "ValidatorIsLighthouse": "name a validator that is no lighthouse, or none",
         "WrongSigner": "the signature is another account's than the first address says, or of other terms",
         "InvalidSignature": "a signature is 65 bytes with v 27 or 28 and a low s",
         "NotAProvider": "stake on the lighthouse first: only its providers may send to it",
@@ -123,6 +125,17 @@ class NotOffered(ChainError, code="not-offered"):
         )
         self.what = what
         self.generation = generation
+
+
+class OrderAlreadyUsed(ChainError, code="order-used"):
+    """The order can't be withdrawn: it has become a liability, or was withdrawn before. `order` is its hash."""
+
+    def __init__(self, order: str) -> None:
+        super().__init__(
+            f"the order {order} is used: it has become a contract, or was withdrawn",
+            hint="look for its contract with `aira liability list`",
+        )
+        self.order = order
 
 
 class InsufficientFunds(ChainError, code="insufficient-funds"):

@@ -7,15 +7,16 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from mesh.chain.errors import NoContracts, NotALiability
+from mesh.chain.errors import NoContracts, NotALiability, OrderAlreadyUsed, Reverted
 from mesh.chain.events import NewLiability, liability_created, xrt_minted
 from mesh.chain.following import retrying
 from mesh.chain.reader import list_created
+from mesh.errors import InvalidMessage
 from schemas.address import parse_address
 from schemas.cid import format_cid
 from schemas.records import Liability
 from schemas.signing import recover
-from schemas.wire import cancellation_hash, order_abi
+from schemas.wire import cancellation_hash, message_hash, order_abi
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from mesh.chain.contracts import Contracts
     from mesh.chain.node import Node
     from mesh.chain.transactions import Receipt
-    from schemas.messages import Demand, Offer, Result
+    from schemas.messages import Demand, Offer, Order, Result
 
 GETTERS: Final = (
     "model",
@@ -100,7 +101,7 @@ class Liabilities:
         return await self._contracts.version.nonce_of(await self._contracts.address_or_own(address))
 
     async def is_order_used(self, order_hash: bytes, signer: str) -> bool:
-        """Whether a generation-3 order of `signer` (address) was used already (generation 5 uses nonces instead)."""
+        """Whether a generation-3 order of `signer` (address) was used or withdrawn; generation 5 uses nonces."""
         return await self._contracts.version.is_order_used(order_hash, signer)
 
     async def get(self, address: str) -> Liability:
@@ -156,6 +157,27 @@ class Liabilities:
         created = Created(made.liability, receipt.tx, receipt.gas_used, receipt.wei)
         self._contracts.version.recognise(created.liability)
         return created
+
+    async def withdraw(self, order: Order) -> Receipt:
+        """Make a signed order of one's own unusable on the chain, for every provider.
+
+        In generation 5 it uses up the account's nonce, so all orders with this nonce are withdrawn. Raises
+        `OrderAlreadyUsed` if the order has become a liability or was withdrawn; `NotOffered`; `InvalidMessage`
+        (`sender`) for another account's order; `Reverted` (`WrongNonce`) for a nonce that is not the next one yet.
+        """
+        digest = message_hash(order)
+        signer, own = recover(digest, order.signature), self._contracts.own_address
+        if signer != own:
+            raise InvalidMessage("sender", f"the order is signed by {signer}, and this account is {own}")
+        try:
+            return await self._contracts.send(self._contracts.version.withdrawal(order))
+        except Reverted as error:
+            match error.reason, *error.arguments:
+                case ("WrongNonce", int(given), int(following)) if given > following:
+                    raise
+                case ("OrderUsed" | "WrongNonce", *_):
+                    raise OrderAlreadyUsed(digest.hex()) from error
+            raise
 
     async def finalize(self, lighthouse: str, result: Result) -> Settled:
         """Finalize a liability by its signed result, as a provider of the lighthouse."""

@@ -19,7 +19,10 @@ GENERATIONS: Final = {5: "generation_5", 3: "generation_3"}
 
 
 class Row(NamedTuple):
-    """A row of the table; a pair is generation 5, generation 3. A reverted original took what it was given."""
+    """A row of the table; a pair is generation 5, generation 3. A reverted original took what it was given.
+
+    `-` is what the originals can't do, or what was not measured.
+    """
 
     label: str
     originals: tuple[str, str]
@@ -31,8 +34,10 @@ ROWS: Final = {
     "create_cost_0": Row("createLiability, cost 0", ("796,277", "809,155"), (145_000, 190_000)),
     "create_cost": Row("createLiability, cost > 0", ("858,781", "870,450"), (165_000, 212_000)),
     "create_cost_fee": Row("  + lighthouseFee", ("901,585", "914,228"), (185_000, 232_000)),
+    "create_validator": Row("  + validator, no fees", ("-", "-"), (175_000, 220_000)),
     "finalize_cost_0": Row("finalize, cost 0", ("268,656", "214,894"), (102_000, 102_000)),
     "finalize_cost": Row("finalize, cost > 0", ("279,670", "226,793"), (115_000, 115_000)),
+    "withdraw_order": Row("withdraw an order", ("-", "-"), (35_000, 50_000)),
     "revert_mismatch": Row("reverted create (mismatch)", ("the limit", "~700,000"), (60_000, 60_000)),
 }
 
@@ -59,6 +64,10 @@ def _measure(market: Market) -> dict[str, int]:
         created = suite.send(market.creation(*market.pair(**terms)), market.provider)
         used[f"create_{ending}"] = created["gasUsed"]
         used[f"finalize_{ending}"] = market.finalize(market.liability_of(created))["gasUsed"]
+    jury = suite.deploy("Jury", suite.xrt.address)
+    judged = market.creation(*market.pair(cost=XRT, validator=jury.address))
+    used["create_validator"] = suite.send(judged, market.provider)["gasUsed"]
+    used["withdraw_order"] = suite.send(market.withdrawal(market.demand()), market.promisee)["gasUsed"]
     mismatch = market.creation(market.demand(cost=XRT), market.offer(cost=2 * XRT))
     used["revert_mismatch"] = suite.attempt(mismatch, market.provider)["gasUsed"]
     return {key: used[key] for key in ROWS}

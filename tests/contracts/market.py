@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from web3.logs import DISCARD
 
-from schemas import ZERO_ADDRESS, Demand, Offer, Result, cid_of_digest, order_abi, parse_cid
+from schemas import ZERO_ADDRESS, Demand, Offer, Result, cid_of_digest, message_hash, order_abi, parse_cid
 from tests.contracts.suite import XRT, Person, Suite
 
 if TYPE_CHECKING:
@@ -67,6 +67,13 @@ class Market:
         """The liability that a transaction made."""
         (event,) = self.suite.factory.events.NewLiability().process_receipt(receipt, errors=DISCARD)
         return self.suite.contract("Liability", event["args"]["liability"])
+
+    def withdrawal(self, order: Demand | Offer) -> Any:
+        """The call by which the order's maker makes it unusable."""
+        functions = self.suite.factory.functions
+        if order.generation == 3:
+            return functions.withdrawOrder(message_hash(order))
+        return functions.withdrawNonce(int(order.nonce))
 
     def result(self, liability: Contract, *, success: bool = True, by: Person | None = None) -> Result:
         """A signed result, by default the promisor's."""

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from schemas import parse_cid
+from schemas import order_abi, parse_cid
 from tests.contracts.market import RESULT
 from tests.contracts.suite import REFUND_DELAY, XRT
 
@@ -101,3 +101,31 @@ def test_a_validator_that_does_not_answer_locks_nothing(market: Market) -> None:
 
     assert suite.balance(market.promisee) == before
     assert suite.balance(suite.factory) == 0
+
+
+@pytest.mark.parametrize("own", [False, True], ids=["the same lighthouse", "a lighthouse of the thief"])
+def test_an_offer_is_not_taken_for_a_demand_of_the_robot(market: Market, own: bool) -> None:
+    """An offer on lighthouse L with validator V has the bytes of a demand on lighthouse V with validator L."""
+    suite, robot, thief = market.suite, market.promisor, market.outsider
+    trap = market.lighthouse
+    if own:
+        trap = suite.create_lighthouse(name="trap")
+    suite.join(trap, thief, XRT)
+    before = suite.balance(robot)
+    as_demand = order_abi(market.offer(cost=COST, validator=trap.address))
+    counter = market.offer(by=thief, cost=COST, lighthouse=trap.address, validator=market.lighthouse.address)
+    while not trap.functions.isTurnOf(thief.address).call():
+        suite.chain.mine(1)
+
+    theft = market.creation(as_demand, counter, trap)
+
+    suite.attempt(theft, thief)
+    assert suite.balance(robot) == before
+    assert market.refusal(theft, thief) == ("ValidatorIsLighthouse", market.lighthouse.address)
+
+
+def test_no_order_names_a_lighthouse_as_validator(market: Market) -> None:
+    other = market.suite.create_lighthouse(name="other")
+    for lighthouse in (market.lighthouse, other):
+        call = market.creation(*market.pair(cost=COST, validator=lighthouse.address))
+        assert market.refusal(call) == ("ValidatorIsLighthouse", lighthouse.address)

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.chain import XRT, Account, Chain, NotALiability, NotOffered, new_private_key
+from mesh.chain import XRT, Account, Chain, NotALiability, NotOffered, OrderAlreadyUsed, new_private_key
 from mesh.devchain import EmbeddedChain
 from mesh.errors import InvalidMessage
-from schemas import cancellation_hash
+from schemas import cancellation_hash, message_hash
 from tests.mesh.chain.conftest import QUICK, Flaky, cid, prepare, raises_with, reverted
 
 if TYPE_CHECKING:
+    from schemas import Demand, Offer
     from tests.mesh.chain.conftest import DeployedMarket
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
@@ -180,3 +181,63 @@ async def test_watching_survives_an_outage() -> None:
             assert not watching.done()
             flaky.is_lost = False
             assert (await watching).is_finalized
+
+
+async def _counted(market: DeployedMarket, maker: Account, generation: int, ahead: int) -> dict[str, Any]:
+    """What a generation-5 order has in place of a random nonce."""
+    if generation == 3:
+        return {}
+    async with market.chain() as chain:
+        return {"sender": maker.address, "nonce": await chain.liabilities.next_nonce(maker.address) + ahead}
+
+
+async def _order(market: DeployedMarket, generation: int, *, ahead: int = 0, **fields: Any) -> Demand:
+    return market.demand(**await _counted(market, market.promisee, generation, ahead), **fields)
+
+
+async def _matching_offer(market: DeployedMarket, generation: int, **fields: Any) -> Offer:
+    return market.offer(**await _counted(market, market.promisor, generation, 0), **fields)
+
+
+@pytest.mark.parametrize("generation", [3, 5])
+async def test_a_withdrawn_order_makes_no_contract(market: DeployedMarket, generation: int) -> None:
+    demand = await _order(market, generation, cost=XRT)
+    offer = await _matching_offer(market, generation, cost=XRT)
+    async with market.chain(market.promisee) as chain:
+        withdrawn = await chain.liabilities.withdraw(demand)
+        assert 0 < withdrawn.gas_used < 50_000
+        assert withdrawn.wei > 0
+        with raises_with(OrderAlreadyUsed, code="order-used", order=message_hash(demand).hex()):
+            await chain.liabilities.withdraw(demand)
+    async with market.chain(market.provider) as chain:
+        with reverted({3: "OrderUsed", 5: "WrongSigner"}[generation]):
+            await chain.liabilities.create("airalab", demand, offer)
+
+
+@pytest.mark.parametrize("generation", [3, 5])
+async def test_an_order_that_is_a_contract_is_not_withdrawn(market: DeployedMarket, generation: int) -> None:
+    demand = await _order(market, generation)
+    offer = await _matching_offer(market, generation)
+    async with market.chain(market.provider) as chain:
+        await chain.liabilities.create("airalab", demand, offer)
+    async with market.chain(market.promisee) as chain:
+        with raises_with(OrderAlreadyUsed, order=message_hash(demand).hex()):
+            await chain.liabilities.withdraw(demand)
+
+
+async def test_only_the_next_order_of_the_own_account_is_withdrawn(market: DeployedMarket) -> None:
+    demand = await _order(market, 5, ahead=1)
+    async with market.chain(market.promisee) as chain:
+        with reverted("WrongNonce"):
+            await chain.liabilities.withdraw(demand)
+    async with market.chain(market.stranger) as chain:
+        with raises_with(InvalidMessage, reason="sender"):
+            await chain.liabilities.withdraw(demand)
+
+
+@pytest.mark.parametrize("generation", [3, 5])
+async def test_the_originals_withdraw_no_order(market: DeployedMarket, generation: int) -> None:
+    demand = await _order(market, generation)
+    async with market.chain(market.promisee, contracts="original", generation=generation) as chain:
+        with raises_with(NotOffered, what="withdrawal of orders", generation=generation):
+            await chain.liabilities.withdraw(demand)
