@@ -9,7 +9,8 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Final
 
-from sha3 import keccak_256  # type: ignore[import-untyped]
+# `sha3` itself imports hashlib, and with it OpenSSL: 3.5 MB that an edge agent does not need.
+from _pysha3 import keccak_256  # type: ignore[import-not-found]
 
 from schemas.errors import InvalidAddress
 

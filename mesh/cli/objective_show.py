@@ -194,5 +194,5 @@ def draw(rates: TopicRates, path: Path, *, title: str) -> None:
 
 def _plain_text(text: str) -> str:
     """Text from others for matplotlib, where a dollar starts a formula and a leading underscore hides a label."""
-    shown = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
+    shown = "".join(letter if letter.isprintable() else "\ufffd" for letter in text)
     return shown.replace("$", r"\$").lstrip("_")

@@ -76,7 +76,7 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[object]], *, number
 
 def printable(text: str) -> str:
     """Text from others without control characters, which could control the terminal."""
-    return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
+    return "".join(letter if letter.isprintable() else "\ufffd" for letter in text)
 
 
 def plural(count: int, one: str) -> str:

@@ -63,5 +63,5 @@ def _shown(message: Any) -> str:
     if isinstance(message, Empty):
         return "std_msgs/Empty"
     text = f"{len(message)} bytes" if isinstance(message, bytes) else str(getattr(message, "data", message))
-    shown = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text[:SHOWN])
+    shown = "".join(letter if letter.isprintable() else "\ufffd" for letter in text[:SHOWN])
     return shown if len(text) <= SHOWN else f"{shown}…"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-import secrets
+import os
 import sys
 import threading
 import time
@@ -52,7 +52,7 @@ class LogBuffer:
     """Keeps the last events of a process, numbered from 1. Every method may be called from any thread."""
 
     def __init__(self, *, max_events: int = MAX_EVENTS, max_bytes: int = MAX_BYTES) -> None:
-        self.instance: Final = secrets.token_hex(8)
+        self.instance: Final = os.urandom(8).hex()
         """Identifies this run of the process."""
         self.began: Final = timestamp(time.time())
         self._max_events = max_events

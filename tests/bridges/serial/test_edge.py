@@ -117,15 +117,25 @@ async def test_two_boards_of_two_agents_do_not_affect_each_other(place: Place) -
                 await Device(robot, patience=2.0).call("/hear", String("hello"))
 
 
-def test_an_edge_agent_imports_no_chain_and_no_event_loop() -> None:
+def loaded_by(dialects: str, *suspects: str) -> list[str]:
+    """Those of these modules that an edge agent has loaded for its dialects (a list in Python)."""
     code = (
-        "import sys, bridges.serial.cli, bridges.serial.process, bridges.serial.metrics;"
+        "import sys, mesh.__main__, mesh.cli, bridges.serial.cli, bridges.serial.process, bridges.serial.metrics;"
         "from bridges.serial.dialect import dialect_names, load_dialect;"
-        "[load_dialect(name) for name in dialect_names()];"
-        "print(sorted({'web3', 'eth_account', 'eth_abi', 'asyncio', 'aiohttp', 'mcap'} & set(sys.modules)))"
+        f"[load_dialect(name) for name in {dialects}];"
+        f"print(*sorted({set(suspects)} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    return done.stdout.split()
+
+
+def test_an_edge_agent_imports_no_chain_and_no_event_loop() -> None:
+    assert loaded_by("dialect_names()", "web3", "eth_account", "eth_abi", "asyncio", "aiohttp", "mcap") == []
+
+
+def test_an_edge_agent_loads_neither_openssl_nor_unicodes_tables() -> None:
+    """They would be an eighth of its memory."""
+    assert loaded_by("['frames']", "_hashlib", "unicodedata") == []
 
 
 async def test_a_board_that_never_answers_is_logged_once(place: Place) -> None:
