@@ -5,6 +5,8 @@
 - recorder: JSON messages of 100 bytes from another process over Zenoh through `mesh.recording.Recorder` into a file,
   compared with a bare `mcap.Writer` that writes messages from memory, alternating.
 - playback: how late messages recorded at 1 kHz are played.
+- job: the same as a job, up to the handler, while the recording is synced and the position saved; and how many messages
+  a second a job plays at once.
 
 Each is measured three times and the best result counts, as other load on the machine is not ours. Lost messages are
 added up.
@@ -24,7 +26,7 @@ import threading
 import time
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from mcap.writer import Writer
 from zenoh import CongestionControl
@@ -34,11 +36,19 @@ from common import router as router_process
 from mesh.content import Exchange, Store
 from mesh.network import Endpoints, Network
 from mesh.recording import Recorder, RecordingAbout, open_objective, play
+from mesh.settings import Settings
+from mesh.work import Ledger
+from mesh.work.playbacks import Playbacks
+from schemas import ZERO_ADDRESS, Liability, cid_of_bytes
 from schemas.payloads import JSON
 from schemas.unixfs import cid_of_stream
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+
+    from mesh.recording import Played
+    from mesh.work.job import Job
+    from mesh.work.run import JobRun
 
 MEGABYTE: Final = 1e6
 ROUNDS: Final = 3
@@ -50,7 +60,26 @@ LIMITS: Final = {
     "recorder ratio": (">=", 0.6),
     "recorder lost": ("<=", 0),
     "playback p99_ms": ("<=", 2),
+    "job p99_ms": ("<=", 5),
+    "job messages_per_s": (">=", 5000),
 }
+LIABILITY: Final = Liability(
+    address=ZERO_ADDRESS,
+    model=cid_of_bytes(b"model"),
+    objective=cid_of_bytes(b"objective"),
+    result="",
+    promisee=ZERO_ADDRESS,
+    promisor=ZERO_ADDRESS,
+    lighthouse=ZERO_ADDRESS,
+    lighthouse_fee=0,
+    token=ZERO_ADDRESS,
+    cost=0,
+    validator=ZERO_ADDRESS,
+    validator_fee=0,
+    is_success=False,
+    is_finalized=False,
+)
+"""The contract of the measured job; no chain knows it."""
 
 Results = dict[str, dict[str, float]]
 
@@ -108,6 +137,23 @@ def measure_playback(folder: Path, seconds: int) -> dict[str, float]:
     return {"p99_ms": round(p99 * 1e3, 3)}
 
 
+def measure_job(folder: Path, seconds: int) -> dict[str, float]:
+    """How late the handler of a job gets messages at a thousand per second, and how many per second at once."""
+    path, count = folder / "job.mcap", seconds * HERTZ
+    with Recorder(path, RecordingAbout()) as recorder:
+        for number in range(count):
+            recorder.record("/pose", _message(number), JSON, log_time_ns=10**18 + number * 10**9 // HERTZ)
+    with _router() as endpoint:
+        late, rate = float("inf"), 0.0
+        for number in range(ROUNDS):
+            times = asyncio.run(_work(endpoint, folder / f"job-{number}", path, "recorded"))
+            expected = (moment - times[0] - step / HERTZ for step, moment in enumerate(times))
+            late = min(late, statistics.quantiles(expected, n=100)[98])
+            times = asyncio.run(_work(endpoint, folder / f"at-once-{number}", path, "at-once"))
+            rate = max(rate, count / (times[-1] - times[0]))
+    return {"p99_ms": round(late * 1e3, 3), "messages_per_s": round(rate)}
+
+
 def missed(results: Results) -> list[str]:
     """The limits that are not met."""
     lines = []
@@ -139,6 +185,7 @@ def main() -> int:
             "transfer": measure_transfer(folder, options.mebibytes),
             "recorder": measure_recorder(folder, options.messages),
             "playback": measure_playback(folder, options.seconds),
+            "job": measure_job(folder, options.seconds),
         }
     print(json.dumps(results) if options.json else table(results))
     too_low = missed(results)
@@ -247,6 +294,28 @@ async def _play(path: Path) -> list[float]:
         started = now if started is None else started
         late.append((now - started - step.due_ns) / 1e9)
     return late
+
+
+async def _work(endpoint: str, folder: Path, path: Path, pace: Literal["recorded", "at-once"]) -> list[float]:
+    """When the handler of a job got each message of the objective at `path`."""
+    times: list[float] = []
+    objective = await asyncio.to_thread(open_objective, path)
+
+    async def handle(job: Job, message: Played) -> None:
+        times.append(time.perf_counter())
+
+    async with Network(Endpoints(connect=(endpoint,))) as network, Ledger(folder / "ledger.sqlite") as ledger:
+        playbacks = Playbacks(network.session, ZERO_ADDRESS, ledger, Settings(playback=pace), folder)
+        await ledger.add_job(LIABILITY)
+        (job,) = await ledger.jobs()
+        async with asyncio.TaskGroup() as tasks:
+
+            async def work(run: JobRun) -> None:
+                await playbacks.play_and_save(run, handle)
+
+            await playbacks.begin(job, objective, play=work, tasks=tasks)
+        await playbacks.suspend(LIABILITY.address)
+    return times
 
 
 def _message(number: int) -> bytes:

@@ -50,8 +50,9 @@ def command(
 
     Without LIABILITY, --objective and --result are required, and neither a chain nor a network is used.
 
-    Each check holds, fails, or stays open for lack of information. The exit code is 0 if none fails, 1 if one fails,
-    and 2 if the checks could not run.
+    Each check holds, fails, or stays open for lack of information. Messages of the objective that are not in the
+    recording fail it, unless the job is known to have ended without success. The exit code is 0 if no check fails, 1 if
+    one fails, and 2 if the checks could not run.
     """
     exit_code = 0
 

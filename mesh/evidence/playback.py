@@ -53,8 +53,8 @@ def check_played(
 ) -> Finding:
     """Compare the messages of an objective with the played ones, both in order.
 
-    `seams` are the numbers of played messages after which the agent crashed and continued. Unless the job is known to
-    be `complete`, the end may be missing.
+    `seams` are the numbers of played messages after which the agent crashed and continued. A job that is not `complete`
+    may have played only the beginning, and lost some of it in a crash.
     """
     seams = frozenset(seams)
     bounds = [0, *sorted({seam for seam in seams if 0 <= seam <= len(played)}), len(played)]
@@ -75,7 +75,8 @@ def check_played(
         missing = f"only the first {position} of the objective's {len(objective)} messages were played{again}"
         return Finding(_NAME, False if complete else None, missing)
     if unseen:
-        return Finding(_NAME, None, f"{unseen} messages are not in the recording: the agent crashed there{again}")
+        lost = f"{unseen} messages are not in the recording: the agent crashed there{again}"
+        return Finding(_NAME, False if complete else None, lost)
     return Finding(_NAME, True, f"all {position} messages of the objective were played, in order{again}")
 
 

@@ -113,7 +113,7 @@ def _check_playback(
 ) -> Finding:
     chosen = {name for name in recording.metadata.get(ABOUT, {}).get("topics", "").split(",") if name}
     due = [digest_of(message) for message in objective.messages() if not chosen or message.topic in chosen]
-    finding = check_played(due, played, seams=seams, complete=claim.success is True)
+    finding = check_played(due, played, seams=seams, complete=claim.success is not False)
     if chosen:
         said = f"{finding.detail}; only {len(chosen)} topics were recorded"
         return Finding(finding.name, finding.holds, said)
@@ -220,5 +220,5 @@ def _check_closed(recording: Objective) -> Finding:
     if closing.get("lost") != "0":
         return Finding("closed", False, f"the recorder lost {closing.get('lost', 'unknown')[:20]} messages")
     if RECOVERED in recording.metadata:
-        return Finding("closed", None, "the agent crashed and continued: the last second before the crash is missing")
+        return Finding("closed", None, "the agent crashed and continued: the last second before may be missing")
     return Finding("closed", True, "the recorder closed it and had lost nothing")

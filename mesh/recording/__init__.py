@@ -21,13 +21,13 @@ from mesh.recording.objective import (
     rates_of,
 )
 from mesh.recording.packing import InvalidLine, PackSummary, bag_to_mcap, messages_in, pack
-from mesh.recording.partial import ABOUT, CLOSED, RECOVERED, RecoverySummary, recover
+from mesh.recording.partial import ABOUT, CLOCK_RECORD, CLOSED, RecordingAbout
 from mesh.recording.playback import (
     AtOnce,
-    Clock,
     FixedRate,
     MonotonicClock,
     Pace,
+    PlaybackClock,
     RecordedTimes,
     Step,
     paced,
@@ -35,18 +35,20 @@ from mesh.recording.playback import (
     timeline,
 )
 from mesh.recording.preflight import Preflight, preflight
-from mesh.recording.recorder import Recorder, Recorders, RecorderSettings, RecordingAbout, RecordingSummary
+from mesh.recording.recorder import Recorder, RecorderSettings, RecordingSummary
+from mesh.recording.recorders import Recorders
+from mesh.recording.recovery import RECOVERED, RecoverySummary, recover
 from mesh.recording.source import Attachment, RecordingStatistics
 
 __all__ = [
     "ABOUT",
+    "CLOCK_RECORD",
     "CLOSED",
     "GENEROUS",
     "RECOVERED",
     "AtOnce",
     "Attachment",
     "ChannelMessage",
-    "Clock",
     "CorruptRecording",
     "FixedRate",
     "InvalidLine",
@@ -56,6 +58,7 @@ __all__ = [
     "Objective",
     "Pace",
     "PackSummary",
+    "PlaybackClock",
     "Played",
     "Preflight",
     "RecordedTimes",

@@ -270,11 +270,11 @@ class McapWriter:
         )
 
 
-def check_message(topic: str, payload: object, log_time_ns: object, publish_time_ns: object) -> None:
+def check_message(topic: str, payload: object, *times_ns: object) -> None:
     """Raise `Unrecordable` for a message that no record can hold."""
     if not isinstance(payload, bytes):
         raise Unrecordable(f"a payload must be bytes, not {payload.__class__.__name__}")
-    for moment in (log_time_ns, publish_time_ns):
+    for moment in times_ns:
         if not isinstance(moment, int) or not 0 <= moment <= MAX_TIME:
             raise Unrecordable(f"{moment!r} is not a time in nanoseconds")
     _check_text(topic)

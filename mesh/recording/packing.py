@@ -27,7 +27,7 @@ from mesh.errors import InputError, InvalidKey
 from mesh.recording.limits import Limits
 from mesh.recording.mcap_writer import MAX_TIME, McapWriter
 from mesh.recording.objective import Played, open_source
-from mesh.recording.partial import copy_content
+from mesh.recording.recovery import copy_content
 from schemas.agent_keys import topic_chunks
 from schemas.errors import InvalidPayload
 from schemas.payloads import EMPTY, JSON, STRING, Empty, PayloadType, String, encode_value, payload_type

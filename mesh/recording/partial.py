@@ -9,26 +9,21 @@ from __future__ import annotations
 
 import fcntl
 import os
-import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, BinaryIO, Final, Literal, Self, TypeAlias, get_args
 
-from mcap.opcode import Opcode
-
-from mesh.content.files import atomic_file, sync_directory
-from mesh.recording.errors import CorruptRecording, NotARecording, RecordingExists, Unrecordable
-from mesh.recording.limits import Limits
-from mesh.recording.mcap_records import mcap_records
-from mesh.recording.mcap_source import McapReader
+from mesh.content.files import sync_directory
+from mesh.recording.errors import NotARecording, RecordingExists, Unrecordable
 from mesh.recording.mcap_writer import McapWriter
+from mesh.recording.recovery import RECOVERED, copy_content, last_time, readable_part
 from schemas.payloads import EMPTY, PayloadType
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
     from pathlib import Path
 
-    from mesh.content import Progress
+    from mesh.clock import Clock
     from mesh.recording.mcap_writer import WriterChannel
     from mesh.recording.source import RecordingSource
 
@@ -38,22 +33,12 @@ ABOUT: Final = "aira"
 """Name of the metadata record with the job that the recording belongs to."""
 CLOSED: Final = "aira-closed"
 """Name of the metadata record that is written last."""
-RECOVERED: Final = "aira-recovered"
-"""Name of the metadata record that marks a file, or its first part, as recovered."""
-PROGRESS_EVERY: Final = 1000
-"""Messages between two calls of `progress`."""
+CLOCK_RECORD: Final = "aira-clock"
+"""Name of the metadata record with the time of day at which each part of the file began.
 
-_NO_LIMIT: Final = 1 << 62
-_UNLIMITED: Final = Limits(
-    size=_NO_LIMIT,
-    expanded=_NO_LIMIT,
-    bz2=_NO_LIMIT,
-    record=1 << 30,
-    definitions=1 << 30,
-    channels=_NO_LIMIT,
-    messages=_NO_LIMIT,
-    blocks=_NO_LIMIT,
-)
+`unix_ns` is that time by the machine's clock, `log_ns` the log time that stands for it; a value for each part.
+"""
+
 _ROLES: Final[Mapping[MessageRole, Mapping[str, str]]] = {role: {"role": role} for role in get_args(MessageRole)}
 
 
@@ -65,12 +50,18 @@ A plain tuple, since there may be hundreds of thousands a second.
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecoverySummary:
-    """What was recovered: `messages` messages, in the file at `path`. `why` says why not more; empty if all were."""
+class RecordingAbout:
+    """The job that a recording belongs to: the content of its metadata record `aira`. Any field may be empty.
 
-    path: Path
-    messages: int
-    why: str
+    `topics` are the recorded topics, separated by commas; empty for all.
+    """
+
+    liability: str = ""
+    agent: str = ""
+    lighthouse: str = ""
+    objective: str = ""
+    software: str = ""
+    topics: str = ""
 
 
 class PartialFile:
@@ -80,10 +71,11 @@ class PartialFile:
     file exists or another process is writing it, and `OSError`.
     """
 
-    def __init__(self, final: Path) -> None:
+    def __init__(self, final: Path, clock: Clock) -> None:
         if final.exists():
             raise RecordingExists(final)
         self._final = final
+        self._clock = clock
         self._part = final.with_name(f"{final.name}.part")
         self._cut = final.with_name(f"{final.name}.cut")
         final.parent.mkdir(parents=True, exist_ok=True)
@@ -92,7 +84,6 @@ class PartialFile:
         self._writer = McapWriter(self._stream)
         self._channels: dict[str, tuple[PayloadType, MessageRole, WriterChannel]] = {}
         """The channel of the last message on each topic: the next one most likely has the same type and role."""
-        self._unflushed_since: float | None = None
         self._unsynced_since: float | None = None
         self.recovered = 0
 
@@ -102,149 +93,100 @@ class PartialFile:
     def __exit__(self, *exc_info: object) -> None:
         self._stream.close()
 
-    def begin(self, about: Mapping[str, str]) -> None:
-        """Write the metadata `about`, and the messages of an interrupted recording of the same name."""
-        self._writer.add_metadata(ABOUT, about)
-        if self._cut.exists():
-            self._writer.add_metadata(RECOVERED, self._copy_cut())
-            self.recovered = self._writer.messages
-        self._sync()
+    @property
+    def messages(self) -> int:
+        """How many messages it has."""
+        return self._writer.messages
+
+    def begin(self, about: RecordingAbout) -> int:
+        """Write the metadata `about`, and the messages of an interrupted recording of the same name.
+
+        Returns the log time of this moment: the time of day, unless that is before the last message. Closes the file
+        if it fails.
+        """
+        try:
+            return self._begin(about)
+        except BaseException:
+            self._stream.close()
+            raise
+
+    def _begin(self, about: RecordingAbout) -> int:
+        self._writer.add_metadata(ABOUT, asdict(about))
+        cut = self._copy_cut() if self._cut.exists() else None
+        self.recovered = self.messages
+        unix_ns = self._clock.time_ns()
+        log_ns = max(unix_ns, 0 if cut is None else last_time(cut))
+        earlier = {} if cut is None else cut.metadata.get(CLOCK_RECORD, {})
+        times = {"unix_ns": unix_ns, "log_ns": log_ns}
+        self._writer.add_metadata(
+            CLOCK_RECORD, {name: f"{earlier.get(name, '')},{time}".lstrip(",") for name, time in times.items()}
+        )
+        self.sync()
         self._cut.unlink(missing_ok=True)
         sync_directory(self._final.parent)
+        return log_ns
 
-    def add(self, messages: Iterable[PendingMessage]) -> list[Unrecordable]:
-        """Write messages in their order. Returns an error for each that no file can hold. Raises `OSError`."""
-        refused: list[Unrecordable] = []
-        for topic, payload, type, role, log_time_ns, publish_time_ns in messages:
+    def add(self, messages: Iterable[PendingMessage]) -> list[tuple[PendingMessage, Unrecordable]]:
+        """Write messages in their order. Returns those that no file can hold, and why. Raises `OSError`."""
+        refused: list[tuple[PendingMessage, Unrecordable]] = []
+        for message in messages:
+            topic, payload, type, role, log_time_ns, publish_time_ns = message
             known = self._channels.get(topic)
             if known is None or known[0] is not type or known[1] != role:
                 try:
                     channel = self._writer.channel(topic, _type_to_write(type), _ROLES[role])
                 except Unrecordable as error:
-                    refused.append(error)
+                    refused.append((message, error))
                     continue
                 known = self._channels[topic] = (type, role, channel)
             self._writer.write(known[2], payload, log_time_ns, publish_time_ns)
-        if self._unflushed_since is None:
-            self._unflushed_since = time.monotonic()
-            if self._unsynced_since is None:
-                self._unsynced_since = self._unflushed_since
+        if self._unsynced_since is None:
+            self._unsynced_since = self._clock.monotonic()
         return refused
 
-    def seconds_until_due(self, flush: float, sync: float) -> float | None:
-        """Seconds until `flush_if_due` has something to do; None if everything is on the disk."""
-        due = [
-            since + every
-            for since, every in ((self._unflushed_since, flush), (self._unsynced_since, sync))
-            if since is not None
-        ]
-        return max(0.0, min(due) - time.monotonic()) if due else None
+    def seconds_until_due(self, every: float) -> float | None:
+        """Seconds until `sync_if_due` has something to do; None if everything is on the disk."""
+        if self._unsynced_since is None:
+            return None
+        return max(0.0, self._unsynced_since + every - self._clock.monotonic())
 
-    def flush_if_due(self, flush: float, sync: float) -> None:
-        """Flush messages older than `flush` seconds to the operating system, older than `sync` seconds to the disk."""
-        now = time.monotonic()
-        if self._unsynced_since is not None and now >= self._unsynced_since + sync:
-            self._sync()
-        elif self._unflushed_since is not None and now >= self._unflushed_since + flush:
-            self._writer.flush()
-            self._unflushed_since = None
+    def sync_if_due(self, every: float) -> None:
+        """Sync messages older than `every` seconds to the disk."""
+        if self.seconds_until_due(every) == 0:
+            self.sync()
 
     def finish(self, closing: Mapping[str, str]) -> tuple[int, int]:
         """End the file, sync it and give it its final name. Returns its numbers of messages and bytes."""
         messages = self._writer.messages
         self._writer.add_metadata(CLOSED, {"messages": str(messages), **closing})
         self._writer.finish()
-        self._sync()
+        self.sync()
         self._part.rename(self._final)
         sync_directory(self._final.parent)
         return messages, self._stream.tell()
 
-    def _copy_cut(self) -> dict[str, str]:
-        """Copy the readable part of the interrupted recording, and return the metadata to write about it.
+    def sync(self) -> None:
+        """Write everything to the disk."""
+        self._writer.flush()
+        os.fsync(self._stream.fileno())
+        self._unsynced_since = None
+
+    def _copy_cut(self) -> RecordingSource | None:
+        """Copy the readable part of the interrupted recording, and write the metadata about it; None if it has none.
 
         `seams` are the numbers of messages after which a recorder continued, one for each interruption.
         """
         try:
             source, why = readable_part(self._cut)
         except NotARecording:
-            return {"messages": "0", "seams": "0", "why": "none of it had reached the disk"}
+            why = "none of it had reached the disk"
+            self._writer.add_metadata(RECOVERED, {"messages": "0", "seams": "0", "why": why})
+            return None
         copy_content(source, self._writer)
-        messages, earlier = str(self._writer.messages), source.metadata.get(RECOVERED, {}).get("seams", "")
-        return {"messages": messages, "seams": f"{earlier},{messages}".lstrip(","), "why": why}
-
-    def _sync(self) -> None:
-        self._writer.flush()
-        self._stream.flush()
-        os.fsync(self._stream.fileno())
-        self._unflushed_since = self._unsynced_since = None
-
-
-def recover(path: Path, target: Path | None = None) -> RecoverySummary:
-    """Write the readable beginning of the MCAP file at `path` to a new, complete file; the old one is unchanged.
-
-    Without `target` that is `NAME.mcap` for `NAME.mcap.part`, else `NAME.recovered.mcap`. Messages, channels, schemas,
-    metadata and attachments are kept; the metadata record `aira-recovered` says what was recovered. Reading stops at
-    the first record that is cut off or has a wrong checksum. Blocks on the disk.
-
-    Raises `NotARecording` if it is not an MCAP file, `RecordingExists` if `target` exists, and `OSError`.
-    """
-    final = target or _name_for(path)
-    if final.exists():
-        raise RecordingExists(final)
-    source, why = readable_part(path)
-    with atomic_file(final) as stream:
-        writer = McapWriter(stream)
-        for name, values in source.metadata.items():
-            writer.add_metadata(name, values)
-        copy_content(source, writer)
-        writer.add_metadata(RECOVERED, {"messages": str(writer.messages), "why": why})
-        writer.finish()
-    return RecoverySummary(path=final, messages=writer.messages, why=why)
-
-
-def readable_part(path: Path) -> tuple[RecordingSource, str]:
-    """The readable beginning of an MCAP file, and why reading stopped there; empty if nothing is missing.
-
-    Raises `NotARecording` if it does not begin as an MCAP file, and `OSError`.
-    """
-    why = ""
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        reader = McapReader(path, file, _UNLIMITED)
-        try:
-            for header in mcap_records(path, file, size):
-                if header.opcode == Opcode.DATA_END:
-                    break
-                reader.read(header)
-        except CorruptRecording as error:
-            why = error.why
-    return reader.source(size), why
-
-
-def copy_content(source: RecordingSource, writer: McapWriter, *, progress: Progress | None = None) -> None:
-    """Write all messages of a source, in file order and on equal channels, and its attachments."""
-    with source.path.open("rb") as stream:
-        for attachment in source.attachments:
-            stream.seek(attachment.offset)
-            writer.add_attachment(attachment, stream.read(attachment.size))
-    total = sum(segment.count for segment in source.segments)
-    for done, (number, sequence, log_time, publish_time, payload) in enumerate(source.in_file_order(), 1):
-        channel = source.channels[number]
-        writer.add(
-            channel.topic,
-            payload,
-            channel.type,
-            metadata=channel.metadata,
-            log_time_ns=log_time,
-            publish_time_ns=publish_time,
-            sequence=sequence,
-        )
-        if progress is not None and (done % PROGRESS_EVERY == 0 or done == total):
-            progress(done, total)
-
-
-def _name_for(path: Path) -> Path:
-    return path.with_suffix("") if path.suffix == ".part" else path.with_suffix(".recovered.mcap")
+        messages, earlier = str(self.messages), source.metadata.get(RECOVERED, {}).get("seams", "")
+        seams = f"{earlier},{messages}".lstrip(",")
+        self._writer.add_metadata(RECOVERED, {"messages": messages, "seams": seams, "why": why})
+        return source
 
 
 def _set_aside(final: Path, part: Path, cut: Path) -> None:

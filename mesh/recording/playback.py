@@ -81,7 +81,7 @@ class Step(Struct, frozen=True):
     message: Played
 
 
-class Clock(Protocol):
+class PlaybackClock(Protocol):
     """A monotonic clock, in nanoseconds."""
 
     def now_ns(self) -> int:
@@ -119,7 +119,7 @@ def timeline(messages: Iterable[Played], pace: Pace, *, first_index: int = 0, st
 
 
 async def paced(
-    messages: AsyncIterable[Played], pace: Pace, clock: Clock, *, first_index: int = 0, start_ns: int = 0
+    messages: AsyncIterable[Played], pace: Pace, clock: PlaybackClock, *, first_index: int = 0, start_ns: int = 0
 ) -> AsyncGenerator[Step, None]:
     """Each step of the `timeline` of `messages` when it is due by `clock`, never earlier.
 
@@ -149,7 +149,7 @@ async def play(
     pace: Pace = _AS_RECORDED,
     start_index: int = 0,
     start_ns: int = 0,
-    clock: Clock = _CLOCK,
+    clock: PlaybackClock = _CLOCK,
 ) -> AsyncGenerator[Step, None]:
     """Play an objective: each of its messages when it is due.
 

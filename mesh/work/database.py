@@ -25,7 +25,8 @@ CREATE TABLE IF NOT EXISTS jobs (
     position INTEGER NOT NULL DEFAULT 0,
     note TEXT NOT NULL DEFAULT '',
     aside INTEGER NOT NULL DEFAULT 0,
-    changed REAL NOT NULL
+    changed REAL NOT NULL,
+    recorded INTEGER NOT NULL DEFAULT 0
 );
 CREATE TABLE IF NOT EXISTS outbox (
     identity TEXT PRIMARY KEY,
@@ -136,6 +137,8 @@ class Database:
         if version > VERSION:
             raise LedgerTooNew(self._path, found=version, known=VERSION)
         await self._opened().executescript(SCHEMA)
+        if "recorded" not in [row[1] for row in await self.rows("PRAGMA table_info (jobs)")]:
+            await self.run("ALTER TABLE jobs ADD COLUMN recorded INTEGER NOT NULL DEFAULT 0")
         await self.run(f"PRAGMA user_version = {VERSION}")
 
     def _opened(self) -> aiosqlite.Connection:

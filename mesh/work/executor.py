@@ -16,9 +16,11 @@ from msgspec.structs import replace
 
 from mesh.errors import AiraError, ClosedError, ContentError, InputError
 from mesh.log_context import liability_context, log_event, with_liability_context
+from mesh.recording import RecordingFailed
 from mesh.work.database import LedgerUnusable
 from mesh.work.ledger import STARTABLE, TO_BE_DONE, Phase, WrongPhase, advance
 from mesh.work.outbox import outgoing
+from mesh.work.run import RecordingIncomplete
 from schemas import Result
 
 if TYPE_CHECKING:
@@ -132,7 +134,7 @@ class Executor:
             job = await self._startable(address, asked="start")
             if job.phase is not Phase.READY:
                 raise WrongPhase(address, asked="start", phase=job.phase)
-            await self._begin(job, 0)
+            await self._begin(job)
 
     @with_liability_context
     async def restart(self, address: str) -> None:
@@ -142,9 +144,9 @@ class Executor:
             job = await self._startable(address, asked="restart")
             await self._playbacks.suspend(address)
             # In this order: after a crash in between, the position must not be past what the recording holds.
-            await self._ledger.set_position(address, 0)
+            await self._ledger.set_position(address, 0, recorded=0)
             await asyncio.to_thread(self._playbacks.discard_recording, address)
-            await self._begin(job, 0)
+            await self._begin(replace(job, position=0, recorded=0))
 
     @with_liability_context
     async def resume(self, address: str) -> None:
@@ -154,7 +156,7 @@ class Executor:
             job = await self._startable(address, asked="resume")
             if self._playbacks.run(address) is not None:
                 raise WrongPhase(address, asked="resume", phase=job.phase)
-            await self._begin(job, job.position)
+            await self._begin(job)
 
     async def read(self, address: str) -> Liability:
         """The record of a job's liability as the ledger has it. Raises `WrongPhase` for a liability without a job."""
@@ -167,14 +169,18 @@ class Executor:
     async def finish(self, address: str, *, success: bool, note: str = "") -> str:
         """End a job: close the recording, put it in the store, sign and send the Result. Returns the recording's CID.
 
-        `note` says why the job failed, in the recording and the ledger. The recording of a job that never started holds
-        only the note. Raises `WrongPhase` if the job has ended already.
+        `note` says why the job failed, in the recording and the ledger. A job whose recording lacks what was played
+        ends without success. Raises `WrongPhase` if the job has ended already.
         """
         async with self._changing:
             job = await self._job(address, asked="finish")
             advance(address, job.phase, Phase.COMPLETE)
-            run = await self._playbacks.stop(address) or await self._playbacks.create(job.liability)
+            stopped = await self._playbacks.stop(address)
+            run = stopped or await self._playbacks.create(job.liability, recorded=job.recorded)
             summary = await run.close(note)
+            if success and (missing := run.missing + summary.lost_played):
+                success, note = False, str(RecordingIncomplete(address, missing))
+                log.error("%s", note, extra=log_event("recording-incomplete", missing=missing))
             cid = await asyncio.to_thread(self._store.put_file, summary.path, pin=address)
             await self.owe_result(address, success=success, result=cid, note=note)
             await asyncio.to_thread(summary.path.unlink, missing_ok=True)
@@ -226,13 +232,9 @@ class Executor:
         async with self._changing:
             return self._playbacks.task(address)
 
-    async def _begin(self, job: JobRecord, position: int) -> None:
-        liability, objective = job.liability, self._fetched[job.liability.address]
-        facts = log_event("job-started", position=position, count=objective.count)
-        log.info("running, from message %d of %d", position, objective.count, extra=facts)
-        await self._playbacks.begin(
-            liability, objective, position=position, play=self._run_job, tasks=self._task_group()
-        )
+    async def _begin(self, job: JobRecord) -> None:
+        objective = self._fetched[job.liability.address]
+        await self._playbacks.begin(job, objective, play=self._run_job, tasks=self._task_group())
 
     async def _run_job(self, run: JobRun) -> None:
         """Play a run. With handlers, or when it fails, the job then finishes; else the run stays open."""
@@ -240,13 +242,12 @@ class Executor:
         try:
             await self._on_phase(Phase.RUNNING, run.liability)
             await self._playbacks.play_and_save(run, None if self._handlers is None else self._handlers.handle)
-        except LedgerUnusable:  # not the job's fault: it is resumed when the ledger is usable
+        except (LedgerUnusable, RecordingFailed):  # the job goes on when the disk is usable
             raise
         except Exception as error:
             success, note = False, str(error) or type(error).__name__
             facts = log_event("job-failed", code=getattr(error, "code", ""))
             log.warning("the job failed: %s", note, exc_info=not isinstance(error, AiraError), extra=facts)
-        await self._ledger.set_position(address, run.position)
         if self._handlers is not None or not success:
             await self._unless_ended(self.finish(address, success=success, note=note))
 

@@ -81,7 +81,7 @@ class JobRecord(msgspec.Struct, frozen=True, kw_only=True):
     """A job as the ledger holds it.
 
     `success` and `result` (CIDv0 of the recording) are set from COMPLETE on. `position` counts the objective's messages
-    that were played. `note` says why a job failed.
+    that were played; its recording had `recorded` messages on the disk then. `note` says why a job failed.
     """
 
     liability: Liability
@@ -89,6 +89,7 @@ class JobRecord(msgspec.Struct, frozen=True, kw_only=True):
     success: bool | None
     result: str | None
     position: int
+    recorded: int
     note: str
 
 
@@ -138,9 +139,14 @@ class Ledger:
             (phase, position, time.time(), liability),
         )
 
-    async def set_position(self, liability: str, position: int) -> None:
-        """Set how many messages the job at `liability` (address) has played."""
-        await self._database.run("UPDATE jobs SET position = ? WHERE liability = ?", (position, liability))
+    async def set_position(self, liability: str, position: int, *, recorded: int) -> None:
+        """Set how many messages the job at `liability` (address) has played.
+
+        Its recording must already have `recorded` messages on the disk, and with them all that were played.
+        """
+        await self._database.run(
+            "UPDATE jobs SET position = ?, recorded = ? WHERE liability = ?", (position, recorded, liability)
+        )
 
     async def complete(self, liability: str, *, success: bool, result: str, note: str, outgoing: Outgoing) -> None:
         """Set the job's outcome and keep its signed Result for sending: both or, if this is cancelled, neither."""
@@ -240,6 +246,7 @@ def _job(row: Any) -> JobRecord:
         success=None if row[3] is None else bool(row[3]),
         result=row[4],
         position=row[5],
+        recorded=row[9],
         note=row[6],
     )
 

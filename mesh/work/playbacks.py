@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import time
 from contextvars import ContextVar, copy_context
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import mesh
+from mesh.background import Background
 from mesh.errors import AiraError, InputError
 from mesh.log_context import liability_context, log_event
 from mesh.recording import AtOnce, Limits, RecordedTimes, Recorders, RecordingAbout, preflight
 from mesh.settings import LONGEST
 from mesh.work.ledger import Phase
-from mesh.work.run import JobRun
+from mesh.work.run import JobRun, RecordingIncomplete
 
 if TYPE_CHECKING:
     from asyncio import TaskGroup
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from mesh.recording import Objective, Pace, Recorder
     from mesh.settings import ContentSettings, ExecutionSettings
     from mesh.work.job import TopicHandlers
-    from mesh.work.ledger import Ledger
+    from mesh.work.ledger import JobRecord, Ledger
     from mesh.work.run import Handle
     from schemas import Liability
 
@@ -39,7 +39,7 @@ FETCHES: Final = 32
 PREFLIGHTS: Final = 1
 """Objectives checked at once: a check uses one core, and up to 256 MiB of memory for a malicious file."""
 SAVE_INTERVAL: Final = 0.5
-"""Seconds between two writes of a run's position to the ledger."""
+"""Seconds after which a run's recording is synced and its position saved, again and again: what a crash repeats."""
 
 _playing: ContextVar[str] = ContextVar("playing", default="")
 """The job whose playback, or handler, is the running code."""
@@ -107,10 +107,12 @@ class Playbacks:
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self.recorders = Recorders()
 
-    async def create(self, liability: Liability, objective: Objective | None = None, *, position: int = 0) -> JobRun:
+    async def create(
+        self, liability: Liability, objective: Objective | None = None, *, position: int = 0, recorded: int = 0
+    ) -> JobRun:
         """A run of `objective` from the message at `position`; without an objective, one that only records.
 
-        It continues the recording of an interrupted run of the same liability.
+        It continues the recording of an interrupted run of the same liability, which had synced `recorded` messages.
         """
         return JobRun(
             self._session,
@@ -121,20 +123,23 @@ class Playbacks:
             pace=self._pace,
             position=position,
             recorded=self._recorded,
+            earlier=recorded,
         )
 
     async def begin(
         self,
-        liability: Liability,
+        job: JobRecord,
         objective: Objective,
         *,
-        position: int,
         play: Callable[[JobRun], Coroutine[Any, Any, None]],
         tasks: TaskGroup,
     ) -> None:
         """Open a run of a job, write to the ledger that it is running, and `play` it in one of `tasks`."""
-        address = liability.address
-        run = self._runs[address] = await self.create(liability, objective, position=position)
+        address, position = job.liability.address, job.position
+        facts = log_event("job-started", position=position, count=objective.count)
+        log.info("running, from message %d of %d", position, objective.count, extra=facts)
+        run = await self.create(job.liability, objective, position=position, recorded=job.recorded)
+        self._runs[address] = run
         await self._ledger.set_phase(address, Phase.RUNNING, position=position)
         run.open()
         context = copy_context()
@@ -143,16 +148,30 @@ class Playbacks:
         task.add_done_callback(partial(self._drop_task, address))
 
     async def play_and_save(self, run: JobRun, handle: Handle | None) -> None:
-        """Play a run to its end, and keep its position in the ledger. Raises what `handle` raises."""
-        address, saved = run.liability.address, time.monotonic()
+        """Play a run to its end, and keep in the ledger how far its recording on the disk reaches.
 
-        async def save(position: int) -> None:
-            nonlocal saved
-            if time.monotonic() - saved >= SAVE_INTERVAL:
-                saved = time.monotonic()
-                await self._ledger.set_position(address, position)
+        Raises what `handle` raises, `RecordingFailed`, `LedgerUnusable`, and at once `RecordingIncomplete`.
+        """
+        if run.missing:
+            raise RecordingIncomplete(run.liability.address, run.missing)
+        async with Background() as tasks:
+            tasks.start(self._save_regularly(run), f"position {run.liability.address}")
+            await run.play(handle)
+        await self._save(run)
 
-        await run.play(handle, progress=save)
+    async def _save_regularly(self, run: JobRun) -> None:
+        saved = run.position
+        while True:
+            await asyncio.sleep(SAVE_INTERVAL)
+            if run.position > saved:
+                saved = await self._save(run)
+
+    async def _save(self, run: JobRun) -> int:
+        """Sync the recording of a run, then save its position; returns that. A run that was stopped saves nothing."""
+        synced, address = await run.sync(), run.liability.address
+        if self._runs.get(address) is run:
+            await self._ledger.set_position(address, synced.position, recorded=synced.messages)
+        return synced.position
 
     def run(self, address: str) -> JobRun | None:
         """The open run of a job."""
@@ -170,13 +189,11 @@ class Playbacks:
         return self._runs.pop(address, None)
 
     async def suspend(self, address: str) -> None:
-        """Stop the run of a job, save its position and close it, so that another run can continue it."""
+        """Stop the run of a job, close it and save its position, so that another run can continue it."""
         run = await self.stop(address)
         if run is not None:
-            try:
-                await self._ledger.set_position(address, run.position)
-            finally:
-                await run.close()
+            summary = await run.close()
+            await self._ledger.set_position(address, run.position, recorded=summary.messages)
 
     async def suspend_all(self) -> None:
         """Suspend all runs. A position that can't be saved is logged."""

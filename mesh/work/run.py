@@ -7,10 +7,11 @@ import contextlib
 import logging
 import secrets
 import threading
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import zenoh
 
+from mesh.errors import AiraError
 from mesh.log_context import log_event
 from mesh.recording import AtOnce, Unrecordable, play
 from mesh.work.job import HandlerCancelled, Job
@@ -36,11 +37,30 @@ FLUSH: Final = "aira/flush"
 """Encoding of the message that a run sends to itself to know that it has received everything before it."""
 
 
+class RecordingIncomplete(AiraError, code="recording-incomplete"):
+    """A job's recording lacks messages that were played, so the job is not a success. `missing` is how many."""
+
+    def __init__(self, liability: str, missing: int) -> None:
+        super().__init__(
+            f"the recording of {liability} lacks {missing} messages that the disk had, or that were played"
+        )
+        self.liability = liability
+        self.missing = missing
+
+
+class SyncedRun(NamedTuple):
+    """What of a run is on the disk: `messages` are recorded, and with them all of the objective up to `position`."""
+
+    position: int
+    messages: int
+
+
 class JobRun(Job):
     """A job while it is worked on: `open`, then `play` once, then `close`. It can't be used again after `close`.
 
     It plays `objective`, if there is one, from the message at `position`, and records the topics in `recorded` (None:
     all). It owns the `recorder`; what arrives on the job's topics is recorded in Zenoh's thread, past the event loop.
+    An interrupted run that it continues had synced `earlier` messages.
     """
 
     def __init__(
@@ -54,13 +74,13 @@ class JobRun(Job):
         pace: Pace | None = None,
         position: int = 0,
         recorded: frozenset[str] | None = None,
+        earlier: int = 0,
     ) -> None:
         super().__init__(session, agent, liability, position=position)
         self._recorder = recorder
         self._objective = objective
         self._types = _described(objective)
-        self._marker = secrets.token_bytes(16)
-        self._flushed = threading.Event()
+        self._markers: dict[bytes, threading.Event] = {}
         self._queue: asyncio.Queue[Played | None] = asyncio.Queue(QUEUED)
         self._player: asyncio.Task[None] | None = None
         self._closing = False
@@ -70,6 +90,8 @@ class JobRun(Job):
         """The topics that are recorded; None for all."""
         self.unrecordable = 0
         """Messages on the job's topics that could not be recorded."""
+        self.missing = max(0, earlier - recorder.recovered)
+        """Messages of the interrupted run that are no longer on the disk, although they were synced."""
         if objective is not None:
             self.topics = frozenset(topic.name for topic in objective.topics)
 
@@ -78,28 +100,33 @@ class JobRun(Job):
         selector = topic_selector(self._agent, self.liability.address)
         self._subscriber = self._session.declare_subscriber(selector, self._receive)
 
-    async def play(
-        self,
-        handle: Handle | None,
-        *,
-        progress: Callable[[int], Awaitable[None]],
-    ) -> None:
+    async def play(self, handle: Handle | None) -> None:
         """Play the objective to its end, each message at its time. Returns when the last one is handled.
 
-        Each message goes to the mesh, into the recording and to `handle`, one after the other; then `progress` gets the
-        new position. Raises what `handle` raises. If the run is closed meanwhile (`handle` may do that), it returns
-        after the message that is being handled.
+        Each message goes into the recording, to the mesh and to `handle`, one after the other; then it counts in
+        `position`. Raises what `handle` raises. If the run is closed meanwhile (`handle` may do that), it returns after
+        the message that is being handled.
         """
         failed: BaseException | None = None
         try:
             async with asyncio.TaskGroup() as tasks:
                 if not self._closing:
                     self._player = tasks.create_task(self._publish_messages(), name=f"player {self.liability.address}")
-                tasks.create_task(self._handle_all(handle, progress), name=f"handlers {self.liability.address}")
+                tasks.create_task(self._handle_all(handle), name=f"handlers {self.liability.address}")
         except ExceptionGroup as group:
             failed = group.exceptions[0]
         if failed is not None:
             raise failed
+
+    async def sync(self) -> SyncedRun:
+        """Sync the recording of all messages that were handled, and of what their handlers published.
+
+        Raises `RecordingFailed`.
+        """
+        position = self.position
+        if self._subscriber is not None:
+            await asyncio.to_thread(self._receive_sent)
+        return SyncedRun(position, await asyncio.wrap_future(self._recorder.sync()))
 
     async def close(self, note: str = "") -> RecordingSummary:
         """Close the recording, which has everything that was received before. `note` is written at its end."""
@@ -118,6 +145,8 @@ class JobRun(Job):
         assert self._objective is not None, "a run without an objective only records"
         async for step in play(self._objective, pace=self.pace, start_index=self.position):
             message = step.message
+            while self._recorder.is_behind:
+                await asyncio.wrap_future(self._recorder.sync())
             if self._is_recorded(message.topic):
                 self._recorder.record(message.topic, message.payload, message.type, role="objective")
             key = str(ObjectiveTopicKey(self._agent, self.liability.address, message.topic))
@@ -125,17 +154,12 @@ class JobRun(Job):
             await self._queue.put(message)
         await self._queue.put(None)
 
-    async def _handle_all(
-        self,
-        handle: Handle | None,
-        progress: Callable[[int], Awaitable[None]],
-    ) -> None:
+    async def _handle_all(self, handle: Handle | None) -> None:
         while (message := await self._queue.get()) is not None and not self._closing:
             if handle is not None:
                 self.playing = message
                 await self._handle_one(handle, message)
             self.position += 1
-            await progress(self.position)
 
     async def _handle_one(self, handle: Handle, message: Played) -> None:
         try:
@@ -150,8 +174,8 @@ class JobRun(Job):
     def _receive(self, sample: zenoh.Sample) -> None:
         """Zenoh's callback: record a message on the job's topics, or take the run's own marker."""
         encoding = str(sample.encoding)
-        if encoding == FLUSH and sample.payload.to_bytes() == self._marker:
-            self._flushed.set()
+        if encoding == FLUSH and (flushed := self._markers.pop(sample.payload.to_bytes(), None)) is not None:
+            flushed.set()
             return
         try:
             key = parse_agent_key(str(sample.key_expr))
@@ -173,14 +197,21 @@ class JobRun(Job):
         return self.recorded is None or topic in self.recorded
 
     def _unsubscribe(self) -> None:
-        """Samples reach a subscriber in order: once it has the marker, it has everything that was sent before."""
+        self._receive_sent()
         subscriber, self._subscriber = self._subscriber, None
         with contextlib.suppress(zenoh.ZError):  # a broken session delivers nothing more
-            marker = LiabilityTopicKey(self._agent, self.liability.address, NOTE_TOPIC)
-            local = zenoh.Locality.SESSION_LOCAL
-            self._session.put(str(marker), self._marker, encoding=FLUSH, allowed_destination=local)
-            self._flushed.wait(timeout=5)
             subscriber.undeclare()
+
+    def _receive_sent(self) -> None:
+        """Return when everything that was sent before is received: samples reach a subscriber in order."""
+        marker, flushed = secrets.token_bytes(16), threading.Event()
+        self._markers[marker] = flushed
+        with contextlib.suppress(zenoh.ZError):
+            key = LiabilityTopicKey(self._agent, self.liability.address, NOTE_TOPIC)
+            local = zenoh.Locality.SESSION_LOCAL
+            self._session.put(str(key), marker, encoding=FLUSH, allowed_destination=local)
+            flushed.wait(timeout=5)
+        self._markers.pop(marker, None)
 
 
 def _described(objective: Objective | None) -> dict[tuple[str, str], PayloadType]:

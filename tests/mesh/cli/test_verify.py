@@ -23,7 +23,7 @@ from mesh.composition import load_account
 from mesh.errors import AiraError, InvalidAddress
 from mesh.settings import Settings
 from schemas import cid_of_bytes
-from tests.mesh.evidence.jobs import LIABILITY, OTHER, make_job
+from tests.mesh.evidence.jobs import LIABILITY, OTHER, WORDS, make_job
 from tests.support.commands import aira, refused
 from tests.support.development import settings_of
 from tests.support.listening import Listener
@@ -70,7 +70,13 @@ def test_a_failed_check_is_named_and_the_exit_code_is_1(job: JobFiles) -> None:
     assert done.exit_code == 1
     assert "FAILS  closed" in done.stdout
     assert "closed it with 11 messages, and it has 4" in done.stdout
-    assert done.stdout.splitlines()[-1].startswith("1 of 14 checks failed")
+    assert done.stdout.splitlines()[-1].startswith("2 of 14 checks failed")
+
+
+def test_unplayed_messages_fail_without_chain_and_network(tmp_path: Path) -> None:
+    done = verified(make_job(tmp_path, played=WORDS[:2]))
+    assert done.exit_code == 1
+    assert "FAILS  played" in done.stdout
 
 
 def test_an_address_is_compared_with_the_one_in_the_recording(job: JobFiles) -> None:

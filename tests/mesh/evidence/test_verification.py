@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import msgspec
 import pytest
 
+from mesh.clock import SYSTEM_CLOCK
+from mesh.evidence import Claim
 from mesh.recording import CLOSED, Recorder, RecordingAbout, open_objective
 from schemas import String, cid_of_bytes, cid_of_file
 from schemas.payloads import STRING
@@ -22,6 +24,7 @@ from tests.mesh.evidence.jobs import (
     renumbered,
     stop,
 )
+from tests.support.clocks import HOUR, NOON, SECOND, SetClock
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -238,16 +241,21 @@ def test_lost_messages_fail_the_closed_finding(tmp_path: Path) -> None:
     assert failures(job.verify())["closed"] == "the recorder lost 1 messages"
 
 
-def interrupted(tmp_path: Path, *parts: tuple[str, ...]) -> JobFiles:
-    """A job whose agent crashed after each of the parts but the last."""
+def interrupted(tmp_path: Path, *parts: tuple[str, ...], clocks: tuple[SetClock, ...] = ()) -> JobFiles:
+    """A job whose agent crashed after each of the parts but the last. Each clock is set back in its part."""
     job = make_job(tmp_path)
     about = {name: text for name, text in open_objective(job.result).metadata["aira"].items() if name != "software"}
     job.result.unlink()
     for number, words in enumerate(parts):
         if number:
             job.result.rename(f"{job.result}.part")
-        with Recorder(job.result, RecordingAbout(**about)) as recorder:
-            record(recorder, words)
+        clock = clocks[number] if clocks else SYSTEM_CLOCK
+        with Recorder(job.result, RecordingAbout(**about), clock=clock) as recorder:
+            for word in words:
+                record(recorder, (word,))
+                if isinstance(clock, SetClock):
+                    clock.pass_by(SECOND)
+                    clock.unix_ns -= HOUR
             if number == len(parts) - 1:
                 stop(recorder)
     job.claim = msgspec.structs.replace(job.claim, result=cid_of_file(job.result))
@@ -279,11 +287,31 @@ def test_a_job_continued_after_a_crash_holds(tmp_path: Path, parts: tuple[tuple[
     assert (played.holds, played.detail) == (True, detail)
 
 
-def test_messages_lost_in_a_crash_leave_the_finding_open(tmp_path: Path) -> None:
-    verdict = interrupted(tmp_path, WORDS[:2], WORDS[3:]).verify()
+@pytest.mark.parametrize(("success", "holds"), [(True, False), (None, False), (False, None)])
+def test_messages_lost_in_a_crash_refute_a_success(tmp_path: Path, success: bool | None, holds: bool | None) -> None:
+    """Unless the job is known to have failed: then they may be missing."""
+    job = interrupted(tmp_path, WORDS[:2], WORDS[3:])
+    verdict = job.verify(success=success)
     played = verdict.of("played")
     assert played is not None
-    assert (played.holds, played.detail[:40]) == (None, "1 messages are not in the recording: the")
+    assert (played.holds, played.detail[:40]) == (holds, "1 messages are not in the recording: the")
+    assert verdict.holds is (holds is None)
+
+
+def test_unplayed_messages_fail_if_nothing_is_known_of_the_job(tmp_path: Path) -> None:
+    job = make_job(tmp_path, played=WORDS[:2])
+    job.claim = Claim()
+    assert "only the first 2" in failures(job.verify())["played"]
+
+
+def test_a_clock_that_is_set_back_makes_no_honest_recording_fail(tmp_path: Path) -> None:
+    """By an hour while the robot works, and by another one before it continues after a crash."""
+    job = interrupted(tmp_path, WORDS[:3], WORDS[3:], clocks=(SetClock(), SetClock(NOON - 2 * HOUR)))
+    verdict = job.verify()
+    assert failures(verdict) == {}
+    times = verdict.of("times")
+    assert times is not None
+    assert times.holds
 
 
 def test_an_objective_that_is_not_a_recording_was_not_played(tmp_path: Path) -> None:

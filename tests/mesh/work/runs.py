@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 import zenoh
 
-from mesh.recording import AtOnce, RecordedTimes, Recorder, RecordingAbout, open_objective
+from mesh.recording import AtOnce, RecordedTimes, Recorder, RecorderSettings, RecordingAbout, open_objective
 from mesh.work.run import JobRun
 from tests.mesh.work.samples import liability
 from tests.support.routers import EmbeddedRouter, client_config
@@ -44,6 +44,7 @@ class Making:
         position: int = 0,
         topics: frozenset[str] | None = None,
         pace: AtOnce | RecordedTimes = AT_ONCE,
+        queue_bytes: int = 64 << 20,
     ) -> JobRun:
         """A run of the objective in `content`, not yet open."""
         played: Objective | None = None
@@ -54,7 +55,7 @@ class Making:
             self.session,
             AGENT,
             liability(),
-            Recorder(self.path, RecordingAbout()),
+            Recorder(self.path, RecordingAbout(), settings=RecorderSettings(queue_bytes=queue_bytes)),
             objective=played,
             pace=pace,
             position=position,

@@ -22,13 +22,6 @@ if TYPE_CHECKING:
 __all__ = ["making", "session"]
 
 
-class Positions(list[int]):
-    """Takes note of a run's progress."""
-
-    async def __call__(self, position: int) -> None:
-        self.append(position)
-
-
 async def test_only_chosen_topics_are_recorded_and_all_are_played(making: Making) -> None:
     run = making.run(objective(("/a", "a"), ("/b", "b")), topics=frozenset({"/a", "/said"}))
     run.open()
@@ -39,19 +32,23 @@ async def test_only_chosen_topics_are_recorded_and_all_are_played(making: Making
     async def note(_: Job, message: Played) -> None:
         performed.append(message.topic)
 
-    await run.play(note, progress=Positions())
+    await run.play(note)
     await run.close()
     assert performed == ["/a", "/b"]
     assert sorted(topic for topic, _, _ in making.recorded()) == ["/a", "/said"]
 
 
-async def test_progress_counts_the_handled_messages(making: Making) -> None:
+async def test_the_position_counts_the_handled_messages(making: Making) -> None:
     run = making.run(objective(("/a", "0"), ("/a", "1"), ("/a", "2")), position=1)
     run.open()
-    positions = Positions()
-    await run.play(None, progress=positions)
+    positions: list[int] = []
+
+    async def note(run: Job, _: Played) -> None:
+        positions.append(run.position)
+
+    await run.play(note)
     await run.close()
-    assert positions == [2, 3]
+    assert positions == [1, 2]
     assert run.position == 3
     assert [payload for _, payload, _ in making.recorded()] == [String("1").encode(), String("2").encode()]
 
@@ -69,7 +66,7 @@ async def test_the_handler_gets_one_message_after_the_other_and_sees_which(makin
         await asyncio.sleep(0.02)
         busy -= 1
 
-    await run.play(slow, progress=Positions())
+    await run.play(slow)
     await run.close()
 
 
@@ -81,7 +78,7 @@ async def test_a_failing_handler_stops_the_playback_with_its_error_and_its_cause
         raise ValueError("no") from KeyError("why")
 
     with pytest.raises(ValueError, match="no") as caught:
-        await run.play(fail, progress=Positions())
+        await run.play(fail)
     assert isinstance(caught.value.__cause__, KeyError)
     assert run.position == 0
     await run.close()
@@ -97,7 +94,7 @@ async def test_a_handler_that_ends_cancelled_fails_without_cancelling_the_playba
         await future
 
     with pytest.raises(HandlerCancelled):
-        await run.play(wait_for_what_is_cancelled, progress=Positions())
+        await run.play(wait_for_what_is_cancelled)
     await run.close()
 
 
@@ -114,7 +111,7 @@ async def test_cancelling_the_playback_cancels_the_handler_and_counts_handled_me
                 ended.append("cancelled")
                 raise
 
-    playing = asyncio.create_task(run.play(stay_at_the_second, progress=Positions()))
+    playing = asyncio.create_task(run.play(stay_at_the_second))
     await until(lambda: run.position == 1)
     playing.cancel()
     with pytest.raises(asyncio.CancelledError):
@@ -135,7 +132,7 @@ async def test_a_handler_may_close_its_own_run_and_is_the_last_to_be_called(maki
         await run.close("enough")
 
     async with asyncio.timeout(10):
-        await run.play(close, progress=Positions())
+        await run.play(close)
     assert calls == 1
     assert making.recorded()[-1] == (NOTE_TOPIC, String("enough").encode(), "ros1;std_msgs/String")
 
@@ -143,7 +140,7 @@ async def test_a_handler_may_close_its_own_run_and_is_the_last_to_be_called(maki
 async def test_a_run_that_is_closed_while_its_handler_waits_for_a_message_ends(making: Making) -> None:
     run = making.run(objective(("/a", "now"), ("/a", "much later"), step_ns=10**12), pace=RecordedTimes())
     run.open()
-    playing = asyncio.create_task(run.play(None, progress=Positions()))
+    playing = asyncio.create_task(run.play(None))
     await until(lambda: run.position == 1)
     await run.close()
     async with asyncio.timeout(10):

@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import time
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import pytest
 import zenoh
 
 from mesh.recording import json_type, open_objective
-from mesh.work.run import FLUSH, NOTE_TOPIC
+from mesh.recording.partial import PartialFile
+from mesh.work.run import FLUSH, NOTE_TOPIC, SyncedRun
 from schemas import Empty, String
 from tests.mesh.work.runs import AGENT, Making, making, session
 from tests.mesh.work.samples import liability
 from tests.support.bags import Bag, BagMessage
+from tests.support.objectives import objective
 from tests.support.routers import EmbeddedRouter, client_config
 from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from mesh.recording import Played
+    from mesh.work.job import Job
 
 __all__ = ["making", "session"]
 
@@ -76,6 +81,42 @@ async def test_a_type_that_the_objective_describes_is_recorded_with_that_descrip
     assert (topic.name, topic.type.schema_data) == ("/scanned", b"float32 angle\n")
 
 
+async def test_playing_waits_for_a_slow_disk_and_loses_nothing(making: Making, monkeypatch: pytest.MonkeyPatch) -> None:
+    add, waiting = PartialFile.add, list[int]()
+
+    def slowly(self: PartialFile, messages: list[Any]) -> Any:
+        waiting.append(len(messages))
+        time.sleep(0.02)
+        return add(self, messages)
+
+    monkeypatch.setattr(PartialFile, "add", slowly)
+    run = making.run(objective(*(("/blob", bytes(1000)) for _ in range(300))), queue_bytes=20_000)
+    run.open()
+    await run.play(None)
+    summary = await run.close()
+    assert (summary.messages, summary.lost) == (300, 0)
+    assert max(waiting) <= 20
+
+
+async def test_a_sync_has_what_was_handled_and_what_the_handlers_published(making: Making) -> None:
+    run = making.run(objective(*(("/say", str(number)) for number in range(100))))
+    run.open()
+    synced: list[SyncedRun] = []
+
+    async def say(job: Job, message: Played) -> None:
+        job.publish("/said", message.payload)
+        if job.position == 50:
+            synced.append(await run.sync())
+
+    await run.play(say)
+    ((position, messages),) = synced
+    assert position == 50
+    assert messages >= 101, "fifty were handled and answered, the next was played"
+    assert await run.sync() == (100, 200)
+    await run.close()
+    assert await run.sync() == (100, 200)
+
+
 async def test_messages_of_another_session_before_the_end_are_recorded(making: Making, device: zenoh.Session) -> None:
     run = making.run()
     run.open()
@@ -115,8 +156,9 @@ async def test_a_forged_end_mark_of_another_session_does_not_cut_the_recording(
         await until_heard(device, "aira/agent/*/liability/*/topic/y")
         device.put(f"{TOPICS}/x", b"arrived")
         await until(copies.try_recv)
-    assert not run._flushed.is_set()
+    run.publish("/last", b"mine")
     await run.close()
+    assert (b"mine") in [payload for _, payload, _ in making.recorded()]
     assert (b"arrived") in [payload for _, payload, _ in making.recorded()]
 
 

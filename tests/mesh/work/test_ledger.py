@@ -59,7 +59,7 @@ async def test_a_phase_without_position_keeps_the_position(ledger: Ledger) -> No
 async def test_a_position_keeps_the_phase(ledger: Ledger) -> None:
     await ledger.add_job(liability())
     await ledger.set_phase(liability().address, Phase.COMPLETE)
-    await ledger.set_position(liability().address, 3)
+    await ledger.set_position(liability().address, 3, recorded=5)
     job = await ledger.job(liability().address)
     assert job is not None
     assert (job.phase, job.position) == (Phase.COMPLETE, 3)

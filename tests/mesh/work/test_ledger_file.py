@@ -67,6 +67,19 @@ async def test_written_rows_survive_a_kill(path: Path) -> None:
     assert cursor >= last
 
 
+async def test_a_ledger_from_before_recordings_were_counted_is_usable(path: Path) -> None:
+    async with Ledger(path) as ledger:
+        await ledger.add_job(liability())
+    database = sqlite3.connect(path)
+    database.execute("ALTER TABLE jobs DROP COLUMN recorded")
+    database.close()
+    async with Ledger(path) as ledger:
+        assert [job.recorded for job in await ledger.jobs()] == [0]
+        await ledger.set_position(liability().address, 3, recorded=5)
+    async with Ledger(path) as ledger:
+        assert [(job.position, job.recorded) for job in await ledger.jobs()] == [(3, 5)]
+
+
 def version_of(path: Path) -> int:
     database = sqlite3.connect(path)
     version: int = database.execute("PRAGMA user_version").fetchone()[0]
