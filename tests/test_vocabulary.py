@@ -109,6 +109,21 @@ def test_the_documented_log_events_are_those_of_the_source() -> None:
     assert documented("Log events") == names
 
 
+def test_the_documented_codes_of_the_doctor_are_those_of_the_source() -> None:
+    codes = {"ok"}
+    for path, tree in sources():
+        for node in ast.walk(tree):
+            match node:
+                case ast.Call(func=ast.Name(id="passed" | "warning" | "failed"), keywords=keywords) if (
+                    "doctor/" in path or path.endswith("/check.py")
+                ):
+                    given = [keyword.value for keyword in keywords if keyword.arg == "code"]
+                    parts = [part for code in given for part in ast.walk(code)]
+                    codes |= {str(part.value) for part in parts if isinstance(part, ast.Constant)}
+
+    assert documented("Doctor") == codes
+
+
 @pytest.mark.parametrize(("path", "tree"), [pytest.param(path, tree, id=path) for path, tree in sources()])
 def test_every_log_event_has_a_stable_name(path: str, tree: ast.Module) -> None:
     functions: list[ast.AST] = [

@@ -53,6 +53,7 @@ async def check_swarm(settings: IpfsSettings) -> CheckResult:
         if not count:
             return warning(
                 "the daemon has no peers, so its messages reach no other node",
+                code="no-peers",
                 hint="name legacy nodes with --ipfs-swarm-connect /…/p2p/ID, or give the daemon internet access",
             )
         return passed(f"connected to {count} peer{'' if count == 1 else 's'}")

@@ -35,7 +35,9 @@ def checks(context: DoctorContext) -> list[Check]:
 def check_port(settings: SerialSettings) -> CheckResult:
     """Whether the port exists, may be used, and is not in use. Raises `PortMissing`, `InputError`."""
     if not settings.port:
-        return failed("no serial port is given", hint="give --port /dev/ttyACM0, or --port usb:VENDOR:PRODUCT")
+        return failed(
+            "no serial port is given", code="no-port", hint="give --port /dev/ttyACM0, or --port usb:VENDOR:PRODUCT"
+        )
     path = PortName(settings.port).find()
     try:
         SerialPort(path, baud=settings.baud).close()
@@ -70,6 +72,7 @@ def check_board(settings: SerialSettings, *, timeout: float = ANSWER_TIMEOUT) ->
     others = " or ".join(f"--protocol {name}" for name in dialect_names() if name != settings.protocol)
     return failed(
         f"no board answers in {settings.protocol} at {settings.baud:,} baud",
+        code="board-silent",
         hint=f"check that the firmware is loaded, --baud, and the protocol: {others}",
     )
 
@@ -80,10 +83,14 @@ def _unusable(path: Path, error: LineError) -> CheckResult:
         return _forbidden(path)
     if isinstance(error, PortBusy):
         return failed(
-            str(error), hint=f"`fuser {path}` shows the process; if it is `aira edge`, stop it to check the line"
+            str(error),
+            code="port-busy",
+            hint=f"`fuser {path}` shows the process; if it is `aira edge`, stop it to check the line",
         )
     return failed(
-        str(error), hint="check that this is the board's port; `ls -l /dev/serial/by-id` lists connected devices"
+        str(error),
+        code=error.code,
+        hint="check that this is the board's port; `ls -l /dev/serial/by-id` lists connected devices",
     )
 
 
@@ -95,9 +102,12 @@ def _forbidden(path: Path) -> CheckResult:
     if about.st_gid == 0:
         return failed(
             f"{found}, which no user should join",
+            code="port-forbidden",
             hint="let udev assign the port to the group dialout, and join that group",
         )
-    return failed(found, hint=f"sudo usermod -aG {group} {user}, then log in again (a service: restart it)")
+    return failed(
+        found, code="port-forbidden", hint=f"sudo usermod -aG {group} {user}, then log in again (a service: restart it)"
+    )
 
 
 def _name(find: Callable[[int], Sequence[object]], number: int) -> str:

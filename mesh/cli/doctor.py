@@ -74,8 +74,8 @@ def command(settings: Settings, as_json: bool, timeout: float, role: Role | None
     balances, and the disk; for a bridge also the IPFS daemon, for an edge agent the serial port and its board (opening
     the port resets most boards). Changes and spends nothing, and shows no key or password.
 
-    Prints a line for each check: ok, warn (it works now) or FAIL; with --json an object with name, ok, found and do. A
-    check that depends on a failed one is skipped. The exit code is 1 if a check fails.
+    Prints a line for each check: ok, warn (it works now) or FAIL; with --json an object with name, ok, found, do and
+    code. A check that depends on a failed one is skipped. The exit code is 1 if a check fails.
     """
     try:
         context = _context_of(settings, role, **options)
@@ -128,13 +128,14 @@ async def _examine(context: DoctorContext, failed: list[str], *, seconds: float,
 
 def _print_object(context: DoctorContext, checked: CompletedCheck) -> None:
     assert checked.result is not None
-    found, do = (context.without_secrets(text) for text in checked.result[1:])
-    print_json({"name": checked.name, "ok": checked.result.ok, "found": found, "do": do})
+    result = checked.result
+    found, do = (context.without_secrets(text) for text in (result.message, result.hint))
+    print_json({"name": checked.name, "ok": result.ok, "found": found, "do": do, "code": result.code})
 
 
 def _print_result(context: DoctorContext, checked: CompletedCheck, width: int) -> None:
     assert checked.result is not None
-    status, found, do = checked.result
+    status, _, found, do = checked.result
     mark = click.style(f"{status.value:<{MARK}}", fg=COLOURS[status], bold=status is CheckStatus.FAIL)
     print_line(f"{mark}{checked.name:<{width}}  {printable(context.without_secrets(found))}")
     if do:

@@ -55,7 +55,9 @@ class AccountChecks:
         if readable:
             names = " and ".join(map(str, readable))
             hint = f"chmod 600 {' '.join(map(str, readable))}"
-            return warning(f"{self.address}, but other users of this machine can read {names}", hint=hint)
+            return warning(
+                f"{self.address}, but other users of this machine can read {names}", code="keyfile-readable", hint=hint
+            )
         return passed(f"{self.address}, the password decrypts {files[0]}")
 
     async def check_ether(self) -> CheckResult:
@@ -69,14 +71,19 @@ class AccountChecks:
         if count >= AMPLE:
             return passed(f"{shown}: gas for {'more than 1,000' if count > 1000 else f'{count:,}'} transactions")
         if count >= 1:
-            return warning(f"{shown}: gas for only {count} transactions", hint="send it ETH to pay for gas")
+            return warning(
+                f"{shown}: gas for only {count} transactions", code="little-gas", hint="send it ETH to pay for gas"
+            )
         if self._context.role == "agent":
             return warning(
                 f"{shown}: not enough gas for a transaction",
+                code="no-gas",
                 hint="send it ETH if it should approve fees or cancel jobs; working and being paid needs none",
             )
         return failed(
-            f"{shown}: not enough gas for a transaction", hint=f"send it at least {at_least(AMPLE * one, ETH)}"
+            f"{shown}: not enough gas for a transaction",
+            code="no-gas",
+            hint=f"send it at least {at_least(AMPLE * one, ETH)}",
         )
 
     async def check_tokens(self) -> CheckResult:
@@ -86,7 +93,9 @@ class AccountChecks:
         if balance or self._context.role != "person":
             return passed(shown)
         return failed(
-            f"{shown}: it can't pay for a job", hint=f"send it {coin.symbol}, for example with `aira xrt transfer`"
+            f"{shown}: it can't pay for a job",
+            code="no-tokens",
+            hint=f"send it {coin.symbol}, for example with `aira xrt transfer`",
         )
 
     async def check_allowance(self) -> CheckResult:
@@ -100,10 +109,12 @@ class AccountChecks:
         if await node.eth_balance(self.address) < LEAST_GAS * await node.gas_price():
             return failed(
                 f"the factory may not transfer {coin.symbol} of {self.address}, which has no ETH to approve it",
+                code="no-allowance",
                 hint=f"send it ETH for gas; then `aira demand` approves the cost of a job, or use {approve}",
             )
         return warning(
             f"the factory may not transfer {coin.symbol} of {self.address} yet",
+            code="no-allowance",
             hint=f"`aira demand` and agents approve the cost of each job; to approve more, use {approve}",
         )
 
@@ -125,12 +136,12 @@ class AccountChecks:
         state = await chain.lighthouses.get(self._context.settings.lighthouse_contract)
         block, providers = await chain.block_number(), list(state.stakes)
         if state.current == self.address:
-            return passed(f"its own, with {state.quota:,} transactions left")
+            return passed(f"its own, with {state.quota:,} transactions left", code="own-turn")
         place = f"{providers.index(state.current) + 1} of {len(providers)}" if state.current in providers else "left"
         active = f"last active {block - state.keep_alive_block:,} blocks ago"
         active = active if state.keep_alive_block else "not active yet"
         may = "may send now" if await chain.lighthouses.is_turn(state.address, self.address) else "waits for its turn"
-        return passed(f"{state.current} ({place}), {active}; this account {may}")
+        return passed(f"{state.current} ({place}), {active}; this account {may}", code="other-turn")
 
     async def _coin(self) -> Currency:
         token = await self._chain_checks.chain.tokens.info(self._context.settings.erc20_token)

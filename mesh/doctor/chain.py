@@ -62,11 +62,13 @@ class ChainChecks:
             if syncing:
                 return failed(
                     f"{endpoint} is still syncing at block {number:,}",
+                    code="node-syncing",
                     hint="wait until it is synced; until then it does not have the newest blocks",
                 )
             if is_stalled(client, number=number, age=age):
                 return failed(
                     f"{endpoint} is stalled: its newest block {number:,} is {duration(age)} old",
+                    code="node-stalled",
                     hint="see the node's log: check its peers and its free disk space",
                 )
             old = f"{duration(max(age, 0))} old"
@@ -80,6 +82,7 @@ class ChainChecks:
         if self._expected and found != self._expected:
             return failed(
                 f"{self.node.endpoint} is on the chain {found}, not on {self._expected}",
+                code="other-chain",
                 hint="give a node of the expected chain with --web3-http-provider",
             )
         return passed(f"{found}, genesis {await self._genesis()}")
@@ -97,13 +100,19 @@ class ChainChecks:
         if expected == "mesh" and not ours:
             return failed(
                 f"the factory or XRT does not run this project's code: {where}",
+                code="not-our-contracts",
                 hint="give --contracts original if they are the originals; else check --ens-contract and the names",
             )
         if expected == "original" and ours:
             return failed(
-                f"these are this project's contracts, not the originals: {where}", hint="give --contracts mesh"
+                f"these are this project's contracts, not the originals: {where}",
+                code="our-contracts",
+                hint="give --contracts mesh",
             )
-        return passed(f"{'contracts of this project' if ours else 'original contracts'}: {where}")
+        return passed(
+            f"{'contracts of this project' if ours else 'original contracts'}: {where}",
+            code="own" if ours else "original",
+        )
 
     async def check_lighthouse(self) -> CheckResult:
         """Whether the lighthouse exists and belongs to the factory. Raises `UnknownName`."""
@@ -112,6 +121,7 @@ class ChainChecks:
         if not await self.chain.lighthouses.exists(address):
             return failed(
                 f"{name} is {address}, which is not a lighthouse of this factory",
+                code="not-a-lighthouse",
                 hint="choose one of `aira lighthouse list` with --lighthouse-contract",
             )
         state = await self.chain.lighthouses.get(address)
@@ -119,6 +129,7 @@ class ChainChecks:
         if not providers:
             return warning(
                 f"{name} ({address}) has no provider, so its orders are not matched",
+                code="no-provider",
                 hint="become its provider with `aira lighthouse join STAKE`, then run `aira provider`",
             )
         return passed(f"{name} is {address}, with {providers} provider{'s' if providers > 1 else ''}")
@@ -138,7 +149,9 @@ async def check_node_clock(endpoint: str) -> CheckResult:
     """Compare this clock with that of the node's machine."""
     node_time = await _server_time(endpoint)
     return (
-        passed("the node does not report its time") if node_time is None else compare_node_clock(node_time, time.time())
+        passed("the node does not report its time", code="no-time")
+        if node_time is None
+        else compare_node_clock(node_time, time.time())
     )
 
 

@@ -39,9 +39,13 @@ class CheckStatus(Enum):
 
 
 class CheckResult(NamedTuple):
-    """What a check found, in one line, and what to do about it (empty if it passed)."""
+    """What a check found: a stable `code` for programs, a line for people, and what to do (empty if it passed).
+
+    The code is `ok` for a check that passed in the usual way, and an error's code for one that an error ended.
+    """
 
     status: CheckStatus
+    code: str
     message: str
     hint: str = ""
 
@@ -51,24 +55,28 @@ class CheckResult(NamedTuple):
         return self.status is not CheckStatus.FAIL
 
 
-def passed(message: str) -> CheckResult:
+def passed(message: str, *, code: str = "ok") -> CheckResult:
     """The check passed."""
-    return CheckResult(CheckStatus.OK, message)
+    return CheckResult(CheckStatus.OK, code, message)
 
 
-def warning(message: str, *, hint: str) -> CheckResult:
+def warning(message: str, *, code: str, hint: str) -> CheckResult:
     """It works now, but needs attention."""
-    return CheckResult(CheckStatus.WARN, message, hint)
+    return CheckResult(CheckStatus.WARN, code, message, hint)
 
 
-def failed(message: str, *, hint: str) -> CheckResult:
+def failed(message: str, *, code: str, hint: str) -> CheckResult:
     """The check failed."""
-    return CheckResult(CheckStatus.FAIL, message, hint)
+    return CheckResult(CheckStatus.FAIL, code, message, hint)
 
 
 def from_error(error: AiraError) -> CheckResult:
     """An error as a failed check."""
-    return failed(str(error), hint=error.hint or "see docs/deploy.md; `aira settings` shows the effective settings")
+    return failed(
+        str(error),
+        code=error.code,
+        hint=error.hint or "see docs/deploy.md; `aira settings` shows the effective settings",
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,8 +162,14 @@ async def _run(
     except TimeoutError:
         if not limit.expired():
             raise
-        return failed(f"no answer within {seconds:g} s", hint="try a longer --timeout if it may be slow")
+        return failed(
+            f"no answer within {seconds:g} s", code="no-answer", hint="try a longer --timeout if it may be slow"
+        )
     except ModuleNotFoundError as error:
         if (extra := EXTRAS.get((error.name or "").partition(".")[0])) is None:
             raise
-        return failed(f"the check needs {error.name}, which is not installed", hint=f"pip install 'aira-mesh[{extra}]'")
+        return failed(
+            f"the check needs {error.name}, which is not installed",
+            code="not-installed",
+            hint=f"pip install 'aira-mesh[{extra}]'",
+        )

@@ -48,7 +48,7 @@ def compare_router_clock(theirs: float, ours: float) -> CheckResult:
     ahead = ours - theirs
     if abs(ahead) <= TOLERATED:
         return passed(f"differs by {abs(ahead):.2f} s from the router's clock")
-    return failed(f"this machine's clock is {_apart(ahead)} the router's", hint=CURE)
+    return failed(f"this machine's clock is {_apart(ahead)} the router's", code="clock-off", hint=CURE)
 
 
 def compare_node_clock(theirs: float, ours: float) -> CheckResult:
@@ -56,16 +56,20 @@ def compare_node_clock(theirs: float, ours: float) -> CheckResult:
     ahead = ours - theirs
     if abs(ahead) <= TOLERATED + 1:
         return passed("agrees with the node's clock to the second")
-    return failed(f"this machine's clock is {_apart(ahead)} the clock of the node's machine", hint=CURE)
+    return failed(
+        f"this machine's clock is {_apart(ahead)} the clock of the node's machine", code="clock-off", hint=CURE
+    )
 
 
 def compare_chain_clock(block_time: float, ours: float) -> CheckResult:
     """Compare the time of the newest block with this clock (seconds since the epoch)."""
     age = ours - block_time
     if age < -AHEAD:
-        return failed(f"this machine's clock is {duration(-age)} behind the newest block", hint=CURE)
+        return failed(
+            f"this machine's clock is {duration(-age)} behind the newest block", code="clock-behind", hint=CURE
+        )
     if age > RECENT:
-        return passed(f"the newest block is {duration(age)} old, too old to compare clocks")
+        return passed(f"the newest block is {duration(age)} old, too old to compare clocks", code="block-too-old")
     return passed(f"agrees with the newest block, {'0 s' if age < 1 else duration(age)} old")
 
 
@@ -105,10 +109,11 @@ def check_data_folder(folder: Path, *, slow: float = SLOW) -> CheckResult:
     if took > slow:
         return warning(
             f"{existing} takes {took:.1f} s to write and sync a small file",
+            code="disk-slow",
             hint="use a local disk for --data-dir; each step of a job waits for the disk",
         )
     if existing != folder:
-        return passed(f"{folder} will be created on start; {existing} is writable")
+        return passed(f"{folder} will be created on start; {existing} is writable", code="folder-missing")
     return passed(f"{folder} is writable (a file was synced in {took * 1000:.0f} ms) and belongs to {_owner(folder)}")
 
 
@@ -118,9 +123,11 @@ def check_disk_space(folder: Path, *, content_limit: int, least: int = LEAST) ->
     kept = sum(map(_size, folder.glob("*/content/*")))
     shown = f"{_gigabytes(free)} free, content uses {_gigabytes(kept)} of at most {_gigabytes(content_limit)}"
     if free < least:
-        return failed(f"{shown} in {folder}", hint="free some space, or use another disk with --data-dir")
+        return failed(
+            f"{shown} in {folder}", code="disk-space", hint="free some space, or use another disk with --data-dir"
+        )
     if free + kept < content_limit:
-        return warning(shown, hint="reduce --content-limit, or free some space")
+        return warning(shown, code="disk-space", hint="reduce --content-limit, or free some space")
     return passed(shown)
 
 
@@ -129,16 +136,18 @@ def _write_failure(folder: Path, existing: Path, error: OSError) -> CheckResult:
     if error.errno in FULL:
         return failed(
             f"the disk of {existing} is full: {error.strerror}",
+            code="disk-full",
             hint="free some space there, or use another disk with --data-dir",
         )
     other = "use another folder with --data-dir"
     if error.errno not in FORBIDDEN:
-        return failed(f"{existing} is not writable: {error.strerror}", hint=other)
+        return failed(f"{existing} is not writable: {error.strerror}", code="not-writable", hint=other)
     user = os.geteuid()
     # A folder above may belong to the system: don't suggest changing its owner.
     own = f"sudo chown -R {user} {folder}" if existing == folder else f"sudo install -d -o {user} {folder}"
     return failed(
         f"{existing} is not writable: {error.strerror}; it belongs to {_owner(existing)}, not to {_user(user)}",
+        code="not-writable",
         hint=f"{own}, or {other}",
     )
 

@@ -20,7 +20,7 @@ from mesh.identity.roster import read_roster
 from mesh.identity.routers import router_endpoints
 from mesh.network import Tls
 from mesh.network.endpoints import check_locators
-from mesh.network.handshake import WILDCARD_HOSTS, refusal_reason
+from mesh.network.handshake import WILDCARD_HOSTS, refusal_by
 
 if TYPE_CHECKING:
     from mesh.doctor.context import DoctorContext
@@ -44,7 +44,7 @@ def check_router_address(locator: str, settings: Settings) -> CheckResult:
     check_locators(locator)
     place = PLACE.match(locator)
     if place is None:
-        return passed(f"{locator} can't be checked without a session; see the session check")
+        return passed(f"{locator} can't be checked without a session; see the session check", code="not-checked")
     host, port = place["six"] or place["host"], int(place["port"])
     host = LOOPBACK.get(host, host)
     try:
@@ -52,6 +52,7 @@ def check_router_address(locator: str, settings: Settings) -> CheckResult:
     except (socket.gaierror, UnicodeError):
         return failed(
             f"{locator}: can't resolve the name {host}",
+            code="unresolvable",
             hint="check its spelling and this machine's DNS settings, or use the router's IP address",
         )
     began = time.monotonic()
@@ -76,11 +77,14 @@ def check_certificate(context: DoctorContext) -> CheckResult:
     """Whether the own certificate can be used, and for how long. Raises `ConfigurationError` if it can't."""
     tls = Tls.from_settings(context.settings)
     if tls is None:
-        return failed("a tls/ endpoint needs the site's certificate, but none is set", hint=OWN_FILES)
+        return failed(
+            "a tls/ endpoint needs the site's certificate, but none is set", code="no-certificate", hint=OWN_FILES
+        )
     own = certificate_info(tls, mode="router" if context.role == "router" else "client")
     if own is None:
         return warning(
             "the site's certificate is set, but no certificate of our own",
+            code="no-own-certificate",
             hint="ask the site's operator for a certificate, then " + OWN_FILES,
         )
     whose = f"{own.name or 'no name'}, {', '.join(own.roles) or 'no role'}, {own.address}"
@@ -91,18 +95,20 @@ def check_roster(context: DoctorContext) -> CheckResult:
     """Whether the router's settings and roster can be used. Raises `ConfigurationError`."""
     router_endpoints(context.settings)
     if not context.settings.roster:
-        return passed("none: the router listens on loopback only, and every client may do everything")
+        return passed("none: the router listens on loopback only, and every client may do everything", code="no-roster")
     roster = read_roster(Path(context.settings.roster).expanduser())
     admitted = roster.admitted()
     if not admitted:
         return failed(
             f"{context.settings.roster} admits no member",
+            code="no-members",
             hint="add one with `aira identity new FOLDER --site SITE --role ROLE --roster FILE`",
         )
     own = context.identity.address if context.identity is not None else ""
     if own and context.settings.link and own not in {member.address for member in admitted}:
         return failed(
             f"{own} is not in {context.settings.roster}, so the routers that this one links to deny all its operations",
+            code="not-in-roster",
             hint="add it with the role router, there and to the rosters of those routers",
         )
     revoked = len(roster.member) - len(admitted)
@@ -114,24 +120,36 @@ def _unanswered(locator: str, error: OSError) -> CheckResult:
     if isinstance(error, ConnectionRefusedError):
         return failed(
             f"{locator}: no router listens there",
+            code="no-router",
             hint="start one with `aira router`, or give another address with --connect tcp/HOST:PORT",
         )
     why = f"no answer within {SECONDS:g} s" if isinstance(error, TimeoutError) else error.strerror or str(error)
     return failed(
-        f"{locator}: {why}", hint="check that the machine is on and reachable, and that its firewall allows the port"
+        f"{locator}: {why}",
+        code="no-answer",
+        hint="check that the machine is on and reachable, and that its firewall allows the port",
     )
 
 
 def _shown(locator: str, tls: Tls | None, place: tuple[str, int], answers: str) -> CheckResult:
     """The certificate that a TLS router presents, and whether it accepts ours."""
     if tls is None:
-        return failed(f"{locator}: the router requires a certificate, but none is set", hint=OWN_FILES)
-    if (why := refusal_reason(tls, locator, SECONDS)) is not None:
-        return failed(f"{locator}: {why}", hint=f"check that {tls.ca} is of this router's site; {OWN_FILES}")
+        return failed(
+            f"{locator}: the router requires a certificate, but none is set",
+            code="certificate-required",
+            hint=OWN_FILES,
+        )
+    if (refusal := refusal_by(tls, locator, SECONDS)) is not None:
+        return failed(
+            f"{locator}: {refusal.text}",
+            code=refusal.reason,
+            hint=f"check that {tls.ca} is of this router's site; {OWN_FILES}",
+        )
     certificate = _certificate_of(tls, place, named=not is_everywhere(locator))
     if certificate is None:
         return failed(
             f"{locator}: the TLS 1.3 handshake failed",
+            code="handshake-failed",
             hint="check that this is the router's port, and that the router runs with --listen tls/HOST:PORT",
         )
     whose = next(
@@ -164,4 +182,8 @@ def _lasting(words: str, until: float, *, whose: str) -> CheckResult:
     if until - time.time() > SOON:
         return passed(f"{words}, until {day} ({left})")
     renew = "`aira identity renew FOLDER --site SITE` where the site's key is; open sessions switch automatically"
-    return warning(f"{words}, but only until {day} ({left})", hint=f"renew the {whose} certificate: {renew}")
+    return warning(
+        f"{words}, but only until {day} ({left})",
+        code="certificate-expires",
+        hint=f"renew the {whose} certificate: {renew}",
+    )

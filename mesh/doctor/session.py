@@ -214,7 +214,7 @@ class SessionChecks:
         if self._roles == ("watcher",):
             if not await pair.is_subscribed(self._keys.own):
                 raise IdentityDenied(self._address)
-            return passed("a watcher may not write; the router forwards its subscriptions")
+            return passed("a watcher may not write; the router forwards its subscriptions", code="watcher")
         took = await pair.round_trip(self._keys.own)
         if took is None:
             raise IdentityDenied(self._address)
@@ -230,13 +230,13 @@ class SessionChecks:
             return self._open(" and ".join(names[key] for key in delivered))
         if not tried:
             return self._untried()
-        return passed("denied as expected: " + " and ".join(f"a write to {names[key]}" for key in tried))
+        return passed("denied as expected: " + " and ".join(f"a write to {names[key]}" for key in tried), code="denied")
 
     async def check_clock(self) -> CheckResult:
         """Compare this clock with the router's, which timestamps what it forwards."""
         stamped = self._opened().stamped
         if stamped is None:
-            return passed("the router does not report its time")
+            return passed("the router does not report its time", code="no-time")
         return compare_router_clock(*stamped)
 
     def _opened(self) -> SessionPair:
@@ -246,13 +246,21 @@ class SessionChecks:
     def _open(self, where: str) -> CheckResult:
         """The result when the router forwarded a write that no role may make."""
         if "router" in self._roles:
-            return passed("not checked: a router's identity may write everything; use a member's identity")
+            return passed(
+                "not checked: a router's identity may write everything; use a member's identity", code="not-checked"
+            )
         if self._locator.startswith(TLS_PREFIXES):
-            return failed(f"the router allows any write: a write to {where} was forwarded", hint=ROSTER)
+            return failed(
+                f"the router allows any write: a write to {where} was forwarded", code="router-open", hint=ROSTER
+            )
         if is_loopback(self._locator):
-            return passed("the router is open: every client may write everything, which is acceptable on loopback")
+            return passed(
+                "the router is open: every client may write everything, which is acceptable on loopback",
+                code="router-open",
+            )
         return failed(
             f"the router is open to every client that can reach it: a write to {where} was forwarded",
+            code="router-open",
             hint="create a site with a roster and certificates (docs/sites.md): `aira identity site FOLDER`",
         )
 
@@ -261,10 +269,12 @@ class SessionChecks:
         if self._context.agent:
             return warning(
                 "not checked: this identity can't read its agent's jobs",
+                code="not-checked",
                 hint="check --agent and --device of its entry: `aira router acl --check --roster FILE`",
             )
         return failed(
             f"the router does not let this identity read the market {self._context.settings.lighthouse_contract}",
+            code="market-denied",
             hint="give --lighthouse-contract of the site, or add the market to `lighthouses` in the roster",
         )
 

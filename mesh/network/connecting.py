@@ -16,7 +16,10 @@ from mesh.outage_log import OutageLog
 from mesh.retry import Backoff
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from mesh.network.endpoints import Endpoints
+    from mesh.network.handshake import TlsRefusal
 
 log = logging.getLogger(__name__)
 
@@ -25,13 +28,15 @@ CAUSE: Final = re.compile(r"\[\S+?: (?P<cause>.+?) at /")
 
 
 class NotAdmitted(RemoteError, code="not-admitted"):
-    """A router answers, but it and this identity do not accept each other."""
+    """A router answers, but it and this identity do not accept each other. `reasons` has a word for each locator."""
 
-    def __init__(self, *refusals: str) -> None:
+    def __init__(self, refusals: Mapping[str, TlsRefusal]) -> None:
+        said = "; ".join(f"{locator}: {refusal.text}" for locator, refusal in refusals.items())
         super().__init__(
-            f"rejected by the Zenoh router at {'; '.join(refusals)}",
+            f"rejected by the Zenoh router at {said}",
             hint="set --tls-ca, --tls-certificate and --tls-key to your site's; `aira identity show` prints them",
         )
+        self.reasons = {locator: refusal.reason for locator, refusal in refusals.items()}
 
 
 class SessionOpening:
@@ -96,14 +101,14 @@ class SessionOpening:
         """Raise `NotAdmitted` if all routers reject this identity: waiting longer would not help."""
         if (tls := self._endpoints.tls) is None:
             return
-        from mesh.network.handshake import refusal_reason
+        from mesh.network.handshake import refusal_by
 
-        refusals = []
+        refusals = {}
         for locator in self._endpoints.connect:
-            if (reason := refusal_reason(tls, locator, ATTEMPT_TIMEOUT)) is None:
+            if (refusal := refusal_by(tls, locator, ATTEMPT_TIMEOUT)) is None:
                 return
-            refusals.append(f"{locator}: {reason}")
-        raise NotAdmitted(*refusals)
+            refusals[locator] = refusal
+        raise NotAdmitted(refusals)
 
     def _not_listening(self, error: zenoh.ZError) -> ConfigurationError:
         found = CAUSE.search(str(error))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import zenoh
 
 from mesh.errors import ConfigurationError
-from mesh.network.tls import Tls
+from mesh.network.tls import Tls, UnusableTls
 from mesh.retry import RetryPolicy
 
 if TYPE_CHECKING:
@@ -105,8 +105,10 @@ class Endpoints:
 
             check_files(self.tls, mode=self.mode)
         else:
-            raise ConfigurationError(
-                "a tls/ endpoint needs the site's certificate", hint="give --tls-ca, or tls_ca in the settings"
+            raise UnusableTls(
+                "no-authority",
+                "a tls/ endpoint needs the site's certificate",
+                hint="give --tls-ca, or tls_ca in the settings",
             )
 
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 import re
 import socket
 import ssl
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
-from mesh.errors import ConfigurationError
+from mesh.network.tls import UnusableTls
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -24,26 +24,41 @@ WILDCARD_HOSTS: Final = ("0.0.0.0", "::")
 """Hosts that stand for all of a router's addresses; no certificate names them."""
 ALERT_TIMEOUT: Final = 1.0
 """Seconds in which a router that rejects the certificate says so after the handshake."""
+HOSTNAME_MISMATCH: Final = 62
+"""OpenSSL's number of the error that a certificate names another host."""
+
+
+class TlsRefusal(NamedTuple):
+    """Why a router and an identity reject each other: a word for programs and a sentence for people."""
+
+    reason: Literal["certificate-required", "other-site", "expired", "rejected", "untrusted", "wrong-host"]
+    text: str
+
+
+OTHER_SITE: Final = TlsRefusal("other-site", "the certificate is not from its site")
+REJECTED: Final = TlsRefusal("rejected", "it rejects the certificate")
 ALERTS: Final = {
-    "CERTIFICATE_REQUIRED": "it requires a certificate",
-    "UNKNOWN_CA": "the certificate is not from its site",
-    "CERTIFICATE_EXPIRED": "the certificate has expired",
-    "CERTIFICATE_UNKNOWN": "it rejects the certificate",
-    "BAD_CERTIFICATE": "it rejects the certificate",
-    "DECRYPT_ERROR": "the certificate is not from its site",
+    "CERTIFICATE_REQUIRED": TlsRefusal("certificate-required", "it requires a certificate"),
+    "UNKNOWN_CA": OTHER_SITE,
+    "CERTIFICATE_EXPIRED": TlsRefusal("expired", "the certificate has expired"),
+    "CERTIFICATE_UNKNOWN": REJECTED,
+    "BAD_CERTIFICATE": REJECTED,
+    "DECRYPT_ERROR": OTHER_SITE,
 }
-"""TLS alert with which a router ends the handshake → the reason."""
+"""What each TLS alert means with which a router ends the handshake."""
 
 
 def check_files(tls: Tls, *, mode: str) -> None:
-    """Raise `ConfigurationError` for files that can't work: missing, malformed, expired, or not matching.
+    """Raise `UnusableTls` for files that can't work: missing, malformed, expired, or not matching.
 
     `mode` is the mode of the session that uses them: `router` or `client`.
     """
     if (tls.certificate is None) != (tls.key is None):
-        raise ConfigurationError("only one of tls_certificate and tls_key is set", hint=NEW_IDENTITY_HINT)
+        raise UnusableTls("incomplete", "only one of tls_certificate and tls_key is set", hint=NEW_IDENTITY_HINT)
     if tls.certificate is None and mode == "router":
-        raise ConfigurationError("a router needs a certificate for tls/", hint="add --tls-certificate and --tls-key")
+        raise UnusableTls(
+            "no-certificate", "a router needs a certificate for tls/", hint="add --tls-certificate and --tls-key"
+        )
     for what, path in (("site's certificate", tls.ca), ("certificate", tls.certificate), ("key", tls.key)):
         if path is not None:
             _check_readable(what, path)
@@ -53,7 +68,7 @@ def check_files(tls: Tls, *, mode: str) -> None:
         _check_certificate(tls, mode)
 
 
-def refusal_reason(tls: Tls, locator: str, seconds: float) -> str | None:
+def refusal_by(tls: Tls, locator: str, seconds: float) -> TlsRefusal | None:
     """Why the router at a `tls/` locator and this identity reject each other.
 
     None if nothing answers there within `seconds`, or if the handshake succeeds. Blocks.
@@ -71,17 +86,18 @@ def refusal_reason(tls: Tls, locator: str, seconds: float) -> str | None:
         return None
 
 
-def _handshake(context: ssl.SSLContext, connection: socket.socket, host: str) -> str | None:
+def _handshake(context: ssl.SSLContext, connection: socket.socket, host: str) -> TlsRefusal | None:
     """With TLS 1.3 the client finishes first; the router's rejection arrives in place of data."""
     try:
         with context.wrap_socket(connection, server_hostname=host) as secured:
             secured.settimeout(ALERT_TIMEOUT)
             secured.recv(1)
     except ssl.SSLCertVerificationError as error:
-        return f"its certificate is not trusted: {error.verify_message.rstrip('.')}"
+        text = f"its certificate is not trusted: {error.verify_message.rstrip('.')}"
+        return TlsRefusal("wrong-host" if error.verify_code == HOSTNAME_MISMATCH else "untrusted", text)
     except ssl.SSLError as error:
         reason = error.reason or ""
-        return next((reason_text for alert, reason_text in ALERTS.items() if reason.endswith(alert)), None)
+        return next((refusal for alert, refusal in ALERTS.items() if reason.endswith(alert)), None)
     except OSError:
         return None
     return None
@@ -101,17 +117,19 @@ def _check_certificate(tls: Tls, mode: str) -> None:
         except ssl.SSLWantReadError:
             continue
         except ssl.SSLCertVerificationError as error:
-            raise ConfigurationError(
-                f"the certificate {tls.certificate} can't be used: {_explained(error, tls)}",
+            reason, explained = _explained(error, tls)
+            raise UnusableTls(
+                reason,
+                f"the certificate {tls.certificate} can't be used: {explained}",
                 hint="`aira identity show` prints its contents, `aira identity renew` renews it",
             ) from None
 
 
-def _explained(error: ssl.SSLCertVerificationError, tls: Tls) -> str:
-    reason = error.verify_message
-    if any(word in reason for word in ("issuer", "self-signed", "signature")):
-        return f"it is not from the site of {tls.ca}"
-    return reason.replace("certificate", "it", 1)
+def _explained(error: ssl.SSLCertVerificationError, tls: Tls) -> tuple[str, str]:
+    said = error.verify_message
+    if any(word in said for word in ("issuer", "self-signed", "signature")):
+        return "other-site", f"it is not from the site of {tls.ca}"
+    return "expired" if "expired" in said else "invalid", said.replace("certificate", "it", 1)
 
 
 def _context(tls: Tls, protocol: ssl._SSLMethod) -> ssl.SSLContext:
@@ -120,8 +138,8 @@ def _context(tls: Tls, protocol: ssl._SSLMethod) -> ssl.SSLContext:
     try:
         context.load_verify_locations(tls.ca)
     except ssl.SSLError:
-        raise ConfigurationError(
-            f"the site's certificate {tls.ca} is not a PEM certificate", hint=NEW_IDENTITY_HINT
+        raise UnusableTls(
+            "not-pem", f"the site's certificate {tls.ca} is not a PEM certificate", hint=NEW_IDENTITY_HINT
         ) from None
     if tls.pair is not None:
         try:
@@ -131,12 +149,15 @@ def _context(tls: Tls, protocol: ssl._SSLMethod) -> ssl.SSLContext:
     return context
 
 
-def _unusable(tls: Tls, error: ssl.SSLError) -> ConfigurationError:
+def _unusable(tls: Tls, error: ssl.SSLError) -> UnusableTls:
     if error.reason in ("KEY_VALUES_MISMATCH", "KEY_TYPE_MISMATCH"):
-        return ConfigurationError(
-            f"the key {tls.key} does not belong to the certificate {tls.certificate}", hint=NEW_IDENTITY_HINT
+        return UnusableTls(
+            "wrong-key",
+            f"the key {tls.key} does not belong to the certificate {tls.certificate}",
+            hint=NEW_IDENTITY_HINT,
         )
-    return ConfigurationError(
+    return UnusableTls(
+        "not-pem",
         f"the certificate {tls.certificate} or its key {tls.key} is not PEM, or is encrypted with a password",
         hint=NEW_IDENTITY_HINT,
     )
@@ -146,7 +167,8 @@ def _check_readable(what: str, path: Path) -> None:
     try:
         path.read_bytes()
     except OSError as error:
-        raise ConfigurationError(f"can't read the {what} {path}: {error.strerror}", hint=NEW_IDENTITY_HINT) from None
+        message = f"can't read the {what} {path}: {error.strerror}"
+        raise UnusableTls("unreadable", message, hint=NEW_IDENTITY_HINT) from None
 
 
 def _no_password() -> str:

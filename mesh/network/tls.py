@@ -12,6 +12,15 @@ if TYPE_CHECKING:
     from mesh.settings import NetworkSettings
 
 
+class UnusableTls(ConfigurationError, code="tls-unusable"):
+    """The files of the TLS identity can't be used. `reason` is `no-authority`, `no-certificate`, `incomplete`,
+    `unreadable`, `not-pem`, `wrong-key`, `expired`, `other-site` or `invalid`."""
+
+    def __init__(self, reason: str, message: str, *, hint: str) -> None:
+        super().__init__(message, hint=hint)
+        self.reason = reason
+
+
 @dataclass(frozen=True, kw_only=True)
 class Tls:
     """The certificate files of one identity (paths, PEM): the site's, the session's own, and its key.
@@ -28,7 +37,7 @@ class Tls:
     def from_settings(cls, settings: NetworkSettings) -> Tls | None:
         """The identity that the settings name, None if they name none. Raises `ConfigurationError`."""
         if not settings.tls_ca and (settings.tls_certificate or settings.tls_key):
-            raise ConfigurationError("tls_certificate is set, but tls_ca is not", hint="add --tls-ca")
+            raise UnusableTls("no-authority", "tls_certificate is set, but tls_ca is not", hint="add --tls-ca")
         if not settings.tls_ca:
             return None
         return cls(

@@ -157,10 +157,12 @@ def read_archive(path: Path, open_sink: Callable[[str, int], AbstractContextMana
         about, sums, listed = reading.about(), {}, 0
         while (header := reading.header()).name != CHECKSUMS:
             if part_of(header.name) not in about.parts or header.name in sums:
-                raise ArchiveUnusable(path, f"it contains {header.name[:200]!r}, which is not part of a state")
+                raise ArchiveUnusable(
+                    path, "unexpected-file", f"it contains {header.name[:200]!r}, which is not part of a state"
+                )
             listed += len(header.name) + DIGITS
             if listed > LARGEST_TEXT:
-                raise ArchiveUnusable(path, "it contains more files than its checksums can list")
+                raise ArchiveUnusable(path, "too-many-files", "it contains more files than its checksums can list")
             with open_sink(header.name, header.size) as sink:
                 sums[header.name] = reading.copy(header.size, sink)
         text = reading.text(header)
@@ -168,7 +170,7 @@ def read_archive(path: Path, open_sink: Callable[[str, int], AbstractContextMana
         stated = reading.decoded(text, dict[str, str])
         if stated != sums:
             wrong = next(iter(sorted(name for name in {*sums, *stated} if sums.get(name) != stated.get(name))))
-            raise ArchiveUnusable(path, f"the checksum of {wrong[:200]} does not match")
+            raise ArchiveUnusable(path, "wrong-checksum", f"the checksum of {wrong[:200]} does not match")
         return about
 
 
@@ -182,7 +184,9 @@ class _ArchiveReader:
         try:
             self._file = self._path.open("rb")
         except OSError as error:
-            raise ArchiveUnusable(self._path, f"can't read it: {error.strerror}", hint="use another backup") from None
+            raise ArchiveUnusable(
+                self._path, "unreadable", f"can't read it: {error.strerror}", hint="use another backup"
+            ) from None
         self._stream = zstandard.ZstdDecompressor().stream_reader(self._file)
         return self
 
@@ -193,15 +197,19 @@ class _ArchiveReader:
         """The first member."""
         header = self.header()
         if header.name != ABOUT:
-            raise ArchiveUnusable(self._path, "it is not a backup of a state", hint="`aira state backup` creates one")
+            raise ArchiveUnusable(
+                self._path, "not-a-backup", "it is not a backup of a state", hint="`aira state backup` creates one"
+            )
         text = self.text(header)
         stated = self.decoded(text, dict[str, object]).get("format")
         if stated != FORMAT:
             why = f"it was written by another version (format {str(stated)[:20]}, this one knows {FORMAT})"
-            raise ArchiveUnusable(self._path, why, hint="use the version of aira-mesh that wrote it, or a newer one")
+            raise ArchiveUnusable(
+                self._path, "other-version", why, hint="use the version of aira-mesh that wrote it, or a newer one"
+            )
         about = self.decoded(text, ArchiveInfo)
         if not all(is_part(part) for part in about.parts) or len(set(about.parts)) < len(about.parts):
-            raise ArchiveUnusable(self._path, "it names parts that no state has")
+            raise ArchiveUnusable(self._path, "unexpected-part", "it names parts that no state has")
         return about
 
     def header(self) -> tarfile.TarInfo:
@@ -210,15 +218,15 @@ class _ArchiveReader:
         try:
             header = tarfile.TarInfo.frombuf(block, "utf-8", "surrogateescape")
         except tarfile.HeaderError:
-            raise ArchiveUnusable(self._path, "it is damaged or not a backup") from None
+            raise ArchiveUnusable(self._path, "not-a-backup", "it is damaged or not a backup") from None
         if header.type != tarfile.REGTYPE or header.size < 0:
-            raise ArchiveUnusable(self._path, f"{header.name[:200]!r} in it is not a regular file")
+            raise ArchiveUnusable(self._path, "not-a-file", f"{header.name[:200]!r} in it is not a regular file")
         return header
 
     def text(self, header: tarfile.TarInfo) -> bytes:
         """All bytes of a member."""
         if header.size > LARGEST_TEXT:
-            raise ArchiveUnusable(self._path, f"{header.name} in it is too long")
+            raise ArchiveUnusable(self._path, "too-long", f"{header.name} in it is too long")
         text = self._read(header.size)
         self._read(-header.size % tarfile.BLOCKSIZE)
         return text
@@ -228,7 +236,7 @@ class _ArchiveReader:
         try:
             return msgspec.json.decode(text, type=kind)
         except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-            raise ArchiveUnusable(self._path, f"it is damaged: {error}") from None
+            raise ArchiveUnusable(self._path, "damaged", f"it is damaged: {error}") from None
 
     def copy(self, size: int, sink: Sink) -> str:
         """Write the bytes of a member to `sink`; returns their SHA-256."""
@@ -246,9 +254,9 @@ class _ArchiveReader:
         try:
             rest = self._read(2 * tarfile.BLOCKSIZE) + self._stream.read(1)
         except zstandard.ZstdError as error:
-            raise ArchiveUnusable(self._path, f"it is damaged ({error})") from None
+            raise ArchiveUnusable(self._path, "damaged", f"it is damaged ({error})") from None
         if any(rest) or len(rest) > 2 * tarfile.BLOCKSIZE:
-            raise ArchiveUnusable(self._path, "it has data after its end")
+            raise ArchiveUnusable(self._path, "trailing-data", "it has data after its end")
 
     def _read(self, size: int) -> bytes:
         """Exactly `size` bytes."""
@@ -257,9 +265,9 @@ class _ArchiveReader:
             try:
                 piece = self._stream.read(left)
             except (zstandard.ZstdError, OSError) as error:
-                raise ArchiveUnusable(self._path, f"it is damaged or not a backup ({error})") from None
+                raise ArchiveUnusable(self._path, "damaged", f"it is damaged or not a backup ({error})") from None
             if not piece:
-                raise ArchiveUnusable(self._path, "it is truncated")
+                raise ArchiveUnusable(self._path, "truncated", "it is truncated")
             pieces.append(piece)
             left -= len(piece)
         return b"".join(pieces)

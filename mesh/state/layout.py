@@ -43,11 +43,18 @@ _CHAIN_NAME: Final = re.compile(_CHAIN)
 
 
 class ArchiveUnusable(InputError, code="archive-unusable"):
-    """A file is not a backup, is damaged, or contains unexpected files. Nothing of it was used."""
+    """A file is not a backup, is damaged, or contains unexpected files. Nothing of it was used.
 
-    def __init__(self, path: Path, why: str, *, hint: str = "use another backup; nothing was changed") -> None:
+    `reason` is `unreadable`, `not-a-backup`, `damaged`, `truncated`, `other-version`, `unexpected-part`,
+    `unexpected-file`, `not-a-file`, `too-many-files`, `too-long`, `wrong-checksum`, `trailing-data` or `no-space`.
+    """
+
+    def __init__(
+        self, path: Path, reason: str, why: str, *, hint: str = "use another backup; nothing was changed"
+    ) -> None:
         super().__init__(f"{path} can't be used: {why}", hint=hint)
         self.path = path
+        self.reason = reason
 
 
 class StateInUse(ConfigurationError, code="state-in-use"):

@@ -112,7 +112,7 @@ def _unpack(archive: Path, staging: Path) -> None:
         left -= size
         if left < 0:
             raise ArchiveUnusable(
-                archive, "it needs more space than the disk has free", hint="free some space on that disk"
+                archive, "no-space", "it needs more space than the disk has free", hint="free some space on that disk"
             )
         path = staging / path_of(name)
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)

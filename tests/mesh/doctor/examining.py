@@ -33,13 +33,13 @@ class Found(defaultdict[str, list[CheckResult]]):
         """The names of the checks that failed."""
         return [name for name, results in self.items() for result in results if not result.ok]
 
-    def cause(self, name: str) -> str:
-        """Message and hint of the check of that name, which must be the only failed one."""
+    def cause(self, name: str) -> CheckResult:
+        """The failed result of the check of that name, which must be the only failed one."""
         assert self.failed == [name], dict(self)
         (result,) = [result for result in self[name] if not result.ok]
         assert result.status is CheckStatus.FAIL
         assert result.hint
-        return f"{result.message}; {result.hint}"
+        return result
 
 
 async def examined(context: DoctorContext, *, seconds: float = SECONDS) -> Found:

@@ -21,18 +21,22 @@ def test_a_difference_of_some_seconds_passes(ahead: float) -> None:
 def test_a_larger_difference_fails_with_its_size_and_direction(ahead: float, words: str) -> None:
     for result in (compare_router_clock(NOW - ahead, NOW), compare_node_clock(NOW - ahead, NOW)):
         assert not result.ok
-        assert f"this machine's clock is {words} t" in result.message
-        assert "set the clock" in result.hint
+        assert result.code == "clock-off"
+        assert words in result.message
 
 
 def test_a_block_from_the_future_means_a_clock_that_is_behind() -> None:
-    assert "2 days behind the newest block" in compare_chain_clock(NOW + 2 * 86_400, NOW).message
+    result = compare_chain_clock(NOW + 2 * 86_400, NOW)
+    assert result.code == "clock-behind"
+    assert "2 days" in result.message
     assert not compare_chain_clock(NOW + 31, NOW).ok
     assert compare_chain_clock(NOW + 29, NOW).ok
 
 
 def test_an_old_block_is_no_evidence_about_the_clock() -> None:
-    assert compare_chain_clock(NOW - 7_200, NOW).message == "the newest block is 2 hours old, too old to compare clocks"
+    result = compare_chain_clock(NOW - 7_200, NOW)
+    assert result.code == "block-too-old"
+    assert "2 hours" in result.message
 
 
 def test_durations_are_printed_in_a_readable_unit() -> None:

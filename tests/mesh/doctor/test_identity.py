@@ -31,10 +31,9 @@ async def test_a_member_of_a_site_is_admitted_and_denied_forbidden_writes(site: 
     assert found.failed == []
     assert list(found) == ["certificate", "router", "session", "own write", "denied write", "router clock"]
     assert "arm-1, agent" in found.one("certificate").message
-    assert "accepts our certificate and presents that of router" in found.one("router").message
-    assert found.one("own write").message.startswith("received through the router after ")
-    assert found.one("denied write").message == f"denied as expected: a write to the market {MARKET}"
-    assert "from the router's clock" in found.one("router clock").message
+    assert [found.one(name).code for name in ("own write", "router clock")] == ["ok"] * 2
+    assert found.one("denied write").code == "denied"
+    assert MARKET in found.one("denied write").message
 
 
 @pytest.mark.parametrize("role", ["agent", "person", "provider", "operator", "bridge", "watcher"])
@@ -44,7 +43,7 @@ async def test_every_role_passes_with_its_rights(site: Site, role: Role) -> None
         found = await examined(context_of_member(site, folder))
 
     assert found.failed == []
-    assert found.one("denied write").message.startswith("denied as expected: ")
+    assert found.one("denied write").code == "denied"
     assert ("another agent's keys" in found.one("denied write").message) is (role in ("operator", "watcher"))
 
 
@@ -56,7 +55,8 @@ async def test_an_edge_agent_is_checked_with_the_device_that_it_serves(site: Sit
         unnamed = await examined(DoctorContext(settings=settings, requested_role="edge"))
 
     assert named.failed == []
-    assert named.one("denied write").message == "denied as expected: a write to its agent's jobs"
+    assert named.one("denied write").code == "denied"
+    assert "its agent's jobs" in named.one("denied write").message
     assert "own write" in unnamed.failed
 
 
@@ -66,7 +66,8 @@ async def test_an_edge_agent_s_own_device_need_not_be_named(site: Site) -> None:
         found = await examined(DoctorContext(settings=settings_of(site.client(folder))))
 
     assert found.failed == ["serial port"]
-    assert found.one("denied write").message == "denied as expected: a write to its agent's jobs"
+    assert found.one("denied write").code == "denied"
+    assert "its agent's jobs" in found.one("denied write").message
 
 
 async def test_an_expired_certificate_is_named_and_the_router_is_not_blamed(site: Site) -> None:
@@ -75,8 +76,8 @@ async def test_an_expired_certificate_is_named_and_the_router_is_not_blamed(site
         found = await examined(context_of_member(site, arm))
 
     cause = found.cause("certificate")
-    assert "it has expired" in cause
-    assert "`aira identity renew`" in cause
+    assert cause.code == "tls-unusable"
+    assert "`aira identity renew`" in cause.hint
     assert list(found) == ["certificate"]
 
 
@@ -86,7 +87,7 @@ async def test_a_certificate_that_ends_soon_is_a_warning_with_its_end(site: Site
         found = await examined(context_of_member(site, arm))
 
     result = found.one("certificate")
-    assert result.status is CheckStatus.WARN
+    assert (result.status, result.code) == (CheckStatus.WARN, "certificate-expires")
     assert time.strftime("%Y-%m-", time.gmtime(time.time() + 86_400)) in result.message
     assert "aira identity renew" in result.hint
 
@@ -103,8 +104,7 @@ async def test_an_identity_without_rights_fails(site: Site, kind: str, revoked: 
         found = await examined(context_of_member(site, arm))
 
     cause = found.cause("own write")
-    assert "it is not in the roster, or revoked" in cause
-    assert "ask the site's operator" in cause
+    assert cause.code == "identity-denied"
 
 
 async def test_a_market_that_the_site_does_not_carry_is_named(site: Site) -> None:
@@ -113,8 +113,8 @@ async def test_a_market_that_the_site_does_not_carry_is_named(site: Site) -> Non
         found = await examined(context_of_member(site, arm, lighthouse_contract="other.lighthouse.3.robonomics.eth"))
 
     cause = found.cause("denied write")
-    assert "does not let this identity read the market other.lighthouse.3.robonomics.eth" in cause
-    assert "lighthouses" in cause
+    assert cause.code == "market-denied"
+    assert "other.lighthouse.3.robonomics.eth" in cause.message
 
 
 async def test_a_certificate_without_its_authority_is_a_failed_check(site: Site) -> None:
@@ -123,7 +123,7 @@ async def test_a_certificate_without_its_authority_is_a_failed_check(site: Site)
 
     found = await examined(DoctorContext(settings=settings, requested_role="operator"))
 
-    assert "tls_ca is not" in found.cause("certificate")
+    assert found.cause("certificate").code == "tls-unusable"
 
 
 async def test_a_router_is_checked_for_its_roster_and_listen_addresses(site: Site) -> None:
@@ -134,8 +134,8 @@ async def test_a_router_is_checked_for_its_roster_and_listen_addresses(site: Sit
         running = await examined(context)
 
     assert context.role == "router"
-    assert "no router listens there" in idle.cause("router")
-    assert idle.one("roster").message == f"1 member, none revoked, markets {MARKET}"
+    assert idle.cause("router").code == "no-router"
+    assert "1 member" in idle.one("roster").message
     assert running.failed == []
     assert list(running) == ["roster", "certificate", "router", "session"]
 

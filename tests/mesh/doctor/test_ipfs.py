@@ -43,8 +43,8 @@ async def test_a_daemon_without_pubsub_fails_and_one_without_peers_is_a_warning(
     with Mute() as mute:
         found = await found_at(mute.api)
 
-    assert "not enabled" in found.cause("ipfs pubsub")
-    assert "ipfs config --json Pubsub.Enabled true" in found.cause("ipfs pubsub")
+    assert found.cause("ipfs pubsub").code == "pubsub-disabled"
+    assert "ipfs config --json Pubsub.Enabled true" in found.cause("ipfs pubsub").hint
     assert found.one("ipfs swarm").status is CheckStatus.WARN
     assert "--ipfs-swarm-connect" in found.one("ipfs swarm").hint
 
@@ -57,9 +57,9 @@ async def test_a_daemon_that_denies_access_fails(tmp_path: Path) -> None:
         secret.write_text("Bearer right")
         allowed = await found_at(recent.api, ipfs_authorization_file=str(secret))
 
-    assert "Access Denied" in cause
-    assert "--ipfs-authorization-file" in cause
-    assert "wrong" not in cause
+    assert cause.code == "access-denied"
+    assert "--ipfs-authorization-file" in cause.hint
+    assert "wrong" not in cause.message + cause.hint
     assert allowed.one("ipfs daemon").ok
 
 
@@ -67,8 +67,8 @@ async def test_an_unreachable_daemon_is_named_once() -> None:
     api = f"http://127.0.0.1:{free_port()}"
     found = await found_at(api)
 
-    assert api in found.cause("ipfs daemon")
-    assert "is the daemon running" in found.cause("ipfs daemon")
+    assert found.cause("ipfs daemon").code == "daemon-unreachable"
+    assert api in found.cause("ipfs daemon").message
     assert list(found) == ["ipfs daemon"]
 
 

@@ -41,7 +41,7 @@ async def test_a_router_on_every_address_passes(site: Site, hosts: tuple[str, ..
         session.close()  # type: ignore[no-untyped-call]
 
     assert found.failed == [], dict(found)
-    assert "accepts our certificate and presents that of everywhere" in found.one("router").message
+    assert "everywhere" in found.one("router").message
 
 
 async def test_a_router_of_a_foreign_site_on_every_address_is_named(site: Site, tmp_path: Path) -> None:
@@ -55,7 +55,7 @@ async def test_a_router_of_a_foreign_site_on_every_address_is_named(site: Site, 
     finally:
         session.close()  # type: ignore[no-untyped-call]
 
-    assert "is not trusted" in found.cause("router")
+    assert found.cause("router").code == "untrusted"
 
 
 @pytest.mark.parametrize(("role", "option"), [("operator", "--connect"), ("edge", "--connect"), ("router", "--listen")])
@@ -63,5 +63,5 @@ async def test_settings_without_a_router_are_named(role: Role, option: str) -> N
     found = await examined(DoctorContext(settings=Settings(connect=(), listen=()), requested_role=role))
 
     result = found.one("router")
-    assert (result.ok, result.message) == (False, "the settings name no router")
+    assert (result.ok, result.code) == (False, "router-missing")
     assert option in result.hint
