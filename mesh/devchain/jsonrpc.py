@@ -6,8 +6,10 @@ Quantities are hexadecimal without leading zeros (`0x0`, `0x1f`), data is hexade
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 
 from mesh.errors import AiraError
@@ -27,7 +29,21 @@ INVALID_REQUEST: Final = -32600
 INVALID_PARAMS: Final = -32602
 INTERNAL_ERROR: Final = -32603
 SERVER_ERROR: Final = -32000
-MAX_BATCH: Final = 1000
+RESPONSE_TOO_LARGE: Final = -32003
+LIMIT_EXCEEDED: Final = -32005
+
+MAX_BATCH: Final = 1_000
+"""Requests in a batch."""
+MAX_QUANTITY: Final = 2**256 - 1
+MAX_RESPONSE_BYTES: Final = 25_000_000
+"""The answers to a batch; the requests that come after are refused."""
+INLINE_BYTES: Final = 50_000
+"""Requests up to this size are parsed on the event loop; larger ones, and all answers, in a thread."""
+
+CHANGES: Final = frozenset({"eth_sendRawTransaction", "eth_sendTransaction", "evm_mine", "evm_revert"})
+"""The methods that change the chain: one after another."""
+RUNS: Final = frozenset({"eth_call", "eth_estimateGas"})
+"""The methods that run contracts, which takes time, and change nothing: several at once."""
 
 Method: TypeAlias = "Callable[[list[Any]], Awaitable[Any]]"
 """A method that a connection has in addition to the provider's. Raises `RpcError`."""
@@ -52,13 +68,14 @@ class RpcError(Exception):
 
 def parse_quantity(value: object) -> int:
     """A quantity of the parameters as an int. Raises `RpcError` (invalid params)."""
-    if isinstance(value, int) and not isinstance(value, bool) and value >= 0:
-        return value
-    if isinstance(value, str) and value.startswith("0x"):
-        try:
-            return int(value, 16)
-        except ValueError:
-            pass
+    number = -1
+    if isinstance(value, int) and not isinstance(value, bool):
+        number = value
+    elif isinstance(value, str) and value.startswith("0x"):
+        with suppress(ValueError):
+            number = int(value, 16)
+    if 0 <= number <= MAX_QUANTITY:
+        return number
     raise RpcError(INVALID_PARAMS, f"{str(value)[:80]!r} is not a quantity (0x…)")
 
 
@@ -103,24 +120,35 @@ def camel(name: str) -> str:
 class Dispatcher:
     """Answers JSON-RPC requests with the results of a provider; any other text with a JSON-RPC error."""
 
-    def __init__(self, provider: AsyncBaseProvider) -> None:
+    def __init__(self, provider: AsyncBaseProvider, *, max_response_bytes: int = MAX_RESPONSE_BYTES) -> None:
         self._provider = provider
+        self._max_response_bytes = max_response_bytes
 
-    async def respond(self, text: str | bytes, *, methods: Mapping[str, Method] | None = None) -> Any:
-        """The response to a request or a batch; None for notifications, which get none.
+    async def respond(self, text: str | bytes, *, methods: Mapping[str, Method] | None = None) -> str | None:
+        """The response to a request or a batch, as JSON; None for notifications, which get none.
 
         `methods` are those of the connection it came on.
         """
         try:
-            body = json.loads(text)
+            body = json.loads(text) if len(text) < INLINE_BYTES else await asyncio.to_thread(json.loads, text)
         except (ValueError, RecursionError):
-            return _failure(None, PARSE_ERROR, "the body is not JSON")
+            return json.dumps(_failure(None, PARSE_ERROR, "the body is not JSON"))
         if not isinstance(body, list):
             return await self._answer(body, methods or {})
         if not 0 < len(body) <= MAX_BATCH:
-            return _failure(None, INVALID_REQUEST, f"a batch holds 1 to {MAX_BATCH} requests")
-        answers = [answer for one in body if (answer := await self._answer(one, methods or {})) is not None]
-        return answers or None
+            return json.dumps(_failure(None, INVALID_REQUEST, f"a batch holds 1 to {MAX_BATCH} requests"))
+        answers: list[str] = []
+        size = 0
+        for request in body:
+            if size > self._max_response_bytes:
+                id_ = request.get("id") if isinstance(request, dict) else None
+                answer: str | None = json.dumps(_failure(id_, RESPONSE_TOO_LARGE, "response too large"))
+            else:
+                answer = await self._answer(request, methods or {})
+            if answer is not None:
+                answers.append(answer)
+                size += len(answer)
+        return f"[{','.join(answers)}]" if answers else None
 
     async def ask(self, method: str, params: list[Any]) -> Any:
         """The result of a method of the provider. Raises `RpcError`, and what the provider raises."""
@@ -130,15 +158,17 @@ class Dispatcher:
             raise RpcError(int(error["code"]), str(error["message"]), data=error.get("data"))
         return response.get("result")
 
-    async def _answer(self, request: Any, methods: Mapping[str, Method]) -> dict[str, Any] | None:
+    async def _answer(self, request: Any, methods: Mapping[str, Method]) -> str | None:
         """The response to one request; None for a notification, which gets none."""
         if not isinstance(request, dict) or not isinstance(request.get("method"), str):
-            return _failure(None, INVALID_REQUEST, "a request is an object with jsonrpc, id, method and params")
+            return json.dumps(
+                _failure(None, INVALID_REQUEST, "a request is an object with jsonrpc, id, method and params")
+            )
         id_, params = request.get("id"), request.get("params", [])
         if not isinstance(params, list):
-            return _failure(id_, INVALID_PARAMS, "params are a list")
+            return json.dumps(_failure(id_, INVALID_PARAMS, "params are a list"))
         answer = await self._call(request["method"], params, id_, methods)
-        return answer if "id" in request else None
+        return await asyncio.to_thread(json.dumps, answer) if "id" in request else None
 
     async def _call(self, method: str, params: list[Any], id_: Any, methods: Mapping[str, Method]) -> dict[str, Any]:
         try:

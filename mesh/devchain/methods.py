@@ -1,19 +1,22 @@
 """The JSON-RPC methods of the embedded node, and the filters that it keeps for its clients.
 
-Enough for this project's clients, web3.py, ethers and the legacy JavaScript (which polls blocks and receipts, and
-lists lighthouses with a filter). The node has no accounts of its own to sign with.
+Enough for this project's clients, web3.py, ethers and both legacy JavaScript clients, which also send transactions of
+the node's unlocked accounts.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.chain.errors import METHOD_NOT_FOUND
-from mesh.devchain.evm import PRIORITY_FEE_WEI, Call, Evm
+from mesh.devchain.calls import parse_call
+from mesh.devchain.evm import PRIORITY_FEE_WEI, Evm
 from mesh.devchain.jsonrpc import (
     INTERNAL_ERROR,
     INVALID_PARAMS,
+    LIMIT_EXCEEDED,
     SERVER_ERROR,
     RpcError,
     parse_data,
@@ -21,6 +24,7 @@ from mesh.devchain.jsonrpc import (
     to_json,
 )
 from mesh.devchain.subscriptions import LogFilter
+from mesh.devchain.unlocked import UnlockedAccounts
 from schemas import keccak256
 
 if TYPE_CHECKING:
@@ -37,7 +41,8 @@ class Methods:
 
     def __init__(self, evm: Evm) -> None:
         self._evm = evm
-        filters = NodeFilters(evm, self._logs)
+        filters = NodeFilters(evm, self._logs, self._bound)
+        accounts = UnlockedAccounts(evm)
         self._table: dict[str, Callable[..., Any]] = {
             "web3_clientVersion": lambda: "aira-embedded/py-evm",
             "web3_sha3": lambda data: keccak256(parse_data(data)),
@@ -45,7 +50,11 @@ class Methods:
             "net_listening": lambda: True,
             "net_peerCount": lambda: 0,
             "eth_syncing": lambda: False,
-            "eth_accounts": list,
+            "eth_accounts": lambda: accounts.addresses,
+            "eth_coinbase": lambda: accounts.addresses[0],
+            "eth_sign": accounts.sign,
+            "personal_sign": lambda text, address, _password=None: accounts.sign(address, text),
+            "eth_sendTransaction": accounts.send,
             "eth_chainId": lambda: evm.chain_id,
             "eth_blockNumber": lambda: evm.head,
             "eth_gasPrice": lambda: evm.base_fee + PRIORITY_FEE_WEI,
@@ -64,8 +73,8 @@ class Methods:
             "eth_getFilterChanges": filters.changes,
             "eth_getFilterLogs": filters.everything,
             "eth_uninstallFilter": filters.remove,
-            "eth_call": lambda call, block="latest": evm.call(_call(call), self._height(block)),
-            "eth_estimateGas": lambda call, block="latest": evm.estimate(_call(call), self._height(block)),
+            "eth_call": lambda call, block="latest": evm.calls.call(parse_call(call), self._height(block)),
+            "eth_estimateGas": lambda call, block="latest": evm.calls.estimate(parse_call(call), self._height(block)),
             "eth_sendRawTransaction": lambda raw: evm.send(parse_data(raw)),
             "evm_mine": self._mine,
             "evm_snapshot": lambda: evm.head,
@@ -125,22 +134,16 @@ class Methods:
             first = self._bound(query.get("fromBlock"))
             last = self._bound(query.get("toBlock"))
         wanted = LogFilter(query)
-        return [log for log in self._evm.logs(first, last) if wanted.accepts(log)]
+        found = list(
+            islice((log for log in self._evm.logs(first, last) if wanted.accepts(log)), self._evm.max_logs + 1)
+        )
+        if len(found) > self._evm.max_logs:
+            raise RpcError(LIMIT_EXCEEDED, f"query returned more than {self._evm.max_logs} results")
+        return found
 
     def _bound(self, block: object) -> int:
         """A bound of a range of blocks, which may be past the head, unlike the block of a call."""
         return self._evm.height(block or "latest") if block is None or block in TAGS else parse_quantity(block)
-
-
-def _call(call: dict[str, Any]) -> Call:
-    fields: Call = {"data": parse_data(call.get("input") or call.get("data") or "0x")}
-    for name in ("from", "to"):
-        if call.get(name) not in (None, "0x"):
-            fields[name] = parse_data(call[name], length=20)
-    for name in ("gas", "value"):
-        if call.get(name) is not None:
-            fields[name] = parse_quantity(call[name])
-    return fields
 
 
 class _Filter:
@@ -154,12 +157,18 @@ class _Filter:
 class NodeFilters:
     """The filters of one node (`eth_newFilter`, …): each returns what is new since the last request.
 
-    `logs` answers a query as `eth_getLogs` does. All methods raise `RpcError`.
+    `logs` answers a query as `eth_getLogs` does, and `bound` reads a bound of its range. All methods raise `RpcError`.
     """
 
-    def __init__(self, evm: Evm, logs: Callable[[dict[str, Any]], list[dict[str, Any]]]) -> None:
+    def __init__(
+        self,
+        evm: Evm,
+        logs: Callable[[dict[str, Any]], list[dict[str, Any]]],
+        bound: Callable[[object], int],
+    ) -> None:
         self._evm = evm
         self._logs = logs
+        self._bound = bound
         self._filters: OrderedDict[str, _Filter] = OrderedDict()
         self._made = 0
 
@@ -174,17 +183,25 @@ class NodeFilters:
         return self._add(None)
 
     def changes(self, name: object) -> list[Any]:
-        """What is new since the last request."""
+        """What is new since the last request. The rest follows with the next one if it is much."""
         found = self._find(name)
         # The chain may have been reverted in the meantime.
         first = min(found.next_block, self._evm.head + 1)
         found.next_block = self._evm.head + 1
         if found.query is None:
+            found.next_block = min(found.next_block, first + self._evm.max_logs)
             return [self._hash(number) for number in range(first, found.next_block)]
         if isinstance(found.query.get("fromBlock"), str) and found.query["fromBlock"].startswith("0x"):
             first = max(first, parse_quantity(found.query["fromBlock"]))
-        logs = self._logs(found.query | {"fromBlock": first})
-        return [log for log in logs if int(log["blockNumber"], 16) >= first]
+        wanted, last = LogFilter(found.query), self._bound(found.query.get("toBlock"))
+        logs: list[dict[str, Any]] = []
+        for log in self._evm.logs(first, last):
+            if wanted.accepts(log):
+                if len(logs) >= self._evm.max_logs and log["blockNumber"] != logs[-1]["blockNumber"]:
+                    found.next_block = int(log["blockNumber"], 16)
+                    break
+                logs.append(log)
+        return logs
 
     def everything(self, name: object) -> list[dict[str, Any]]:
         """All logs that a filter's query accepts."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 from aiohttp import WSMsgType, web
 
 from mesh.devchain.errors import PortUnavailable
-from mesh.devchain.jsonrpc import INVALID_PARAMS, Dispatcher, RpcError
+from mesh.devchain.jsonrpc import INVALID_PARAMS, LIMIT_EXCEEDED, MAX_RESPONSE_BYTES, Dispatcher, RpcError
 from mesh.devchain.subscriptions import Subscriptions
 from mesh.log_context import log_event
 
@@ -29,6 +29,11 @@ HEARTBEAT: Final = 30.0
 """Seconds between two pings of a WebSocket."""
 MAX_UNSENT: Final = 10_000
 """Messages that wait for a client to read them; a client that falls further behind is disconnected."""
+MAX_UNSENT_BYTES: Final = 64_000_000
+MAX_CONNECTIONS: Final = 200
+"""WebSockets that are open at once; more are refused with HTTP 503."""
+MAX_SUBSCRIPTIONS: Final = 100
+"""Subscriptions of a connection."""
 LOOPBACK_NAMES: Final = frozenset({"127.0.0.1", "localhost", "[::1]", "::1"})
 
 
@@ -52,8 +57,9 @@ class JsonRpcServer:
         host: str = "127.0.0.1",
         port: int = 0,
         allowed_origins: Iterable[str] = (),
+        max_response_bytes: int = MAX_RESPONSE_BYTES,
     ) -> None:
-        self._dispatcher = Dispatcher(provider)
+        self._dispatcher = Dispatcher(provider, max_response_bytes=max_response_bytes)
         self._subscriptions: Subscriptions | None = None
         self._connections: set[WebSocketConnection] = set()
         self._host = host
@@ -112,7 +118,7 @@ class JsonRpcServer:
         answer = await self._dispatcher.respond(await request.read())
         if answer is None:
             return web.Response(status=204, headers=headers)
-        return web.json_response(answer, headers=headers)
+        return web.Response(text=answer, content_type="application/json", headers=headers)
 
     async def _open_socket(self, request: web.Request) -> web.StreamResponse:
         headers = self._admit(request)
@@ -121,11 +127,13 @@ class JsonRpcServer:
             raise web.HTTPUpgradeRequired(
                 text="this is a node: POST JSON-RPC here, or open a WebSocket", headers=headers
             )
+        if len(self._connections) >= MAX_CONNECTIONS:
+            raise web.HTTPServiceUnavailable(text="too many WebSockets are open", headers=headers)
         assert self._subscriptions is not None
-        await socket.prepare(request)
         connection = WebSocketConnection(request, socket, self._dispatcher, self._subscriptions)
         self._connections.add(connection)
         try:
+            await socket.prepare(request)
             await connection.run()
         finally:
             self._connections.discard(connection)
@@ -166,8 +174,9 @@ class WebSocketConnection:
         self._dispatcher = dispatcher
         self._subscriptions = subscriptions
         self._own_ids: set[str] = set()
-        self._unsent: asyncio.Queue[Any] = asyncio.Queue()
-        self._held: list[Any] | None = None
+        self._unsent: asyncio.Queue[str] = asyncio.Queue()
+        self._unsent_bytes = 0
+        self._held: list[str] | None = None
         """Notifications during a request: the id of a new subscription is sent before its first notification."""
 
     async def run(self) -> None:
@@ -181,8 +190,8 @@ class WebSocketConnection:
                 self._held = []
                 answer = await self._dispatcher.respond(message.data, methods=methods)
                 held, self._held = self._held, None
-                for one in ([] if answer is None else [answer]) + held:
-                    self._send(one)
+                for text in ([] if answer is None else [answer]) + held:
+                    self._send(text)
         finally:
             for subscription_id in self._own_ids:
                 self._subscriptions.remove(subscription_id)
@@ -194,6 +203,8 @@ class WebSocketConnection:
         await self._socket.close(code=1001, message=b"the node ends")
 
     async def _subscribe(self, params: list[Any]) -> str:
+        if len(self._own_ids) >= MAX_SUBSCRIPTIONS:
+            raise RpcError(LIMIT_EXCEEDED, f"a connection has at most {MAX_SUBSCRIPTIONS} subscriptions")
         subscription_id = await self._subscriptions.add(params, self._notify)
         self._own_ids.add(subscription_id)
         return subscription_id
@@ -205,15 +216,23 @@ class WebSocketConnection:
         return self._subscriptions.remove(params[0])
 
     def _notify(self, notification: dict[str, Any]) -> None:
+        text = json.dumps(notification)
         if self._held is None:
-            self._send(notification)
+            self._send(text)
+        elif len(self._held) < MAX_UNSENT:
+            self._held.append(text)
         else:
-            self._held.append(notification)
+            self._drop()
 
-    def _send(self, message: Any) -> None:
-        if self._unsent.qsize() < MAX_UNSENT:
-            self._unsent.put_nowait(message)
-        elif self._request.transport is not None:
+    def _send(self, text: str) -> None:
+        self._unsent_bytes += len(text)
+        if self._unsent.qsize() < MAX_UNSENT and self._unsent_bytes < MAX_UNSENT_BYTES:
+            self._unsent.put_nowait(text)
+        else:
+            self._drop()
+
+    def _drop(self) -> None:
+        if self._request.transport is not None:
             log.warning(
                 "a client reads too slowly; disconnecting it",
                 extra=log_event("rpc-client-dropped", client=self._request.remote),
@@ -223,4 +242,6 @@ class WebSocketConnection:
     async def _write(self) -> None:
         with suppress(ConnectionError):
             while True:
-                await self._socket.send_str(json.dumps(await self._unsent.get()))
+                text = await self._unsent.get()
+                await self._socket.send_str(text)
+                self._unsent_bytes -= len(text)

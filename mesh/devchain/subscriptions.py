@@ -13,7 +13,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 from mesh.chain.errors import METHOD_NOT_FOUND
-from mesh.devchain.jsonrpc import INVALID_PARAMS, RpcError, parse_data
+from mesh.devchain.jsonrpc import INVALID_PARAMS, RpcError, parse_data, parse_quantity
 from mesh.log_context import log_event
 
 if TYPE_CHECKING:
@@ -27,6 +27,11 @@ POLL_INTERVAL: Final = 0.05
 
 REMEMBERED: Final = 128
 """Blocks that are remembered, to notice that they were replaced."""
+
+MAX_PLACES: Final = 4
+"""Topics of a log."""
+MAX_ALTERNATIVES: Final = 1_000
+"""Addresses in a query of logs, or topics in one place."""
 
 BODY: Final = frozenset({"transactions", "uncles", "withdrawals", "size", "totalDifficulty"})
 """Members of a block that are not in its header."""
@@ -49,6 +54,15 @@ class LogFilter:
         addresses, places = query.get("address") or [], query.get("topics") or []
         if not isinstance(places, list | tuple):
             raise RpcError(INVALID_PARAMS, "the topics of a query of logs are a list")
+        if len(_alternatives(addresses)) > MAX_ALTERNATIVES:
+            raise RpcError(INVALID_PARAMS, "exceed max addresses")
+        if len(places) > MAX_PLACES or any(len(_alternatives(place)) > MAX_ALTERNATIVES for place in places):
+            raise RpcError(INVALID_PARAMS, "exceed max topics")
+        bounds = [query.get("fromBlock"), query.get("toBlock")]
+        if all(isinstance(bound, str) and bound.startswith("0x") for bound in bounds):
+            first, last = map(parse_quantity, bounds)
+            if first > last:
+                raise RpcError(INVALID_PARAMS, "invalid block range params")
         self._addresses = {_hex(parse_data(address, length=20)) for address in _alternatives(addresses)}
         self._topics: Sequence[set[str] | None] = [
             None if place is None else {_hex(parse_data(topic, length=32)) for topic in _alternatives(place)}

@@ -120,3 +120,37 @@ async def test_a_block_filter_has_no_logs(node: EmbeddedChain) -> None:
     with pytest.raises(RpcError) as caught:
         await node.request("eth_getFilterLogs", [name])
     assert caught.value.code == INVALID_PARAMS
+
+
+async def test_the_node_signs_for_its_funded_accounts(node: EmbeddedChain) -> None:
+    [first, second, *others] = await node.request("eth_accounts", [])
+    assert len(others) == 8
+    assert first == await node.request("eth_coinbase", [])
+    hash_ = await node.request("eth_sendTransaction", [{"from": first, "to": second, "value": "0x5"}])
+    transaction = await node.request("eth_getTransactionByHash", [hash_])
+    assert (transaction["from"], transaction["to"], transaction["gas"]) == (first, second, hex(21_000))
+    given = {"from": first, "to": second, "gas": "0x7530", "gasPrice": "0x77359400", "nonce": "0x1"}
+    transaction = await node.request("eth_getTransactionByHash", [await node.request("eth_sendTransaction", [given])])
+    assert {name: transaction[name] for name in ("gas", "gasPrice", "nonce")} == {
+        name: given[name] for name in ("gas", "gasPrice", "nonce")
+    }
+
+
+async def test_the_node_signs_messages_as_anvil_does(node: EmbeddedChain) -> None:
+    first = (await node.request("eth_accounts", []))[0]
+    signed = await node.request("eth_sign", [first, "0x11"])
+    assert signed == (
+        "0x8afa5df03d97e7cd3b15002a4813add96a04fa0bae5650d993b9036d82d73f3c"
+        "5b9dba495ff7638c54737ad84375222028faa2d91fbe1b5b6d6298039d7d61171b"
+    )
+    assert signed == await node.request("personal_sign", ["0x11", first])
+
+
+@pytest.mark.parametrize(
+    ("method", "params"),
+    [("eth_sendTransaction", [{"from": FRIEND}]), ("eth_sendTransaction", [{}]), ("eth_sign", [FRIEND, "0x11"])],
+)
+async def test_the_node_signs_for_no_other_account(node: EmbeddedChain, method: str, params: list[Any]) -> None:
+    with pytest.raises(RpcError) as caught:
+        await node.request(method, params)
+    assert caught.value.code == INVALID_PARAMS

@@ -1,0 +1,81 @@
+"""py-evm with a limit on the time that one run may take.
+
+Gas alone does not bound it: py-evm needs ten seconds and more for the gas of one block. Code without end has to jump or
+to call, so time is checked there.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Final
+
+from eth.constants import GAS_JUMPDEST
+from eth.vm import mnemonics, opcode_values
+from eth.vm.forks.prague import PragueVM
+from eth.vm.forks.prague.computation import PragueComputation
+from eth.vm.forks.prague.state import PragueState
+from eth.vm.opcode import as_opcode
+
+from mesh.devchain.jsonrpc import SERVER_ERROR, RpcError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from eth.abc import ComputationAPI
+
+GAS_LIMIT: Final = 30_000_000
+"""Gas that a block may use, and a call."""
+
+
+class _RunTooLong(Exception):
+    """A run used up its time. Not an error of the EVM: it ends the outermost run."""
+
+
+class _Limit(threading.local):
+    """The limit of the run in this thread."""
+
+    deadline: float | None = None
+    """As `time.thread_time` counts: a busy machine does not shorten a run."""
+
+
+_limit: Final = _Limit()
+
+
+@contextmanager
+def bounded(seconds: float) -> Iterator[None]:
+    """End a run of the body once this thread has computed for that many seconds. Raises `RpcError` then, as geth."""
+    _limit.deadline = time.thread_time() + seconds
+    try:
+        yield
+    except _RunTooLong:
+        raise RpcError(SERVER_ERROR, f"execution aborted (timeout = {seconds:g}s)") from None
+    finally:
+        _limit.deadline = None
+
+
+def _check_time(computation: object = None) -> None:
+    if _limit.deadline is not None and time.thread_time() > _limit.deadline:
+        raise _RunTooLong
+
+
+class _BoundedComputation(PragueComputation):
+    opcodes = PragueComputation.opcodes | {
+        opcode_values.JUMPDEST: as_opcode(logic_fn=_check_time, mnemonic=mnemonics.JUMPDEST, gas_cost=GAS_JUMPDEST)
+    }
+
+    @classmethod
+    def apply_computation(cls, *args: Any, **kwargs: Any) -> ComputationAPI:
+        _check_time()
+        return super().apply_computation(*args, **kwargs)
+
+
+class _BoundedState(PragueState):
+    computation_class = _BoundedComputation
+
+
+class BoundedVM(PragueVM):
+    """The rules of Prague, in runs that `bounded` limits."""
+
+    _state_class = _BoundedState
