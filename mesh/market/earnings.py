@@ -14,7 +14,7 @@ REASONS: Final = 64
 """Rejection reasons that are counted apart; further ones, which a stranger's contract may invent, count as `OTHER`."""
 OTHER: Final = "Other"
 REMEMBERED: Final = 4096
-"""Liabilities whose entries can still be reverted; a reorganisation replaces only the last blocks."""
+"""Transactions whose entries can still be reverted, or come back; a reorganisation replaces only the last blocks."""
 WN_DIGITS: Final = 9
 WEI_DIGITS: Final = 18
 
@@ -72,18 +72,18 @@ class EarningsLedger:
         self._reverted = EarningsEntry()
         self._matches = 0
         self._rejected: Counter[str] = Counter()
-        self._created: OrderedDict[str, EarningsEntry] = OrderedDict()
-        self._finalized: OrderedDict[str, EarningsEntry] = OrderedDict()
+        self._mined: OrderedDict[str, EarningsEntry] = OrderedDict()
+        self._gone: OrderedDict[str, EarningsEntry] = OrderedDict()
 
     def created(self, created: Created, *, fee: int) -> None:
         """A contract was created; its promisor paid `fee` (wn)."""
         entry = EarningsEntry(created=1, gas_used=created.gas_used, spent=created.wei, fees=fee)
-        self._enter(self._created, created.liability, entry)
+        self._enter(created.tx, entry)
 
-    def finalized(self, liability: str, settled: Settled) -> None:
-        """The contract at the address `liability` was finalized."""
+    def finalized(self, settled: Settled) -> None:
+        """A contract was finalized."""
         entry = EarningsEntry(finalized=1, gas_used=settled.gas_used, spent=settled.wei, minted=settled.minted)
-        self._enter(self._finalized, liability, entry)
+        self._enter(settled.tx, entry)
 
     def failed(self, error: Reverted) -> None:
         """A transaction was reverted; it cost gas if it was mined."""
@@ -98,13 +98,16 @@ class EarningsLedger:
         """A demand and an offer matched."""
         self._matches += 1
 
-    def liability_reverted(self, liability: str) -> None:
-        """A reorganisation reverted the creation of a contract."""
-        self._take_off(self._created, liability)
+    def reverted(self, tx: str) -> None:
+        """A reorganisation reverted a transaction, perhaps not ours."""
+        if (entry := self._mined.pop(tx, None)) is not None:
+            self._reverted = _sum(self._reverted, entry)
+            _keep(self._gone, tx, entry)
 
-    def finalization_reverted(self, liability: str) -> None:
-        """A reorganisation reverted the finalization of a contract."""
-        self._take_off(self._finalized, liability)
+    def mined(self, tx: str) -> None:
+        """A transaction is on the chain, perhaps not ours: if it was reverted before, it counts again."""
+        if (entry := self._gone.pop(tx, None)) is not None:
+            self._enter(tx, entry)
 
     def earnings(self) -> Earnings:
         """The sums now."""
@@ -117,15 +120,17 @@ class EarningsLedger:
         """Everything that was entered, and what of it was reverted."""
         return Turnover(self._matches, self._entered, self._reverted)
 
-    def _enter(self, entries: OrderedDict[str, EarningsEntry], liability: str, entry: EarningsEntry) -> None:
-        self._take_off(entries, liability)
-        entries[liability] = entry
+    def _enter(self, tx: str, entry: EarningsEntry) -> None:
+        self.reverted(tx)
+        self._gone.pop(tx, None)
         self._entered = _sum(self._entered, entry)
-        if len(entries) > REMEMBERED:
-            entries.popitem(last=False)
+        _keep(self._mined, tx, entry)
 
-    def _take_off(self, entries: OrderedDict[str, EarningsEntry], liability: str) -> None:
-        self._reverted = _sum(self._reverted, entries.pop(liability, EarningsEntry()))
+
+def _keep(entries: OrderedDict[str, EarningsEntry], tx: str, entry: EarningsEntry) -> None:
+    entries[tx] = entry
+    if len(entries) > REMEMBERED:
+        entries.popitem(last=False)
 
 
 def _sum(total: EarningsEntry, more: EarningsEntry) -> EarningsEntry:

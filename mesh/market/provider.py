@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from mesh.chain import InsufficientFunds
 from mesh.log_context import LogSource, source_context
-from mesh.market.book import LIMIT, Match, OrderBook, Refusal
+from mesh.market.book import LIMIT, Match, OrderBook
 from mesh.market.earnings import Earnings, EarningsLedger
 from mesh.market.services import OrderBookService, ProviderStatusService
 from mesh.market.settlement import OPEN_LIABILITIES, Settlement
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from mesh.network import Network, Subscription
     from mesh.retry import RetryPolicy
     from mesh.telemetry.metrics import MetricFamily
+    from schemas import Verified
 
 __all__ = ["Earnings", "Provider", "ProviderProcess", "check_account"]
 
@@ -74,6 +75,7 @@ class Provider(Role):
 
     async def _open(self, stack: AsyncExitStack) -> None:
         address, head = await self._chain.names.address(self._lighthouse), await self._chain.block_number()
+        head = max(head - self._chain.node.timing.reorg_depth, 0)  # blocks that may be replaced are read again
         self.book = OrderBook(address, limit=self._limit)
         self.book.expire(head)
         self.queue = TransactionQueue(
@@ -106,10 +108,10 @@ class Provider(Role):
             self.channel,
             book=self.book,
             queue=self.queue,
-            results=self.results,
             earnings=self.ledger,
             head=head,
             matched=self._matched,
+            forget=self._forget,
             open_limit=self._open_liabilities,
         )
         self._status = ProviderStatusService(
@@ -147,8 +149,13 @@ class Provider(Role):
         await orders.recall()
         async for order in orders:
             await self.queue.has_room()
-            if self.settlement.add(order) is Refusal.FULL:
-                orders.forget(order)
+            self.settlement.add(order)
+
+    def _forget(self, verified: Verified[Any]) -> None:
+        """Let the next copy of a message through: it is not handled, or its effect was not confirmed."""
+        for subscription in (self._demands, self._offers, self.results):
+            if subscription.kind == verified.message.kind:
+                subscription.forget(verified)
 
     async def _take_results(self) -> None:
         async for result in self.results:

@@ -1,14 +1,17 @@
 """Settlement: creating liabilities from matching orders, and finalizing them by results.
 
-Other providers do the same, and the chain may replace its last blocks. So settlement follows the chain: orders that
-others used leave the book, and what a reorganisation reverts is done again.
+Other providers do the same, and the chain may replace its last blocks. So settlement follows the chain, and a receipt
+settles nothing. Orders that others used leave the book. A match or result stays under settlement (`Unconfirmed`) until
+its event was read on the followed chain and is `Timing.confirmations` deep; if it vanishes before, or is reverted
+later, it is settled again. What leaves for another reason (it is refused, another provider was first) is forgotten by
+its subscription, so that the copy that its sender repeats next gets through.
 """
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import time
-from collections import OrderedDict
 from contextlib import aclosing
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
@@ -27,57 +30,34 @@ from mesh.chain import (
 from mesh.errors import AiraError, InputError
 from mesh.log_context import liability_context, log_event
 from mesh.market.book import ORDER_USED, Match, Refusal, at_fault, reason_word
+from mesh.market.rejections import RejectionPublisher
+from mesh.market.unconfirmed import Unconfirmed
 from mesh.outage_log import OutageLog
 from mesh.retry import Backoff
-from schemas import ZERO_ADDRESS, Demand, Offer, RejectKey, Result, address_bytes
-from schemas.signing import Rejection
+from schemas import ZERO_ADDRESS, Demand, Offer, Result, address_bytes
 
 if TYPE_CHECKING:
-    import asyncio
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from mesh.chain import BlockEvents, Chain
     from mesh.market.book import Order, OrderBook
     from mesh.market.earnings import EarningsLedger
     from mesh.market.transaction_queue import TransactionQueue
-    from mesh.network import Channel, Subscription
+    from mesh.network import Channel
     from schemas import Liability, Verified
 
 log = logging.getLogger(__name__)
 
 OPEN_LIABILITIES: Final = 65_536
 """Records of liabilities that are kept until they are finalized; others are read when their result arrives."""
-REMEMBERED: Final = 4096
-"""Liabilities whose messages are kept for a reorganisation, which replaces only the last blocks."""
-
-
-class SettledMessages:
-    """The orders and the result that the latest liabilities were created from and finalized by."""
-
-    def __init__(self, limit: int = REMEMBERED) -> None:
-        self._limit = limit
-        self._messages: OrderedDict[str, list[Verified[Any]]] = OrderedDict()
-
-    def add(self, liability: str, *messages: Verified[Any] | None) -> None:
-        """Remember messages (None: unknown here) that were used at the liability's address."""
-        kept = self._messages.setdefault(liability, [])
-        kept.extend(message for message in messages if message is not None and message not in kept)
-        if len(self._messages) > self._limit:
-            self._messages.popitem(last=False)
-
-    def pop(self, liability: str, *kinds: type[Any]) -> list[Verified[Any]]:
-        """Remove and return the messages of these kinds, in the order in which they were added."""
-        kept = self._messages.get(liability, [])
-        popped = [message for message in kept if isinstance(message.message, kinds)]
-        kept[:] = [message for message in kept if message not in popped]
-        return popped
+MISSING_CHECKS: Final = 3
+"""Checks in a row that find no trace of a mined transaction before it is sent again: one node may be behind another."""
 
 
 class Settlement:
     """The settlement of one market by the chain's account, on the market's open `channel`; it begins after `head`.
 
-    `matched` is called with each match. `results` is where results come from: one that could not be used yet is
-    forgotten there, so that it arrives again.
+    `matched` is called with each match. `forget` lets the next copy of a message through, as `Subscription.forget`.
     """
 
     def __init__(
@@ -87,34 +67,31 @@ class Settlement:
         *,
         book: OrderBook,
         queue: TransactionQueue,
-        results: Subscription[Result],
         earnings: EarningsLedger,
         head: int,
         matched: Callable[[Match], None],
+        forget: Callable[[Verified[Any]], None],
         open_limit: int = OPEN_LIABILITIES,
     ) -> None:
         assert chain.account is not None
         assert channel.address is not None
-        self.head = head
-        """The latest block that was read."""
-        self.read_at = time.monotonic()
-        """When it was read, on the monotonic clock."""
+        self.head, self.read_at = head, time.monotonic()
+        """The latest block that was read, and when, on the monotonic clock."""
         self.following = OutageLog(log, "chain")
         """Outages of the node while the chain is followed."""
         self.reading = OutageLog(log, "node")
         """Outages of the node while the state of liabilities and orders is read."""
         self._chain = chain
-        self._account = chain.account
-        self._channel = channel
         self._lighthouse = channel.address
         self._book = book
         self._queue = queue
-        self._results = results
         self._earnings = earnings
         self._matched = matched
+        self._forget = forget
+        self.reject: Final = RejectionPublisher(channel, chain.account, earnings).reject
         self._open_limit = open_limit
         self._open: dict[str, Liability] = {}
-        self._settled = SettledMessages()
+        self._unconfirmed = Unconfirmed(chain.node.timing.reorg_depth)
         self._history = History(chain.node.timing.reorg_depth)
 
     def start(self, tasks: asyncio.TaskGroup) -> None:
@@ -125,19 +102,21 @@ class Settlement:
     def add(self, order: Verified[Order]) -> Refusal | None:
         """Add an order to the book, and settle the match that it completes.
 
-        If the book refuses the order, returns why, and publishes a rejection unless the order is in the book already.
+        If the book refuses the order, returns why, and publishes a rejection unless the order is known already.
         """
-        outcome = self._book.add(order)
+        outcome = Refusal.DUPLICATE if order in self._unconfirmed else self._book.add(order)
         if isinstance(outcome, Match):
             demand, offer = outcome.demand.hash.hex(), outcome.offer.hash.hex()
             event = log_event("orders-matched", demand=demand, offer=offer)
             log.info("matched demand %s and offer %s", demand, offer, extra=event)
             self._earnings.matched()
             self._matched(outcome)
+            self._unconfirmed.begin(*outcome)
             self._tasks.create_task(self._create(outcome))
         elif isinstance(outcome, Refusal):
             if outcome is not Refusal.DUPLICATE:
                 self.reject(order, outcome.value, f"the order book refuses it: {outcome.value}")
+                self._forget(order)
             return outcome
         return None
 
@@ -145,11 +124,14 @@ class Settlement:
         """Finalize the liability that a result names, if the result may do that."""
         with liability_context(result.message.liability):
             liability = await self._chain.retrying(partial(self._liability, result), outages=self.reading)
-            if liability is None:
-                self._results.forget(result)
+            if result in self._unconfirmed:
+                return
+            if liability is None or liability.is_finalized:  # which may not be confirmed either
+                self._forget(result)
             elif result.signer != liability.promisor and liability.validator == ZERO_ADDRESS:
                 self.reject(result, "WrongSigner", f"signed by {result.signer}, not by the promisor")
-            elif not liability.is_finalized:
+            else:
+                self._unconfirmed.begin(result)
                 self._tasks.create_task(self._finalize(result))
 
     async def _liability(self, result: Verified[Result]) -> Liability | None:
@@ -172,20 +154,46 @@ class Settlement:
             await self._not_created(match, match, error)
         else:
             self._earnings.created(created, fee=offer.message.lighthouse_fee)
-            self._settled.add(created.liability, demand, offer)
-            event = log_event(
-                "contract-created", demand=demand.hash.hex(), offer=offer.hash.hex(), gas=created.gas_used
-            )
+            orders = {"demand": demand.hash.hex(), "offer": offer.hash.hex()}
+            event = log_event("contract-created", gas=created.gas_used, **orders)
             with liability_context(created.liability):
                 log.info("created, gas %d", created.gas_used, extra=event)
+            if not await self._is_confirmed(match, created.tx):
+                self._contract_reverted(created.liability, created.tx)
+            for order in match:
+                if not self._unconfirmed.end(order):
+                    self.add(order)
 
     async def _not_created(self, match: Match, rejected: tuple[Verified[Order], ...], error: AiraError) -> None:
         """Reject some orders of a match; put the other one back into the book, unless it was used meanwhile."""
+        reason = _reason(error)
         for order in match:
-            if order in rejected:
-                self.reject(order, _reason(error), str(error))
-            elif not await self._chain.retrying(partial(self._is_used, order), outages=self.reading):
+            was_used = self._unconfirmed.end(order)
+            if order in rejected and (reason == ORDER_USED or not was_used):
+                self.reject(order, reason, str(error))
+            if was_used:
+                continue
+            if order in rejected or await self._chain.retrying(partial(self._is_used, order), outages=self.reading):
+                self._forget(order)
+            else:
                 self.add(order)
+
+    async def _is_confirmed(self, messages: Sequence[Verified[Any]], tx: str) -> bool:
+        """Wait until the event that used the messages has its confirmations; False if their transaction vanished."""
+        timing, missing = self._chain.node.timing, 0
+        while missing < MISSING_CHECKS:
+            if all(self._unconfirmed.is_read(one, until=self.head - timing.confirmations + 1) for one in messages):
+                return True
+            await asyncio.sleep(timing.poll_interval)
+            is_there = all(self._unconfirmed.is_read(one, until=self.head) for one in messages)
+            is_there = is_there or await self._chain.retrying(partial(self._is_on_chain, tx), outages=self.reading)
+            missing = 0 if is_there else missing + 1
+        return False
+
+    async def _is_on_chain(self, tx: str) -> bool:
+        """Whether the node has a transaction, waiting or mined with success."""
+        receipt = await self._chain.node.receipt(tx)
+        return await self._chain.node.has_transaction(tx) if receipt is None else receipt["status"] == 1
 
     async def _is_used(self, order: Verified[Order]) -> bool:
         try:
@@ -200,30 +208,19 @@ class Settlement:
         with liability_context(message.liability):
             try:
                 finalized = await self._queue.send(partial(self._chain.liabilities.finalize, self._lighthouse, message))
-            except Reverted as error:
-                if error.reason != "AlreadyFinalized":
+            except (Reverted, NodeUnreachable, RequestRefused) as error:
+                if not isinstance(error, Reverted) or error.reason != "AlreadyFinalized":
                     self.reject(result, _reason(error), str(error))
-            except (NodeUnreachable, RequestRefused) as error:
-                # Perhaps not the result's fault; the promisor keeps sending it.
-                self.reject(result, _reason(error), str(error))
-                self._results.forget(result)
+                if not self._unconfirmed.end(result):
+                    self._forget(result)
             else:
-                self._earnings.finalized(message.liability, finalized)
-                self._settled.add(message.liability, result)
+                self._earnings.finalized(finalized)
                 event = log_event("contract-finalized", success=message.success, gas=finalized.gas_used)
                 log.info("finalized, success %s, gas %d", message.success, finalized.gas_used, extra=event)
-
-    def reject(self, message: Verified[Any], reason: str, detail: str) -> None:
-        """Count and publish a rejection. A used order's sender knows already that it became a contract."""
-        self._earnings.rejected(reason)
-        order = message.hash.hex()
-        event = log_event("message-rejected", order=order, signer=message.signer, reason=reason)
-        log.warning("rejected %s of %s: %s", order, message.signer, detail, extra=event)
-        if reason != ORDER_USED:
-            provider = self._account.address
-            rejection = Rejection(order=order, reason=reason, detail=detail, provider=provider)
-            key = str(RejectKey(self._channel.lighthouse, order, provider))
-            self._channel.put(key, rejection.signed_by(self._account.signer).encode())
+                if not await self._is_confirmed((result,), finalized.tx):
+                    self._earnings.reverted(finalized.tx)
+                if not self._unconfirmed.end(result):
+                    await self.add_result(result)
 
     async def _follow(self) -> None:
         backoff = Backoff(self._chain.node.timing.outage_retry)
@@ -244,52 +241,57 @@ class Settlement:
 
     async def _take_block(self, block: BlockEvents) -> None:
         for event in block.events:
+            if isinstance(event, NewLiability | Finalized):
+                self._earnings.mined(event.tx)
             if isinstance(event, NewLiability):
-                await self._take_created(event.liability)
+                await self._take_created(event.liability, block.block_number)
             elif isinstance(event, Finalized):
                 self._open.pop(event.liability, None)
+                self._unconfirmed.finalized(event.liability, block.block_number)
         self.head, self.read_at = block.block_number, time.monotonic()
+        self._unconfirmed.confirm(self.head)
         for order in self._book.expire(self.head):
             expired = log_event("order-expired", order=order.hash.hex(), signer=order.signer)
             log.info("expired order %s of %s", order.hash.hex(), order.signer, extra=expired)
 
-    async def _take_created(self, address: str) -> None:
-        """Take the orders of a new liability out of the book."""
+    async def _take_created(self, address: str, block: int) -> None:
+        """Take the orders of a new liability, created in that block, out of the book."""
         liability = await self._chain.liabilities.get(address)
         if liability.lighthouse != self._lighthouse:
             return
         demand_hash, offer_hash = await self._chain.liabilities.order_hashes(address)
-        demand = self._book.remove(demand_hash + address_bytes(liability.promisee))
-        offer = self._book.remove(offer_hash + address_bytes(liability.promisor))
-        self._settled.add(address, demand, offer)
+        for digest, signer in ((demand_hash, liability.promisee), (offer_hash, liability.promisor)):
+            identity = digest + address_bytes(signer)
+            order = self._book.remove(identity) or self._unconfirmed.get(identity)
+            if order is not None:
+                self._unconfirmed.created(address, block, order)
         if not liability.is_finalized:
             self._open[address] = liability
             if len(self._open) > self._open_limit:
                 del self._open[next(iter(self._open))]
 
     def _revert(self, block: Reorganisation) -> None:
-        """Do again what a reorganisation reverted. What happened again by itself, the contracts refuse."""
+        """Settle again what a reorganisation reverted. What happened again by itself, the contracts refuse."""
         self.head = block.block_number
-        created = [event.liability for event in block.reverted_events if isinstance(event, NewLiability)]
-        finalized = [event.liability for event in block.reverted_events if isinstance(event, Finalized)]
-        reorganised = log_event("chain-reorganised", head=self.head, created=len(created), finalized=len(finalized))
-        log.warning(
-            "a reorganisation reverted %d new contracts and %d finalizations",
-            len(created),
-            len(finalized),
-            extra=reorganised,
-        )
-        for address in created:
-            with liability_context(address):
-                log.warning("a reorganisation reverted the contract", extra=log_event("contract-reverted"))
-            self._open.pop(address, None)
-            self._earnings.liability_reverted(address)
-            for order in self._settled.pop(address, Demand, Offer):
+        created = [event for event in block.reverted_events if isinstance(event, NewLiability)]
+        finalized = [event for event in block.reverted_events if isinstance(event, Finalized)]
+        counts = {"created": len(created), "finalized": len(finalized)}
+        event = log_event("chain-reorganised", head=self.head, **counts)
+        log.warning("a reorganisation reverted %d new contracts, %d finalizations", *counts.values(), extra=event)
+        for creation in created:
+            self._contract_reverted(creation.liability, creation.tx)
+            self._open.pop(creation.liability, None)
+            for order in self._unconfirmed.reverted(creation.liability, Demand, Offer):
                 self.add(order)
-        for address in finalized:
-            self._earnings.finalization_reverted(address)
-            for result in self._settled.pop(address, Result):
-                self._tasks.create_task(self._finalize(result))
+        for end in finalized:
+            self._earnings.reverted(end.tx)
+            for result in self._unconfirmed.reverted(end.liability, Result):
+                self._tasks.create_task(self.add_result(result))
+
+    def _contract_reverted(self, address: str, tx: str) -> None:
+        with liability_context(address):
+            log.warning("a reorganisation reverted the contract", extra=log_event("contract-reverted"))
+        self._earnings.reverted(tx)
 
 
 def _reason(error: AiraError) -> str:

@@ -249,7 +249,7 @@ class Subscription(Generic[M]):
         return self._validator.kind.__name__.lower()
 
     def forget(self, verified: Verified[M]) -> None:
-        """Deliver a message once more when it is sent again, because it can't be handled yet."""
+        """Deliver a message once more when it is sent again; see `MessageValidator`."""
         self._validator.forget(verified)
 
     def statistics(self) -> ValidationStatistics:

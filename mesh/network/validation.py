@@ -68,9 +68,12 @@ class MessageValidator(Generic[M]):
     """Verifies the messages of one kind, and counts those that it rejects.
 
     `lighthouse` is the market's name in keys; `address`, if given, must be the orders' lighthouse. `head` returns the
-    latest block number, or 0 when it isn't known (then no deadline is checked). A message is a duplicate when key and
-    signature equal those of one of the last `deduplication_limit` accepted messages: equal generation-3 terms from two
-    signers are two messages. Thread-safe.
+    latest block number, or 0 when it isn't known (then no deadline is checked). Thread-safe.
+
+    A message is a duplicate when key and signature equal those of one of the last `deduplication_limit` accepted
+    messages that were not forgotten since; equal generation-3 terms from two signers are two messages. The rule for
+    consumers: hold a message until the chain has confirmed its effect, or `forget` it. Senders repeat a message until
+    they see its effect, so the copy that arrives next takes the place of the one that had none.
     """
 
     def __init__(
@@ -125,7 +128,7 @@ class MessageValidator(Generic[M]):
             self._invalid[reason] += 1
 
     def forget(self, verified: Verified[M]) -> None:
-        """Accept an accepted message once more when it is sent again."""
+        """Accept an accepted message once more when it is sent again: its consumer no longer holds it."""
         with self._lock:
             self._seen.pop((verified_key(self._lighthouse, verified), verified.message.signature), None)
 

@@ -7,22 +7,22 @@ from mesh.market import earnings
 from mesh.market.earnings import REASONS, Earnings, EarningsLedger
 
 ADDRESS = "0x19437Cb65760805A0e55339186F03B2d980eBBf9"
-OTHER = "0x27023154114b066515Ae678cb06E19417B8fcA73"
+CREATION, OTHER_CREATION, FINALIZATION = "0xabc", "0xbca", "0xdef"
 NOTHING = Earnings(created=0, finalized=0, rejected={}, gas_used=0, spent=0, fees=0, minted=0)
 
 
-def created(address: str = ADDRESS) -> Created:
-    return Created(address, "0xabc", gas_used=150_000, wei=3 * 10**14)
+def created(tx: str = CREATION) -> Created:
+    return Created(ADDRESS, tx, gas_used=150_000, wei=3 * 10**14)
 
 
 def settled() -> Settled:
-    return Settled("0xdef", gas_used=100_000, wei=2 * 10**14, minted=42_000)
+    return Settled(FINALIZATION, gas_used=100_000, wei=2 * 10**14, minted=42_000)
 
 
 def test_earnings_of_a_whole_job() -> None:
     ledger = EarningsLedger()
     ledger.created(created(), fee=5)
-    ledger.finalized(ADDRESS, settled())
+    ledger.finalized(settled())
     assert ledger.earnings() == Earnings(
         created=1, finalized=1, rejected={}, gas_used=250_000, spent=5 * 10**14, fees=5, minted=42_000
     )
@@ -39,11 +39,11 @@ def test_a_failed_transaction_costs_gas_if_it_was_mined() -> None:
 def test_a_reorganisation_subtracts_reverted_earnings() -> None:
     ledger = EarningsLedger()
     ledger.created(created(), fee=5)
-    ledger.created(created(OTHER), fee=1)
-    ledger.finalized(ADDRESS, settled())
-    ledger.finalization_reverted(ADDRESS)
-    ledger.liability_reverted(ADDRESS)
-    ledger.liability_reverted(ADDRESS)
+    ledger.created(created(OTHER_CREATION), fee=1)
+    ledger.finalized(settled())
+    ledger.reverted(FINALIZATION)
+    ledger.reverted(CREATION)
+    ledger.reverted(CREATION)
     assert ledger.earnings() == Earnings(
         created=1, finalized=0, rejected={}, gas_used=150_000, spent=3 * 10**14, fees=1, minted=0
     )
@@ -51,9 +51,21 @@ def test_a_reorganisation_subtracts_reverted_earnings() -> None:
 
 def test_a_reorganisation_does_not_subtract_earnings_of_others() -> None:
     ledger = EarningsLedger()
-    ledger.liability_reverted(ADDRESS)
-    ledger.finalization_reverted(ADDRESS)
+    ledger.reverted(CREATION)
+    ledger.reverted(FINALIZATION)
     assert ledger.earnings() == NOTHING
+
+
+def test_a_reverted_transaction_that_is_mined_again_counts_again() -> None:
+    ledger = EarningsLedger()
+    ledger.created(created(), fee=5)
+    ledger.mined(CREATION)
+    ledger.reverted(CREATION)
+    assert ledger.earnings() == NOTHING
+    ledger.mined(CREATION)
+    ledger.mined(CREATION)
+    ledger.mined(OTHER_CREATION)
+    assert (ledger.earnings().created, ledger.earnings().fees) == (1, 5)
 
 
 def test_rejections_are_counted_by_reason() -> None:
@@ -66,7 +78,7 @@ def test_rejections_are_counted_by_reason() -> None:
 def test_earnings_as_text_are_one_line() -> None:
     ledger = EarningsLedger()
     ledger.created(created(), fee=2 * 10**9)
-    ledger.finalized(ADDRESS, settled())
+    ledger.finalized(settled())
     ledger.rejected("full")
     assert str(ledger.earnings()) == (
         "contracts: 1 made, 1 finalized; messages rejected: 1; "
@@ -78,9 +90,9 @@ def test_turnover_only_grows_and_counts_reverted_entries_separately() -> None:
     ledger = EarningsLedger()
     ledger.matched()
     ledger.created(created(), fee=5)
-    ledger.finalized(ADDRESS, settled())
-    ledger.finalization_reverted(ADDRESS)
-    ledger.liability_reverted(ADDRESS)
+    ledger.finalized(settled())
+    ledger.reverted(FINALIZATION)
+    ledger.reverted(CREATION)
     ledger.created(created(), fee=5)
     seen = ledger.turnover()
     assert seen.matches == 1

@@ -1,0 +1,40 @@
+"""Rejections: what a provider tells the sender of a message that it can't use, and why."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any
+
+from mesh.log_context import log_event
+from mesh.market.book import ORDER_USED
+from schemas import RejectKey
+from schemas.signing import Rejection
+
+if TYPE_CHECKING:
+    from mesh.chain import Account
+    from mesh.market.earnings import EarningsLedger
+    from mesh.network import Channel
+    from schemas import Verified
+
+log = logging.getLogger(__name__)
+
+
+class RejectionPublisher:
+    """Counts the rejections of a provider's `account` in `earnings`, and publishes them on the market's `channel`."""
+
+    def __init__(self, channel: Channel, account: Account, earnings: EarningsLedger) -> None:
+        self._channel = channel
+        self._account = account
+        self._earnings = earnings
+
+    def reject(self, message: Verified[Any], reason: str, detail: str) -> None:
+        """Count and publish a rejection. A used order's sender knows already that it became a contract."""
+        self._earnings.rejected(reason)
+        order = message.hash.hex()
+        event = log_event("message-rejected", order=order, signer=message.signer, reason=reason)
+        log.warning("rejected %s of %s: %s", order, message.signer, detail, extra=event)
+        if reason != ORDER_USED:
+            provider = self._account.address
+            rejection = Rejection(order=order, reason=reason, detail=detail, provider=provider)
+            key = str(RejectKey(self._channel.lighthouse, order, provider))
+            self._channel.put(key, rejection.signed_by(self._account.signer).encode())
