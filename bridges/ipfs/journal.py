@@ -14,6 +14,7 @@ from bridges.ipfs.errors import JournalFailed
 from bridges.ipfs.publish_queue import QueuedMessage
 from bridges.ipfs.validation import RelayMessage
 from mesh.errors import ConfigurationError
+from mesh.private_files import make_private_database, make_private_folder, open_private
 from mesh.retry import RetryPolicy
 
 if TYPE_CHECKING:
@@ -111,8 +112,9 @@ class RelayJournal:
 
     def __enter__(self) -> Self:
         try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._lock = os.open(self._path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            make_private_folder(self._path.parent)
+            self._lock = open_private(self._path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT)
+            make_private_database(self._path)
         except OSError as error:
             raise ConfigurationError(f"can't write a journal in {self._path.parent}: {error.strerror}") from None
         try:

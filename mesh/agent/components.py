@@ -14,6 +14,7 @@ from mesh.content import Exchange, Store
 from mesh.errors import ConfigurationError
 from mesh.network import Channel, Network, Services
 from mesh.outage_log import OutageLog
+from mesh.private_files import make_private_folder
 from mesh.work.ledger import Ledger
 from mesh.work.outbox import RESEND, Outbox
 
@@ -142,7 +143,7 @@ async def _chain_folder(chain: Chain) -> str:
 
 def _make_folder(folder: Path) -> None:
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_private_folder(folder)
     except OSError as error:
         raise ConfigurationError(
             f"can't keep recordings in {folder}: {error.strerror}", hint="give another folder with --data-dir"

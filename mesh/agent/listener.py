@@ -160,7 +160,11 @@ class ChainListener:
         if liability.promisor != self._account or not self._parts.settings.enable_executor:
             return
         await self._executor.wait_until_open()
-        if liability.is_finalized or not await self._ledger.add_job(liability):
+        if liability.is_finalized:
+            if await self._ledger.bring_back(liability.address):
+                await self.finalized(liability.address, success=liability.is_success, result=liability.result)
+            return
+        if not await self._ledger.add_job(liability):
             return
         job = await self._ledger.job(liability.address)
         if job is not None and job.result is not None:

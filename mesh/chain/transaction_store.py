@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from mesh.chain.accounts import SignedTransaction
 from mesh.chain.errors import TransactionDamaged, TransactionsNotKept
+from mesh.private_files import make_private_folder
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -111,7 +112,7 @@ class TransactionStore:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         with _on_disk(folder / "x"):
-            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            make_private_folder(folder)
 
     def add(self, entry: PendingTransaction) -> LockedEntry | None:
         """Create and lock the file of a nonce; None if it exists."""

@@ -13,6 +13,7 @@ from mesh.content.files import directory_lock, stamp, sync_directory
 from mesh.content.quota import EvictionReport, Pins, Quota
 from mesh.content.recovery import DAMAGED_SUFFIX, is_cid, open_directory
 from mesh.errors import ConfigurationError
+from mesh.private_files import make_private_folder
 from schemas.cid import parse_cid
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ class StoreDirectory:
     def __init__(self, path: str | Path, *, quota: int | None) -> None:
         self.directory: Final = Path(path)
         try:
-            self.directory.mkdir(parents=True, exist_ok=True)
+            make_private_folder(self.directory)
             self._pins = Pins(self.directory)
             self._index, self._in_use = open_directory(self.directory)
         except OSError as error:

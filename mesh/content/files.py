@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, BinaryIO, Final, Protocol, Self, TypeAlias, cast
 
 from mesh.content.errors import StoreFull
+from mesh.private_files import open_private
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -59,7 +60,7 @@ class TemporaryFile:
     @classmethod
     def take(cls, path: Path) -> TemporaryFile | None:
         """The file at `path`, created if it does not exist, or None if another writer has it locked."""
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        descriptor = open_private(path, os.O_RDWR | os.O_CREAT)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             same = os.fstat(descriptor).st_ino == os.stat(path).st_ino
@@ -114,7 +115,7 @@ class TemporaryFile:
         """Delete the file when the `with` block ends, even if it was kept."""
         self._delete_on_exit = True
 
-    def finish(self, size: int, *, mode: int = 0o444) -> None:
+    def finish(self, size: int, *, mode: int = 0o400) -> None:
         """Cut the file to `size` bytes and sync it to the disk. Raises `StoreFull`."""
         with raising_store_full(self.path.parent):
             os.ftruncate(self._descriptor, size)
@@ -128,11 +129,14 @@ class TemporaryFile:
 
 
 @contextmanager
-def atomic_file(final: Path) -> Iterator[BinaryIO]:
-    """A stream to a file that appears at `final`, complete and synced, if the `with` block ends without error."""
+def atomic_file(final: Path, *, private: bool = False) -> Iterator[BinaryIO]:
+    """A stream to a file that appears at `final`, complete and synced, if the `with` block ends without error.
+
+    Only this user can read it if it is `private`.
+    """
     temporary = final.with_name(f"{final.name}.new")
     try:
-        with temporary.open("wb") as stream:
+        with open(temporary, "wb", opener=open_private if private else None) as stream:
             yield stream
             stream.flush()
             os.fsync(stream.fileno())
@@ -156,7 +160,7 @@ def raising_store_full(directory: Path) -> Iterator[None]:
 @contextmanager
 def directory_lock(directory: Path) -> Iterator[None]:
     """Hold the exclusive lock of the directory, waiting for any other process or thread that has it."""
-    descriptor = os.open(directory / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    descriptor = open_private(directory / ".lock", os.O_RDWR | os.O_CREAT)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield

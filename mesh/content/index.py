@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple
 
 from mesh.content.errors import StoreDamaged, StoreFull
 from mesh.errors import ClosedError
+from mesh.private_files import make_private_database
 from schemas.cid import parse_cid
 from schemas.unixfs import blocks_of_stream, parse_block
 
@@ -80,6 +81,7 @@ class BlockIndex:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._lock = threading.Lock()
+        make_private_database(path)
         self._connection = sqlite3.connect(path, timeout=_BUSY_SECONDS, isolation_level=None, check_same_thread=False)
         try:
             self._prepare()

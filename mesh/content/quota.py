@@ -17,6 +17,7 @@ from mesh.content.files import PART_PREFIX, PUT_PREFIX, TemporaryFile, directory
 from mesh.content.recovery import DAMAGED_SUFFIX, delete_leftovers
 from mesh.errors import InputError
 from mesh.log_context import log_event
+from mesh.private_files import PRIVATE_FILE, PRIVATE_FOLDER
 from schemas.cid import CID_LENGTH, parse_cid
 
 if TYPE_CHECKING:
@@ -50,14 +51,14 @@ class Pins:
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory / ".pins"
-        self._directory.mkdir(exist_ok=True)
+        self._directory.mkdir(mode=PRIVATE_FOLDER, exist_ok=True)
         sync_directory(directory)
 
     def add(self, cid: str, label: str) -> None:
         """Pin a CID, whether or not the file is held yet. Raises `InvalidCid`, and `InputError` for the label."""
         path = self._path(cid, label)
         if not path.exists():
-            path.touch()
+            path.touch(mode=PRIVATE_FILE)
             sync_directory(self._directory)
 
     def drop(self, cid: str, label: str) -> None:
@@ -154,7 +155,7 @@ class Quota:
     def _candidates(self) -> Iterator[IndexedFile]:
         """The files that may be evicted, in the order of eviction: damaged ones, then the least recently used."""
         pinned = self._pins.by_cid()
-        for file in self._index.files():
+        for file in sorted(self._index.files(), key=lambda file: not file.name.endswith(DAMAGED_SUFFIX)):
             if file.name.startswith(PUT_PREFIX) or file.name.removeprefix(PART_PREFIX) in pinned:
                 continue
             if not (file.name.startswith(PART_PREFIX) and is_locked(self._directory / file.name)):

@@ -15,6 +15,7 @@ from mesh.content.files import PART_PREFIX, PUT_PREFIX, TemporaryFile, directory
 from mesh.content.index import BlockIndex
 from mesh.errors import InvalidCid
 from mesh.log_context import log_event
+from mesh.private_files import open_private
 from schemas.cid import parse_cid
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ def open_directory(directory: Path) -> tuple[BlockIndex, int]:
     Processes open a directory one at a time. Raises `StoreDamaged`, and `OSError` if the directory can't be used.
     """
     with directory_lock(directory):
-        in_use = os.open(directory / _IN_USE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        in_use = open_private(directory / _IN_USE, os.O_RDWR | os.O_CREAT)
         try:
             fcntl.flock(in_use, fcntl.LOCK_SH)
             index = _open_index(directory / _INDEX, in_use)

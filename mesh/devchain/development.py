@@ -25,6 +25,7 @@ from mesh.devchain.anvil import serve_anvil
 from mesh.devchain.anvil_state import deploying
 from mesh.devchain.embedded import serve_embedded
 from mesh.devchain.errors import KeyfilesNotWritable, MarketMissing
+from mesh.private_files import make_private_folder
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
@@ -201,7 +202,7 @@ def _accounts_of(keys: Sequence[bytes]) -> dict[str, Account]:
 
 def _write_keyfiles(folder: Path, private_keys: tuple[bytes, ...]) -> None:
     """A keyfile per role under one random password. The keys are public knowledge: never use them on a real chain."""
-    folder.mkdir(parents=True, exist_ok=True)
+    make_private_folder(folder)
     password = folder / "password"
     if not password.exists():
         password.write_text(secrets.token_urlsafe(12) + "\n")

@@ -14,6 +14,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, BinaryIO, Final, Literal, Self, TypeAlias, get_args
 
 from mesh.content.files import sync_directory
+from mesh.private_files import make_missing_folders, open_private
 from mesh.recording.errors import NotARecording, RecordingExists, Unrecordable
 from mesh.recording.mcap_writer import McapWriter
 from mesh.recording.recovery import RECOVERED, copy_content, last_time, readable_part
@@ -78,7 +79,7 @@ class PartialFile:
         self._clock = clock
         self._part = final.with_name(f"{final.name}.part")
         self._cut = final.with_name(f"{final.name}.cut")
-        final.parent.mkdir(parents=True, exist_ok=True)
+        make_missing_folders(final.parent)
         _set_aside(final, self._part, self._cut)
         self._stream = _locked(self._part)
         self._writer = McapWriter(self._stream)
@@ -201,7 +202,7 @@ def _set_aside(final: Path, part: Path, cut: Path) -> None:
 
 
 def _locked(part: Path) -> BinaryIO:
-    return _lock_of(part, part.open("xb"))
+    return _lock_of(part, open(part, "xb", opener=open_private))
 
 
 def _lock_of(path: Path, stream: BinaryIO) -> BinaryIO:

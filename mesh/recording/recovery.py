@@ -60,7 +60,7 @@ def recover(path: Path, target: Path | None = None) -> RecoverySummary:
     if final.exists():
         raise RecordingExists(final)
     source, why = readable_part(path)
-    with atomic_file(final) as stream:
+    with atomic_file(final, private=True) as stream:
         writer = McapWriter(stream)
         for name, values in source.metadata.items():
             writer.add_metadata(name, values)

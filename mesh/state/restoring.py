@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, BinaryIO, Final
 from mesh.content.files import raising_store_full, sync_directory
 from mesh.content.recovery import is_in_use
 from mesh.errors import ConfigurationError
+from mesh.private_files import make_missing_folders, open_private
 from mesh.state.archive import read_archive, read_info
 from mesh.state.inventory import check_ledger, locked_ledger, read_ledger
 from mesh.state.layout import (
@@ -89,7 +90,7 @@ async def restore(archive: Path, folder: Path, *, existing: ExistingState = Exis
 def _scratch(folder: Path) -> Iterator[Path]:
     """A temporary folder in the data folder, which may be the only writable one, as in a container."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_missing_folders(folder)
         staging = Path(tempfile.mkdtemp(prefix=STAGING, dir=folder))
     except OSError as error:
         raise ConfigurationError(
@@ -115,13 +116,13 @@ def _unpack(archive: Path, staging: Path) -> None:
                 archive, "no-space", "it needs more space than the disk has free", hint="free some space on that disk"
             )
         path = staging / path_of(name)
-        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        with raising_store_full(staging), path.open("xb") as file:
+        make_missing_folders(path.parent)
+        with raising_store_full(staging), open(path, "xb", opener=open_private) as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
         if path.parent.name == CONTENT:
-            path.chmod(0o444)
+            path.chmod(0o400)
 
     read_archive(archive, keep)
 
@@ -184,7 +185,7 @@ def _exchange(staging: Path, folder: Path, parts: tuple[str, ...], replaced: tup
 
 def _move(source: Path, target: Path, moved: list[tuple[Path, Path]]) -> None:
     try:
-        target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        make_missing_folders(target.parent)
         source.rename(target)
     except OSError as error:
         raise ConfigurationError(f"can't move {target} into place: {error.strerror}") from None

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import aiosqlite
 
 from mesh.errors import ClosedError, ConfigurationError
+from mesh.private_files import make_private_database, make_private_folder
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -85,7 +86,8 @@ class Database:
         if self._connection is not None:
             raise ClosedError("this ledger is open already")
         try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
+            make_private_folder(self._path.parent)
+            make_private_database(self._path)
             self._connection = await aiosqlite.connect(self._path, isolation_level=None)
             await self._prepare()
         except (OSError, aiosqlite.Error) as error:

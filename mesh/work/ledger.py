@@ -129,8 +129,12 @@ class Ledger:
         )
 
     async def set_aside(self, liability: str) -> None:
-        """Hide a job, with everything that is known of it, until `add_job` brings it back."""
+        """Hide a job, with everything that is known of it, until `add_job` or `bring_back` shows it again."""
         await self._database.run("UPDATE jobs SET aside = 1 WHERE liability = ?", (liability,))
+
+    async def bring_back(self, liability: str) -> bool:
+        """Show a job that was set aside. False if there is none."""
+        return await self._database.run("UPDATE jobs SET aside = 0 WHERE liability = ? AND aside", (liability,))
 
     async def set_phase(self, liability: str, phase: Phase, *, position: int | None = None) -> None:
         """Set the phase of the job at `liability` (address) and, if given, how many messages it has played."""

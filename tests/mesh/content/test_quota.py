@@ -265,3 +265,19 @@ def test_processes_together_stay_within_the_quota(tmp_path: Path) -> None:
         assert store.check().damaged == ()
         assert set(store.pins()) <= set(store.list())
     assert leftovers(tmp_path) == []
+
+
+def test_damaged_files_are_evicted_first_even_after_the_index_was_rebuilt(tmp_path: Path) -> None:
+    with Store(tmp_path) as store:
+        files = [store.put_bytes(bytes([number]) * 1_000) for number in range(20)]
+        damaged, sound = files[::4], [cid for number, cid in enumerate(files) if number % 4]
+        for cid in damaged:
+            flip_bit(tmp_path / cid, 0)
+        store.check()
+        assert len(store.damaged()) == 5
+    for index in tmp_path.glob(".blocks.sqlite*"):
+        index.unlink()
+    with Store(tmp_path) as store:
+        assert store.collect(15_000).bytes == 5_000
+        assert store.damaged() == ()
+        assert all(map(store.has, sound))

@@ -6,6 +6,7 @@ import sqlite3
 from typing import TYPE_CHECKING
 
 import pytest
+from msgspec.structs import replace
 
 from mesh.agent import Phase
 from mesh.recording import open_objective
@@ -126,6 +127,25 @@ async def test_a_finalization_without_a_result_is_not_reverted(place: Place) -> 
         await robot.runtime.listener.finalization_reverted(liability("of somebody else").address)
         assert [job.phase for job in await robot.parts.ledger.jobs(Phase)] == [Phase.FINALIZED]
         assert await robot.parts.ledger.outbox(head=0) == []
+
+
+async def test_a_job_whose_contract_comes_back_finalized_is_finalized(place: Place) -> None:
+    """A reorganisation takes the contract, and the new blocks have it together with its end."""
+    ours = liability(promisor=place.address("robot"))
+    async with place.agent("robot") as robot:
+        ledger, listener = robot.parts.ledger, robot.runtime.listener
+        await ledger.add_job(ours)
+        await ledger.set_phase(ours.address, Phase.COMPLETE)
+        await listener.liability_reverted(ours.address)
+        assert await ledger.job(ours.address) is None
+        ended = replace(ours, is_finalized=True, is_success=True)
+        await listener.new_liability(ended, demand_hash=b"d" * 32, offer_hash=b"o" * 32)
+        job = await ledger.job(ours.address)
+        assert job is not None
+        assert job.phase is Phase.FINALIZED
+        unknown = replace(ended, address=liability("of another chain").address)
+        await listener.new_liability(unknown, demand_hash=b"d" * 32, offer_hash=b"o" * 32)
+        assert await ledger.job(unknown.address) is None
 
 
 async def test_a_contract_created_again_at_another_address_is_paid_once(place: Place, paid: Paying) -> None:

@@ -1,0 +1,75 @@
+"""State on the disk is readable by its own user only, whatever the umask: files 600, folders 700.
+
+State that an older version or another program left more open is tightened when it is opened.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+PRIVATE_FILE: Final = 0o600
+PRIVATE_FOLDER: Final = 0o700
+_OTHERS: Final = 0o077
+_DATABASE_SUFFIXES: Final = ("", "-wal", "-shm")
+
+
+def make_private_folder(folder: Path) -> None:
+    """Create a folder for state, and parents that are missing, for this user only. Raises `OSError`.
+
+    An existing folder that is more open is tightened with all that is in it; its parents stay as they are.
+    """
+    make_missing_folders(folder)
+    if tighten(folder):
+        for path in folder.rglob("*"):
+            with suppress(FileNotFoundError):  # temporary files go away
+                tighten(path)
+
+
+def make_missing_folders(folder: Path) -> None:
+    """Create the folder and its parents for this user only where they are missing. Raises `OSError`."""
+    for missing in reversed([folder, *folder.parents]):
+        if not missing.exists():
+            missing.mkdir(mode=PRIVATE_FOLDER, exist_ok=True)
+    if not folder.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(folder))
+
+
+def open_private(path: Path | str, flags: int) -> int:
+    """Open a file as `os.open` does, creating it for this user only (an `opener` for `open`). Raises `OSError`."""
+    descriptor = os.open(path, flags | os.O_CLOEXEC, PRIVATE_FILE)
+    status = os.fstat(descriptor)
+    if status.st_mode & _OTHERS and status.st_uid == os.geteuid() and stat.S_ISREG(status.st_mode):
+        os.fchmod(descriptor, stat.S_IMODE(status.st_mode) & ~_OTHERS)
+    return descriptor
+
+
+def make_private_database(path: Path) -> None:
+    """Create the empty file of an SQLite database, or tighten an existing one with its log. Raises `OSError`.
+
+    SQLite gives the files beside it the mode of the database.
+    """
+    os.close(open_private(path, os.O_RDWR | os.O_CREAT))
+    for suffix in _DATABASE_SUFFIXES[1:]:
+        beside = path.with_name(path.name + suffix)
+        if beside.exists():
+            tighten(beside)
+
+
+def tighten(path: Path) -> bool:
+    """Take all rights of others from this user's file or folder; whether there were any.
+
+    Folders that users share, as /tmp, and links stay as they are.
+    """
+    status = path.lstat()
+    is_ours = status.st_uid == os.geteuid() and not status.st_mode & stat.S_ISVTX and not stat.S_ISLNK(status.st_mode)
+    if not (status.st_mode & _OTHERS and is_ours):
+        return False
+    path.chmod(stat.S_IMODE(status.st_mode) & ~_OTHERS)
+    return True
