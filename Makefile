@@ -19,7 +19,7 @@ JOBS ?= 3
 # CI measures coverage, which takes time.
 COVERAGE := $(if $(filter true,$(CI)),--cov --cov-report=term --durations=10)
 
-.PHONY: help setup demo test compose-test lint peers bench contracts contracts-check slither firmware lock clean
+.PHONY: help setup demo test simulate compose-test lint peers bench contracts contracts-check slither firmware lock clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -47,6 +47,9 @@ demo: $(INSTALLED) ## a whole market on this machine, in one process; ARGS="..."
 
 test: $(INSTALLED) ## the tests, without containers; ARGS="-k name" chooses some
 	@$(BIN)/pytest -n $(JOBS) --dist loadfile -m "not compose" $(COVERAGE) $(ARGS)
+
+simulate: $(INSTALLED) ## whole markets in simulated time, with faults; ARGS="--seed N --jobs J --json"
+	@$(BIN)/python -m tests.simulation $(ARGS)
 
 compose-test: $(INSTALLED) ## the compose files in real containers (`make peers` installs podman)
 	@$(BIN)/pytest -m compose tests/deploy tests/support $(ARGS)

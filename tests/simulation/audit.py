@@ -1,0 +1,171 @@
+"""The invariants: what must hold after every history, whatever went wrong in it."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections import defaultdict
+from contextlib import closing
+from typing import TYPE_CHECKING, Final
+
+from mesh.chain import Chain, Finalized, NewLiability, Transfer
+from mesh.chain.events import decode_log
+from mesh.evidence.claims import Claim
+from mesh.evidence.verification import verify
+from mesh.work.ledger import Phase
+from schemas import ZERO_ADDRESS
+from tests.simulation.chain import NodeFaults, SimulatedNode
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mesh.work.ledger import JobRecord
+    from schemas import Liability
+    from tests.simulation.market import Market
+
+INVALID: Final = frozenset(
+    {"played", "sequence", "statistics", "readable", "result-file", "objective-file", "signature"}
+)
+"""The findings of `aira verify` that no job of an honest robot may have."""
+
+
+class Audit:
+    """Checks a market that has come to rest."""
+
+    def __init__(self, market: Market) -> None:
+        self._market = market
+        self._chain = market.deployed.chain
+        self.paid: set[str] = set()
+        self.refunded: set[str] = set()
+        self.open: set[str] = set()
+        self.paid_twice = 0
+
+    def liabilities(self) -> dict[str, Finalized | None]:
+        """All liabilities on the chain, with how they ended."""
+        found: dict[str, Finalized | None] = {}
+        for log in self._chain.evm.logs(self._chain.began + 1, self._chain.evm.head):
+            event = decode_log(_parsed(log))
+            if isinstance(event, NewLiability):
+                found.setdefault(event.liability, None)
+            elif isinstance(event, Finalized):
+                if found.get(event.liability) is not None:
+                    self._market.violated("finalized-twice", event.liability)
+                found[event.liability] = event
+        return found
+
+    def money(self) -> None:
+        """Tokens are conserved, and each liability has paid what it got, once, to one account."""
+        balance: dict[str, int] = defaultdict(int)
+        payouts: dict[str, list[Transfer]] = defaultdict(list)
+        liabilities = self.liabilities()
+        for log in self._chain.evm.logs(self._chain.began + 1, self._chain.evm.head):
+            event = decode_log(_parsed(log))
+            if isinstance(event, Transfer):
+                balance[event.sender] -= event.value
+                balance[event.recipient] += event.value
+                if event.sender in liabilities and event.value:
+                    payouts[event.sender].append(event)
+        for liability, finalized in liabilities.items():
+            if finalized is None:
+                self.open.add(liability)
+            else:
+                (self.paid if finalized.success else self.refunded).add(liability)
+            if balance[liability] and finalized is not None:
+                self._market.violated("tokens-not-conserved", f"{liability} keeps {balance[liability]} wn")
+            if len(payouts[liability]) > 1:
+                self.paid_twice += 1
+                self._market.violated("paid-twice", f"{liability}: {payouts[liability]}")
+        if sum(amount for account, amount in balance.items() if account != ZERO_ADDRESS) != -balance[ZERO_ADDRESS]:
+            self._market.violated("tokens-not-conserved", "sent and received amounts differ")
+
+    async def promises(self) -> None:
+        """What people were told is what happened, and nobody paid for an order that they believed dead."""
+        node = SimulatedNode(self._chain, NodeFaults())
+        told = {order.contract: order for person in self._market.people for order in person.orders if order.contract}
+        dead = {
+            order.order: order
+            for person in self._market.people
+            for order in person.orders
+            if order.order and order.told in self._market.final_words
+        }
+        async with Chain(node, ens=self._market.deployed.market.deployment.ens) as chain:
+            for address in self.liabilities():
+                demand, _ = await chain.liabilities.order_hashes(address)
+                if (believed := dead.get(demand.hex())) is not None:
+                    self._market.violated("promise-broken", f"{believed.person} was told {believed.told!r}; {address}")
+                record = await chain.liabilities.get(address)
+                self._told(address, told.get(address), record)
+                if record.is_finalized and record.is_success:
+                    self._evidence(record)
+        for address, order in told.items():
+            if order.told in ("paid", "refunded") and address not in self.liabilities():
+                self._market.violated("promise-broken", f"{order.person} was told {order.told!r}; {address} is gone")
+
+    def _told(self, address: str, order: object, record: Liability) -> None:
+        told = getattr(order, "told", None)
+        if told in ("paid", "refunded") and (told == "paid") != record.is_success:
+            self._market.violated("promise-broken", f"{address}: told {told!r}, but success is {record.is_success}")
+
+    def _evidence(self, record: Liability) -> None:
+        """A success has a complete recording, which the robot still has."""
+        robot = next(one for one in self._market.robots if one.account.address == record.promisor)
+        store = next(iter(sorted(robot.folder.rglob("content"))), None)
+        recording = None if store is None else _file(store, record.result)
+        if recording is None:
+            self._market.violated("recording-missing", f"{record.address}: {record.result}")
+            return
+        objective = next(
+            path for path in self._market.objectives.values() if self._market.cids[path] == record.objective
+        )
+        verdict = verify(
+            Claim.of_contract(record),
+            objective=objective,
+            result=recording,
+            objective_cid=record.objective,
+            result_cid=record.result,
+        )
+        for finding in verdict.findings:
+            is_open = finding.name == "played" and finding.holds is None
+            if is_open or (finding.holds is False and finding.name in INVALID):
+                self._market.violated("recording-incomplete", f"{record.address} {finding.name}: {finding.detail}")
+
+    def ledgers(self) -> None:
+        """Each robot's ledger says of its jobs what the chain says."""
+        ended = self.liabilities()
+        for robot in self._market.robots:
+            jobs = {job.liability.address: job for job in _jobs(robot.folder)}
+            for address, job in jobs.items():
+                finalized = ended.get(address)
+                is_ended = finalized is not None
+                if (job.phase is Phase.FINALIZED) != is_ended and address in ended:
+                    self._market.violated("ledger-differs", f"{robot.name} {address} is {job.phase}, ended {is_ended}")
+                elif address not in ended:
+                    self._market.violated("ledger-differs", f"{robot.name} has {address}, which is not on the chain")
+
+
+def _jobs(folder: Path) -> list[JobRecord]:
+    from mesh.work.ledger import _job
+
+    found: list[JobRecord] = []
+    for path in sorted(folder.rglob("ledger.sqlite")):
+        with closing(sqlite3.connect(path)) as database:
+            found += [_job(row) for row in database.execute("SELECT * FROM jobs WHERE NOT aside")]
+    return found
+
+
+def _file(store: Path, cid: str) -> Path | None:
+    return next((path for path in sorted(store.rglob(cid)) if path.is_file()), None)
+
+
+def _parsed(log: dict[str, object]) -> dict[str, object]:
+    """A log as web3 gives it."""
+    from hexbytes import HexBytes
+
+    return {
+        **log,
+        "topics": [HexBytes(str(topic)) for topic in log["topics"]],  # type: ignore[attr-defined]
+        "data": HexBytes(str(log["data"])),
+        "blockNumber": int(str(log["blockNumber"]), 16),
+        "logIndex": int(str(log["logIndex"]), 16),
+        "transactionHash": HexBytes(str(log["transactionHash"])),
+        "blockHash": HexBytes(str(log["blockHash"])),
+    }

@@ -1,0 +1,255 @@
+"""The simulated chain: the real contracts on the embedded EVM, with a pool, blocks by time, and reorganisations.
+
+Each process reaches it through a node of its own, which may be slow, silent or wrong.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+from web3.providers.async_base import AsyncBaseProvider
+
+from mesh.devchain.evm import Evm
+from mesh.devchain.jsonrpc import SERVER_ERROR, RpcError, parse_data
+from mesh.devchain.methods import Methods
+from tests.simulation.threads import scheduler
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+LATENCY: Final = (0.001, 0.03)
+BUMP_PERCENT: Final = 10
+"""By how much a transaction must pay more to take another's place."""
+SEND: Final = "eth_sendRawTransaction"
+
+
+@dataclass
+class NodeFaults:
+    """How probable each fault of an answer is."""
+
+    unreachable: float = 0.0
+    silent: float = 0.0
+    late: float = 0.0
+    spoilt: float = 0.0
+    lost_after_sending: float = 0.0
+    seen: Counter[str] = field(default_factory=Counter)
+
+    def stop(self) -> None:
+        """Answer properly from now on."""
+        self.unreachable = self.silent = self.late = self.spoilt = self.lost_after_sending = 0.0
+
+
+@dataclass
+class MiningFaults:
+    """How probable it is that a block leaves a transaction out, or that the pool forgets it; how much gas costs."""
+
+    leave_out: float = 0.0
+    forget: float = 0.0
+    price_factor: float = 1.0
+    seen: Counter[str] = field(default_factory=Counter)
+
+
+@dataclass(frozen=True)
+class PooledTransaction:
+    """A transaction that waits to be mined."""
+
+    raw: bytes
+    hash: bytes
+    sender: bytes
+    nonce: int
+    price: int
+
+
+class SimulatedChain:
+    """The chain that all nodes show. `began` is the height at which the history began."""
+
+    def __init__(self) -> None:
+        self.evm = Evm(run_seconds=60.0, max_logs=100_000)
+        self.methods = Methods(self.evm)
+        self.instant = True
+        """Mine each transaction at once, as while the contracts are deployed."""
+        self.pool: dict[tuple[bytes, int], PooledTransaction] = {}
+        self.mined: dict[int, PooledTransaction] = {}
+        """By block: there is one transaction in a block at most."""
+        self.faults = MiningFaults()
+        self.began = 0
+        self.reorganisations = 0
+        self.deepest = 0
+        self.on_block: Callable[[], None] = lambda: None
+        self._cache: dict[str, Any] = {}
+
+    def begin(self) -> None:
+        """From now on blocks are mined by time."""
+        self.instant = False
+        self.began = self.evm.head
+        self._cache.clear()
+
+    def answer(self, method: str, params: Any) -> Any:
+        """The result of a JSON-RPC method. Raises `RpcError`."""
+        if method == SEND and not self.instant:
+            return "0x" + self.submit(parse_data(params[0])).hex()
+        if method == SEND:
+            self._cache.clear()
+            return self.methods.answer(method, params)
+        key = json.dumps([method, params], default=str)
+        if key not in self._cache:
+            self._cache[key] = self._answer(method, params)
+        found = self._cache[key]
+        return json.loads(json.dumps(found)) if isinstance(found, dict | list) else found
+
+    def _answer(self, method: str, params: Any) -> Any:
+        if method == "eth_getTransactionCount" and params[1:] == ["pending"]:
+            return hex(self._next_nonce(parse_data(params[0], length=20)))
+        if method in ("eth_gasPrice", "eth_maxPriorityFeePerGas"):
+            return hex(round(int(self.methods.answer(method, params), 16) * self.faults.price_factor))
+        if method == "eth_getTransactionByHash":
+            waiting = next((one for one in self.pool.values() if one.hash == parse_data(params[0])), None)
+            if waiting is not None:
+                nonce, sender = hex(waiting.nonce), "0x" + waiting.sender.hex()
+                return {"hash": params[0], "blockHash": None, "blockNumber": None, "from": sender, "nonce": nonce}
+        return self.methods.answer(method, params)
+
+    def submit(self, raw: bytes) -> bytes:
+        """Take a signed transaction into the pool; its hash. Raises `RpcError`."""
+        try:
+            decoded = self.evm._backend.chain.get_vm().get_transaction_builder().decode(raw)
+            sender, hash_ = bytes(decoded.sender), bytes(decoded.hash)
+        except Exception as error:
+            raise RpcError(SERVER_ERROR, f"the transaction can't be decoded: {error}") from None
+        nonce = int(decoded.nonce)
+        price = int(getattr(decoded, "max_fee_per_gas", 0) or decoded.gas_price)
+        expected = self.evm.nonce(sender, self.evm.head)
+        if nonce < expected:
+            raise RpcError(SERVER_ERROR, f"nonce too low: next nonce {expected}, tx nonce {nonce}")
+        before = self.pool.get((sender, nonce))
+        if before is not None and before.hash == hash_:
+            raise RpcError(SERVER_ERROR, "already known")
+        if before is not None and price * 100 < before.price * (100 + BUMP_PERCENT):
+            raise RpcError(SERVER_ERROR, "replacement transaction underpriced")
+        funds, wanted = self.evm.balance(sender, self.evm.head), decoded.gas * price + decoded.value
+        if wanted > funds:
+            raise RpcError(SERVER_ERROR, f"insufficient funds for gas * price + value: have {funds} want {wanted}")
+        self.pool[sender, nonce] = PooledTransaction(raw, hash_, sender, nonce, price)
+        self._cache.clear()
+        return hash_
+
+    def mine(self) -> None:
+        """Mine what the pool has, a block for each transaction; an empty block if there is none."""
+        self._cache.clear()
+        if not self._mine_pool():
+            self.evm.mine(1)
+        self.on_block()
+
+    def reorganise(self, depth: int, *, forget: float) -> None:
+        """Replace the last blocks; their transactions go back to the pool, in which some are forgotten."""
+        self._cache.clear()
+        depth = min(depth, self.evm.head - self.began)
+        if depth < 1:
+            return
+        head = self.evm.head
+        self.evm.rewind(head - depth)
+        for number in sorted(number for number in self.mined if number > head - depth):
+            transaction = self.mined.pop(number)
+            if scheduler().random.random() < forget:
+                self.faults.seen["transaction-forgotten"] += 1
+            else:
+                self.pool.setdefault((transaction.sender, transaction.nonce), transaction)
+        self.reorganisations += 1
+        self.deepest = max(self.deepest, depth)
+        self._mine_pool()
+        while self.evm.head <= head:
+            self.evm.mine(1)
+        self.on_block()
+
+    def _mine_pool(self) -> bool:
+        chance, mined = scheduler().random, False
+        waiting = sorted(self.pool.values(), key=lambda one: (one.sender, one.nonce))
+        chance.shuffle(waiting)
+        waiting.sort(key=lambda one: one.nonce)  # stable: of each sender in order
+        for one in waiting:
+            if self.faults.forget and chance.random() < self.faults.forget:
+                self.faults.seen["transaction-forgotten"] += 1
+                del self.pool[one.sender, one.nonce]
+                continue
+            if self.faults.leave_out and chance.random() < self.faults.leave_out:
+                self.faults.seen["transaction-left-out"] += 1
+                continue
+            if one.price < self.evm.base_fee * self.faults.price_factor:
+                continue
+            expected = self.evm.nonce(one.sender, self.evm.head)
+            if one.nonce != expected:
+                if one.nonce < expected:
+                    del self.pool[one.sender, one.nonce]
+                continue
+            del self.pool[one.sender, one.nonce]
+            try:
+                self.evm.send(one.raw)
+            except RpcError:
+                continue
+            self.mined[self.evm.head] = one
+            mined = True
+        return mined
+
+    def _next_nonce(self, sender: bytes) -> int:
+        nonce = self.evm.nonce(sender, self.evm.head)
+        while (sender, nonce) in self.pool:
+            nonce += 1
+        return nonce
+
+
+class SimulatedNode(AsyncBaseProvider):
+    """A node of that chain, as one process reaches it."""
+
+    def __init__(self, chain: SimulatedChain, faults: NodeFaults) -> None:
+        super().__init__()
+        self._chain = chain
+        self._faults = faults
+
+    async def make_request(self, method: Any, params: Any) -> Any:
+        """A JSON-RPC response, or one of the faults."""
+        chance, faults, seen = scheduler().random, self._faults, self._faults.seen
+        await asyncio.sleep(chance.uniform(*LATENCY))
+        if faults.unreachable and chance.random() < faults.unreachable:
+            seen["node-unreachable"] += 1
+            raise ConnectionRefusedError(111, "Connection refused")
+        if faults.silent and chance.random() < faults.silent:
+            seen["node-silent"] += 1
+            await asyncio.sleep(3600)
+        if faults.late and chance.random() < faults.late:
+            seen["node-late"] += 1
+            await asyncio.sleep(chance.uniform(0.1, 10))
+        response: dict[str, Any] = {"jsonrpc": "2.0", "id": 0}
+        try:
+            response["result"] = self._chain.answer(method, list(params))
+        except RpcError as error:
+            response["error"] = error.as_object()
+        if method == SEND and faults.lost_after_sending and chance.random() < faults.lost_after_sending:
+            seen["answer-lost"] += 1
+            raise ConnectionResetError(104, "Connection reset by peer")
+        if faults.spoilt and chance.random() < faults.spoilt:
+            seen["answer-spoilt"] += 1
+            return spoil(response)
+        return response
+
+    async def is_connected(self, show_traceback: bool = False) -> bool:
+        """Whether it answers."""
+        return True
+
+    def __str__(self) -> str:
+        return "the simulated node"
+
+
+def spoil(response: dict[str, Any]) -> Any:
+    """A response in which something is wrong."""
+    chance = scheduler().random
+    result = response.get("result")
+    if isinstance(result, list) and result and isinstance(result[0], dict):
+        result = result[0]
+    if isinstance(result, dict) and chance.random() < 0.7:
+        del result[chance.choice(sorted(result))]
+        return response
+    return {"jsonrpc": "2.0", "id": 0, "result": chance.choice([None, "", "0x", [], {}, "0xzz", 7])}

@@ -1,0 +1,157 @@
+"""The command line of the simulation."""
+
+from __future__ import annotations
+
+import _thread
+import argparse
+import concurrent.futures
+import concurrent.futures.thread as executors
+import gc
+import json
+import os
+import subprocess
+import sys
+import traceback
+from asyncio import Queue
+from collections import Counter
+from dataclasses import asdict, fields
+from typing import TYPE_CHECKING, Any, Final
+
+from tests.simulation import history, router, threads
+from tests.simulation.history import Report
+from tests.simulation.scheduler import REAL_TIME
+
+router.install(lambda: history.CURRENT[-1])  # type: ignore[arg-type,return-value]
+
+from mesh.chain.web3_provider import ReliableProvider  # noqa: E402, F401
+from tests.simulation.chain import SimulatedChain  # noqa: E402
+from tests.simulation.deployment import found  # noqa: E402
+from tests.simulation.faults import FaultPlan  # noqa: E402
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from tests.simulation.deployment import Deployed
+
+JOBS: Final = 6
+"""Jobs in one history, at most."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Run histories, and print what happened. Ends with 1 if an invariant was violated."""
+    options = _options(arguments)
+    executors_module: Any = executors
+    executors_module._global_shutdown_lock = _thread.RLock()  # shared by all processes: never let one wait for it
+    threads.number_in_sets(Queue, concurrent.futures.Future)
+    began = REAL_TIME()
+    deployed = found(SimulatedChain(), threads.begin(0))
+    gc.collect()
+    total = Report(options.seed)
+    for jobs, report in _histories(deployed, options):
+        _add(total, report)
+        if report.violations:
+            _print_failure(report, jobs, options)
+        elif not options.json:
+            print(f"seed {report.seed}: {report.jobs} jobs, {report.paid} paid", flush=True)
+        if options.seconds and REAL_TIME() - began > options.seconds:
+            break
+        if report.violations and not options.keep_going:
+            break
+    total.real_s = round(REAL_TIME() - began, 3)
+    if options.json:
+        print(json.dumps(asdict(total)), flush=True)
+    else:
+        _print_total(total)
+    sys.stdout.flush()
+    os._exit(1 if total.violations else 0)
+
+
+def _options(arguments: Sequence[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog='make simulate ARGS="…"', description=__doc__)
+    parser.add_argument("--seed", type=int, default=None, help="the seed of the first history; a new one by default")
+    parser.add_argument("--jobs", type=int, default=JOBS, help=f"jobs in all; a history has up to {JOBS}")
+    parser.add_argument("--seconds", type=float, default=0.0, help="begin no history after so many real seconds")
+    parser.add_argument("--json", action="store_true", help="print one object at the end")
+    parser.add_argument("--trace", action="store_true", help="print what happened in each history")
+    parser.add_argument("--switches", metavar="FILE", help="write each switch of threads to a file")
+    parser.add_argument("--keep-going", action="store_true", help="do not stop at the first failure")
+    parser.add_argument("--only", default="", help="the kinds of faults, with commas; `none` for none")
+    parser.add_argument("--without", default="", help="kinds of faults that do not happen, with commas")
+    options = parser.parse_args(arguments)
+    if options.seed is None:
+        options.seed = int.from_bytes(os.urandom(4), "big")
+        print(f"seed {options.seed}", file=sys.stderr)
+    names = {field.name for field in fields(FaultPlan)}
+    only, without = (frozenset(filter(None, text.split(","))) for text in (options.only, options.without))
+    if (only | without) - names - {"none"}:
+        parser.error(f"faults are {', '.join(sorted(names))}")
+    options.only, options.without = only or None, without
+    return options
+
+
+def _histories(deployed: Deployed, options: argparse.Namespace) -> Iterator[tuple[int, Report]]:
+    left, seed = options.jobs, options.seed
+    while left > 0:
+        jobs = min(left, JOBS)
+        yield jobs, _in_child(deployed, seed, jobs, options)
+        left, seed = left - jobs, seed + 1
+
+
+def _in_child(deployed: Deployed, seed: int, jobs: int, options: argparse.Namespace) -> Report:
+    """Run a history in a process of its own: nothing is left of it for the next one."""
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(reading)
+        code = 1
+        try:
+            plan = history.plan_of(seed, only=options.only, without=options.without)
+            report, lines = history.run_history(deployed, seed, jobs, plan, switches=options.switches)
+            if options.trace:
+                print(plan, *lines, sep="\n", flush=True)
+            with os.fdopen(writing, "w") as pipe:
+                json.dump(asdict(report), pipe)
+            code = 0
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)
+    os.close(writing)
+    with os.fdopen(reading) as pipe:
+        said = pipe.read()
+    os.waitpid(child, 0)
+    if not said:
+        return Report(seed, violations=["history-failed: the process of the history ended"])
+    return Report(**json.loads(said))
+
+
+def _add(total: Report, report: Report) -> None:
+    for name in ("jobs", "paid", "refunded", "lost", "paid_twice"):
+        setattr(total, name, getattr(total, name) + getattr(report, name))
+    total.simulated_s = round(total.simulated_s + report.simulated_s, 3)
+    total.cpu_s = round(total.cpu_s + report.cpu_s, 3)
+    total.violations += [f"seed {report.seed}: {violation}" for violation in report.violations]
+    total.faults = dict(sorted((Counter(total.faults) + Counter(report.faults)).items()))
+    total.trace = report.trace
+
+
+def _print_failure(report: Report, jobs: int, options: argparse.Namespace) -> None:
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
+    only = f" --only {','.join(sorted(options.only))}" if options.only else ""
+    only += f" --without {','.join(sorted(options.without))}" if options.without else ""
+    print(f"FAILED at commit {commit.stdout.strip()}; replay with", file=sys.stderr)
+    print(f'    make simulate ARGS="--seed {report.seed} --jobs {jobs}{only} --trace"', file=sys.stderr)
+    for violation in report.violations:
+        print(f"  {violation}", file=sys.stderr)
+    sys.stderr.flush()
+
+
+def _print_total(total: Report) -> None:
+    ratio = total.simulated_s / total.cpu_s if total.cpu_s else 0
+    print(
+        f"{total.jobs} jobs, {total.paid} paid, {total.refunded} refunded, {total.lost} lost, {total.paid_twice} paid"
+        f" twice, {len(total.violations)} violations; {total.simulated_s:.0f} simulated seconds in {total.real_s:.0f} s"
+        f" ({total.cpu_s:.0f} s of CPU, {ratio:.0f} times faster than real time)"
+    )

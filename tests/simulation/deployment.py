@@ -1,0 +1,56 @@
+"""The contracts of the simulated market, and the accounts of those who take part."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from mesh.chain import Account, Chain, Timing
+from mesh.devchain.development import ALLOWANCE, DevelopmentMarket, deploy_market
+from schemas import cid_of_bytes
+from tests.simulation import loop
+from tests.simulation.chain import NodeFaults, SimulatedChain, SimulatedNode
+from tests.simulation.scheduler import SECOND, Process, Scheduler
+
+MODEL: Final = cid_of_bytes(b"aira-mesh simulation: a lamp\n")
+ENDPOINT: Final = "tcp/127.0.0.1:7447"
+BLOCK_SECONDS: Final = 6.0
+TIMING: Final = Timing(poll_interval=3.0, receipt_interval=1.0, replace_after=30.0)
+PEOPLE: Final = 2
+ROBOTS: Final = 2
+LIFETIME: Final = 60
+"""Blocks for which an order is valid."""
+
+
+@dataclass(frozen=True)
+class Deployed:
+    """The market on the chain, and the account of each role."""
+
+    chain: SimulatedChain
+    market: DevelopmentMarket
+    accounts: dict[str, Account]
+
+
+def found(chain: SimulatedChain, scheduler: Scheduler) -> Deployed:
+    """Deploy the contracts, and give people and robots their tokens."""
+    deployed: list[Deployed] = []
+    keys = chain.evm.funded_keys
+    names = [f"person-{number}" for number in range(PEOPLE)] + [f"robot-{number}" for number in range(ROBOTS)]
+    accounts = {name: Account.from_key(key) for name, key in zip(names, keys[3:], strict=False)}
+
+    async def main() -> None:
+        node = SimulatedNode(chain, NodeFaults())
+        market = await deploy_market(node, keys)
+        async with Chain(node, account=market.accounts["provider"], ens=market.deployment.ens, timing=TIMING) as client:
+            for account in accounts.values():
+                await client.tokens.transfer(account.address, ALLOWANCE)
+        accounts["provider"] = market.accounts["provider"]
+        deployed.append(Deployed(chain, market, accounts))
+
+    errors: list[BaseException | None] = []
+    loop.start(scheduler, Process(scheduler, "deployment"), main, errors.append)
+    scheduler.run(lambda: bool(errors), until_ns=scheduler.now_ns + 3600 * SECOND)
+    if errors[0] is not None:
+        raise errors[0]
+    chain.begin()
+    return deployed[0]

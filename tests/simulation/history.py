@@ -1,0 +1,161 @@
+"""One history: a market from its beginning until all jobs have ended, under one seed."""
+
+from __future__ import annotations
+
+import gc
+import hashlib
+import os
+import random
+import shutil
+import tempfile
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from tests.simulation import loop, threads
+from tests.simulation.scheduler import REAL_TIME, SECOND, HistoryFailed, Process
+
+if TYPE_CHECKING:
+    from tests.simulation.deployment import Deployed
+    from tests.simulation.faults import FaultPlan
+    from tests.simulation.market import Market
+
+CHAOS_SECONDS: Final = 400
+"""How long faults happen, for each job of a person."""
+CALM_SECONDS: Final = 3600
+"""How long everything has after that to end: the bound within which each accepted job is paid or refunded."""
+FOLDER: Final = Path("/dev/shm" if Path("/dev/shm").is_dir() else tempfile.gettempdir()) / "aira-simulation"
+
+
+@dataclass
+class Report:
+    """What happened in a history."""
+
+    seed: int
+    jobs: int = 0
+    paid: int = 0
+    refunded: int = 0
+    lost: int = 0
+    paid_twice: int = 0
+    violations: list[str] = field(default_factory=list)
+    faults: dict[str, int] = field(default_factory=dict)
+    simulated_s: float = 0.0
+    real_s: float = 0.0
+    cpu_s: float = 0.0
+    trace: str = ""
+    """The hash of the trace."""
+
+
+def plan_of(seed: int, *, only: frozenset[str] | None = None, without: frozenset[str] = frozenset()) -> FaultPlan:
+    """The faults of a seed, of some kinds `only`, or `without` some."""
+    from tests.simulation.faults import choose
+
+    return choose(random.Random(f"faults {seed}"), only=only, without=without)
+
+
+def run_history(
+    deployed: Deployed, seed: int, jobs: int, plan: FaultPlan, *, switches: str | None = None
+) -> tuple[Report, list[str]]:
+    """Run the history of a seed with these faults; what happened, and its trace.
+
+    Each switch of threads is written to the file `switches`: where two runs of a seed differ, it shows where it begins.
+    """
+    from tests.simulation.market import Market
+
+    began, cpu = REAL_TIME(), time.process_time()
+    scheduler = threads.begin(seed)
+    scheduler.now_ns = 2_000 * SECOND
+    if switches:
+        scheduler.watch_switches(Path(switches))
+    # Relative, so that the paths are the same in each run.
+    folder = FOLDER / str(os.getpid())
+    folder.mkdir(parents=True)
+    os.chdir(folder)
+    try:
+        market = Market(scheduler, deployed, Path("market"), jobs)
+        market.folder.mkdir()
+        CURRENT[:] = [market.router]
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        try:
+            _play(market, plan)
+        except HistoryFailed as failure:
+            market.violated("history-failed", str(failure))
+        for name, error in scheduler.failures:
+            market.violated("thread-died", f"{name}: {error!r}")
+        report = _report(market, seed)
+    finally:
+        os.chdir("/")
+        shutil.rmtree(folder)
+    report.real_s, report.cpu_s = round(REAL_TIME() - began, 3), round(time.process_time() - cpu, 3)
+    return report, market.lines
+
+
+def _play(market: Market, plan: FaultPlan) -> None:
+    from tests.simulation.audit import Audit
+    from tests.simulation.faults import Faults
+
+    scheduler = market.scheduler
+    market.disk.install()
+    faults = Faults(market, plan)
+    market.begin()
+    faults.start()
+    chaos = CHAOS_SECONDS * max(person.wanted for person in market.people)
+    scheduler.run(lambda: all(person.is_done for person in market.people), until_ns=scheduler.now_ns + chaos * SECOND)
+    faults.stop()
+    market.trace("faults", "stopped")
+    audit = market.audit = Audit(market)
+    scheduler.run(lambda: _is_settled(market, audit), until_ns=scheduler.now_ns + CALM_SECONDS * SECOND)
+    for person in market.people:
+        for order in person.orders:
+            if order.told in ("", "accepted"):
+                market.violated("not-told", f"{order.person} waits for job {order.number} ({order.told or 'ordered'})")
+    errors: list[BaseException | None] = []
+    loop.start(scheduler, Process(scheduler, "audit"), audit.promises, errors.append)
+    scheduler.run(lambda: bool(errors), until_ns=scheduler.now_ns + 3600 * SECOND)
+    if errors and errors[0] is not None:
+        raise errors[0]
+    audit.money()
+    audit.ledgers()
+    for address in sorted(audit.open):
+        market.violated("not-finalized", address)
+    market.is_over = True
+
+
+def _is_settled(market: Market, audit: object) -> bool:
+    """Whether people have been told everything and all liabilities have ended, for some blocks."""
+    from tests.simulation.audit import Audit
+
+    assert isinstance(audit, Audit)
+    head = market.deployed.chain.evm.head
+    if head == market.settled_head:
+        return False
+    done = all(person.is_done for person in market.people) and all(audit.liabilities().values())
+    market.settled_blocks = market.settled_blocks + 1 if done else 0
+    market.settled_head = head
+    return market.settled_blocks > SETTLED_BLOCKS
+
+
+SETTLED_BLOCKS: Final = 5
+
+
+def _report(market: Market, seed: int) -> Report:
+    orders = [order for person in market.people for order in person.orders]
+    audit = market.audit
+    report = Report(seed, jobs=len(orders), violations=market.violations)
+    if audit is not None:
+        report.paid, report.refunded, report.lost = len(audit.paid), len(audit.refunded), len(audit.open)
+        report.paid_twice = audit.paid_twice
+    counts = Counter(market.faults_seen)
+    counts["reorganisation-blocks"] = market.deployed.chain.deepest
+    report.faults = {kind: count for kind, count in sorted(counts.items()) if count}
+    report.simulated_s = round(market.scheduler.now_ns / SECOND - 2_000, 3)
+    report.trace = hashlib.sha256("\n".join(market.lines).encode()).hexdigest()
+    return report
+
+
+CURRENT: list[object] = []
+"""The router to which sessions are opened."""

@@ -1,0 +1,117 @@
+"""An asyncio event loop in simulated time: asyncio's own, but for waiting."""
+
+from __future__ import annotations
+
+import asyncio
+import heapq
+from typing import TYPE_CHECKING, Any
+
+from tests.simulation.scheduler import SECOND, Fiber, Process, Scheduler
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine
+
+
+class Future(asyncio.Future[Any]):
+    """A future whose place in a set depends on the history, not on its address in memory."""
+
+    def __hash__(self) -> int:
+        return self.number
+
+    number = 0
+
+
+class Task(asyncio.Task[Any]):
+    """The same for tasks."""
+
+    def __hash__(self) -> int:
+        return self.number
+
+    number = 0
+
+
+class SimulatedLoop(asyncio.BaseEventLoop):
+    """The event loop of one simulated process."""
+
+    def __init__(self, scheduler: Scheduler, process: Process) -> None:
+        super().__init__()
+        self._scheduler = scheduler
+        self._process = process
+        self._fiber: Fiber | None = None
+        self._sleeping = False
+        self._tasks: list[Task] = []
+        self._prune_at = 100
+        self.set_task_factory(self._make_task)
+
+    def time(self) -> float:
+        """Simulated seconds."""
+        return self._scheduler.now_ns / SECOND
+
+    def create_future(self) -> asyncio.Future[Any]:
+        """A future of this loop."""
+        future = Future(loop=self)
+        future.number = self._scheduler.count()
+        return future
+
+    def _make_task(self, loop: Any, coro: Any, context: Any = None) -> Task:
+        task = Task(coro, loop=loop, context=context)
+        task.number = self._scheduler.count()
+        self._tasks.append(task)
+        if len(self._tasks) > self._prune_at:
+            self._tasks = [one for one in self._tasks if not one.done()]
+            self._prune_at = 2 * len(self._tasks) + 100
+        return task
+
+    def _run_once(self) -> None:
+        scheduler, ready, scheduled = self._scheduler, self._ready, self._scheduled  # type: ignore[attr-defined]
+        while scheduled and scheduled[0]._cancelled:
+            heapq.heappop(scheduled)._scheduled = False
+        if ready:
+            scheduler.pause()
+        elif not self._stopping:  # type: ignore[attr-defined]
+            self._sleeping = True
+            self._fiber = scheduler.current
+            timeout = None if not scheduled else max(0, round((scheduled[0]._when - self.time()) * SECOND))
+            scheduler.wait(timeout)
+            self._sleeping = False
+        ends = self.time() + 1e-9
+        while scheduled and scheduled[0]._when < ends:
+            handle = heapq.heappop(scheduled)
+            handle._scheduled = False
+            ready.append(handle)
+        for _ in range(len(ready)):
+            handle = ready.popleft()
+            if not handle._cancelled:
+                self._process.step()
+                handle._run()
+
+    def _write_to_self(self) -> None:
+        if self._sleeping and self._fiber is not None:
+            self._sleeping = False
+            self._scheduler.wake(self._fiber)
+
+    def _process_events(self, event_list: object) -> None:
+        """There are no sockets."""
+
+
+def start(
+    scheduler: Scheduler,
+    process: Process,
+    main: Callable[[], Coroutine[Any, Any, None]],
+    ended: Callable[[BaseException | None], None],
+) -> None:
+    """Run `main` in an event loop of its own, in a thread of the process; `ended` is called with its error."""
+
+    def run() -> None:
+        loop = SimulatedLoop(scheduler, process)
+        process.kept.append(loop)
+        error: BaseException | None = None
+        try:
+            asyncio.set_event_loop(None)
+            loop.run_until_complete(main())
+        except BaseException as failure:
+            error = failure
+        process.is_dead = True
+        ended(error)
+
+    scheduler.spawn(run, f"main {process.name}", process)

@@ -1,0 +1,127 @@
+"""A market in the simulation: its chain, its router, its participants, and what was seen of them."""
+
+from __future__ import annotations
+
+import logging
+import os
+import traceback
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from mesh.errors import AiraError
+from mesh.recording.mcap_writer import McapWriter
+from mesh.running import cause_of
+from schemas import EMPTY, cid_of_file
+from tests.simulation.deployment import BLOCK_SECONDS, PEOPLE, ROBOTS, Deployed
+from tests.simulation.disk import SimulatedDisk
+from tests.simulation.roles import PersonRole, ProviderRole, RobotRole, Role
+from tests.simulation.router import Router
+from tests.simulation.scheduler import SECOND, Process, Scheduler
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from mesh.market.book import Match
+    from tests.simulation.audit import Audit
+
+logging.getLogger().setLevel(logging.CRITICAL)
+
+
+@dataclass
+class Market:
+    """Everything in one history."""
+
+    scheduler: Scheduler
+    deployed: Deployed
+    folder: Path
+    jobs: int
+    faults_seen: Counter[str] = field(default_factory=Counter)
+    is_over: bool = False
+    is_calm: bool = False
+    """Whether all faults have stopped."""
+    plan_crash: Callable[[Role, Process], None] = lambda role, process: None
+    lines: list[str] = field(default_factory=list)
+    audit: Audit | None = None
+    settled_head: int = 0
+    settled_blocks: int = 0
+
+    def __post_init__(self) -> None:
+        self.router = Router()
+        self.router.faults.seen = self.faults_seen
+        self.deployed.chain.faults.seen = self.faults_seen
+        self.disk = SimulatedDisk(self.folder)
+        self.disk.seen = self.faults_seen
+        self.violations: list[str] = []
+        self.plays: Counter[tuple[str, int]] = Counter()
+        self.objectives: dict[int, Path] = {}
+        self.cids: dict[Path, str] = {}
+        self.final_words = frozenset({"expired", "rejected"})
+        self.provider = ProviderRole(self, "provider")
+        self.robots = [RobotRole(self, f"robot-{number}") for number in range(ROBOTS)]
+        share = [self.jobs // PEOPLE + (number < self.jobs % PEOPLE) for number in range(PEOPLE)]
+        self.people = [PersonRole(self, f"person-{number}", jobs) for number, jobs in enumerate(share) if jobs]
+        self.roles: list[Role] = [self.provider, *self.robots, *self.people]
+
+    def begin(self) -> None:
+        """Start everything."""
+        for role in self.roles:
+            self.scheduler.call_later(self.scheduler.random.uniform(0, 5), role.start)
+        self.scheduler.call_later(BLOCK_SECONDS, self._mine)
+
+    def _mine(self) -> None:
+        if not self.is_over:
+            self.deployed.chain.mine()
+            self.scheduler.call_later(BLOCK_SECONDS, self._mine)
+
+    def trace(self, who: str, what: str, **facts: Any) -> None:
+        """Note what happened; the trace of a seed is always the same."""
+        said = " ".join(f"{name}={value}" for name, value in facts.items())
+        self.lines.append(f"{self.scheduler.now_ns / SECOND:.6f} {who} {what} {said}".rstrip())
+
+    def violated(self, invariant: str, detail: str) -> None:
+        """An invariant does not hold."""
+        self.trace("invariant", invariant, detail=detail)
+        self.violations.append(f"{invariant}: {detail}")
+
+    def ended(self, role: Role, error: BaseException) -> None:
+        """A process ended by itself."""
+        self.trace(role.name, "ended", error=_cause(error))
+        if os.environ.get("AIRA_SIMULATION_TRACEBACKS"):
+            traceback.print_exception(error)
+        if isinstance(error, BaseExceptionGroup):
+            error = cause_of(error) or error
+        if not isinstance(error, AiraError):
+            self.violated("process-died", f"{role.name}: {_cause(error)}")
+
+    def matched(self, match: Match) -> None:
+        """A provider matched two orders."""
+        self.trace("provider", "matched", demand=match.demand.hash.hex()[:12], offer=match.offer.hash.hex()[:12])
+
+    def played(self, role: Role, liability: str, position: int) -> None:
+        """A robot's device got a message."""
+        self.plays[liability, position] += 1
+
+    def objective(self, messages: int) -> Path:
+        """An objective with so many messages."""
+        if messages not in self.objectives:
+            path = self.folder / f"objective-{messages}.mcap"
+            with path.open("wb") as file:
+                writer = McapWriter(file)
+                channel = writer.channel("/blink", EMPTY, {})
+                for number in range(messages):
+                    writer.write(channel, b"", number * 400_000_000, number * 400_000_000)
+                writer.finish()
+            self.objectives[messages], self.cids[path] = path, cid_of_file(path)
+        return self.objectives[messages]
+
+
+def _cause(error: BaseException) -> str:
+    while isinstance(error, BaseExceptionGroup):
+        error = error.exceptions[0]
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    where = "" if trace is None else f" at {trace.tb_frame.f_code.co_filename.rsplit('/aira', 1)[-1]}:{trace.tb_lineno}"
+    return f"{type(error).__name__}: {error}{where}"

@@ -1,0 +1,221 @@
+"""Those who take part in a simulated market: processes that are started again after each crash."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from mesh.agent import Agent
+from mesh.agent.errors import LiabilityReverted, OrderExpired, OrderRejected
+from mesh.chain import XRT, Chain
+from mesh.errors import AiraError
+from mesh.market.provider import Provider
+from mesh.network import Endpoints, Network
+from mesh.settings import Settings
+from schemas import String
+from tests.simulation import loop
+from tests.simulation.chain import NodeFaults, SimulatedNode
+from tests.simulation.deployment import ENDPOINT, LIFETIME, MODEL, TIMING
+from tests.simulation.scheduler import Process
+
+if TYPE_CHECKING:
+    from mesh.market.book import Match
+    from tests.simulation.market import Market
+
+
+@dataclass
+class Ordered:
+    """What a person wanted, and what they were told."""
+
+    person: str
+    number: int
+    cost: int
+    order: str = ""
+    contract: str = ""
+    told: str = ""
+    """The last thing: accepted, rejected, expired, paid, refunded, reverted, or the code of another error."""
+
+
+class Role:
+    """A participant: a process that is started again after each crash, with what its disk kept."""
+
+    def __init__(self, market: Market, name: str) -> None:
+        self.market = market
+        self.name = name
+        self.account = market.deployed.accounts[name]
+        self.folder = market.folder / name
+        self.process: Process | None = None
+        self.starts = 0
+        self.errors: list[BaseException] = []
+        self.node_faults = NodeFaults(seen=market.faults_seen)
+        self.wall_offset_ns = 0
+
+    async def main(self) -> None:
+        """What the process does."""
+        raise NotImplementedError
+
+    def start(self) -> None:
+        """Start the process."""
+        market = self.market
+        self.starts += 1
+        process = self.process = Process(market.scheduler, f"{self.name}#{self.starts}")
+        process.wall_offset_ns = self.wall_offset_ns
+        process.on_crash = lambda: self._crashed(process)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if not self.market.is_calm:
+            market.plan_crash(self, process)
+        loop.start(market.scheduler, process, self.main, lambda error: self._ended(process, error))
+
+    def crash(self) -> None:
+        """Kill the process."""
+        if self.process is not None and not self.process.is_dead:
+            self.market.scheduler.crash(self.process)
+
+    def _crashed(self, process: Process) -> None:
+        """The process was killed, perhaps together with its machine. It is started again after a while."""
+        market, chance = self.market, self.market.scheduler.random
+        market.router.lose(process)
+        is_power_failure = chance.random() < 0.5
+        kind = "power-failure" if is_power_failure else "kill"
+        market.faults_seen[kind] += 1
+        market.trace(self.name, kind, steps=process.steps, commits=process.commits)
+        market.scheduler.call_later(chance.uniform(0.2, 20), self._restart_from_disk, is_power_failure)
+
+    def _ended(self, process: Process, error: BaseException | None) -> None:
+        """The process ended by itself, which only an error makes it do."""
+        market = self.market
+        market.router.lose(process)
+        if error is not None:
+            self.errors.append(error)
+            market.ended(self, error)
+        market.scheduler.call_later(market.scheduler.random.uniform(0.2, 20), self._restart_from_disk, False)
+
+    def _restart_from_disk(self, is_power_failure: bool) -> None:
+        if not self.market.is_over:
+            self.market.disk.crash(self.folder, power=is_power_failure)
+            self.start()
+
+    def chain(self) -> Chain:
+        """The chain, as this process reaches it."""
+        return Chain(
+            SimulatedNode(self.market.deployed.chain, self.node_faults),
+            account=self.account,
+            ens=self.market.deployed.market.deployment.ens,
+            timing=TIMING,
+            transactions=self.folder / "transactions",
+        )
+
+    def settings(self) -> Settings:
+        """Its settings."""
+        deployment = self.market.deployed.market.deployment
+        return Settings(
+            connect=(ENDPOINT,),
+            connect_timeout=-1,
+            data_dir=str(self.folder),
+            lighthouse_contract=deployment.lighthouse_name,
+            ens_contract=deployment.ens,
+            poll_interval=TIMING.poll_interval,
+            fetch_timeout=60.0,
+        )
+
+
+class ProviderRole(Role):
+    """A provider."""
+
+    provider: Provider | None = None
+
+    async def main(self) -> None:
+        """Match and settle."""
+        market = self.market
+        async with (
+            Network(Endpoints(connect=(ENDPOINT,), timeout=-1)) as network,
+            self.chain() as chain,
+            Provider(
+                network.session, chain, market.deployed.market.deployment.lighthouse_name, matched=self._matched
+            ) as self.provider,
+        ):
+            await self.provider.run()
+
+    def _matched(self, match: Match) -> None:
+        self.market.matched(match)
+
+
+class RobotRole(Role):
+    """A robot with a lamp."""
+
+    agent: Agent | None = None
+
+    async def main(self) -> None:
+        """Offer, and work."""
+        market = self.market
+        async with self.chain() as chain:
+            agent = self.agent = Agent(MODEL, settings=self.settings(), account=self.account, chain=chain)
+
+            @agent.on("*")
+            async def play(job: Any, message: Any) -> None:
+                market.played(self, job.liability.address, job.position)
+                job.publish("/led", String("on"))
+                await asyncio.sleep(0.05)
+
+            @agent.on_demand
+            async def offer(demand: Any) -> None:
+                await agent.offer(demand)
+
+            @agent.on_liability
+            async def phase(phase: Any, liability: Any) -> None:
+                market.trace(self.name, f"job-{phase.value}", liability=liability.address)
+
+            await agent.serve()
+
+
+class PersonRole(Role):
+    """A person who wants some jobs done, one after the other."""
+
+    agent: Agent | None = None
+
+    def __init__(self, market: Market, name: str, jobs: int) -> None:
+        super().__init__(market, name)
+        self.wanted = jobs
+        self.orders: list[Ordered] = []
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the person wants nothing more."""
+        return len(self.orders) >= self.wanted and bool(self.orders[-1].told not in ("", "accepted"))
+
+    async def main(self) -> None:
+        """Order the jobs that are left."""
+        market = self.market
+        if self.orders and self.orders[-1].told in ("", "accepted"):
+            self.orders[-1].told += "+crashed"
+        async with self.chain() as chain:
+            self.agent = agent = Agent(MODEL, settings=self.settings(), account=self.account, chain=chain)
+            async with agent:
+                while len(self.orders) < self.wanted:
+                    await asyncio.sleep(market.scheduler.random.uniform(0.1, 30))
+                    wanted = Ordered(self.name, len(self.orders), cost=market.scheduler.random.randint(1, 50) * XRT)
+                    self.orders.append(wanted)
+                    await self._order(agent, wanted)
+                await asyncio.Event().wait()
+
+    async def _order(self, agent: Agent, wanted: Ordered) -> None:
+        market = self.market
+        objective = market.objective(market.scheduler.random.randint(2, 12))
+        market.trace(self.name, "demands", number=wanted.number, cost=wanted.cost)
+        try:
+            contract = await agent.demand(objective, cost=wanted.cost, lifetime=LIFETIME)
+            wanted.contract, wanted.told = contract.address, "accepted"
+            market.trace(self.name, "accepted", liability=contract.address)
+            outcome = await contract.outcome()
+            wanted.contract = contract.address
+            wanted.told = "paid" if outcome.success else "refunded"
+        except OrderRejected as error:
+            wanted.order, wanted.told = error.rejection.order, "rejected"
+        except OrderExpired as error:
+            wanted.order, wanted.told = error.order, "expired"
+        except LiabilityReverted:
+            wanted.told = "reverted"
+        except AiraError as error:
+            wanted.told = error.code
+        market.trace(self.name, wanted.told, number=wanted.number)

@@ -1,0 +1,168 @@
+"""A simulated Zenoh router, and all that can go wrong between two sessions.
+
+Samples of one session arrive in the order in which they were sent, unless the faults say otherwise; callbacks run on a
+thread of the receiving session.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+import zenoh
+
+from tests.simulation.messages import Callback, CancellationToken, FifoChannel, RingChannel, Sample, matches
+from tests.simulation.queries import Query
+from tests.simulation.scheduler import SECOND
+from tests.simulation.sessions import Session
+from tests.simulation.threads import scheduler
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from tests.simulation.queries import PendingGet
+    from tests.simulation.scheduler import Process
+
+LATENCY: Final = (0.0005, 0.004)
+LOST_LINK_SECONDS: Final = 2.0
+"""How long until the router notices that a session is gone."""
+
+
+@dataclass
+class TransportFaults:
+    """How probable each fault of a message is; `extra` is the most seconds that a delayed one takes longer."""
+
+    drop: float = 0.0
+    duplicate: float = 0.0
+    delay: float = 0.0
+    extra: float = 5.0
+    seen: Counter[str] = field(default_factory=Counter)
+
+
+class Router:
+    """The router, with all its sessions."""
+
+    def __init__(self) -> None:
+        self.faults = TransportFaults()
+        self.sessions: list[Session] = []
+        self.is_up = True
+        self.tap: Callable[[Sample, Session], None] = lambda sample, sender: None
+        self.cut: set[frozenset[str]] = set()
+        """Pairs of session names between which nothing passes."""
+
+    def open(self, config: object = None) -> Session:
+        """`zenoh.open`."""
+        if not self.is_up:
+            raise zenoh.ZError("Unable to connect to any of [tcp/simulated:7447]")
+        process = scheduler().process
+        session = Session(self, process, "outside" if process is None else process.name)
+        self.sessions.append(session)
+        return session
+
+    def forget(self, session: Session) -> None:
+        """A session was closed."""
+        if session in self.sessions:
+            self.sessions.remove(session)
+
+    def lose(self, process: Process) -> None:
+        """A process died: the router notices after a while."""
+        for session in [session for session in self.sessions if session.process is process]:
+            self.sessions.remove(session)
+            session._closed = True
+            for token in session.tokens:
+                scheduler().call_later(LOST_LINK_SECONDS, self.token_changed, token.selector, zenoh.SampleKind.DELETE)
+
+    def set_up(self, up: bool) -> None:
+        """Stop or start the router."""
+        self.is_up = up
+        for session in list(self.sessions):
+            session.set_linked(up)
+
+    def tokens(self) -> list[str]:
+        """The keys of all tokens."""
+        return [token.selector for session in self.sessions if session.is_linked for token in session.tokens]
+
+    def token_changed(self, key: str, kind: Any, *, but: Session | None = None) -> None:
+        """Tell those who watch tokens."""
+        for session in self.sessions:
+            if session is but or not session.is_linked:
+                continue
+            for watcher in session.token_watchers:
+                if matches(watcher.selector, key):
+                    self.later(session, None, watcher.deliver, Sample(key, b"", kind=kind))
+
+    def linked(self, sender: Session, receiver: Session) -> bool:
+        """Whether anything passes from one session to another."""
+        if sender is receiver:
+            return True
+        return sender.is_linked and receiver.is_linked and frozenset((sender.name, receiver.name)) not in self.cut
+
+    def later(self, session: Session, sender: Session | None, function: Callable[..., object], *arguments: Any) -> None:
+        """Call a function on a session's thread after the network's latency, in the order of the sender."""
+        current = scheduler()
+        when = current.now_ns + round(current.random.uniform(*LATENCY) * SECOND)
+        if sender is not None:
+            when = max(when, session.last_arrival.get(sender, 0) + 1)
+            session.last_arrival[sender] = when
+        current.call_at(when, session.arrive, function, *arguments)
+
+    def publish(self, sample: Sample, sender: Session) -> None:
+        """Bring a sample to all subscribers."""
+        self.tap(sample, sender)
+        for session in self.sessions:
+            if any(matches(receiver.selector, str(sample.key_expr)) for receiver in session.subscribers):
+                if self.linked(sender, session):
+                    self._transfer(sample, sender, session)
+                else:
+                    self.faults.seen["partition"] += 1
+
+    def _transfer(self, sample: Sample, sender: Session, session: Session) -> None:
+        current, faults = scheduler(), self.faults
+        if session is sender:
+            self.later(session, sender, self.deliver, sample, sender, session)
+            return
+        if faults.drop and current.random.random() < faults.drop:
+            faults.seen["message-dropped"] += 1
+            return
+        if faults.duplicate and current.random.random() < faults.duplicate:
+            faults.seen["message-duplicated"] += 1
+            self._delayed(sample, sender, session)
+        if faults.delay and current.random.random() < faults.delay:
+            faults.seen["message-delayed"] += 1
+            self._delayed(sample, sender, session)
+            return
+        self.later(session, sender, self.deliver, sample, sender, session)
+
+    def _delayed(self, sample: Sample, sender: Session, session: Session) -> None:
+        seconds = scheduler().random.uniform(0, self.faults.extra)
+        scheduler().call_later(seconds, session.arrive, self.deliver, sample, sender, session)
+
+    def deliver(self, sample: Sample, sender: Session, session: Session) -> None:
+        """Give a sample to the matching subscribers of a session."""
+        for receiver in list(session.subscribers):
+            if matches(receiver.selector, str(sample.key_expr)):
+                receiver.deliver(sample)
+
+    def query(
+        self, pending: PendingGet, sender: Session, key: str, payload: bytes | None, parameters: dict[str, str]
+    ) -> None:
+        """Bring a query to all queryables."""
+        for session in self.sessions:
+            if not self.linked(sender, session):
+                continue
+            for receiver in session.queryables:
+                if matches(receiver.selector, key):
+                    pending.outstanding += 1
+                    query = Query(pending, receiver, payload, parameters)
+                    self.later(session, sender, receiver.deliver, query)
+
+
+def install(router_of: Callable[[], Router]) -> None:
+    """Replace Zenoh's entry points for the rest of this process."""
+    module: Any = zenoh
+    module.open = lambda config: router_of().open(config)
+    module.CancellationToken = CancellationToken
+    module.handlers.FifoChannel = FifoChannel
+    module.handlers.RingChannel = RingChannel
+    module.handlers.Callback = Callback
