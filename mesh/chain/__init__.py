@@ -18,6 +18,7 @@ from mesh.chain.accounts import (
     new_private_key,
     write_keyfile,
 )
+from mesh.chain.answers import BlockHeader
 from mesh.chain.client import Chain
 from mesh.chain.contracts import LighthouseState
 from mesh.chain.deploy import XRT, Deployment, DeploymentPlan, deploy
@@ -55,7 +56,7 @@ from mesh.chain.events import (
 from mesh.chain.following import BlockEvents, History, Reorganisation
 from mesh.chain.liabilities import Created, RefundState, Settled
 from mesh.chain.names import namehash
-from mesh.chain.node import BlockHeader, Node
+from mesh.chain.node import Node
 from mesh.chain.policy import GWEI, FeePolicy, Timing
 from mesh.chain.tokens import Token
 from mesh.chain.transactions import Receipt, TransactionSender

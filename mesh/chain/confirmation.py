@@ -19,9 +19,8 @@ from mesh.retry import Backoff
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from web3.types import TxReceipt
-
     from mesh.chain.accounts import Account, SignedTransaction
+    from mesh.chain.answers import MinedTransaction
     from mesh.chain.node import Node
     from mesh.chain.pending import PendingTransactions
     from mesh.chain.transaction_store import PendingTransaction
@@ -86,7 +85,9 @@ async def is_known(node: Node, versions: Iterable[SignedTransaction]) -> bool:
     return False
 
 
-async def find_receipt(node: Node, versions: Iterable[SignedTransaction]) -> tuple[SignedTransaction, TxReceipt] | None:
+async def find_receipt(
+    node: Node, versions: Iterable[SignedTransaction]
+) -> tuple[SignedTransaction, MinedTransaction] | None:
     """The version of a transaction that was mined, and its receipt; None if none was."""
     for signed in versions:
         receipt = await node.receipt(signed.hash)
@@ -107,7 +108,7 @@ class Confirmation:
         self._nonce_used = 0
         """Checks in a row that found the nonce used by another transaction."""
 
-    async def wait(self) -> tuple[SignedTransaction, TxReceipt]:
+    async def wait(self) -> tuple[SignedTransaction, MinedTransaction]:
         """The version that was mined, and its receipt, once it has the confirmations.
 
         Raises `NonceLost`, `TransactionTimeout`, `NodeUnreachable`.
@@ -132,7 +133,7 @@ class Confirmation:
         except TimeoutError:
             raise TransactionTimeout(self._entry.newest.hash, timing.receipt_timeout) from None
 
-    async def _find_confirmed(self) -> tuple[SignedTransaction, TxReceipt] | None:
+    async def _find_confirmed(self) -> tuple[SignedTransaction, MinedTransaction] | None:
         """The version that was mined, if it has the confirmations. Sends it again if its block was replaced."""
         confirmations = self._node.timing.confirmations
         head = await self._node.block_number() if confirmations > 1 else 0
@@ -145,7 +146,7 @@ class Confirmation:
         if found is not None:
             self._was_mined = True
             _, receipt = found
-            return found if confirmations == 1 or head >= receipt["blockNumber"] + confirmations - 1 else None
+            return found if confirmations == 1 or head >= receipt.block_number + confirmations - 1 else None
         if self._was_mined:
             self._was_mined = False
             log.warning(

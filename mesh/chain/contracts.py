@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
-from mesh.chain.errors import NoAccount, NotOffered, UnknownContracts
+from mesh.chain.errors import InvalidAnswer, NoAccount, NotOffered, UnknownContracts
 from mesh.errors import InvalidMessage
 from schemas.address import ZERO_ADDRESS, parse_address
 from schemas.cid import parse_cid
@@ -30,6 +30,10 @@ ContractKind = Literal["mesh", "original"]
 
 AGREE: Final = True
 """A provider always agrees with a result; only a validator, who finalizes on its own, can disagree."""
+
+
+MAX_PROVIDERS: Final = 10_000
+"""Providers of one lighthouse that are read."""
 
 
 class LighthouseGetters(NamedTuple):
@@ -225,13 +229,16 @@ def result_arguments(result: Result) -> tuple[bytes, bool, bytes]:
 
 
 async def lighthouse_state(node: Node, address: str, names: LighthouseGetters, *, current: str) -> LighthouseState:
-    """The state of a lighthouse, as of one block. Raises `NoContracts` if there is none, `NodeUnreachable`.
+    """The state of a lighthouse, as of one block. Raises `NoContracts` if there is none,
+    `InvalidAnswer` for one with too many providers, `NodeUnreachable`.
 
     `current` is the getter for the current provider: of its address, or of its index (`marker`).
     """
     block = await node.block_number()
     functions = node.contract("Lighthouse", address).functions
     count = await node.read(functions[names.length](), block=block)
+    if count > MAX_PROVIDERS:
+        raise InvalidAnswer(f"{names.length} of {address}", f"{count} providers, and {MAX_PROVIDERS} are read at most")
     found = await node.read_all((functions[names.at](index) for index in range(count)), block=block)
     stakes = await node.read_all((functions[names.stake](provider) for provider in found), block=block)
     getters = (names.minimal_stake, names.timeout_blocks, names.keep_alive_block, "quota", current)

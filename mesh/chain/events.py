@@ -5,19 +5,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 
-from eth_abi.abi import decode
-from eth_abi.exceptions import DecodingError
-
+from mesh.chain.answers import SpoiledAnswer, decode_values
 from mesh.chain.artifacts import load_artifact, signature_of
+from mesh.chain.errors import InvalidAnswer
 from schemas import keccak256
-from schemas.address import ZERO_ADDRESS, checksum_address
+from schemas.address import ZERO_ADDRESS
 from schemas.cid import format_cid
 from schemas.errors import InvalidCid
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
+
+    from mesh.chain.answers import Log
+
+
+E = TypeVar("E")
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,20 +110,19 @@ EVENT_CLASSES: Final[Mapping[str, type[ChainEvent]]] = MappingProxyType(
 ChainEvent: TypeAlias = NewLiability | Finalized | NewLighthouse | Transfer | Approval | Online | Offline | Current
 
 
-def decode_log(log: Any) -> ChainEvent | None:
+def decode_log(log: Log) -> ChainEvent | None:
     """The event in a log; None for a log of other contracts that only looks similar."""
-    entry = _layouts().get(bytes(log["topics"][0])) if log["topics"] else None
+    entry = _layouts().get(log.topics[0]) if log.topics else None
     if entry is None:
         return None
     name, indexed, plain = entry
-    if len(log["topics"]) != 1 + len(indexed):
+    if len(log.topics) != 1 + len(indexed):
         return None
     try:
-        keys = [decode([kind], bytes(topic))[0] for kind, topic in zip(indexed, log["topics"][1:], strict=True)]
-        data = bytes(log["data"])
-        values = decode(plain, _padded(data) if plain == ["string"] else data)
-        return _event(name, _address(log["address"]), (*keys, *values), "0x" + bytes(log["transactionHash"]).hex())
-    except (DecodingError, UnicodeDecodeError, InvalidCid):
+        keys = [decode_values([kind], topic)[0] for kind, topic in zip(indexed, log.topics[1:], strict=True)]
+        values = decode_values(plain, _padded(log.data) if plain == ["string"] else log.data)
+        return _event(name, log.address, (*keys, *values), "0x" + log.transaction_hash.hex())
+    except (SpoiledAnswer, InvalidCid):
         return None
 
 
@@ -134,20 +137,22 @@ def topics_of(*contracts: str) -> list[str]:
     return ["0x" + topic.hex() for topic, layout in _layouts().items() if layout[0] in names]
 
 
-def lighthouse_created(logs: Iterable[Any]) -> NewLighthouse:
-    """The lighthouse that a transaction created."""
-    return next(event for log in logs if isinstance(event := decode_log(log), NewLighthouse))
+def lighthouse_created(logs: Iterable[Log]) -> NewLighthouse:
+    """The lighthouse that a transaction created. Raises `InvalidAnswer` if its logs don't say it."""
+    return _first((decode_log(log) for log in logs), NewLighthouse)
 
 
-def liability_created(logs: Iterable[Any], *, factory: str) -> NewLiability:
-    """The liability that a transaction created. Other contracts, such as tokens, may log the same event."""
-    ours = (decode_log(log) for log in logs if _address(log["address"]) == factory)
-    return next(event for event in ours if isinstance(event, NewLiability))
+def liability_created(logs: Iterable[Log], *, factory: str) -> NewLiability:
+    """The liability that a transaction created. Other contracts, such as tokens, may log the same event.
+
+    Raises `InvalidAnswer` if the logs don't say it.
+    """
+    return _first((decode_log(log) for log in logs if log.address == factory), NewLiability)
 
 
-def xrt_minted(logs: Iterable[Any], *, xrt: str, account: str) -> int:
+def xrt_minted(logs: Iterable[Log], *, xrt: str, account: str) -> int:
     """The XRT (wn) that a transaction minted for an account. Other tokens may log the same event."""
-    transfers = (decode_log(log) for log in logs if _address(log["address"]) == xrt)
+    transfers = (decode_log(log) for log in logs if log.address == xrt)
     return sum(
         transfer.value
         for transfer in transfers
@@ -155,29 +160,32 @@ def xrt_minted(logs: Iterable[Any], *, xrt: str, account: str) -> int:
     )
 
 
+def _first(events: Iterable[ChainEvent | None], kind: type[E]) -> E:
+    for event in events:
+        if isinstance(event, kind):
+            return event
+    raise InvalidAnswer("the transaction", f"no event {kind.__name__} is in its receipt")
+
+
 def _event(name: str, emitter: str, values: tuple[Any, ...], tx: str) -> ChainEvent:
     match name, values:
         case "NewLiability", (liability,):
-            return NewLiability(_address(liability), tx)
+            return NewLiability(liability, tx)
         case "Finalized", (success, result):
             return Finalized(emitter, success, format_cid(result) if result else "", tx)
         case "NewLighthouse", (lighthouse, label):
-            return NewLighthouse(_address(lighthouse), label, tx)
+            return NewLighthouse(lighthouse, label, tx)
         case "Transfer", (sender, recipient, value):
-            return Transfer(_address(sender), _address(recipient), value, tx)
+            return Transfer(sender, recipient, value, tx)
         case "Approval", (owner, spender, value):
-            return Approval(_address(owner), _address(spender), value, tx)
+            return Approval(owner, spender, value, tx)
         case "Online", (provider,):
-            return Online(emitter, _address(provider), tx)
+            return Online(emitter, provider, tx)
         case "Offline", (provider,):
-            return Offline(emitter, _address(provider), tx)
+            return Offline(emitter, provider, tx)
         case "Current", (provider, quota):
-            return Current(emitter, _address(provider), quota, tx)
+            return Current(emitter, provider, quota, tx)
     raise AssertionError(name)
-
-
-def _address(text: str) -> str:
-    return checksum_address(bytes.fromhex(text[2:]))
 
 
 EVENTS: Final = {

@@ -52,7 +52,8 @@ from mesh.retry import Backoff
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Awaitable, Callable
 
-    from mesh.chain.node import BlockHeader, Node
+    from mesh.chain.answers import BlockHeader
+    from mesh.chain.node import Node
     from mesh.chain.reader import ReadRange
     from mesh.errors import AiraError
 
@@ -258,5 +259,4 @@ class _Follower:
             return block.block_hash == head.hash
         if block.block_number == head.number - 1:
             return block.block_hash == head.parent_hash
-        now = await self._node.header(block.block_number)
-        return now is not None and now.hash == block.block_hash
+        return await self._node.block_hash(block.block_number) == block.block_hash

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
+from mesh.chain.answers import decode_cid
 from mesh.chain.errors import NoContracts, NotALiability, OrderAlreadyUsed, Reverted
 from mesh.chain.events import NewLiability, liability_created, xrt_minted
 from mesh.chain.following import retrying
 from mesh.chain.reader import list_created
 from mesh.errors import InvalidMessage
 from schemas.address import parse_address
-from schemas.cid import format_cid
 from schemas.records import Liability
 from schemas.signing import recover
 from schemas.wire import cancellation_hash, message_hash, order_abi
@@ -276,9 +276,9 @@ async def read_liability(node: Node, address: str, *, block: int | None = None) 
     held: dict[str, Any] = dict(zip(GETTERS, values, strict=True))
     return Liability(
         address=address,
-        model=format_cid(held["model"]),
-        objective=format_cid(held["objective"]),
-        result=format_cid(held["result"]) if held["result"] else "",
+        model=decode_cid(held["model"]),
+        objective=decode_cid(held["objective"]),
+        result=decode_cid(held["result"]),
         promisee=parse_address(held["promisee"]),
         promisor=parse_address(held["promisor"]),
         lighthouse=parse_address(held["lighthouse"]),

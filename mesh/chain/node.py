@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from web3 import AsyncWeb3
-from web3.exceptions import BadFunctionCallOutput, BlockNotFound, TransactionNotFound
+from web3.providers.async_base import AsyncBaseProvider
 
+from mesh.chain.answers import ANSWERS, SpoiledAnswer, decode_values
 from mesh.chain.artifacts import load_artifact
-from mesh.chain.errors import METHOD_NOT_FOUND, NoContracts, NodeUnreachable, RequestRefused
+from mesh.chain.errors import METHOD_NOT_FOUND, InvalidAnswer, NoContracts, NodeUnreachable, RequestRefused
 from mesh.chain.metrics import NodeMetrics
 from mesh.chain.pending import PendingTransactions
 from mesh.chain.policy import FeePolicy, Fees, GasMarket, Timing
@@ -19,29 +20,20 @@ from mesh.chain.web3_provider import open_provider
 from mesh.errors import ClosedError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Collection, Iterable, Mapping, Sequence
     from pathlib import Path
     from typing import Self
 
     from eth_typing import ChecksumAddress
-    from hexbytes import HexBytes
     from web3.contract import AsyncContract
     from web3.contract.async_contract import AsyncContractFunction
-    from web3.types import BlockIdentifier, FilterParams, RPCEndpoint, TxParams, TxReceipt
 
+    from mesh.chain.answers import BlockHeader, Log, MinedTransaction
     from mesh.chain.web3_provider import Endpoint
 
-CONTRACTS_KEPT = 1024
-
-
-class BlockHeader(NamedTuple):
-    """A block. Hashes are 32 bytes, `timestamp` is Unix time, `base_fee` is wei (None: the chain has none)."""
-
-    number: int
-    hash: bytes
-    parent_hash: bytes
-    timestamp: int
-    base_fee: int | None
+CONTRACTS_KEPT: Final = 1024
+READ_AT_ONCE: Final = 100
+"""Contract functions that `read_all` calls at the same time."""
 
 
 class Node:
@@ -73,7 +65,7 @@ class Node:
         self._chain_folder: Path | None = None
         self._provider = open_provider(endpoint, self.timing, self.metrics)
         self._chain_id: int | None = None
-        self._web3: AsyncWeb3[Any] = AsyncWeb3(self._provider, middleware=[])
+        self._web3: AsyncWeb3[Any] = AsyncWeb3(AsyncBaseProvider(), middleware=[])
         self._pending: dict[str, PendingTransactions] = {}
         self.contract = lru_cache(maxsize=CONTRACTS_KEPT)(self._contract)
 
@@ -92,7 +84,7 @@ class Node:
     async def __aenter__(self) -> Self:
         self._provider.open()
         try:
-            self._chain_id = await self._web3.eth.chain_id
+            self._chain_id = int(await self._ask("eth_chainId"))
             await self._provider.check_chains(self._chain_id)
             if self._transactions is not None:
                 self._chain_folder = self._transactions / await self._chain_name()
@@ -107,60 +99,64 @@ class Node:
 
     async def request(self, method: str, *params: Any) -> Any:
         """The result of any JSON-RPC method, as JSON."""
-        response = await self._provider.make_request(cast("RPCEndpoint", method), list(params))
-        return response["result"]
+        return await self._provider.request(method, list(params))
 
     async def client_version(self) -> str:
         """The name and version of the node's program."""
-        return str(await self._web3.client_version)
+        return str(await self._ask("web3_clientVersion"))
 
     async def is_syncing(self) -> bool:
         """Whether the node says that it has not all blocks yet."""
-        return bool(await self._web3.eth.syncing)
+        return bool(await self._ask("eth_syncing"))
 
     async def block_number(self) -> int:
         """Number of the latest block."""
-        return int(await self._web3.eth.block_number)
+        return int(await self._ask("eth_blockNumber"))
 
-    async def header(self, number: int) -> BlockHeader | None:
-        """A block; None if the chain does not have it."""
-        return await self._header(number)
+    async def header(self, block: int | str) -> BlockHeader | None:
+        """A block, by its number or `latest`; None if the chain does not have it."""
+        header: BlockHeader | None = await self._ask("eth_getBlockByNumber", _block(block), False)
+        return header
 
     async def latest_header(self) -> BlockHeader:
         """The latest block."""
-        header = await self._header("latest")
+        header = await self.header("latest")
         if header is None:
             raise NodeUnreachable(self.endpoint, "it has no blocks")
         return header
 
     async def block_hash(self, number: int) -> bytes:
         """The 32-byte hash of a block. Raises `NodeUnreachable` if the node does not have the block."""
-        header = await self._header(number)
+        header = await self.header(number)
         if header is None:
             raise NodeUnreachable(self.endpoint, f"it has no block {number}")
         return header.hash
 
-    async def logs(self, query: Mapping[str, Any]) -> list[Any]:
-        """The logs that match an `eth_getLogs` query."""
-        return list(await self._web3.eth.get_logs(cast("FilterParams", query)))
+    async def logs(self, first: int, last: int, *, addresses: Collection[str], topics: Sequence[str]) -> list[Log]:
+        """The logs of the blocks from `first` to `last`, both included, whose first topic is one of `topics`.
+
+        Those of all contracts, unless `addresses` are given.
+        """
+        query: dict[str, Any] = {"fromBlock": hex(first), "toBlock": hex(last), "topics": [list(topics)]}
+        if addresses:
+            query["address"] = list(addresses)
+        return list(await self._ask("eth_getLogs", query))
 
     async def eth_balance(self, address: str) -> int:
         """Wei of an account."""
-        return int(await self._web3.eth.get_balance(self.checksum(address)))
+        return int(await self._ask("eth_getBalance", address, "latest"))
 
     async def transaction_count(self, address: str, *, pending: bool = False) -> int:
         """How many transactions an account has on the chain; with `pending`, also those that wait to be mined."""
-        return int(
-            await self._web3.eth.get_transaction_count(self.checksum(address), "pending" if pending else "latest")
-        )
+        return int(await self._ask("eth_getTransactionCount", address, "pending" if pending else "latest"))
 
     async def code(self, address: str) -> bytes:
         """The code of the contract at an address; empty if there is none."""
-        return bytes(await self._web3.eth.get_code(self.checksum(address)))
+        return bytes(await self._ask("eth_getCode", address, "latest"))
 
     async def gas_price(self) -> int:
         """The price of a unit of gas that the node suggests, wei."""
-        return int(await self._web3.eth.gas_price)
+        return int(await self._ask("eth_gasPrice"))
 
     async def gas_market(self) -> GasMarket:
         """The price of gas in the latest block, with the priority fee that the node suggests."""
@@ -171,48 +167,56 @@ class Node:
         priority = await self._suggested_priority(base)
         return GasMarket(base + priority, Fees(2 * base + priority, priority))
 
-    async def estimate_gas(self, call: TxParams) -> int:
+    async def estimate_gas(self, call: Mapping[str, Any]) -> int:
         """Gas of a transaction in the state that pending ones leave. Raises `Reverted`."""
-        return int(await self._web3.eth.estimate_gas(call, "pending"))
+        return int(await self._ask("eth_estimateGas", _call(call), "pending"))
 
-    async def call(self, call: TxParams, *, block: BlockIdentifier = "latest") -> bytes:
-        """What a call returns in the state after a block. Raises `Reverted`."""
-        return bytes(await self._web3.eth.call(call, block))
+    async def call(self, call: Mapping[str, Any], *, block: int | str = "latest") -> bytes:
+        """What a call (`from`, `to`, `data`, `value`) returns in the state after a block. Raises `Reverted`."""
+        return bytes(await self._ask("eth_call", _call(call), _block(block)))
 
     async def send_raw(self, raw: bytes) -> None:
         """Give a signed transaction to the node, once."""
-        await self._web3.eth.send_raw_transaction(raw)
+        await self._ask("eth_sendRawTransaction", "0x" + raw.hex())
 
     async def has_transaction(self, tx: str) -> bool:
         """Whether the node has a transaction, mined or waiting."""
         try:
-            await self._web3.eth.get_transaction(cast("HexBytes", tx))
-        except (TransactionNotFound, RequestRefused):
+            return await self._ask("eth_getTransactionByHash", tx) is not None
+        except RequestRefused:
             return False
-        return True
 
-    async def receipt(self, tx: str) -> TxReceipt | None:
+    async def receipt(self, tx: str) -> MinedTransaction | None:
         """The receipt of a transaction; None if it is not mined."""
-        try:
-            return await self._web3.eth.get_transaction_receipt(cast("HexBytes", tx))
-        except TransactionNotFound:
-            return None
+        receipt: MinedTransaction | None = await self._ask("eth_getTransactionReceipt", tx)
+        return receipt
 
-    async def read(self, call: AsyncContractFunction, *, block: BlockIdentifier = "latest") -> Any:
-        """What a contract's function returns. Raises `Reverted`, and `NoContracts` if there is no such contract."""
-        try:
-            return await call.call(block_identifier=block)
-        except BadFunctionCallOutput:
-            raise NoContracts(f"contract with {call.fn_name} at {call.address}", self.chain_id) from None
+    async def read(self, call: AsyncContractFunction, *, block: int | str = "latest") -> Any:
+        """What a contract's function returns.
 
-    async def read_all(self, calls: Iterable[AsyncContractFunction], *, block: BlockIdentifier) -> list[Any]:
-        """What several functions return in the state of one block, asked at once. Raises as `read` does."""
+        Raises `Reverted`, `NoContracts` if there is no such contract, `InvalidAnswer` for other data.
+        """
+        returned = await self.call({"to": call.address, "data": call._encode_transaction_data()}, block=block)
+        if not returned:
+            raise NoContracts(f"contract with {call.fn_name} at {call.address}", self.chain_id)
         try:
-            async with asyncio.TaskGroup() as group:
-                tasks = [group.create_task(self.read(call, block=block)) for call in calls]
-        except ExceptionGroup as failed:
-            raise failed.exceptions[0] from None
-        return [task.result() for task in tasks]
+            (value,) = decode_values([output["type"] for output in call.abi["outputs"]], returned)
+        except SpoiledAnswer as error:
+            raise InvalidAnswer(f"{call.fn_name} of {call.address}", str(error)) from None
+        return value
+
+    async def read_all(self, calls: Iterable[AsyncContractFunction], *, block: int | str) -> list[Any]:
+        """What several functions return in the state of one block, `READ_AT_ONCE` at a time. Raises as `read` does."""
+        left, found = list(calls), []
+        while left:
+            some, left = left[:READ_AT_ONCE], left[READ_AT_ONCE:]
+            try:
+                async with asyncio.TaskGroup() as group:
+                    tasks = [group.create_task(self.read(call, block=block)) for call in some]
+            except ExceptionGroup as failed:
+                raise failed.exceptions[0] from None
+            found += [task.result() for task in tasks]
+        return found
 
     def creation_code(self, name: str, *arguments: Any) -> bytes:
         """The data of a transaction that deploys one of our contracts (`artifacts.NAMES`)."""
@@ -228,24 +232,14 @@ class Node:
             self._pending[address] = PendingTransactions(store)
         return self._pending[address]
 
-    async def _header(self, identifier: BlockIdentifier) -> BlockHeader | None:
-        try:
-            block = await self._web3.eth.get_block(identifier)
-        except BlockNotFound:
-            return None
-        base_fee = block.get("baseFeePerGas")
-        return BlockHeader(
-            number=int(block["number"]),
-            hash=bytes(block["hash"]),
-            parent_hash=bytes(block["parentHash"]),
-            timestamp=int(block["timestamp"]),
-            base_fee=None if base_fee is None else int(base_fee),
-        )
+    async def _ask(self, method: str, *params: Any) -> Any:
+        """What the node answers to one of the methods in `ANSWERS`, with the type that is declared there."""
+        return await self._provider.request(method, list(params), kind=ANSWERS[method])
 
     async def _suggested_priority(self, base: int) -> int:
         """The priority fee that the node suggests, or how far its gas price is above the base fee."""
         try:
-            return int(await self._web3.eth.max_priority_fee)
+            return int(await self._ask("eth_maxPriorityFeePerGas"))
         except RequestRefused as refused:
             if refused.rpc_code != METHOD_NOT_FOUND:
                 raise
@@ -257,13 +251,18 @@ class Node:
 
     def contract_with_abi(self, address: str, abi: Any) -> AsyncContract:
         """The contract at an address with any ABI."""
-        return self._web3.eth.contract(self.checksum(address), abi=abi)
+        return self._web3.eth.contract(cast("ChecksumAddress", address), abi=abi)
 
     def _contract(self, name: str, address: str) -> AsyncContract:
         """The contract at an address with the ABI of one of ours (`artifacts.NAMES`); cached."""
         return self.contract_with_abi(address, load_artifact(name).abi)
 
-    @staticmethod
-    def checksum(address: str) -> ChecksumAddress:
-        """An address as web3's types have it; ours are EIP-55 already."""
-        return cast("ChecksumAddress", address)
+
+def _block(identifier: int | str) -> str:
+    """A block as JSON-RPC has it: its number as a quantity, or a tag."""
+    return identifier if isinstance(identifier, str) else hex(identifier)
+
+
+def _call(call: Mapping[str, Any]) -> dict[str, Any]:
+    """A call as JSON-RPC has it."""
+    return {name: hex(member) if isinstance(member, int) else member for name, member in call.items()}

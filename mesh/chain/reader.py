@@ -9,16 +9,16 @@ from contextlib import aclosing
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 from mesh.chain.errors import NodeUnreachable, RequestRefused
 from mesh.chain.events import ChainEvent, NewLiability, NewLighthouse, decode_log, topics_of
-from schemas.address import parse_address
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Awaitable, Callable, Collection, Iterable, Sequence
+    from collections.abc import AsyncGenerator, Awaitable, Callable, Iterable
 
-    from mesh.chain.node import BlockHeader, Node
+    from mesh.chain.answers import BlockHeader, Log
+    from mesh.chain.node import Node
 
 MAX_RANGE: Final = 2_000
 """Blocks in one request. Halved each time a node refuses, and grown by a quarter each time it answers."""
@@ -91,18 +91,18 @@ async def read_events(node: Node, sources: EventSources, first: int, last: int) 
     Raises `ReplacedWhileReading` when the logs of a block are of two different blocks.
     """
     addresses = [sources.factory, sources.token, *sources.lighthouses]
-    logs = await _logs(node, first, last, addresses=addresses, topics=topics_of("Factory", "XRT", "Lighthouse"))
+    logs = await node.logs(first, last, addresses=addresses, topics=topics_of("Factory", "XRT", "Lighthouse"))
     for log in logs:
-        if isinstance(event := decode_log(log), NewLiability) and parse_address(log["address"]) == sources.factory:
+        if isinstance(event := decode_log(log), NewLiability) and log.address == sources.factory:
             sources.recognise(event.liability)
-    endings = await _logs(node, first, last, addresses=(), topics=topics_of("Liability"))
-    endings = [log for log in endings if await sources.is_liability(parse_address(log["address"]))]
+    endings = await node.logs(first, last, addresses=(), topics=topics_of("Liability"))
+    endings = [log for log in endings if await sources.is_liability(log.address)]
     return _by_block((*logs, *endings), last)
 
 
 async def read_created(node: Node, factory: str, first: int, last: int) -> list[SeenBlock]:
     """The same with the events of the factory only."""
-    return _by_block(await _logs(node, first, last, addresses=[factory], topics=topics_of("Factory")), last)
+    return _by_block(await node.logs(first, last, addresses=[factory], topics=topics_of("Factory")), last)
 
 
 async def list_created(node: Node, factory: str, from_block: int) -> list[NewLiability | NewLighthouse]:
@@ -113,12 +113,12 @@ async def list_created(node: Node, factory: str, from_block: int) -> list[NewLia
     return [event for event in events if isinstance(event, NewLiability | NewLighthouse)]
 
 
-def _by_block(logs: Iterable[Any], last: int) -> list[SeenBlock]:
-    ordered = sorted(logs, key=lambda log: (log["blockNumber"], log["logIndex"]))
+def _by_block(logs: Iterable[Log], last: int) -> list[SeenBlock]:
+    ordered = sorted(logs, key=lambda log: (log.block_number, log.log_index))
     blocks = []
-    for number, group in groupby(ordered, key=lambda log: int(log["blockNumber"])):
+    for number, group in groupby(ordered, key=lambda log: log.block_number):
         of_block = list(group)
-        hashes = {bytes(log["blockHash"]) for log in of_block}
+        hashes = {log.block_hash for log in of_block}
         if len(hashes) > 1:
             raise ReplacedWhileReading
         events = tuple(event for log in of_block if (event := decode_log(log)) is not None)
@@ -134,10 +134,3 @@ def _with_hash_of(block: SeenBlock, head: BlockHeader) -> SeenBlock:
     if block.block_hash:
         raise ReplacedWhileReading
     return SeenBlock(block.block_number, head.hash, block.events)
-
-
-async def _logs(node: Node, first: int, last: int, *, addresses: Collection[str], topics: Sequence[str]) -> list[Any]:
-    query: dict[str, Any] = {"fromBlock": first, "toBlock": last, "topics": [list(topics)]}
-    if addresses:
-        query["address"] = list(addresses)
-    return await node.logs(query)

@@ -7,7 +7,7 @@ or `Panic(uint256)`. Geth, anvil and the embedded chain put it into the `data` o
 from __future__ import annotations
 
 from functools import cache
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from eth_abi.abi import decode
 from eth_abi.exceptions import DecodingError
@@ -18,7 +18,7 @@ from schemas import keccak256
 from schemas.address import parse_address
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from mesh.chain.answers import RpcFailure
 
 REVERTED: Final = 3
 """The JSON-RPC code that geth and anvil give to a call which the contract reverted."""
@@ -30,13 +30,12 @@ PANIC: Final = bytes.fromhex("4e487b71")
 """Selector of `Panic(uint256)`, a failed assertion of the compiler."""
 
 
-def decode_revert(error: Mapping[str, Any]) -> Reverted | None:
+def decode_revert(failure: RpcFailure) -> Reverted | None:
     """The revert in a node's JSON-RPC error; None if it is another kind of error."""
-    data = _revert_data(error.get("data"))
-    message = str(error.get("message", ""))
-    if data is None and error.get("code") != REVERTED and "revert" not in message.lower():
+    data = _revert_data(failure.data)
+    if data is None and failure.code != REVERTED and "revert" not in failure.message.lower():
         return None
-    return explain(data or b"", message=message)
+    return explain(data or b"", message=failure.message)
 
 
 def explain(data: bytes, *, message: str = "") -> Reverted:

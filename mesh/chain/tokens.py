@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from eth_abi.abi import decode
 from eth_abi.exceptions import DecodingError
-from web3.exceptions import BadFunctionCallOutput
 
 from mesh.chain.errors import NoContracts, Reverted
 
@@ -112,7 +111,7 @@ class Tokens:
         call: Any = {"to": contract.address, "data": function._encode_transaction_data()}
         try:
             return await self._contracts.node.call(call)
-        except (Reverted, BadFunctionCallOutput, NoContracts):
+        except (Reverted, NoContracts):
             return b""
 
 

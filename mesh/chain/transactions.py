@@ -11,7 +11,7 @@ import itertools
 import logging
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final
 
 from mesh.chain.confirmation import (
     Confirmation,
@@ -27,13 +27,12 @@ from mesh.chain.metrics import TransactionOutcome
 from mesh.chain.transaction_store import PendingTransaction, effect_of
 from mesh.log_context import log_event
 from mesh.retry import Backoff, RetryPolicy
-from schemas.address import parse_address
 
 if TYPE_CHECKING:
     from web3.contract.async_contract import AsyncContractFunction
-    from web3.types import TxParams, TxReceipt
 
     from mesh.chain.accounts import Account, SignedTransaction
+    from mesh.chain.answers import Log, MinedTransaction
     from mesh.chain.node import Node
     from mesh.chain.pending import PendingTransactions
     from mesh.chain.policy import Fees
@@ -50,7 +49,7 @@ NONCE_RETRY: Final = RetryPolicy(initial=0.0, ceiling=0.0, attempts=25)
 
 @dataclass(frozen=True, slots=True)
 class Receipt:
-    """A mined transaction that succeeded. `contract` is what it deployed, if anything; `logs` as web3 gives them.
+    """A mined transaction that succeeded. `contract` is what it deployed, if anything.
 
     `wei` is what its gas cost.
     """
@@ -60,7 +59,7 @@ class Receipt:
     gas_used: int
     wei: int
     contract: str | None
-    logs: tuple[Any, ...]
+    logs: tuple[Log, ...]
 
 
 class TransactionSender:
@@ -216,11 +215,13 @@ class TransactionSender:
             return await is_known(self._node, entry.versions)
         return True
 
-    async def _outcome(self, entry: PendingTransaction, signed: SignedTransaction, receipt: TxReceipt) -> Receipt:
+    async def _outcome(
+        self, entry: PendingTransaction, signed: SignedTransaction, receipt: MinedTransaction
+    ) -> Receipt:
         """The receipt of a mined transaction. Raises `Reverted` if it failed."""
-        gas_used, contract = int(receipt["gasUsed"]), receipt["contractAddress"]
-        wei = gas_used * int(receipt["effectiveGasPrice"])
-        succeeded = receipt["status"] == 1
+        gas_used = receipt.gas_used
+        wei = gas_used * receipt.effective_gas_price
+        succeeded = receipt.status == 1
         self._node.metrics.count(TransactionOutcome.MINED if succeeded else TransactionOutcome.FAILED)
         self._node.metrics.paid(gas_used=gas_used, wei=wei)
         if not succeeded:
@@ -228,22 +229,22 @@ class TransactionSender:
             raise Reverted(why.reason, arguments=why.arguments, data=why.data, gas_used=gas_used, wei=wei)
         return Receipt(
             tx=signed.hash,
-            block_number=int(receipt["blockNumber"]),
+            block_number=receipt.block_number,
             gas_used=gas_used,
             wei=wei,
-            contract=None if contract is None else parse_address(contract),
-            logs=tuple(receipt["logs"]),
+            contract=receipt.contract_address,
+            logs=tuple(receipt.logs),
         )
 
-    async def _why_failed(self, fields: dict[str, Any], receipt: TxReceipt) -> Reverted:
+    async def _why_failed(self, fields: dict[str, Any], receipt: MinedTransaction) -> Reverted:
         """Why a mined transaction failed although its simulation succeeded: asked of the state after its block."""
         try:
-            await self._node.call(self._call(fields), block=receipt["blockNumber"])
+            await self._node.call(self._call(fields), block=receipt.block_number)
         except Reverted as why:
             return why
         except RequestRefused as refused:
             return Reverted(refused.detail)
-        return Reverted("OutOfGas" if receipt["gasUsed"] >= fields["gas"] else "")
+        return Reverted("OutOfGas" if receipt.gas_used >= fields["gas"] else "")
 
     async def _raise_if_poor(self, fields: dict[str, Any], refused: RequestRefused) -> None:
         balance = await self._node.eth_balance(self.account.address)
@@ -251,7 +252,7 @@ class TransactionSender:
         if balance < needed:
             raise InsufficientFunds(self.account.address, balance=balance, needed=needed) from refused
 
-    def _call(self, fields: dict[str, Any]) -> TxParams:
+    def _call(self, fields: dict[str, Any]) -> dict[str, Any]:
         """The same as a call, without prices: a simulation is not paid for."""
         call = {"from": self.account.address, "data": fields["data"], "value": fields["value"]}
-        return cast("TxParams", call | ({"to": fields["to"]} if fields["to"] else {}))
+        return call | ({"to": fields["to"]} if fields["to"] else {})

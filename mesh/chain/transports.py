@@ -6,17 +6,21 @@ web3's own HTTP provider opens a connection for each request, and its WebSocket 
 from __future__ import annotations
 
 import asyncio
-import json
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from aiohttp import ClientSession, ClientWebSocketResponse, WSMsgType
+import msgspec
+from aiohttp import ClientResponse, ClientSession, ClientWebSocketResponse, WSMsgType
 from web3.providers.async_base import AsyncJSONBaseProvider
+
+from mesh.chain.answers import MAX_ANSWER, SpoiledAnswer
 
 if TYPE_CHECKING:
     from web3.types import RPCEndpoint, RPCResponse
 
 
 TOO_MANY_REQUESTS: Final = 429
+PIECE: Final = 1 << 16
+"""Bytes that are read of an answer at a time."""
 
 
 class HttpTransport(AsyncJSONBaseProvider):
@@ -32,12 +36,12 @@ class HttpTransport(AsyncJSONBaseProvider):
         if self._session is None:
             self._session = ClientSession(headers={"Content-Type": "application/json"})
         async with self._session.post(self._url, data=self.encode_rpc_request(method, params)) as response:
-            body = await response.read()
+            body = await _read(response)
             # Some nodes answer errors with HTTP 4xx or 5xx and a JSON-RPC error in the body. "Too many requests" is
             # raised for a retry.
             if response.status == TOO_MANY_REQUESTS or (not response.ok and not body.lstrip().startswith(b"{")):
                 response.raise_for_status()
-            return self.decode_rpc_response(body)
+            return _decode(body)
 
     async def close(self) -> None:
         """Close the connection; a later request opens another."""
@@ -88,7 +92,7 @@ class WebSocketTransport(AsyncJSONBaseProvider):
             if self._socket is None or self._socket.closed:
                 await self.close()
                 self._session = ClientSession()
-                self._socket = await self._session.ws_connect(self._url, max_msg_size=0, heartbeat=30)
+                self._socket = await self._session.ws_connect(self._url, max_msg_size=MAX_ANSWER, heartbeat=30)
                 self._listening = asyncio.create_task(self._read(self._socket), name="aira-chain-websocket")
             return self._socket
 
@@ -97,18 +101,46 @@ class WebSocketTransport(AsyncJSONBaseProvider):
         async for message in socket:
             if message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
                 self._deliver(message.data)
-        for answer in self._waiting.values():
-            if not answer.done():
-                answer.set_exception(ConnectionResetError("the connection was closed"))
+        self._fail_all(ConnectionResetError("the connection was closed"))
 
     def _deliver(self, text: str | bytes) -> None:
+        """Give an answer to the request with its id. One that names no request may be anybody's: all ask again."""
         try:
-            response = json.loads(text)
-        except ValueError:
+            response: Any = _decode(text)
+            number = response.get("id") if isinstance(response, dict) else None
+            if not isinstance(number, int):
+                raise SpoiledAnswer("an answer without the id of its request")
+        except ValueError as error:
+            self._fail_all(error)
             return
-        answer = self._waiting.get(response.get("id", -1)) if isinstance(response, dict) else None
+        answer = self._waiting.get(number)
         if answer is not None and not answer.done():
             answer.set_result(response)
 
+    def _fail_all(self, error: Exception) -> None:
+        for answer in self._waiting.values():
+            if not answer.done():
+                answer.set_exception(error)
+
     def __str__(self) -> str:
         return self._url
+
+
+async def _read(response: ClientResponse) -> bytes:
+    """The body of an answer. Raises `SpoiledAnswer` above `MAX_ANSWER`."""
+    body = bytearray()
+    async for piece in response.content.iter_chunked(PIECE):
+        body += piece
+        if len(body) > MAX_ANSWER:
+            raise SpoiledAnswer(f"its answer is longer than {MAX_ANSWER} bytes")
+    return bytes(body)
+
+
+def _decode(text: str | bytes) -> RPCResponse:
+    """The JSON of an answer. Raises `ValueError`: `SpoiledAnswer` for one that begins as an answer does."""
+    try:
+        response: RPCResponse = msgspec.json.decode(text)
+    except (ValueError, RecursionError):
+        begins = text.lstrip()[:1] in (b"{", "{")
+        raise SpoiledAnswer("its answer is not JSON to the end") if begins else ValueError("not JSON") from None
+    return response

@@ -1,7 +1,4 @@
-"""The web3 provider in front of one or several nodes, with retries.
-
-What uses it (web3's modules and contracts) raises `NodeUnreachable`, `Reverted` and `RequestRefused`.
-"""
+"""Requests to one or several nodes, with retries. Every answer is checked here, before anything uses it."""
 
 from __future__ import annotations
 
@@ -13,6 +10,7 @@ from aiohttp import ClientError, ClientResponseError
 from web3.exceptions import Web3Exception
 from web3.providers.async_base import AsyncBaseProvider
 
+from mesh.chain.answers import ANSWERS, RpcFailure, SpoiledAnswer, decode_answer
 from mesh.chain.errors import InvalidEndpoint, NodeUnreachable, RequestRefused, WrongChain
 from mesh.chain.metrics import NodeMetrics
 from mesh.chain.reverts import decode_revert
@@ -24,19 +22,18 @@ from mesh.retry import Backoff
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from web3.types import RPCEndpoint, RPCResponse
-
     from mesh.chain.policy import Timing
 
 log = logging.getLogger(__name__)
 
 CONNECTION_ERRORS: Final = (OSError, TimeoutError, ClientError, Web3Exception, ValueError)
-"""What transports raise for a missing node, a lost connection and an answer that is not JSON."""
+"""What transports raise for a missing node, a lost connection and an answer that is not JSON; and `SpoiledAnswer`."""
 
 Transport: TypeAlias = HttpTransport | WebSocketTransport
 Endpoint: TypeAlias = "str | Sequence[str] | AsyncBaseProvider"
 
 SEND: Final = "eth_sendRawTransaction"
+CHAIN_ID: Final = "eth_chainId"
 TRANSIENT_STATUS: Final = frozenset({429, 500, 502, 503, 504})
 
 CHECK_TIMEOUT: Final = 2.0
@@ -56,24 +53,26 @@ class Upstream:
         self.owned = owned
         self.is_on_chain = False
         """Whether it said that it is on the chain of the others."""
+        self.is_node = False
+        """Whether it has answered as a node does, so that it is one although it may fail to do so at times."""
 
 
-class ReliableProvider(AsyncBaseProvider):
-    """A provider in front of one or several others, with bounded retries.
+class ReliableProvider:
+    """One or several nodes, with bounded retries.
 
-    A request goes to the node that answered last; if its connection fails, to the next, and so on around all of them,
-    again and again by `Timing.request_retry`. Only a transaction goes to one node once, because its sender must know
-    whether an earlier attempt may have arrived; the sender's next attempt goes to the next node. A node on another
-    chain than the first that answered is an error when opening, if it answers soon, and skipped later.
+    A request goes to the node that answered last; if its connection fails or its answer is spoiled, to the next, and
+    so on around all of them, again and again by `Timing.request_retry`. Only a transaction goes to one node once,
+    because its sender must know whether an earlier attempt may have arrived; the sender's next attempt goes to the
+    next node. A node on another chain than the first that answered is an error when opening, if it answers soon, and
+    skipped later.
     """
 
     def __init__(self, upstreams: Sequence[Upstream], *, timing: Timing, metrics: NodeMetrics) -> None:
-        super().__init__()
         self.endpoint = ", ".join(upstream.endpoint for upstream in upstreams)
         self._upstreams = tuple(upstreams)
         self._timing = timing
         self._metrics = metrics
-        self._chain_id: object = None
+        self._expected: int | RpcFailure | None = None
         self._is_open = False
 
     def open(self) -> None:
@@ -99,13 +98,13 @@ class ReliableProvider(AsyncBaseProvider):
         """The number of a node's chain; None if it does not answer."""
         try:
             async with asyncio.timeout(CHECK_TIMEOUT):
-                response: Any = await upstream.provider.make_request("eth_chainId", [])  # type: ignore[arg-type]
-                return int(response["result"], 16)
-        except (*CONNECTION_ERRORS, LookupError, TypeError):
+                found = await _chain_id(upstream)
+        except CONNECTION_ERRORS:
             return None
+        return found if isinstance(found, int) else None
 
-    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
-        """The node's response, which holds a result.
+    async def request(self, method: str, params: Any, *, kind: Any = Any) -> Any:
+        """The node's result, of the type `kind` (see `mesh.chain.answers`).
 
         Raises `NodeUnreachable` after the last attempt, `Reverted`, `RequestRefused`, `ClosedError`.
         """
@@ -113,43 +112,40 @@ class ReliableProvider(AsyncBaseProvider):
             raise ClosedError("the connection to the node is not open: use it with `async with`")
         backoff = Backoff(self._timing.request_retry)
         while True:
-            failures: list[Exception] = []
+            may_pass = False
             for upstream in self._upstreams[:1] if method == SEND else self._upstreams:
                 try:
-                    answer = await self._ask(upstream, method, params)
+                    answer = await self._ask(upstream, method, params, kind)
                     self._metrics.answered()
-                    return _checked(method, answer)
+                    return _result(method, answer)
                 except AiraError:
                     raise
                 except CONNECTION_ERRORS as error:
-                    failures.append(error)
+                    failure = error
+                    may_pass = may_pass or _may_pass(error, upstream)
                     reason = _reason(error)
                     self._demote(upstream, reason)
                     if len(self._upstreams) > 1:
                         reason = f"{upstream.endpoint}: {reason}"
             log.debug("%s failed (%s)", method, reason)
-            if method == SEND or not any(_is_transient(failure) for failure in failures) or not await backoff.wait():
+            if method == SEND or not may_pass or not await backoff.wait():
                 break
         self._metrics.failed()
-        raise NodeUnreachable(self.endpoint, reason) from failures[-1]
+        raise NodeUnreachable(self.endpoint, reason) from failure
 
-    async def _ask(self, upstream: Upstream, method: RPCEndpoint, params: Any) -> dict[str, Any]:
+    async def _ask(self, upstream: Upstream, method: str, params: Any, kind: Any) -> Any:
         """What a node answers. Raises `CONNECTION_ERRORS`."""
         async with asyncio.timeout(self._timing.request_timeout):
             if not upstream.is_on_chain and len(self._upstreams) > 1:
                 await self._check_chain(upstream)
-            response: Any = await upstream.provider.make_request(method, params)
-        if not isinstance(response, dict) or ("result" not in response and "error" not in response):
-            raise NotJsonRpc("what answers is not a JSON-RPC server")
-        return response
+            return await _ask(upstream, method, params, kind)
 
     async def _check_chain(self, upstream: Upstream) -> None:
-        response: Any = await upstream.provider.make_request("eth_chainId", [])  # type: ignore[arg-type]
-        found = response.get("result") if isinstance(response, dict) else None
-        if self._chain_id is None:
-            self._chain_id = found
-        if found is None or found != self._chain_id:
-            raise NotJsonRpc(f"it is on the chain {found}, the others are on {self._chain_id}")
+        found = await _chain_id(upstream)
+        if self._expected is None:
+            self._expected = found
+        if found != self._expected:
+            raise NotJsonRpc(f"it is on the chain {_shown(found)}, the others are on {_shown(self._expected)}")
         upstream.is_on_chain = True
 
     def _demote(self, upstream: Upstream, reason: str) -> None:
@@ -166,14 +162,6 @@ class ReliableProvider(AsyncBaseProvider):
                     "node-switched", failed=upstream.endpoint, reason=reason, next=self._upstreams[0].endpoint
                 ),
             )
-
-    async def is_connected(self, show_traceback: bool = False) -> bool:
-        """Whether a node answers."""
-        try:
-            await self.make_request("web3_clientVersion", [])  # type: ignore[arg-type]
-        except AiraError:
-            return False
-        return True
 
     async def close(self) -> None:
         """Close the connections that this side opened; further requests raise `ClosedError`."""
@@ -208,23 +196,38 @@ def _upstream(url: str) -> Upstream:
     return Upstream(transport, endpoint=url, owned=transport)
 
 
-def _checked(method: str, response: dict[str, Any]) -> RPCResponse:
-    """The response, unless it is an error."""
-    error = response.get("error")
-    if error is None:
-        return response  # type: ignore[return-value]
-    if not isinstance(error, dict):
-        raise RequestRefused(method, 0, str(error))
-    reverted = decode_revert(error)
-    if reverted is not None:
-        raise reverted
-    raise RequestRefused(method, int(error.get("code", 0)), str(error.get("message", "")))
+async def _ask(upstream: Upstream, method: str, params: Any, kind: Any) -> Any:
+    """The result or the `RpcFailure` of one request to one node. Raises `CONNECTION_ERRORS`."""
+    response: Any = await upstream.provider.make_request(method, params)  # type: ignore[arg-type]
+    if not isinstance(response, dict) or not response.keys() & {"jsonrpc", "result", "error"}:
+        raise NotJsonRpc("what answers is not a JSON-RPC server")
+    answer = decode_answer(method, response, kind)
+    upstream.is_node = True
+    return answer
 
 
-def _is_transient(error: Exception) -> bool:
+async def _chain_id(upstream: Upstream) -> int | RpcFailure:
+    found: int | RpcFailure = await _ask(upstream, CHAIN_ID, [], ANSWERS[CHAIN_ID])
+    return found
+
+
+def _result(method: str, answer: Any) -> Any:
+    """The answer, unless it is a failure. Raises `Reverted`, `RequestRefused`."""
+    if not isinstance(answer, RpcFailure):
+        return answer
+    reverted = decode_revert(answer)
+    raise reverted or RequestRefused(method, answer.code, answer.message)
+
+
+def _may_pass(error: Exception, upstream: Upstream) -> bool:
+    """Whether the same request to the same node may succeed later."""
     if isinstance(error, ClientResponseError):
         return error.status in TRANSIENT_STATUS
-    return not isinstance(error, ValueError)
+    return upstream.is_node or isinstance(error, SpoiledAnswer) or not isinstance(error, ValueError)
+
+
+def _shown(chain: int | RpcFailure) -> str:
+    return hex(chain) if isinstance(chain, int) else chain.message
 
 
 def _reason(error: Exception) -> str:
@@ -235,6 +238,6 @@ def _reason(error: Exception) -> str:
             return "no answer in time"
         case OSError() if error.strerror:
             return error.strerror
-        case ValueError() if not isinstance(error, NotJsonRpc):
+        case ValueError() if not isinstance(error, NotJsonRpc | SpoiledAnswer):
             return "the answer is not JSON"
     return str(error) or type(error).__name__

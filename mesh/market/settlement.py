@@ -139,7 +139,7 @@ class Settlement:
         address = result.message.liability
         try:
             return self._open.get(address) or await self._chain.liabilities.get(address)
-        except (NotALiability, RequestRefused) as error:
+        except (NotALiability, NoContracts, RequestRefused) as error:
             log.debug("a result waits to be sent again: %s", error)
             return None
 
@@ -193,7 +193,7 @@ class Settlement:
     async def _is_on_chain(self, tx: str) -> bool:
         """Whether the node has a transaction, waiting or mined with success."""
         receipt = await self._chain.node.receipt(tx)
-        return await self._chain.node.has_transaction(tx) if receipt is None else receipt["status"] == 1
+        return await self._chain.node.has_transaction(tx) if receipt is None else receipt.status == 1
 
     async def _is_used(self, order: Verified[Order]) -> bool:
         try:

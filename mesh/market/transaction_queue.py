@@ -13,7 +13,15 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from mesh.chain import FeeTooHigh, InsufficientFunds, NodeUnreachable, RequestRefused, Reverted, TransactionTimeout
+from mesh.chain import (
+    FeeTooHigh,
+    InsufficientFunds,
+    NoContracts,
+    NodeUnreachable,
+    RequestRefused,
+    Reverted,
+    TransactionTimeout,
+)
 from mesh.errors import ChainError
 from mesh.outage_log import OutageLog
 from mesh.retry import Backoff, RetryPolicy
@@ -207,7 +215,7 @@ class TransactionQueue:
             try:
                 if await self._turns.has_come(since=since):
                     return
-            except (NodeUnreachable, RequestRefused, NoStake) as error:
+            except (NodeUnreachable, RequestRefused, NoContracts, NoStake) as error:
                 self._outages.failed(error, WAITS)
                 await backoff.wait()
             else:
@@ -216,7 +224,7 @@ class TransactionQueue:
     async def _is_our_turn(self) -> bool:
         try:
             return await self._chain.lighthouses.is_turn(self._lighthouse)
-        except (NodeUnreachable, RequestRefused):
+        except (NodeUnreachable, RequestRefused, NoContracts):
             return False
 
 

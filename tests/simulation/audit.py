@@ -8,6 +8,7 @@ from contextlib import closing
 from typing import TYPE_CHECKING, Final
 
 from mesh.chain import Chain, Finalized, NewLiability, Transfer
+from mesh.chain.answers import ANSWERS, decode_answer
 from mesh.chain.events import decode_log
 from mesh.evidence.claims import Claim
 from mesh.evidence.verification import verify
@@ -18,6 +19,7 @@ from tests.simulation.chain import NodeFaults, SimulatedNode
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from mesh.chain import ChainEvent
     from mesh.work.ledger import JobRecord
     from schemas import Liability
     from tests.simulation.market import Market
@@ -39,11 +41,15 @@ class Audit:
         self.open: set[str] = set()
         self.paid_twice = 0
 
+    def _events(self) -> list[ChainEvent | None]:
+        """All events on the chain."""
+        response = {"result": list(self._chain.evm.logs(self._chain.began + 1, self._chain.evm.head))}
+        return [decode_log(log) for log in decode_answer("eth_getLogs", response, ANSWERS["eth_getLogs"])]
+
     def liabilities(self) -> dict[str, Finalized | None]:
         """All liabilities on the chain, with how they ended."""
         found: dict[str, Finalized | None] = {}
-        for log in self._chain.evm.logs(self._chain.began + 1, self._chain.evm.head):
-            event = decode_log(_parsed(log))
+        for event in self._events():
             if isinstance(event, NewLiability):
                 found.setdefault(event.liability, None)
             elif isinstance(event, Finalized):
@@ -57,8 +63,7 @@ class Audit:
         balance: dict[str, int] = defaultdict(int)
         payouts: dict[str, list[Transfer]] = defaultdict(list)
         liabilities = self.liabilities()
-        for log in self._chain.evm.logs(self._chain.began + 1, self._chain.evm.head):
-            event = decode_log(_parsed(log))
+        for event in self._events():
             if isinstance(event, Transfer):
                 balance[event.sender] -= event.value
                 balance[event.recipient] += event.value
@@ -154,18 +159,3 @@ def _jobs(folder: Path) -> list[JobRecord]:
 
 def _file(store: Path, cid: str) -> Path | None:
     return next((path for path in sorted(store.rglob(cid)) if path.is_file()), None)
-
-
-def _parsed(log: dict[str, object]) -> dict[str, object]:
-    """A log as web3 gives it."""
-    from hexbytes import HexBytes
-
-    return {
-        **log,
-        "topics": [HexBytes(str(topic)) for topic in log["topics"]],  # type: ignore[attr-defined]
-        "data": HexBytes(str(log["data"])),
-        "blockNumber": int(str(log["blockNumber"]), 16),
-        "logIndex": int(str(log["logIndex"]), 16),
-        "transactionHash": HexBytes(str(log["transactionHash"])),
-        "blockHash": HexBytes(str(log["blockHash"])),
-    }

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from web3 import HTTPProvider, Web3
+from web3 import HTTPProvider
 
+from mesh.chain.answers import ANSWERS, decode_answer
 from mesh.chain.events import ChainEvent, Finalized, NewLiability, Transfer, decode_log
 from schemas import ZERO_ADDRESS, Empty, cid_of_file
 from tests.support.compose import Project, log_text
@@ -115,8 +116,10 @@ class ComposeDeployment(Project):
 
     def happened(self, *kinds: type[ChainEvent]) -> list[Any]:
         """All events of these kinds on the chain."""
-        node = Web3(HTTPProvider(f"http://{self.address('chain')}:8545", request_kwargs={"timeout": 10}))
-        events = [decode_log(log) for log in node.eth.get_logs({"fromBlock": 0, "toBlock": "latest"})]
+        node = HTTPProvider(f"http://{self.address('chain')}:8545", request_kwargs={"timeout": 10})
+        method: Any = "eth_getLogs"
+        response = node.make_request(method, [{"fromBlock": "0x0", "toBlock": "latest"}])
+        events = [decode_log(log) for log in decode_answer(method, response, ANSWERS[method])]
         return [event for event in events if isinstance(event, kinds)]
 
     def report(self, what: str) -> str:

@@ -122,7 +122,7 @@ async def test_tokens_are_sent_when_the_service_is_open(place: Place, opened: As
     assert (await place.balance("robot"), await place.balance("person")) == (before[0] - 250, before[1] + 250)
     receipt = await place.chains["person"].node.receipt(done.txhash)
     assert receipt is not None
-    assert receipt["status"] == 1
+    assert receipt.status == 1
 
 
 async def test_concurrent_transfers_are_all_sent(place: Place, opened: Asker) -> None:

@@ -125,7 +125,7 @@ async def test_a_transfer_in_another_block_after_a_reorganisation_is_published_o
         await place.node.request("eth_sendRawTransaction", [raw])
         receipt = await chain.node.receipt(tx)
         assert receipt is not None
-        assert receipt["status"] == 1
+        assert receipt.status == 1
         await chain.tokens.transfer(agent.address, 8)
         await until(lambda: events[-1].args_value == 8, seconds=30)
         await until_handled(place, agent)

@@ -52,7 +52,7 @@ class _Swallowing(HttpTransport):
     async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
         if method == "eth_sendRawTransaction" and self.swallows:
             self.swallowed.append(params[0])
-            return {"jsonrpc": "2.0", "id": 1, "result": "0x"}
+            return {"jsonrpc": "2.0", "id": 1, "result": "0x" + "00" * 32}
         return await super().make_request(method, params)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mesh.chain import NewLighthouse
+from mesh.chain.answers import Address, Count, Data, Log, Word
 from mesh.chain.events import decode_log
 from schemas import keccak256
 from schemas.address import address_bytes
@@ -14,14 +15,17 @@ FACTORY = "0x" + "12" * 20
 NAME = b"airalab"
 
 
-def _log(name: bytes, *, announced: int) -> dict[str, object]:
+def _log(name: bytes, *, announced: int) -> Log:
     """A factory's NewLighthouse, with a name whose length is stated as `announced` bytes."""
-    return {
-        "address": FACTORY,
-        "topics": [keccak256(b"NewLighthouse(address,string)"), address_bytes(LIGHTHOUSE).rjust(32, b"\0")],
-        "data": (32).to_bytes(32, "big") + announced.to_bytes(32, "big") + name,
-        "transactionHash": bytes(32),
-    }
+    return Log(
+        address=Address(FACTORY),
+        topics=[Word(keccak256(b"NewLighthouse(address,string)")), Word(address_bytes(LIGHTHOUSE).rjust(32, b"\0"))],
+        data=Data((32).to_bytes(32, "big") + announced.to_bytes(32, "big") + name),
+        block_number=Count(1),
+        block_hash=Word(bytes(32)),
+        transaction_hash=Word(bytes(32)),
+        log_index=Count(0),
+    )
 
 
 @pytest.mark.parametrize("padding", [0, 32 - len(NAME), 5])

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from eth_abi.abi import encode
 
+from mesh.chain.answers import RpcFailure
 from mesh.chain.errors import REVERT_HINTS
 from mesh.chain.reverts import custom_errors, decode_revert, explain
 from schemas import keccak256
@@ -26,7 +27,7 @@ NOT_A_PROVIDER = keccak256(b"NotAProvider(address)")[:4] + encode(["address"], [
     ids=["geth", "anvil", "hardhat", "parity"],
 )
 def test_custom_errors_are_found_wherever_nodes_put_them(error: dict[str, Any]) -> None:
-    reverted = decode_revert(error)
+    reverted = decode_revert(RpcFailure(**error))
     assert reverted is not None
     assert (reverted.reason, reverted.arguments) == ("NotAProvider", (ADDRESS,))
     assert str(reverted) == f"the contract refused: NotAProvider ({ADDRESS})"
@@ -48,7 +49,7 @@ def test_every_hint_is_for_an_error_of_the_contracts() -> None:
     ],
 )
 def test_other_errors_are_not_reverts(error: dict[str, Any]) -> None:
-    assert decode_revert(error) is None
+    assert decode_revert(RpcFailure(**error)) is None
 
 
 def test_a_plain_revert_gives_its_text() -> None:
@@ -56,7 +57,7 @@ def test_a_plain_revert_gives_its_text() -> None:
 
 
 def test_without_data_the_reason_is_taken_from_the_message() -> None:
-    reverted = decode_revert({"code": 3, "message": "execution reverted: too late"})
+    reverted = decode_revert(RpcFailure(3, "execution reverted: too late"))
     assert reverted is not None
     assert reverted.reason == "too late"
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import time
-from contextlib import asynccontextmanager
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from aiohttp import web
@@ -19,21 +18,7 @@ from mesh.errors import ClosedError, ConfigurationError, RemoteError
 from tests.mesh.chain.conftest import QUICK, raises_with, unreachable
 from tests.support.nodes import Anvil
 from tests.support.ports import free_port
-
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable
-
-
-@asynccontextmanager
-async def _server(handler: Callable[[web.Request], Awaitable[web.StreamResponse]]) -> AsyncIterator[str]:
-    """A web server that answers everything by `handler`."""
-    app = web.Application()
-    app.router.add_route("*", "/", handler)
-    runner = web.AppRunner(app, shutdown_timeout=0.1)
-    await runner.setup()
-    await web.TCPSite(runner, "127.0.0.1", 0).start()
-    yield f"http://127.0.0.1:{runner.addresses[0][1]}"
-    await runner.cleanup()
+from tests.support.serving import serving
 
 
 @pytest.mark.parametrize("scheme", ["http", "ws"])
@@ -57,7 +42,7 @@ async def test_attempts_are_bounded_and_spaced() -> None:
         return web.Response(status=503)
 
     timing = replace(QUICK, attempts=4, retry_delay=0.02)
-    async with _server(busy) as url:
+    async with serving(busy) as url:
         with unreachable("503"):
             async with Node(url, timing=timing):
                 pass
@@ -78,7 +63,7 @@ async def test_a_short_outage_is_bridged_by_retries() -> None:
             return web.Response(status=502)
         return web.json_response({"jsonrpc": "2.0", "id": (await request.json())["id"], "result": "0x7"})
 
-    async with _server(hesitant) as url, Node(url, timing=replace(QUICK, attempts=3)) as node:
+    async with serving(hesitant) as url, Node(url, timing=replace(QUICK, attempts=3)) as node:
         assert node.chain_id == 7
 
 
@@ -100,7 +85,7 @@ async def test_a_server_that_is_not_a_node_fails_at_once(response: dict[str, Any
         count += 1
         return web.Response(**response)
 
-    async with _server(answer) as url:
+    async with serving(answer) as url:
         with unreachable(why):
             async with Node(url, timing=QUICK):
                 pass
@@ -112,7 +97,7 @@ async def test_a_node_that_never_answers_times_out() -> None:
         await asyncio.Event().wait()
         raise AssertionError
 
-    async with _server(sleepy) as url:
+    async with serving(sleepy) as url:
         with unreachable("no answer in time"):
             async with Node(url, timing=replace(QUICK, request_timeout=0.05)):
                 pass
@@ -123,7 +108,7 @@ async def test_a_json_rpc_error_with_an_http_status_is_reported() -> None:
         error = {"code": -32005, "message": "limit exceeded"}
         return web.json_response({"jsonrpc": "2.0", "id": 1, "error": error}, status=400)
 
-    async with _server(rude) as url:
+    async with serving(rude) as url:
         with raises_with(RequestRefused, rpc_code=-32005, detail="limit exceeded"):
             async with Node(url, timing=QUICK):
                 pass
@@ -161,7 +146,7 @@ async def test_requests_fail_when_their_websocket_closes() -> None:
         await socket.close()
         return socket
 
-    async with _server(hang_up) as url, asyncio.timeout(5):
+    async with serving(hang_up) as url, asyncio.timeout(5):
         with unreachable("connection was closed"):
             async with Node(url.replace("http", "ws"), timing=QUICK):
                 pass
@@ -270,7 +255,7 @@ async def test_too_many_requests_are_retried() -> None:
             return web.json_response({"jsonrpc": "2.0", "id": 1, "error": error}, status=429)
         return web.json_response({"jsonrpc": "2.0", "id": (await request.json())["id"], "result": "0x7"})
 
-    async with _server(busy) as url, Node(url, timing=replace(QUICK, attempts=3)) as node:
+    async with serving(busy) as url, Node(url, timing=replace(QUICK, attempts=3)) as node:
         assert node.chain_id == 7
 
 

@@ -120,7 +120,7 @@ async def sent(site: Site, chain: Chain, start: int) -> list[Sent]:
             if transaction["to"] and parse_address(transaction["to"]) == lighthouse:
                 receipt = await chain.node.receipt(transaction["hash"])
                 assert receipt is not None
-                found.append(Sent(number, roles[parse_address(transaction["from"])], receipt["status"] == 1))
+                found.append(Sent(number, roles[parse_address(transaction["from"])], receipt.status == 1))
     return found
 
 
