@@ -81,6 +81,9 @@ class ChainListener:
                     log.warning("the chain replaced all blocks after %d", block.block_number, extra=facts)
                     for event in block.reverted_events:
                         await self.revert(event)
+                if block.events:
+                    # If it is handled only in part, and replaced before the agent is back, it is reverted like others.
+                    await self._ledger.set_cursor(self.CURSOR, block.block_number - 1, history=history.encode())
                 for event in block.events:
                     await self.handle(event)
                 await self._ledger.set_cursor(self.CURSOR, block.block_number, history=history.encode())
@@ -207,7 +210,7 @@ class ChainListener:
         A job without a Result stays ended: it was refunded, and will be refunded again.
         """
         async with self._executor.halted(address) as job:
-            if job is not None and job.phase is Phase.FINALIZED and job.result is not None:
+            if job is not None and job.result is not None:
                 log.warning("the finalization was reverted", extra=log_event("finalization-reverted"))
                 await self._owe_result(job)
 

@@ -56,10 +56,8 @@ class Pins:
 
     def add(self, cid: str, label: str) -> None:
         """Pin a CID, whether or not the file is held yet. Raises `InvalidCid`, and `InputError` for the label."""
-        path = self._path(cid, label)
-        if not path.exists():
-            path.touch(mode=PRIVATE_FILE)
-            sync_directory(self._directory)
+        self._path(cid, label).touch(mode=PRIVATE_FILE)
+        sync_directory(self._directory)
 
     def drop(self, cid: str, label: str) -> None:
         """Remove one pin, if it exists. Raises as `add` does."""

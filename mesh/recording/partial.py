@@ -113,7 +113,8 @@ class PartialFile:
 
     def _begin(self, about: RecordingAbout) -> int:
         self._writer.add_metadata(ABOUT, asdict(about))
-        cut = self._copy_cut() if self._cut.exists() else None
+        continues = self._cut.exists()
+        cut = self._copy_cut() if continues else None
         self.recovered = self.messages
         unix_ns = self._clock.time_ns()
         log_ns = max(unix_ns, 0 if cut is None else last_time(cut))
@@ -123,8 +124,10 @@ class PartialFile:
             CLOCK_RECORD, {name: f"{earlier.get(name, '')},{time}".lstrip(",") for name, time in times.items()}
         )
         self.sync()
-        self._cut.unlink(missing_ok=True)
         sync_directory(self._final.parent)
+        if continues:
+            self._cut.unlink()
+            sync_directory(self._final.parent)
         return log_ns
 
     def add(self, messages: Iterable[PendingMessage]) -> list[tuple[PendingMessage, Unrecordable]]:

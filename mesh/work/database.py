@@ -79,7 +79,7 @@ class Database:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._connection: aiosqlite.Connection | None = None
-        self._writing = asyncio.Lock()
+        self._using = asyncio.Lock()
 
     async def open(self) -> None:
         """Open the file, or create it. Raises `LedgerTooNew` if a newer version wrote it."""
@@ -92,7 +92,7 @@ class Database:
             await self._prepare()
         except (OSError, aiosqlite.Error) as error:
             await self.close()
-            raise LedgerUnusable(self._path, error) from None
+            raise LedgerUnusable(self._path, error.strerror if isinstance(error, OSError) else error) from None
         except BaseException:
             await self.close()
             raise
@@ -105,7 +105,7 @@ class Database:
 
     async def run(self, statement: str, values: tuple[Any, ...] = ()) -> bool:
         """Run one statement, and sync it to the disk. Returns whether it changed any rows."""
-        async with self._writing:
+        async with self._using:
             with self._usable():
                 cursor = await self._opened().execute(statement, values)
         changed = cursor.rowcount > 0
@@ -113,9 +113,9 @@ class Database:
         return changed
 
     async def run_together(self, *statements: tuple[str, tuple[Any, ...]]) -> None:
-        """Run all statements in one transaction. If it fails or is cancelled, none of them has an effect."""
+        """Run all statements in one transaction. All of them have an effect or, if it fails, none."""
         connection = self._opened()
-        async with self._writing:
+        async with self._using:
             try:
                 with self._usable():
                     await connection.execute("BEGIN IMMEDIATE")
@@ -128,9 +128,10 @@ class Database:
                 raise
 
     async def rows(self, statement: str, values: tuple[Any, ...] = ()) -> list[Any]:
-        """The rows that a statement returns."""
-        with self._usable():
-            return list(await self._opened().execute_fetchall(statement, values))
+        """The rows that a statement returns: what was committed, never what another task is still writing."""
+        async with self._using:
+            with self._usable():
+                return list(await self._opened().execute_fetchall(statement, values))
 
     async def _prepare(self) -> None:
         await self.run("PRAGMA journal_mode = WAL")

@@ -131,9 +131,7 @@ class Executor:
         """Play the objective of a ready job. Returns when the playback has begun. Raises `WrongPhase`."""
         await self._wait_until_prepared(address)
         async with self._changing:
-            job = await self._startable(address, asked="start")
-            if job.phase is not Phase.READY:
-                raise WrongPhase(address, asked="start", phase=job.phase)
+            job = await self._startable(address, asked="start", phases=(Phase.READY,))
             await self._begin(job)
 
     @with_liability_context
@@ -175,15 +173,14 @@ class Executor:
         async with self._changing:
             job = await self._job(address, asked="finish")
             advance(address, job.phase, Phase.COMPLETE)
-            stopped = await self._playbacks.stop(address)
-            run = stopped or await self._playbacks.create(job.liability, recorded=job.recorded)
+            run = await self._playbacks.stop(address) or await self._playbacks.create(job)
             summary = await run.close(note)
             if success and (missing := run.missing + summary.lost_played):
                 success, note = False, str(RecordingIncomplete(address, missing))
                 log.error("%s", note, extra=log_event("recording-incomplete", missing=missing))
             cid = await asyncio.to_thread(self._store.put_file, summary.path, pin=address)
             await self.owe_result(address, success=success, result=cid, note=note)
-            await asyncio.to_thread(summary.path.unlink, missing_ok=True)
+            await asyncio.to_thread(self._playbacks.discard_recording, address)
             self._fetched.pop(address, None)
         facts = log_event("job-finished", success=success, result=cid, messages=summary.messages)
         log.info("complete, success %s, result %s, %d messages", success, cid, summary.messages, extra=facts)
@@ -252,15 +249,17 @@ class Executor:
             await self._unless_ended(self.finish(address, success=success, note=note))
 
     async def _release(self, address: str) -> None:
-        """Let the store evict the files of a job that has ended, or is gone."""
+        """Delete what a job that has ended has recorded here; let the store evict its files if it is paid, or gone."""
         job = await self._ledger.job(address)
+        if job is not None and job.phase not in TO_BE_DONE:
+            await asyncio.to_thread(self._playbacks.discard_recording, address)
         if job is None or job.phase is Phase.FINALIZED:
             await asyncio.to_thread(self._store.release, address)
 
     async def _release_ended(self) -> None:
         """The same for all jobs: a crash may have come between their end and `_release`."""
         pins = await asyncio.to_thread(self._store.pins)
-        for label in frozenset().union(*pins.values()):
+        for label in (await asyncio.to_thread(self._playbacks.recorded)).union(*pins.values()):
             if label.startswith("0x"):  # other labels belong to others
                 await self._release(label)
 
@@ -270,9 +269,9 @@ class Executor:
             raise WrongPhase(address, asked=asked, phase=None)
         return job
 
-    async def _startable(self, address: str, *, asked: str) -> JobRecord:
+    async def _startable(self, address: str, *, asked: str, phases: tuple[Phase, ...] = STARTABLE) -> JobRecord:
         job = await self._job(address, asked=asked)
-        if job.phase not in STARTABLE or address not in self._fetched:
+        if job.phase not in phases or address not in self._fetched:
             raise WrongPhase(address, asked=asked, phase=job.phase)
         return job
 

@@ -153,7 +153,7 @@ class Ledger:
         )
 
     async def complete(self, liability: str, *, success: bool, result: str, note: str, outgoing: Outgoing) -> None:
-        """Set the job's outcome and keep its signed Result for sending: both or, if this is cancelled, neither."""
+        """Set the job's outcome and keep its signed Result for sending: both or neither."""
         ended = "UPDATE jobs SET phase = ?, success = ?, result = ?, note = ?, changed = ? WHERE liability = ?"
         await self._database.run_together(
             (ended, (Phase.COMPLETE, success, result, note, time.time(), liability)), (POST, _posted(outgoing))

@@ -107,23 +107,21 @@ class Playbacks:
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self.recorders = Recorders()
 
-    async def create(
-        self, liability: Liability, objective: Objective | None = None, *, position: int = 0, recorded: int = 0
-    ) -> JobRun:
-        """A run of `objective` from the message at `position`; without an objective, one that only records.
+    async def create(self, job: JobRecord, objective: Objective | None = None) -> JobRun:
+        """A run of `objective` from the job's position; without an objective, one that only records.
 
-        It continues the recording of an interrupted run of the same liability, which had synced `recorded` messages.
+        It continues the recording of an interrupted run of the same job.
         """
         return JobRun(
             self._session,
             self._agent,
-            liability,
-            await asyncio.to_thread(self._open_recorder, liability),
+            job.liability,
+            await asyncio.to_thread(self._open_recorder, job.liability),
             objective=objective,
             pace=self._pace,
-            position=position,
+            position=job.position,
             recorded=self._recorded,
-            earlier=recorded,
+            earlier=job.recorded,
         )
 
     async def begin(
@@ -138,8 +136,7 @@ class Playbacks:
         address, position = job.liability.address, job.position
         facts = log_event("job-started", position=position, count=objective.count)
         log.info("running, from message %d of %d", position, objective.count, extra=facts)
-        run = await self.create(job.liability, objective, position=position, recorded=job.recorded)
-        self._runs[address] = run
+        run = self._runs[address] = await self.create(job, objective)
         await self._ledger.set_phase(address, Phase.RUNNING, position=position)
         run.open()
         context = copy_context()
@@ -208,6 +205,10 @@ class Playbacks:
     def _drop_task(self, address: str, task: asyncio.Task[None]) -> None:
         if self._tasks.get(address) is task:
             del self._tasks[address]
+
+    def recorded(self) -> set[str]:
+        """The addresses of the liabilities that have a recording here. Blocks on the disk."""
+        return {path.name.partition(".")[0] for path in self._folder.glob("*.mcap*")}
 
     def discard_recording(self, address: str) -> None:
         """Delete what an earlier run of the liability at `address` has recorded. Blocks on the disk."""

@@ -220,6 +220,21 @@ def test_pins_survive_the_process_the_file_and_the_index(store: Store) -> None:
         again.unpin(wanted, "nobody")
 
 
+def test_a_pin_that_exists_is_synced_all_the_same(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The process that set it may have been killed before it was on the disk."""
+    wanted = cid_of_bytes(b"not here yet")
+    (store.directory / ".pins" / f"{wanted}.{JOB}").touch()
+    synced, fsync = list[str](), os.fsync
+
+    def noted(descriptor: int) -> None:
+        fsync(descriptor)
+        synced.append(os.readlink(f"/proc/self/fd/{descriptor}"))
+
+    monkeypatch.setattr(os, "fsync", noted)
+    store.pin(wanted, JOB)
+    assert str(store.directory / ".pins") in synced
+
+
 @pytest.mark.parametrize("label", ["", "a/b", "..", "x" * 65, "a b", "a.b", "ä"])
 def test_invalid_labels_are_refused(store: Store, label: str) -> None:
     with pytest.raises(InputError):

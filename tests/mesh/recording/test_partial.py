@@ -86,6 +86,29 @@ def test_a_kill_while_copying_an_interrupted_recording_loses_nothing(tmp_path: P
     assert os.listdir(tmp_path) == ["it.mcap"]
 
 
+def test_the_copy_has_its_name_on_the_disk_before_the_original_is_deleted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And the deletion is there before anything is recorded: else the copy would be taken for an unfinished one."""
+    with Recorder(tmp_path / "it.mcap", ABOUT) as recorder:
+        recorder.record("/a", b"1", RAW)
+    (tmp_path / "it.mcap").rename(tmp_path / "it.mcap.part")
+    order, fsync, unlink = list[str](), os.fsync, Path.unlink
+
+    def noted_fsync(descriptor: int) -> None:
+        fsync(descriptor)
+        order.append("sync " + Path(os.readlink(f"/proc/self/fd/{descriptor}")).name)
+
+    def noted_unlink(path: Path, *, missing_ok: bool = False) -> None:
+        unlink(path, missing_ok=missing_ok)
+        order.append("delete " + path.name)
+
+    monkeypatch.setattr(os, "fsync", noted_fsync)
+    monkeypatch.setattr(Path, "unlink", noted_unlink)
+    with Recorder(tmp_path / "it.mcap", ABOUT):
+        assert order == ["sync it.mcap.part", folder := f"sync {tmp_path.name}", "delete it.mcap.cut", folder]
+
+
 def test_every_seam_of_a_continued_recording_is_in_its_metadata(tmp_path: Path) -> None:
     for number in range(3):
         with Recorder(tmp_path / "it.mcap", ABOUT) as recorder:

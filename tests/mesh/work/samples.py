@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mesh.work import Outgoing
+from mesh.work import JobRecord, Outgoing, Phase
 from schemas import ZERO_ADDRESS, Liability, checksum_address, cid_of_bytes, keccak256
 
 
@@ -23,6 +23,13 @@ def liability(name: str = "one", *, promisor: str = ZERO_ADDRESS, objective: str
         validator_fee=0,
         is_success=False,
         is_finalized=False,
+    )
+
+
+def job(name: str = "one") -> JobRecord:
+    """A job for that contract, before anything is played."""
+    return JobRecord(
+        liability=liability(name), phase=Phase.READY, success=None, result=None, position=0, recorded=0, note=""
     )
 
 

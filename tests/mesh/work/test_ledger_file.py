@@ -9,6 +9,7 @@ import sys
 import threading
 from typing import TYPE_CHECKING
 
+import aiosqlite
 import pytest
 
 from mesh.errors import ClosedError, ConfigurationError
@@ -98,13 +99,18 @@ async def test_a_ledger_of_a_newer_version_is_refused_and_not_touched(path: Path
     assert version_of(path) == VERSION + 1
 
 
+def own_threads() -> set[threading.Thread]:
+    """All threads but those of the event loop's pool, which end with the loop."""
+    return {thread for thread in threading.enumerate() if not thread.name.startswith("asyncio_")}
+
+
 async def refused(path: Path) -> ConfigurationError:
-    before = set(threading.enumerate())
+    before = own_threads()
     with pytest.raises(ConfigurationError) as caught:
         async with Ledger(path):
             pass
     # One that is left behind would keep the interpreter alive.
-    await until(lambda: set(threading.enumerate()) <= before)
+    await until(lambda: own_threads() <= before)
     assert "\n" not in str(caught.value)
     return caught.value
 
@@ -133,7 +139,7 @@ async def test_a_file_that_is_not_a_database_is_an_error(no_database: Path) -> N
 async def test_a_folder_at_the_path_of_the_ledger_is_an_error(no_file: Path) -> None:
     error = await refused(no_file)
     assert isinstance(error, LedgerUnusable)
-    assert (error.code, error.path, error.why) == ("ledger-unusable", no_file, "unable to open database file")
+    assert (error.code, error.path, error.why) == ("ledger-unusable", no_file, "Is a directory")
 
 
 async def test_a_folder_that_can_not_be_created_is_an_error(no_database: Path) -> None:
@@ -170,3 +176,36 @@ async def test_a_full_disk_is_an_error_and_nothing_is_half_written(ledger: Ledge
     assert (job.phase, await ledger.outbox(head=0)) == (Phase.INCOMING, [])
     await ledger.complete(address, success=True, result=RESULT, note="", outgoing=signed)
     assert await ledger.outbox(head=0) == [signed]
+
+
+async def test_what_is_not_committed_is_not_read(ledger: Ledger, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A Result that was read, and sent, before the disk refused it would be one that the ledger does not know."""
+    await ledger.add_job(liability())
+    reached, held, commit = asyncio.Event(), asyncio.Event(), aiosqlite.Connection.commit
+
+    async def refused_commit(connection: aiosqlite.Connection) -> None:
+        reached.set()
+        await held.wait()
+        raise aiosqlite.OperationalError("disk I/O error")
+
+    monkeypatch.setattr(aiosqlite.Connection, "commit", refused_commit)
+    async with asyncio.TaskGroup() as tasks:
+        completing = tasks.create_task(completed(ledger))
+        await reached.wait()
+        sending = tasks.create_task(ledger.waiting())
+        await asyncio.wait([sending], timeout=0.2)
+        held.set()
+        assert isinstance(await completing, LedgerUnusable)
+        assert await sending == 0
+    monkeypatch.setattr(aiosqlite.Connection, "commit", commit)
+    assert not await completed(ledger)
+    assert await ledger.waiting() == 1
+
+
+async def completed(ledger: Ledger) -> LedgerUnusable | None:
+    """Complete the job; why it could not be done, if so."""
+    try:
+        await ledger.complete(liability().address, success=True, result=RESULT, note="", outgoing=message())
+    except LedgerUnusable as error:
+        return error
+    return None

@@ -8,7 +8,7 @@ import pytest
 
 from mesh.recording import AtOnce, RecordedTimes, open_objective
 from schemas import String
-from tests.mesh.work.samples import liability
+from tests.mesh.work.samples import job, liability
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -25,11 +25,11 @@ async def playbacks(place: Place) -> AsyncIterator[Playbacks]:
 
 
 async def test_an_interrupted_recording_is_continued(playbacks: Playbacks) -> None:
-    first = await playbacks.create(liability())
+    first = await playbacks.create(job())
     first.open()
     first.publish("/led", "before")
     await first.close()  # and then, before the Result was in the ledger, a crash
-    second = await playbacks.create(liability())
+    second = await playbacks.create(job())
     second.open()
     second.publish("/led", "after")
     summary = await second.close()
@@ -40,13 +40,13 @@ async def test_an_interrupted_recording_is_continued(playbacks: Playbacks) -> No
 
 @pytest.mark.parametrize("leftover", ["", ".part", ".cut"])
 async def test_a_discarded_recording_is_not_continued(playbacks: Playbacks, leftover: str) -> None:
-    first = await playbacks.create(liability())
+    first = await playbacks.create(job())
     first.open()
     first.publish("/led", "before")
     path = (await first.close()).path
     path.rename(path.with_name(path.name + leftover))
     playbacks.discard_recording(liability().address)
-    summary = await (await playbacks.create(liability())).close()
+    summary = await (await playbacks.create(job())).close()
     assert (summary.messages, summary.recovered) == (0, 0)
 
 
@@ -56,13 +56,13 @@ async def test_a_recording_that_does_not_exist_can_be_discarded(playbacks: Playb
 
 async def test_the_settings_choose_pace_and_topics(place: Place) -> None:
     async with place.agent("robot", enable_executor=False, playback="recorded", recording_topics=" /a,/b/c ,") as robot:
-        run = await robot.runtime.playbacks.create(liability())
+        run = await robot.runtime.playbacks.create(job())
         assert run.pace == RecordedTimes()
         assert run.recorded == frozenset({"/a", "/b/c"})
         await run.close()
 
 
 async def test_by_default_all_topics_are_recorded(playbacks: Playbacks) -> None:
-    run = await playbacks.create(liability())
+    run = await playbacks.create(job())
     assert (run.pace, run.recorded) == (AtOnce(), None)
     await run.close()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import os
 import sqlite3
 from typing import TYPE_CHECKING
 
@@ -16,14 +18,18 @@ from tests.mesh.work.restarts import COST, WORDS, Paying, made_by_a_provider_tha
 from tests.mesh.work.samples import liability
 from tests.support.market import in_phase, offering
 from tests.support.orders import result
-from tests.support.waiting import until
+from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
+    from mesh.agent import Agent
     from tests.support.market import Place
 
 __all__ = ["paid"]
+
+OTHER = liability("set aside until a reorganisation brings it back").address
 
 
 async def test_a_job_that_awaits_its_finish_keeps_its_recording_over_a_restart(place: Place) -> None:
@@ -98,6 +104,52 @@ async def test_a_result_is_out_of_the_outbox_before_its_job_is_marked_as_finaliz
         assert job.phase is Phase.COMPLETE
 
 
+async def test_the_result_of_a_payment_that_was_half_handled_and_reverted_is_sent_again(
+    place: Place, paid: Paying
+) -> None:
+    """The robot ends after it has taken the Result out of the outbox, and a reorganisation takes the payment."""
+    said: list[str] = []
+    async with place.agent("person") as person:
+        ledger = await crashed_at(refuse_to_finalize, place, person)
+        assert await paid.once()
+        await place.forget_blocks(1)
+        accept_changes(ledger)
+        assert not await paid.once()
+        async with speaking(place.agent("robot"), said), place.provider():
+            await until_found(paid.once, what="the payment")
+    assert said == [], "the work was done before the crash"
+
+
+async def test_the_orders_of_a_contract_that_was_half_handled_and_reverted_are_sent_again(
+    place: Place, paid: Paying
+) -> None:
+    """The robot ends after it has taken its offer out of the outbox, and a reorganisation takes the contract."""
+    said: list[str] = []
+    async with place.agent("person") as person:
+        ledger = await crashed_at(refuse_jobs, place, person)
+        await place.forget_blocks(1)
+        accept_changes(ledger)
+        async with speaking(place.agent("robot"), said), place.provider():
+            await until_found(paid.once, what="the payment")
+    assert said == WORDS
+
+
+async def crashed_at(refuse: Callable[[Path], None], place: Place, person: Agent) -> Path:
+    """A robot does a job until its ledger refuses a change; the path of that ledger."""
+    ledgers: list[Path] = []
+
+    async def work() -> None:
+        async with speaking(offering(place.agent("robot")), []) as robot, place.provider():
+            ledgers.append(robot.parts.directory / "ledger.sqlite")
+            refuse(*ledgers)
+            await person.demand(words(place), cost=COST)
+            await asyncio.sleep(60)
+
+    with pytest.raises(ExceptionGroup):
+        await work()
+    return ledgers[0]
+
+
 async def test_the_result_of_a_reverted_payment_is_sent_again(place: Place, paid: Paying) -> None:
     said: list[str] = []
     async with place.agent("person") as person, speaking(offering(place.agent("robot")), said) as robot:
@@ -165,6 +217,39 @@ async def test_a_contract_created_again_at_another_address_is_paid_once(place: P
             await in_phase(robot, contract, Phase.FINALIZED)
     assert said == WORDS
     assert await paid.once()
+
+
+async def test_no_recording_of_an_ended_job_is_left(place: Place) -> None:
+    """Neither of one that was refunded while it ran, nor of one whose robot crashed before it could delete it."""
+    said: list[str] = []
+    async with place.provider(), place.agent("person") as person:
+        async with speaking(offering(place.agent("robot")), said, stuck_at="0") as robot:
+            contract = await person.demand(words(place))
+            await in_phase(robot, contract, Phase.RUNNING)
+            recordings = robot.parts.recordings
+            assert os.listdir(recordings) == [f"{contract.address}.mcap.part"]
+            failed = result(signer=robot.parts.signer, liability=contract.address, success=False)
+            await place.chains["provider"].liabilities.finalize(place.market.deployment.lighthouse_name, failed)
+            await in_phase(robot, contract, Phase.FINALIZED)
+            await until(lambda: os.listdir(recordings) == [])
+        (recordings / f"{contract.address}.mcap").touch()
+        waiting = recordings / f"{OTHER}.mcap"
+        waiting.touch()
+        async with place.agent("robot"):
+            await until(lambda: os.listdir(recordings) == [waiting.name])
+
+
+def refuse_jobs(ledger: Path) -> None:
+    """Have SQLite fail when a job is added."""
+    database = sqlite3.connect(ledger)
+    database.execute("CREATE TRIGGER crash BEFORE INSERT ON jobs BEGIN SELECT RAISE(ABORT, 'crash'); END")
+    database.close()
+
+
+def accept_changes(ledger: Path) -> None:
+    database = sqlite3.connect(ledger)
+    database.execute("DROP TRIGGER crash")
+    database.close()
 
 
 def refuse_to_finalize(ledger: Path) -> None:
