@@ -86,6 +86,9 @@ class _Order(_Message, frozen=True, kw_only=True, rename="camel"):
                 set_address(self, "sender", self.sender)
         except (InvalidCid, InvalidAddress) as error:
             _raise_invalid(self, error)
+        if self.validator == self.lighthouse:
+            # With the two exchanged, an offer is a demand with the same signature: see mesh/chain/validators.py.
+            raise InvalidMessage("validator", "the lighthouse can't be the validator")
         check_uint256("cost", self.cost)
         check_uint256("deadline", self.deadline)
         self._set_nonce()

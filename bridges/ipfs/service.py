@@ -134,6 +134,7 @@ class IpfsBridge(Role):
             lighthouse,
             address=lambda: chain.address(lighthouse),
             resolver=chain.resolve,
+            is_safe=chain.is_safe_validator,
             head=lambda: chain.head,
         )
 

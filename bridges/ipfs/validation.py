@@ -15,6 +15,7 @@ from mesh.network.validation import key_of
 from mesh.outage_log import OutageLog
 from mesh.retry import REMOTE, Backoff, RetryPolicy
 from schemas import (
+    ZERO_ADDRESS,
     Demand,
     FeedbackKey,
     Message,
@@ -97,8 +98,8 @@ class RelayValidator:
     """Validates the messages of one lighthouse (ENS name): `await validator.validate(payload)`.
 
     `address` returns the address that orders must name as their lighthouse, None while it isn't known; `resolver`
-    resolves ENS names in messages; `head` returns the latest block number, or 0 while it isn't known (then no deadline
-    is checked).
+    resolves ENS names in messages; `is_safe` says whether orders may name a validator (address); `head` returns the
+    latest block number, or 0 while it isn't known (then no deadline is checked).
     """
 
     def __init__(
@@ -107,11 +108,13 @@ class RelayValidator:
         *,
         address: Callable[[], str | None] = lambda: None,
         resolver: Resolver | None = None,
+        is_safe: Callable[[str], Awaitable[bool]] | None = None,
         head: Callable[[], int] = lambda: 0,
     ) -> None:
         self._lighthouse = lighthouse
         self._address = address
         self._resolver = resolver
+        self._is_safe = is_safe
         self._head = head
 
     async def validate(self, payload: bytes, *, key: str | None = None) -> RelayMessage:
@@ -119,7 +122,7 @@ class RelayValidator:
 
         `key`, if given, must be the one that the message requires. The signature of order feedback is not verified,
         because what it covers is undocumented. Raises only `InvalidMessage`; its `reason` is one of `schemas.decode`,
-        or `name`, `lighthouse`, `deadline`, `signature`, `sender`, `key`.
+        or `name`, `lighthouse`, `validator`, `deadline`, `signature`, `sender`, `key`.
         """
         message = decode(payload)
         canonical = encode(message)
@@ -139,6 +142,8 @@ class RelayValidator:
         self._check_order(resolved)
         digest = message_hash(resolved)
         verify_hashed(resolved, digest)
+        if isinstance(resolved, Demand | Offer):
+            await self._check_validator(resolved.validator)
         return key_of(self._lighthouse, resolved, digest)
 
     async def _resolved(self, message: SignedMessage) -> SignedMessage:
@@ -151,6 +156,17 @@ class RelayValidator:
             return resolve_names(message, {name: await self._resolver(name) for name in names})
         except AiraError as error:
             raise InvalidMessage("name", str(error)) from error
+
+    async def _check_validator(self, validator: str) -> None:
+        """An order is not relayed before it is known that its validator is no lighthouse."""
+        if validator == ZERO_ADDRESS or self._is_safe is None:
+            return
+        try:
+            is_safe = await self._is_safe(validator)
+        except AiraError as error:
+            raise InvalidMessage("validator", str(error)) from error
+        if not is_safe:
+            raise InvalidMessage("validator", f"{validator} is a lighthouse, or could become one")
 
     def _check_order(self, order: SignedMessage) -> None:
         if isinstance(order, Result):
@@ -208,6 +224,12 @@ class ChainView:
         if self._chain is None:
             raise ChainAwaited("the chain's node was not reached yet")
         return await self._chain.names.address(name)
+
+    async def is_safe_validator(self, validator: str) -> bool:
+        """Whether orders may name a validator (address). Raises `ChainError`."""
+        if self._chain is None:
+            raise ChainAwaited("the chain's node was not reached yet")
+        return await self._chain.validators.is_safe(validator)
 
     async def run(self) -> None:
         """Follow the chain until cancelled. Raises `ConfigurationError` for a chain that contradicts the settings."""

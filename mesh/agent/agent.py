@@ -184,7 +184,13 @@ class Agent(HandlerDecorators, Lifecycle):
         return await self.runtime.executor.finish(address, success=success)
 
     def publish(self, message: Demand | Offer | Result) -> str:
-        """Sign a message with the agent's account and publish it once; returns its key. It is not resent."""
+        """Sign a message with the agent's account and publish it once; returns its key. It is not resent.
+
+        Raises `UnsafeValidator` for an order with a validator that was not checked on the chain before, as `demand` and
+        `offer` do.
+        """
+        if isinstance(message, Demand | Offer):
+            self.parts.chain.validators.check_known(message)
         return self.channel.publish(self.parts.signer.sign(message))
 
     async def add(self, path: Path) -> str:

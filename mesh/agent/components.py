@@ -132,7 +132,14 @@ async def working(
 async def _channel_of(lighthouse: str, network: Network, *, chain: Chain, head: ChainHead) -> Channel:
     """The channel of a lighthouse, not yet open, which resolves names and knows the head by the chain."""
     address = await chain.names.address(lighthouse)
-    return Channel(network.session, lighthouse, address=address, resolver=chain.names.address, head=lambda: head.head)
+    return Channel(
+        network.session,
+        lighthouse,
+        address=address,
+        resolver=chain.names.address,
+        validators=chain.validators,
+        head=lambda: head.head,
+    )
 
 
 async def _chain_folder(chain: Chain) -> str:

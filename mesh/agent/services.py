@@ -18,7 +18,17 @@ from mesh.agent.errors import ServiceClosed
 from mesh.errors import InputError
 from mesh.log_context import log_event
 from mesh.work.ledger import WrongPhase
-from schemas import Result, SignedMessage, message_hash, names_in, parse_address, resolve_names, verify_message
+from schemas import (
+    Demand,
+    Offer,
+    Result,
+    SignedMessage,
+    message_hash,
+    names_in,
+    parse_address,
+    resolve_names,
+    verify_message,
+)
 from schemas.message_requests import Published
 from schemas.rpc import (
     GUARDED,
@@ -217,7 +227,7 @@ class MessageServices:
         """Sign an order in the settings' generation and post it. Raises `InvalidMessage`, `InputError`."""
         request = replace(request, model=await self._chain.names.model(request.model))
         order = await self._resolved(request.unsigned(**await self._nonce_and_sender()))
-        self._check(order)
+        await self._check(order)
         return await self._post(self._parts.signer.sign(order))
 
     async def sign_result(self, request: SignResult) -> Published:
@@ -234,7 +244,7 @@ class MessageServices:
         """Publish a message with a valid signature. Raises `InvalidMessage`, `InputError`."""
         message = await self._resolved(request.message())
         verify_message(message)
-        self._check(message)
+        await self._check(message)
         return self._publish(message)
 
     async def _nonce_and_sender(self) -> dict[str, Any]:
@@ -246,7 +256,7 @@ class MessageServices:
     async def _resolved(self, message: M) -> M:
         return resolve_names(message, {name: await self._chain.names.address(name) for name in names_in(message)})
 
-    def _check(self, message: SignedMessage) -> None:
+    async def _check(self, message: SignedMessage) -> None:
         if isinstance(message, Result):
             return
         channel, head = self._parts.channel, self._parts.chain_head.head
@@ -260,6 +270,8 @@ class MessageServices:
                 f"the order's deadline is block {message.deadline}, but the chain is at block {head} already",
                 hint="give it a later deadline",
             )
+        if isinstance(message, Demand | Offer):
+            await self._chain.validators.check(message)
 
     async def _post(self, signed: SignedMessage) -> Published:
         await self._parts.outbox.post(signed)

@@ -108,10 +108,12 @@ class Trader(Lifecycle):
         return {**terms, "sender": None if order.generation == 3 else self._address}
 
     async def sign(self, kind: type[AnOrder], terms: Terms, **fee: Any) -> AnOrder:
-        """An order with these terms and a fresh nonce, signed and not posted."""
+        """An order with these terms and a fresh nonce, signed and not posted. Raises `UnsafeValidator`."""
         is_counted = terms["sender"] is not None
         nonce = await self._chain.liabilities.next_nonce(self._address) if is_counted else secrets.token_hex(32)
-        return self._parts.signer.sign(kind(**terms, nonce=nonce, **fee))
+        order = kind(**terms, nonce=nonce, **fee)
+        await self._chain.validators.check(order)
+        return self._parts.signer.sign(order)
 
     async def demand(self, terms: Terms, *, validator_fee: int) -> Contract:
         """Sign and post a demand, and wait for the contract that is created from it.

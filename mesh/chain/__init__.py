@@ -60,6 +60,7 @@ from mesh.chain.node import Node
 from mesh.chain.policy import GWEI, FeePolicy, Timing
 from mesh.chain.tokens import Token
 from mesh.chain.transactions import Receipt, TransactionSender
+from mesh.chain.validators import UnsafeValidator, Validators
 
 RECURSION_LIMIT: Final = 3_000
 """Frames: safe on a stack of 2 MB (measured; 6,000 is not), and enough for contracts that call 200 deep."""
@@ -126,6 +127,8 @@ __all__ = [
     "TransactionTimeout",
     "Transfer",
     "UnknownName",
+    "UnsafeValidator",
+    "Validators",
     "WrongChain",
     "WrongPassword",
     "copy_keyfile",

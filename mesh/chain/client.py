@@ -19,6 +19,7 @@ from mesh.chain.node import Node
 from mesh.chain.reader import EventSources, read_events
 from mesh.chain.tokens import Tokens
 from mesh.chain.transactions import TransactionSender
+from mesh.chain.validators import Validators
 from mesh.errors import ClosedError
 from mesh.telemetry.metrics import gauge
 
@@ -55,7 +56,7 @@ class Chain:
     `NodeUnreachable` when the node is lost, except those that wait for something. Methods that send a transaction wait
     until it is mined, and raise `NoAccount`, `Reverted` (also without sending, when the simulation fails),
     `InsufficientFunds`, `TransactionTimeout`. Its methods are grouped in parts: `liabilities`,
-    `lighthouses`, `tokens`, `names`; `follow` yields events.
+    `lighthouses`, `validators`, `tokens`, `names`; `follow` yields events.
     """
 
     def __init__(
@@ -93,6 +94,7 @@ class Chain:
             if self._owns_node:
                 await stack.enter_async_context(self.node)
             self._contracts = await self._find_contracts()
+            self._validators = Validators(self._contracts)
             self._stack = stack.pop_all()
         return self
 
@@ -139,6 +141,12 @@ class Chain:
     def liabilities(self) -> Liabilities:
         """Liabilities, and the orders that they are created from."""
         return Liabilities(self._opened())
+
+    @property
+    def validators(self) -> Validators:
+        """Which validators orders may name."""
+        self._opened()
+        return self._validators
 
     async def has_mesh_contracts(self) -> bool:
         """Whether factory and token have the code that this project's sources compile to."""

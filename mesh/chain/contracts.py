@@ -8,7 +8,7 @@ our contracts, which have both sets of names. `Contracts` is what the parts of a
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NamedTuple
 
 from mesh.chain.errors import InvalidAnswer, NoAccount, NotOffered, UnknownContracts
 from mesh.errors import InvalidMessage
@@ -82,6 +82,9 @@ class LighthouseState:
 
 class ContractVersion:
     """Our own contracts. `factory` is the address of the factory; `generation` names the root of its names."""
+
+    refuses_lighthouses: ClassVar[bool] = True
+    """Whether the contracts refuse an order whose validator is a lighthouse."""
 
     def __init__(self, node: Node, factory: str, generation: int) -> None:
         self.generation = generation
@@ -159,6 +162,8 @@ class OriginalContracts(ContractVersion):
     They give no reasons when they refuse, pay nobody back, and don't say whose liability a contract is: a liability is
     recognised by an event of the factory that names it, or by the gas that the factory has counted for it.
     """
+
+    refuses_lighthouses = False
 
     def check_order(self, order: Order) -> None:
         if order.generation != self.generation:

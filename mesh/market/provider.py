@@ -87,6 +87,7 @@ class Provider(Role):
                 self._lighthouse,
                 address=address,
                 resolver=self._chain.names.address,
+                validators=self._chain.validators,
                 head=lambda: self.settlement.head,
             )
         )

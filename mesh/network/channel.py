@@ -14,10 +14,17 @@ from typing import TYPE_CHECKING, Any, Final, Generic, Self
 
 import zenoh
 
-from mesh.errors import AiraError, ClosedError, InputError, InvalidKey
+from mesh.errors import ClosedError, InputError, InvalidKey
 from mesh.network.pump import Pump, call_in_loop
-from mesh.network.validation import M, MessageValidator, Unresolved, ValidationStatistics, message_key
-from schemas import Result, SignedMessage, Verified, encode, names_in
+from mesh.network.validation import (
+    M,
+    MessageValidator,
+    Unresolved,
+    ValidationStatistics,
+    ValidatorCheck,
+    message_key,
+)
+from schemas import Result, SignedMessage, Verified, encode
 from schemas.keys import PresenceKey, parse_key
 from schemas.selectors import lighthouse_selector, market_selector, presence_selector
 
@@ -42,9 +49,9 @@ class Channel:
     """The channel of one lighthouse on an open session: `async with Channel(session, lighthouse) as channel`.
 
     `lighthouse` is the ENS name of the market. `address`, if given, is the lighthouse that orders must name;
-    `resolver` resolves ENS names in messages; `head` returns the latest block number, for deadlines. Leaving
-    `async with` withdraws the presence tokens and ends the watches; the caller closes the session. Raises `InvalidKey`
-    for a name that no key may contain.
+    `resolver` resolves ENS names in messages; `validators` knows which validators orders may name (None: any); `head`
+    returns the latest block number, for deadlines. Leaving `async with` withdraws the presence tokens and ends the
+    watches; the caller closes the session. Raises `InvalidKey` for a name that no key may contain.
     """
 
     def __init__(
@@ -54,6 +61,7 @@ class Channel:
         *,
         address: str | None = None,
         resolver: Resolver | None = None,
+        validators: ValidatorCheck | None = None,
         head: Callable[[], int] = lambda: 0,
     ) -> None:
         self._session = session
@@ -61,6 +69,7 @@ class Channel:
         lighthouse_selector(self.lighthouse)  # raises InvalidKey
         self.address = address
         self._resolver = resolver
+        self._validators = validators
         self._head = head
         self._declarations: list[Any] = []
         self._open = False
@@ -112,9 +121,14 @@ class Channel:
             raise InputError(f"a {kind.kind} has no liability to select by")
         selector = market_selector(self.lighthouse, kind.kind, model if liability == "*" else liability)
         validator: MessageValidator[M] = MessageValidator(
-            kind, lighthouse=self.lighthouse, address=self.address, head=self._head
+            kind,
+            lighthouse=self.lighthouse,
+            address=self.address,
+            head=self._head,
+            resolver=self._resolver,
+            validators=self._validators,
         )
-        return Subscription(self._session, selector, validator, self._resolver)
+        return Subscription(self._session, selector, validator)
 
     def announce(self, role: str, address: str) -> None:
         """Announce the agent at `address` as present in `role`, for as long as the channel is open."""
@@ -166,9 +180,9 @@ class Channel:
 class Subscription(Generic[M]):
     """The verified messages of one kind, as an async iterator: `async with channel.subscribe(Demand) as demands`.
 
-    The iteration ends when `async with` is left. Supports one consumer. Messages with ENS names are delivered once
-    `resolver` has resolved them, so later messages may overtake them; at most `lookup_limit` of them wait. Raises
-    `ClosedError` before it is entered.
+    The iteration ends when `async with` is left. Supports one consumer. Messages about which the chain has to be asked
+    (ENS names, unknown validators) are delivered after that, so later ones may overtake them; at most `lookup_limit`
+    wait. Raises `ClosedError` before it is entered.
     """
 
     def __init__(
@@ -176,7 +190,6 @@ class Subscription(Generic[M]):
         session: zenoh.Session,
         selector: str,
         validator: MessageValidator[M],
-        resolver: Resolver | None,
         *,
         lookup_limit: int = LOOKUP_LIMIT,
     ) -> None:
@@ -184,14 +197,13 @@ class Subscription(Generic[M]):
         self.selector: Final = selector
         """The key expression that is subscribed to."""
         self._validator: MessageValidator[M] = validator
-        self._resolver = resolver
         self._pump: Pump[Verified[M] | Unresolved[M]] = Pump(session, selector, validator)
         self._unresolved: asyncio.Queue[Unresolved[M]] = asyncio.Queue(lookup_limit)
         self._queries: set[zenoh.CancellationToken] = set()
 
     async def __aenter__(self) -> Self:
         await self._pump.__aenter__()
-        self._lookups = asyncio.create_task(self._resolve_names(), name=f"resolve names on {self.selector}")
+        self._lookups = asyncio.create_task(self._ask_chain(), name=f"ask the chain about {self.selector}")
         return self
 
     async def __aexit__(
@@ -207,8 +219,8 @@ class Subscription(Generic[M]):
 
     async def __anext__(self) -> Verified[M]:
         while isinstance(item := await anext(self._pump), Unresolved):
-            if self._resolver is None or self._unresolved.full():
-                self._validator.reject("name")
+            if self._unresolved.full():
+                self._validator.reject(item.question)
             else:
                 self._unresolved.put_nowait(item)
         return item
@@ -256,25 +268,15 @@ class Subscription(Generic[M]):
         """The messages received, rejected (by reason) and dropped so far."""
         return self._validator.statistics(received=self._pump.received, dropped=self._pump.dropped)
 
-    async def _resolve_names(self) -> None:
-        """Resolve the names of one message after another. An unexpected error of the resolver ends the iteration."""
+    async def _ask_chain(self) -> None:
+        """Ask the chain about one message after another. An unexpected error ends the iteration."""
         try:
             while True:
                 unresolved = await self._unresolved.get()
-                if (verified := await self._resolved(unresolved)) is not None:
+                if (verified := await self._validator.complete(unresolved)) is not None:
                     self._pump.insert(verified)
         except Exception as error:
             self._pump.fail(error)
-
-    async def _resolved(self, unresolved: Unresolved[M]) -> Verified[M] | None:
-        assert self._resolver is not None
-        try:
-            addresses = {name: await self._resolver(name) for name in names_in(unresolved.message)}
-            return self._validator.resolved(unresolved, addresses)
-        except AiraError as error:
-            log.debug("a name in a message can't be resolved: %s", error)
-            self._validator.reject("name")
-            return None
 
 
 def _presence_keys(texts: list[str]) -> Iterator[PresenceKey]:

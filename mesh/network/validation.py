@@ -2,27 +2,43 @@
 
 Checks run from cheap to expensive, so that invalid input costs little: the JSON decodes, the message is new, its key
 is the one that its content requires (which rules out wildcards), its deadline lies ahead. The signature is verified
-last, and once.
+last, and once; only an order whose validator the chain has to be asked about is verified again after that.
 """
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections import Counter, OrderedDict
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, Protocol, TypeVar
 
 import msgspec
 
-from mesh.errors import InvalidMessage
-from schemas import Demand, Offer, Result, SignedMessage, Verified, decode, message_hash, names_in, resolve_names
+from mesh.errors import AiraError, InvalidMessage
+from schemas import (
+    ZERO_ADDRESS,
+    Demand,
+    Offer,
+    Result,
+    SignedMessage,
+    Verified,
+    decode,
+    message_hash,
+    names_in,
+    resolve_names,
+)
 from schemas.keys import market_key
 from schemas.signing import verify_hashed
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Awaitable, Callable
 
     import zenoh
+
+    Resolver = Callable[[str], Awaitable[str]]
+
+log = logging.getLogger(__name__)
 
 M = TypeVar("M", bound=SignedMessage)
 
@@ -48,10 +64,26 @@ def key_of(lighthouse: str, message: SignedMessage, digest: bytes) -> str:
 
 
 class Unresolved(NamedTuple, Generic[M]):
-    """A message that contains ENS names: it can be hashed and verified only after they are resolved."""
+    """A message about which the chain has to be asked first: it contains ENS names, without which it can't be hashed
+    and verified, or is verified and names a validator that is not known yet."""
 
     message: M
     key: str
+
+    @property
+    def question(self) -> str:
+        """What has to be asked, `name` or `validator`: the reason of its rejection if that fails."""
+        return "name" if names_in(self.message) else "validator"
+
+
+class ValidatorCheck(Protocol):
+    """Which validators (EIP-55 addresses) orders may name: `chain.validators`."""
+
+    def known(self, validator: str) -> bool | None:
+        """Whether orders may name it; None if that has to be asked."""
+
+    async def is_safe(self, validator: str) -> bool:
+        """The same, asked. Raises `ChainError`."""
 
 
 class ValidationStatistics(msgspec.Struct, frozen=True, kw_only=True):
@@ -68,7 +100,8 @@ class MessageValidator(Generic[M]):
     """Verifies the messages of one kind, and counts those that it rejects.
 
     `lighthouse` is the market's name in keys; `address`, if given, must be the orders' lighthouse. `head` returns the
-    latest block number, or 0 when it isn't known (then no deadline is checked). Thread-safe.
+    latest block number, or 0 when it isn't known (then no deadline is checked); `resolver` resolves ENS names;
+    `validators` knows which validators orders may name (None: any). Thread-safe, except `complete`.
 
     A message is a duplicate when key and signature equal those of one of the last `deduplication_limit` accepted
     messages that were not forgotten since; equal generation-3 terms from two signers are two messages. The rule for
@@ -83,12 +116,16 @@ class MessageValidator(Generic[M]):
         lighthouse: str,
         address: str | None,
         head: Callable[[], int],
+        resolver: Resolver | None = None,
+        validators: ValidatorCheck | None = None,
         deduplication_limit: int = DEDUPLICATION_LIMIT,
     ) -> None:
         self.kind: type[M] = kind
         self._lighthouse = lighthouse
         self._address = address
         self._head = head
+        self._resolver = resolver
+        self._validators = validators
         self._deduplication_limit = deduplication_limit
         self._lock = threading.Lock()
         self._seen: OrderedDict[tuple[str, str], None] = OrderedDict()
@@ -114,13 +151,31 @@ class MessageValidator(Generic[M]):
             self.reject(error.reason)
             return None
 
-    def resolved(self, unresolved: Unresolved[M], addresses: Mapping[str, str]) -> Verified[M] | None:
-        """The message with its names replaced by `addresses` (name → address), verified; None if it is rejected."""
+    async def complete(self, unresolved: Unresolved[M]) -> Verified[M] | None:
+        """Ask the chain about a message; the verified message, or None, which is counted under its reason."""
+        outcome: Verified[M] | Unresolved[M] | None = unresolved
         try:
-            return self._verified(resolve_names(unresolved.message, addresses), unresolved.key)
+            while isinstance(outcome, Unresolved):
+                unresolved = outcome
+                addresses = await self._answers(unresolved.message)
+                outcome = self._verified(resolve_names(unresolved.message, addresses), unresolved.key)
         except InvalidMessage as error:
             self.reject(error.reason)
             return None
+        except AiraError as error:
+            log.debug("what a message names can't be looked up on the chain: %s", error)
+            self.reject(unresolved.question)
+            return None
+        return outcome
+
+    async def _answers(self, message: SignedMessage) -> dict[str, str]:
+        """The addresses of a message's names; if it has none, its validator is known afterwards. Raises `AiraError`."""
+        names = names_in(message)
+        if not names and self._validators is not None and isinstance(message, Demand | Offer):
+            await self._validators.is_safe(message.validator)
+        if names and self._resolver is None:
+            raise InvalidMessage("name", f"no chain to resolve {', '.join(sorted(names))}")
+        return {name: await self._resolver(name) for name in names if self._resolver is not None}
 
     def reject(self, reason: str) -> None:
         """Count a rejected message under `reason`."""
@@ -143,23 +198,32 @@ class MessageValidator(Generic[M]):
                 dropped=dropped,
             )
 
-    def _verified(self, message: M, key: str) -> Verified[M] | None:
+    def _verified(self, message: M, key: str) -> Verified[M] | Unresolved[M] | None:
         digest = message_hash(message)
         if key != key_of(self._lighthouse, message, digest):
             raise InvalidMessage("key", f"the message does not belong on {key}")
-        self._check_order(message)
+        is_complete = self._check_order(message)
         verified = verify_hashed(message, digest)
+        if not is_complete:
+            return Unresolved(message, key)
         return verified if self._accept_new(message, key) else None
 
-    def _check_order(self, order: SignedMessage) -> None:
+    def _check_order(self, order: SignedMessage) -> bool:
+        """Raise `InvalidMessage` for an order that can't be used; False if the chain has to be asked, too."""
         if isinstance(order, Result):
-            return
+            return True
         if isinstance(order, Demand | Offer) and order.generation == 3 and str(order.nonce).startswith(AMBIGUOUS_NONCE):
             raise InvalidMessage("nonce", "the contracts would take it for the sender of a generation-5 order")
         if order.deadline <= self._head():
             raise InvalidMessage("deadline", f"block {order.deadline} has passed")
         if self._address is not None and order.lighthouse != self._address:
             raise InvalidMessage("lighthouse", f"made for {order.lighthouse}, not for this market")
+        if self._validators is None or not isinstance(order, Demand | Offer) or order.validator == ZERO_ADDRESS:
+            return True
+        is_safe = self._validators.known(order.validator)
+        if is_safe is False:
+            raise InvalidMessage("validator", f"{order.validator} is a lighthouse, or could become one")
+        return is_safe is not None
 
     def _count_duplicate(self) -> None:
         with self._lock:

@@ -36,29 +36,29 @@ signatures = st.binary(min_size=65, max_size=65).map(bytes.hex)
 amounts = st.integers(0, MAX_UINT256) | st.sampled_from((0, 2**53 + 1, 2**64 - 1, 2**64, MAX_UINT256))
 
 
-def _terms(party: SearchStrategy[str], generation: int) -> dict[str, SearchStrategy[Any]]:
-    return {
+def _order(kind: type[Demand] | type[Offer], party: SearchStrategy[str], generation: int) -> SearchStrategy[Any]:
+    fee = "validator_fee" if kind is Demand else "lighthouse_fee"
+    fields: dict[str, SearchStrategy[Any]] = {
         "model": cids,
         "objective": cids,
         "token": party,
         "cost": amounts,
-        "lighthouse": party,
-        "validator": party,
         "deadline": amounts,
         "nonce": hashes if generation == 3 else amounts,
         "sender": st.none() if generation == 3 else party,
         "signature": signatures,
+        fee: amounts,
     }
+    return st.builds(
+        lambda parties, **terms: kind(lighthouse=parties[0], validator=parties[1], **terms),
+        st.tuples(party, party).filter(lambda parties: parties[0] != parties[1]),
+        **fields,
+    )
 
 
 def orders(party: SearchStrategy[str] = parties) -> SearchStrategy[Demand | Offer]:
-    """Demands and offers of both generations, with some signature."""
-    return st.one_of(
-        st.builds(Demand, validator_fee=amounts, **_terms(party, 3)),
-        st.builds(Demand, validator_fee=amounts, **_terms(party, 5)),
-        st.builds(Offer, lighthouse_fee=amounts, **_terms(party, 3)),
-        st.builds(Offer, lighthouse_fee=amounts, **_terms(party, 5)),
-    )
+    """Demands and offers of both generations, with some signature. No lighthouse is its own validator."""
+    return st.one_of(*(_order(kind, party, generation) for kind in (Demand, Offer) for generation in (3, 5)))
 
 
 def results(party: SearchStrategy[str] = parties) -> SearchStrategy[Result]:

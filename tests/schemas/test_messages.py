@@ -7,6 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 from hypothesis import given
+from msgspec.structs import replace
 
 from schemas import (
     MAX_UINT256,
@@ -69,7 +70,8 @@ def test_messages_are_frozen_and_equal_by_value() -> None:
 
 @pytest.mark.parametrize("text", [TOKEN.lower(), "0x" + TOKEN[2:].upper(), TOKEN])
 def test_addresses_are_held_in_eip_55_form(text: str) -> None:
-    assert demand(token=text, lighthouse=text, validator=text).token == TOKEN
+    held = demand(token=text, lighthouse=text), demand(validator=text)
+    assert (held[0].token, held[0].lighthouse, held[1].validator) == (TOKEN, TOKEN, TOKEN)
 
 
 def test_ens_names_are_held_in_lower_case() -> None:
@@ -234,6 +236,20 @@ def test_name_that_maps_to_no_address_is_refused() -> None:
     named = msgspec.structs.replace(RESULT, liability="nobody.eth")
     with pytest.raises(InvalidAddress):
         resolve_names(named, {"nobody.eth": "somewhere"})
+
+
+@pytest.mark.parametrize(
+    "order", [DEMAND, OFFER, DEMAND_5, OFFER_5], ids=lambda order: f"{order.kind} {order.generation}"
+)
+def test_a_lighthouse_is_not_its_own_validator(order: Demand | Offer) -> None:
+    for validator in (LIGHTHOUSE, LIGHTHOUSE.lower()):
+        with pytest.raises(InvalidMessage) as caught:
+            replace(order, validator=validator)
+        assert caught.value.reason == "validator"
+    named = replace(order, lighthouse=LIGHTHOUSE_NAME, validator="lamp.eth")
+    with pytest.raises(InvalidMessage) as caught:
+        resolve_names(named, {LIGHTHOUSE_NAME: LIGHTHOUSE, "lamp.eth": LIGHTHOUSE})
+    assert caught.value.reason == "validator"
 
 
 @given(messages())

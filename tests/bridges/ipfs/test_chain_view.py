@@ -46,12 +46,16 @@ async def test_chain_data_is_read_once_the_node_is_reachable_and_kept_during_an_
         assert (view.address(name), view.head) == (None, 0)
         with pytest.raises(ChainAwaited):
             await view.resolve(name)
+        with pytest.raises(ChainAwaited):
+            await view.is_safe_validator(deployment.xrt)
 
         async with JsonRpcServer(place.node.provider, host="127.0.0.1", port=port):
             await until(lambda: view.address(name), seconds=SECONDS)
             assert view.address(name) == deployment.lighthouse
             assert view.head > 0
             assert await view.resolve(name) == deployment.lighthouse
+            assert await view.is_safe_validator(deployment.xrt)
+            assert not await view.is_safe_validator(deployment.lighthouse)
             # An unknown lighthouse does not affect the others.
             await until(lambda: UNKNOWN in view.error, seconds=SECONDS)
             assert view.address(UNKNOWN) is None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from msgspec.structs import replace
 
-from bridges.ipfs.validation import RelayValidator, legacy_json
+from bridges.ipfs.validation import ChainAwaited, RelayValidator, legacy_json
 from mesh.errors import InputError
 from mesh.network import message_key
 from schemas import FeedbackKey, InvalidMessage, OrderFeedback, TransactionFeedback, decode, encode, resolve_names
@@ -71,6 +71,26 @@ async def test_an_order_of_another_market_or_past_its_deadline_is_rejected() -> 
     assert await reason(validator, encode(demand(lighthouse="0x" + "11" * 20))) == "lighthouse"
     assert await reason(validator, encode(demand(deadline=100))) == "deadline"
     await validator.validate(encode(demand(deadline=101)))
+
+
+async def test_an_order_is_relayed_once_its_validator_is_known_to_be_safe() -> None:
+    asked: list[str] = []
+
+    async def is_safe(validator: str) -> bool:
+        asked.append(validator)
+        if validator == STRANGER.address:
+            raise ChainAwaited("the node was not reached yet")
+        return validator == TOKEN
+
+    validator = RelayValidator(MARKET, is_safe=is_safe)
+    await validator.validate(encode(demand()))
+    forged = replace(demand(validator=PERSON.address), signature="00" * 65)
+    assert await reason(validator, encode(forged)) == "signature"
+    assert asked == []
+    await validator.validate(encode(demand(validator=TOKEN)))
+    for make in (demand, offer):
+        assert await reason(validator, encode(make(validator=PERSON.address))) == "validator"
+        assert await reason(validator, legacy_json(make(validator=STRANGER.address))) == "validator"
 
 
 async def test_a_forged_signature_is_rejected() -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
+from mesh.chain import XRT
 from schemas import ZERO_ADDRESS, Demand, Offer, Result, Verified, cid_of_bytes, message_hash
 from schemas.message_requests import Published, SendDemand, SendOffer, SendResult, SignDemand, SignOffer, SignResult
 from schemas.rpc import Approve
@@ -197,6 +198,19 @@ async def test_orders_of_other_lighthouses_and_expired_orders_are_refused(
     assert "trades on" in await opened.refused("sign/demand", SignDemand(**asked, validator_fee=0))
     late = terms(place, ear, deadline=1)
     assert "deadline is block 1" in await opened.refused("sign/offer", SignOffer(**late, lighthouse_fee=0))
+    assert await waiting(opened.agent) == []
+
+
+async def test_orders_whose_validator_is_a_lighthouse_are_refused(place: Place, opened: Asker, ear: Agent) -> None:
+    lighthouses = place.chains["provider"].lighthouses
+    trap = (await lighthouses.create(minimal_stake=XRT, timeout_blocks=5, name="services")).lighthouse
+    asked = terms(place, ear, validator=trap)
+    for kind, order in (
+        ("sign/offer", SignOffer(**asked, lighthouse_fee=0)),
+        ("sign/demand", SignDemand(**asked, validator_fee=0)),
+        ("send/demand", SendDemand.of(demand_of(place, ear, validator=trap))),
+    ):
+        assert trap in await opened.refused(kind, order)
     assert await waiting(opened.agent) == []
 
 

@@ -75,10 +75,10 @@ async def test_a_limited_number_of_messages_waits_for_names(here: zenoh.Session,
         await asyncio.Event().wait()
         raise AssertionError
 
-    validator = MessageValidator(Demand, lighthouse=MARKET, address=LIGHTHOUSE, head=lambda: 0)
+    validator = MessageValidator(Demand, lighthouse=MARKET, address=LIGHTHOUSE, head=lambda: 0, resolver=resolver)
     selector = market_selector(MARKET, "demand")
     async with (
-        Subscription(here, selector, validator, resolver, lookup_limit=2) as demands,
+        Subscription(here, selector, validator, lookup_limit=2) as demands,
         opened(there) as theirs,
     ):
         await until_heard(there, selector)

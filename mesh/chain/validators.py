@@ -1,0 +1,93 @@
+"""Which validators orders may name: no lighthouse, and nothing that could become one. `chain.validators`.
+
+An offer on lighthouse L with validator V is, with the same signature, a demand on lighthouse V with validator L: the
+format has the two addresses in swapped places. So a stranger whose demand names a lighthouse as validator could use the
+offer of a robot that agrees to it as that robot's demand, and take the cost from the robot. Our contracts refuse such
+orders when the liability is created; the originals don't.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import OrderedDict
+from typing import TYPE_CHECKING, Final
+
+from mesh.chain.lighthouses import Lighthouses
+from mesh.errors import InputError
+from schemas.address import ZERO_ADDRESS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from mesh.chain.contracts import Contracts
+    from schemas.messages import Order
+
+REMEMBERED: Final = 4096
+"""Validators whose verdict is remembered, the latest ones."""
+RECHECK: Final = 60.0
+"""Seconds after which a verdict is asked for again that a transaction can change."""
+
+
+class UnsafeValidator(InputError, code="validator-unsafe"):
+    """An order names a validator that is a lighthouse, or could become one: it could be used as another order."""
+
+    def __init__(self, validator: str) -> None:
+        super().__init__(
+            f"the validator {validator} is a lighthouse, or an account that is not known on the chain",
+            hint="name another validator, or none; an account is known once it has sent a transaction",
+        )
+        self.validator = validator
+
+
+class Validators:
+    """Verdicts on validators, each asked from the chain once. A contract or a lighthouse stays what it is.
+
+    With the originals, an address without code must have sent a transaction: else it may be that of a lighthouse which
+    somebody is about to create.
+    """
+
+    def __init__(self, contracts: Contracts, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self._contracts = contracts
+        self._clock = clock
+        self._verdicts: OrderedDict[str, tuple[bool, float]] = OrderedDict()
+
+    def known(self, validator: str) -> bool | None:
+        """Whether orders may name the validator (EIP-55 address); None if the chain has to be asked."""
+        if validator == ZERO_ADDRESS:
+            return True
+        verdict, until = self._verdicts.get(validator, (None, 0.0))
+        return verdict if self._clock() < until else None
+
+    async def is_safe(self, validator: str) -> bool:
+        """Whether orders may name the validator. Raises `ChainError` if the chain can't be asked."""
+        verdict = self.known(validator)
+        if verdict is None:
+            verdict, is_final = await self._ask(validator)
+            self._verdicts[validator] = (verdict, math.inf if is_final else self._clock() + RECHECK)
+            self._verdicts.move_to_end(validator)
+            if len(self._verdicts) > REMEMBERED:
+                self._verdicts.popitem(last=False)
+        return verdict
+
+    async def check(self, order: Order) -> None:
+        """Raise `UnsafeValidator` if the order names a validator that it must not name; `ChainError`."""
+        if not await self.is_safe(order.validator):
+            raise UnsafeValidator(order.validator)
+
+    def check_known(self, order: Order) -> None:
+        """Like `check`, without asking the chain: a validator that is not known raises, too."""
+        if not self.known(order.validator):
+            raise UnsafeValidator(order.validator)
+
+    async def _ask(self, validator: str) -> tuple[bool, bool]:
+        """The verdict, and whether it is final."""
+        if await Lighthouses(self._contracts).exists(validator):
+            return False, True
+        node = self._contracts.node
+        if await node.code(validator):
+            return True, True
+        if self._contracts.version.refuses_lighthouses:
+            return True, False
+        has_sent = await node.transaction_count(validator) > 0
+        return has_sent, has_sent
