@@ -146,7 +146,11 @@ class MessageValidator(Generic[M]):
             if (key, message.signature) in self._seen:
                 self._count_duplicate()
                 return None
-            return Unresolved(message, key) if names_in(message) else self._verified(message, key)
+            if not (names := names_in(message)):
+                return self._verified(message, key)
+            if self._resolver is None:
+                raise InvalidMessage("name", f"no chain to resolve {', '.join(sorted(names))}")
+            return Unresolved(message, key)
         except InvalidMessage as error:
             self.reject(error.reason)
             return None
@@ -173,8 +177,6 @@ class MessageValidator(Generic[M]):
         names = names_in(message)
         if not names and self._validators is not None and isinstance(message, Demand | Offer):
             await self._validators.is_safe(message.validator)
-        if names and self._resolver is None:
-            raise InvalidMessage("name", f"no chain to resolve {', '.join(sorted(names))}")
         return {name: await self._resolver(name) for name in names if self._resolver is not None}
 
     def reject(self, reason: str) -> None:
