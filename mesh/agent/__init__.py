@@ -2,7 +2,8 @@
 
 from mesh.agent.agent import Agent
 from mesh.agent.contract import Contract, Outcome
-from mesh.agent.errors import LiabilityReverted, OrderExpired, OrderRejected
+from mesh.agent.errors import LiabilityReverted, OrderClosed, OrderExpired
+from mesh.agent.orders import Order, OrderState
 from mesh.work.job import Job, JobFailed
 from mesh.work.ledger import Phase
 
@@ -12,8 +13,10 @@ __all__ = [
     "Job",
     "JobFailed",
     "LiabilityReverted",
+    "Order",
+    "OrderClosed",
     "OrderExpired",
-    "OrderRejected",
+    "OrderState",
     "Outcome",
     "Phase",
 ]

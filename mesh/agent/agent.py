@@ -5,10 +5,11 @@ from __future__ import annotations
 import asyncio
 import logging
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypedDict, Unpack
 
 from mesh.agent.components import watching, working
 from mesh.agent.handlers import HandlerDecorators, dispatch, repeat
+from mesh.agent.orders import Order, OrderState
 from mesh.agent.status import WatcherStatus
 from mesh.background import Background
 from mesh.composition import load_account
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
     from mesh.agent.components import AgentComponents
     from mesh.agent.contract import Contract
+    from mesh.agent.orders import OnRejection
     from mesh.agent.runtime import AgentRuntime
     from mesh.chain import Account, Chain
     from mesh.network import Channel
@@ -37,12 +39,21 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-LIFETIME: Final = 1000
-"""Blocks for which an order is valid by default."""
 DEMANDS: Final = 32
 """Demands that are handled at once: to fetch the objective of one may take long."""
 FETCH_PATIENCE: Final = 10.0
 """Seconds without a new block of an objective after which no offer is made for it."""
+
+
+class DemandTerms(TypedDict, total=False):
+    """The optional arguments of `Agent.order` and `Agent.demand`."""
+
+    cost: int
+    model: str
+    token: str
+    validator: str
+    validator_fee: int
+    lifetime: int | None
 
 
 class Agent(HandlerDecorators, Lifecycle):
@@ -124,13 +135,13 @@ class Agent(HandlerDecorators, Lifecycle):
         token: str = "",
         validator: str = "",
         lighthouse_fee: int = 0,
-        lifetime: int = LIFETIME,
+        lifetime: int | None = None,
     ) -> str:
         """Offer to do a job; returns the order's hash (hex). The offer is resent until it is matched or expires.
 
         With a `demand` the offer agrees to its terms, once its objective was examined; else `objective` (CID), `cost`
         (the token's smallest unit), `token` and `validator` (names or addresses) are the terms, valid for `lifetime`
-        blocks. `lighthouse_fee` is in wn, and paid to the provider.
+        blocks, by default about ten minutes. `lighthouse_fee` is in wn, and paid to the provider.
 
         Raises `InsufficientTokens`, and for an objective that can't be played `ObjectiveUnfit` or a `ContentError`.
         """
@@ -138,12 +149,12 @@ class Agent(HandlerDecorators, Lifecycle):
         if demand is not None:
             wanted = demand.message if isinstance(demand, Verified) else demand
             await self.examine(wanted.objective)
-            terms = trader.terms_of(wanted)
+            terms = trader.writer.terms_of(wanted)
         else:
-            terms = await trader.terms(
+            terms = await trader.writer.terms(
                 model=self.model, objective=objective, cost=cost, token=token, validator=validator, lifetime=lifetime
             )
-        return await trader.offer(terms, lighthouse_fee=lighthouse_fee)
+        return (await trader.post(Offer, terms, lighthouse_fee=lighthouse_fee)).hash
 
     async def examine(self, cid: str) -> Objective:
         """The objective with that CID, fetched if needed, after it was checked as before a job.
@@ -152,7 +163,7 @@ class Agent(HandlerDecorators, Lifecycle):
         """
         return await self.runtime.objectives.examine(cid, patience=FETCH_PATIENCE)
 
-    async def demand(
+    async def order(
         self,
         objective: str | Path,
         *,
@@ -161,19 +172,44 @@ class Agent(HandlerDecorators, Lifecycle):
         token: str = "",
         validator: str = "",
         validator_fee: int = 0,
-        lifetime: int = LIFETIME,
+        lifetime: int | None = None,
+    ) -> Order:
+        """Demand a job; returns the open order, to be waited for or withdrawn: `await order.contract()`.
+
+        `objective` is a CID, or the path of a file, which the agent then serves. The other terms are as for `offer`.
+        The factory gets the allowance that they need. A restarted agent sends the order again.
+
+        Raises `InsufficientTokens`.
+        """
+        writer = self.runtime.trader.writer
+        cid = objective if isinstance(objective, str) else await self.add(objective)
+        terms = await writer.terms(
+            model=model or self.model, objective=cid, cost=cost, token=token, validator=validator, lifetime=lifetime
+        )
+        return await self.runtime.trader.post(Demand, terms, validator_fee=validator_fee)
+
+    async def demand(
+        self, objective: str | Path, *, on_rejection: OnRejection | None = None, **terms: Unpack[DemandTerms]
     ) -> Contract:
         """Demand a job and wait for the contract: `contract = await agent.demand(…); await contract.outcome()`.
 
-        `objective` is a CID, or the path of a file, which the agent then serves. The other terms are as for `offer`.
-        The factory gets the allowance that they need. Raises `OrderExpired`, `OrderRejected` and `InsufficientTokens`.
+        The terms are those of `order`, `on_rejection` that of `Order.contract`. Cancelling withdraws the demand. Raises
+        `OrderExpired`, `OrderClosed` (withdrawn elsewhere) and `InsufficientTokens`.
         """
-        trader = self.runtime.trader
-        cid = objective if isinstance(objective, str) else await self.add(objective)
-        terms = await trader.terms(
-            model=model or self.model, objective=cid, cost=cost, token=token, validator=validator, lifetime=lifetime
-        )
-        return await trader.demand(terms, validator_fee=validator_fee)
+        order = await self.order(objective, **terms)
+        try:
+            return await order.contract(on_rejection=on_rejection)
+        except asyncio.CancelledError:
+            if self._runtime is not None:
+                await order.withdraw()
+            raise
+
+    def orders(self, *states: OrderState) -> list[Order]:
+        """The account's orders in these states, oldest first; by default the open ones, those of earlier runs included.
+
+        Withdrawn ones are listed until their deadline. Matched and expired ones are not listed.
+        """
+        return self.runtime.trader.orders(*(states or (OrderState.OPEN,)))
 
     async def contract(self, address: str) -> Contract:
         """The contract at `address`, of any account; `outcome` waits for its end. Raises `NotALiability`."""

@@ -7,7 +7,7 @@ import logging
 import time
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from mesh.composition import chain_of, endpoints_of
 from mesh.content import Exchange, Store
@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+LEDGER: Final = "ledger.sqlite"
+"""The name of the ledger in an account's folder for a chain."""
+
 
 class ChainHead:
     """How far this agent has handled the chain: the number of its last block, and when that was."""
@@ -37,18 +40,27 @@ class ChainHead:
     def __init__(self, head: int) -> None:
         self._advanced = asyncio.Event()
         self.advance_to(head)
+        self._handled = -1
+
+    def begin_after(self, block: int) -> None:
+        """All blocks up to `block` were handled in earlier runs."""
+        self._handled = block
+        self._advance()
 
     def advance_to(self, block: int) -> None:
         """All of `block` has been handled."""
-        self.head = block
+        self.head = self._handled = block
         self.advanced_at = time.monotonic()
-        self._advanced.set()
-        self._advanced = asyncio.Event()
+        self._advance()
 
     async def reached(self, block: int) -> None:
         """Return when `block` has been handled."""
-        while self.head < block:
+        while self._handled < block:
             await self._advanced.wait()
+
+    def _advance(self) -> None:
+        self._advanced.set()
+        self._advanced = asyncio.Event()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,13 +111,13 @@ async def working(
         if chain is None:
             chain = await stack.enter_async_context(chain_of(settings, account))
         home = settings.state_directory / account.address
-        directory = home / await _chain_folder(chain)
+        directory = await state_folder(settings, chain, account.address)
         chain_head = ChainHead(await chain.block_number())
         network = await stack.enter_async_context(Network(endpoints_of(settings)))
         channel = await stack.enter_async_context(
             await _channel_of(settings.lighthouse_contract, network, chain=chain, head=chain_head)
         )
-        ledger = await stack.enter_async_context(Ledger(directory / "ledger.sqlite"))
+        ledger = await stack.enter_async_context(Ledger(directory / LEDGER))
         store = await asyncio.to_thread(
             Store, home / "content", limit=settings.objective_expanded_limit, quota=settings.content_limit
         )
@@ -140,6 +152,11 @@ async def _channel_of(lighthouse: str, network: Network, *, chain: Chain, head: 
         validators=chain.validators,
         head=lambda: head.head,
     )
+
+
+async def state_folder(settings: Settings, chain: Chain, address: str) -> Path:
+    """The folder of what belongs to this chain: an account's ledger and unfinished recordings."""
+    return settings.state_directory / address / await _chain_folder(chain)
 
 
 async def _chain_folder(chain: Chain) -> str:

@@ -70,8 +70,8 @@ class _WatchedContract:
     """A contract whose end somebody may wait for."""
 
     ended: asyncio.Future[Outcome]
-    demand: str = ""
-    """The demand of ours that it was created from, if any, and what its caller holds."""
+    order: str = ""
+    """The order of ours (hash) that it was created from, if any, and what those hold who waited for it."""
     contract: Contract | None = None
     reverted_until: int | None = None
     """While a reorganisation has reverted it: the block by which it must be created again."""
@@ -100,30 +100,30 @@ class WatchedContracts:
                 self._watched.pop(address, None)
             raise
 
-    def watch(self, liability: Liability, *, demand: str = "") -> Contract:
-        """The contract of `liability`, which was created from our `demand` (hash), if from any."""
+    def watch(self, liability: Liability, *, order: str = "") -> Contract:
+        """The contract of `liability`, which was created from our `order` (hash), if from any."""
         watched = self._watch(liability.address)
         contract = Contract(liability, watched.ended, self._parts)
-        if demand:
-            watched.demand, watched.contract = demand, contract
+        if order:
+            watched.order, watched.contract = order, contract
         if liability.is_finalized:
             self.finalized(liability.address, Outcome(success=liability.is_success, result=liability.result))
         return contract
 
-    def created(self, liability: Liability, demand: str) -> bool:
-        """The contract exists, perhaps again. False if our `demand` (hash) was not the one of a watched contract.
+    def created(self, liability: Liability, order: str) -> Contract | None:
+        """The contract exists, perhaps again. Returns the one that was watched before for our `order` (hash).
 
-        After a reorganisation the contract of a demand may be at another address.
+        After a reorganisation the contract of an order may be at another address.
         """
         if (watched := self._watched.get(liability.address)) is not None:
             watched.reverted_until = None
-        again = next((one for one in self._watched.values() if demand and one.demand == demand), None)
+        again = next((one for one in self._watched.values() if order and one.order == order), None)
         if again is None or again.contract is None:
-            return False
+            return None
         again.reverted_until = None
         self._watched[liability.address] = self._watched.pop(again.contract.address)
         again.contract.liability = liability
-        return True
+        return again.contract
 
     def reverted(self, address: str, deadline: int) -> None:
         """A reorganisation reverted the contract at `address`, whose orders are valid until block `deadline`."""

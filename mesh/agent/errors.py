@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from mesh.errors import AiraError
 
-if TYPE_CHECKING:
-    from schemas.signing import Rejection
 
+class OrderClosed(AiraError, code="order-closed"):
+    """The order is not open any more: `state` is `withdrawn`, or `matched`, with the contract's address `liability`."""
 
-class OrderRejected(AiraError, code="order-rejected"):
-    """A provider can't use the order. `rejection` has the reason, a word for programs, and the detail."""
-
-    def __init__(self, rejection: Rejection) -> None:
+    def __init__(self, order: str, state: str, *, liability: str = "") -> None:
+        became = f"became the contract {liability}" if liability else f"was {state}"
         super().__init__(
-            f"provider {rejection.provider} rejects the order ({rejection.reason}): {rejection.detail}",
-            hint="fix the reported problem and post a new order",
+            f"the order {order[:16]}… {became}",
+            hint="" if liability else "it may still become a contract until its deadline; see `aira order list`",
         )
-        self.rejection = rejection
+        self.order = order
+        self.state = state
+        self.liability = liability
 
 
 class OrderExpired(AiraError, code="order-expired"):
@@ -56,4 +54,4 @@ class ServiceClosed(AiraError, code="service-closed"):
         self.service = service
 
 
-__all__ = ["LiabilityReverted", "OrderExpired", "OrderRejected", "ServiceClosed"]
+__all__ = ["LiabilityReverted", "OrderClosed", "OrderExpired", "ServiceClosed"]

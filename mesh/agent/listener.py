@@ -113,6 +113,7 @@ class ChainListener:
         encoded = await self._ledger.history(self.CURSOR)
         history = History.decode(encoded) if encoded else History(depth)
         history.depth = depth  # the setting may have changed
+        self._parts.chain_head.begin_after(last)
         return last + 1, history
 
     async def handle(self, event: ChainEvent) -> None:
@@ -225,7 +226,7 @@ class ChainListener:
     async def new_head(self, block: int) -> None:
         """All of `block` has been handled. After a reorganisation it may be lower than before."""
         self._parts.chain_head.advance_to(block)
-        self._trader.new_head(block)
+        await self._trader.new_head(block)
         await self._parts.outbox.expire(block)
 
     async def _owe_result(self, job: JobRecord) -> None:

@@ -1,95 +1,199 @@
-"""Open orders of an account: the allowance that they need, and providers' rejections of them."""
+"""Orders of an account: what users see of them, and providers' rejections of them."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, contextmanager
+from dataclasses import dataclass, field
+from enum import StrEnum
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from mesh.background import Background
-from mesh.chain import InsufficientTokens, Reverted
 from mesh.log_context import log_event
 from mesh.network import call_in_loop
-from schemas import InvalidRecord, market_selector
+from schemas import InvalidRecord, market_selector, message_hash
 from schemas.signing import Rejection
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+    from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 
     import zenoh
 
     from mesh.agent.components import AgentComponents
-    from mesh.chain import Chain
+    from mesh.agent.contract import Contract
+    from schemas import Demand, Offer
 
-    OnRejection = Callable[[Rejection], Awaitable[None]]
+    OnRejection = Callable[[Rejection], object]
 
 log = logging.getLogger(__name__)
 
 QUEUED: Final = 64
-"""Most signed rejections of an order that wait to be checked; more are dropped, since anybody can sign one."""
+"""Most signed rejections that wait to be checked; more are dropped, since anybody can sign one."""
+REJECTIONS_KEPT: Final = 64
+"""Most providers whose rejection of an order is remembered."""
 
 
-class Allowances:
-    """The allowance of the factory: what the open orders of `account` may cost, by order and token (smallest unit)."""
+class OrderState(StrEnum):
+    """What has become of an order."""
 
-    def __init__(self, chain: Chain, account: str) -> None:
-        self._chain = chain
-        self._account = account
-        self._amounts: dict[str, Mapping[str, int]] = {}
-        self._approving = asyncio.Lock()
+    OPEN = "open"
+    """It is sent until it becomes a contract, or expires."""
+    MATCHED = "matched"
+    """It became a contract."""
+    WITHDRAWN = "withdrawn"
+    """Its maker withdrew it. Until its deadline it may become a contract all the same."""
+    EXPIRED = "expired"
+    """The chain has reached its deadline."""
 
-    async def ensure(self, order: str, amounts: Mapping[str, int]) -> None:
-        """Make sure that the factory may take `amounts` (by token) for `order` and what the other open orders cost.
 
-        Raises `InsufficientTokens`; the order is then not counted.
-        """
-        async with self._approving:
-            for token, amount in amounts.items():
-                if amount:
-                    others = sum(open_order.get(token, 0) for open_order in self._amounts.values())
-                    await self._ensure(token, amount + others)
-            self._amounts[order] = amounts
+@dataclass(eq=False)
+class TradedOrder:
+    """An order as its trader follows it."""
 
-    def release(self, order: str) -> None:
-        """Stop counting an order that is no longer open. Unknown ones are ignored."""
-        self._amounts.pop(order, None)
+    signed: Demand | Offer
+    posted: float
+    state: OrderState = OrderState.OPEN
+    liability: str = ""
+    created: asyncio.Future[Contract] | None = None
+    """What those wait for who asked for its contract."""
+    rejections: dict[str, Rejection] = field(default_factory=dict)
+    """The last rejection by each provider."""
+    on_rejection: list[OnRejection] = field(default_factory=list)
 
     @property
-    def orders(self) -> frozenset[str]:
-        """The orders that are counted."""
-        return frozenset(self._amounts)
+    def identity(self) -> str:
+        """The order's hash, hexadecimal."""
+        return message_hash(self.signed).hex()
 
-    async def _ensure(self, token: str, needed: int) -> None:
-        balance = await self._chain.tokens.balance(self._account, token=token)
-        if balance < needed:
-            raise InsufficientTokens(self._account, token, balance=balance, needed=needed)
-        factory = self._chain.factory
-        while await self._chain.tokens.allowance(self._account, factory, token=token) < needed:
-            facts = log_event("allowance-approved", token=token, amount=needed)
-            log.info("approving an allowance of %d of token %s for the factory", needed, token, extra=facts)
-            try:
-                await self._chain.tokens.approve(factory, needed, token=token)
-            except Reverted as error:
-                if error.reason != "OutOfGas":
-                    raise
-                # An order became a contract between estimate and block: setting a used-up allowance costs more gas.
-                facts = log_event("allowance-retried", token=token, amount=needed)
-                log.info("approving the allowance again: %s", error, extra=facts)
+    @property
+    def is_open(self) -> bool:
+        """Whether it is sent until it becomes a contract, or expires."""
+        return self.state is OrderState.OPEN
+
+    @property
+    def nonce(self) -> int | None:
+        """In generation 5, which counts an account's orders."""
+        return int(self.signed.nonce) if self.signed.generation == 5 else None
+
+    def shown(self, actions: OrderActions) -> Order:
+        """The order as users see it."""
+        return Order(
+            message=self.signed,
+            hash=self.identity,
+            state=self.state,
+            posted=self.posted,
+            liability=self.liability,
+            _traded=self,
+            _actions=actions,
+        )
+
+    def reject(self, rejection: Rejection) -> bool:
+        """Remember a rejection and report it to those who wait. False if the provider said the same before."""
+        before = self.rejections.get(rejection.provider)
+        if before is not None and before.reason == rejection.reason:
+            return False
+        if before is not None or len(self.rejections) < REJECTIONS_KEPT:
+            self.rejections[rejection.provider] = rejection
+        for report in self.on_rejection:
+            report(rejection)
+        return True
+
+    @contextmanager
+    def reporting(self, on_rejection: OnRejection | None) -> Iterator[None]:
+        """Meanwhile report rejections, those of before first."""
+        if on_rejection is None:
+            yield
+            return
+        for rejection in self.rejections.values():
+            on_rejection(rejection)
+        self.on_rejection.append(on_rejection)
+        try:
+            yield
+        finally:
+            self.on_rejection.remove(on_rejection)
+
+
+class OrderActions(Protocol):
+    """What can be done with orders; the trader does it."""
+
+    async def withdraw(self, order: TradedOrder) -> Order:
+        """See `Order.withdraw`."""
+        ...
+
+    async def withdraw_on_chain(self, order: TradedOrder) -> Order:
+        """See `Order.withdraw_on_chain`."""
+        ...
+
+    async def contract_of(self, order: TradedOrder, on_rejection: OnRejection | None) -> Contract:
+        """See `Order.contract`."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Order:
+    """An order of the agent's account, as it was when it was asked for: `agent.orders()`, `agent.order(…)`."""
+
+    message: Demand | Offer
+    """The signed demand or offer."""
+    hash: str
+    """Its hash: 64 hexadecimal digits."""
+    state: OrderState
+    posted: float
+    """When it was posted first: Unix time."""
+    liability: str
+    """The address of the contract that it became; empty if it became none."""
+    _traded: TradedOrder = field(repr=False, compare=False)
+    _actions: OrderActions = field(repr=False, compare=False)
+
+    @property
+    def kind(self) -> str:
+        """`demand` or `offer`."""
+        return self.message.kind
+
+    @property
+    def deadline(self) -> int:
+        """The block before which it can become a contract."""
+        return self.message.deadline
+
+    async def withdraw(self) -> Order:
+        """Withdraw the order; returns it in its new state.
+
+        A signed withdrawal is sent until the order's deadline, and the order no more. It may still become a contract:
+        by a provider that is creating it now, that the withdrawal does not reach, or that does not obey. Until the
+        deadline the allowance covers the order. Raises `OrderClosed` if it has become a contract.
+        """
+        return await self._actions.withdraw(self._traded)
+
+    async def withdraw_on_chain(self) -> Order:
+        """Withdraw the order by a transaction too, after which no provider can create its contract.
+
+        In generation 5 the transaction uses up the order's nonce. Raises `OrderClosed` if the order has become a
+        contract, `NotOffered` if the contracts are the originals, and the errors of sending a transaction.
+        """
+        return await self._actions.withdraw_on_chain(self._traded)
+
+    async def contract(self, *, on_rejection: OnRejection | None = None) -> Contract:
+        """Wait until the order is a contract. Cancelling the wait changes nothing.
+
+        `on_rejection` is called with each provider's signed statement that it can't use the order, those of before
+        included. The order stays valid, so another provider, or the same one later, may use it. Raises `OrderClosed` if
+        the order was withdrawn, `OrderExpired` at its deadline, `ClosedError` if the agent ends first.
+        """
+        return await self._actions.contract_of(self._traded, on_rejection)
 
 
 class Rejections:
-    """Rejections on the agent's market. Anybody can publish one; only those that a provider signed count."""
+    """Rejections of one's own orders. Anybody can publish one; only those that a provider signed count."""
 
-    def __init__(self, parts: AgentComponents) -> None:
+    def __init__(self, parts: AgentComponents, is_open: Callable[[str], bool]) -> None:
         self._parts = parts
-        self._session = parts.network.session
-        self._chain = parts.chain
+        self._is_open = is_open
 
     @asynccontextmanager
-    async def received(self, order: str, on_rejection: OnRejection) -> AsyncIterator[None]:
-        """Meanwhile call `on_rejection` with each rejection of the order (hash, hexadecimal) that a provider signed.
+    async def received(self, on_rejection: Callable[[Rejection], Awaitable[None]]) -> AsyncIterator[None]:
+        """Meanwhile call `on_rejection` with each rejection of an open order that a provider of the lighthouse signed.
 
         It is called again if it raises that the node is away.
         """
@@ -97,41 +201,41 @@ class Rejections:
         queue: asyncio.Queue[Rejection] = asyncio.Queue(QUEUED)
 
         def receive(sample: zenoh.Sample) -> None:
-            rejection = _signed_rejection(sample.payload.to_bytes())
-            if rejection is not None and rejection.order == order:
+            rejection = self._signed(sample.payload.to_bytes())
+            if rejection is not None:
                 call_in_loop(loop, _put, queue, rejection)
 
-        selector = market_selector(self._parts.channel.lighthouse, "reject", order)
-        subscriber: Any = self._session.declare_subscriber(selector, receive)
+        session = self._parts.network.session
+        subscriber: Any = session.declare_subscriber(market_selector(self._parts.channel.lighthouse, "reject"), receive)
         try:
             async with Background() as tasks:
-                tasks.start(self._check_all(queue, on_rejection), f"rejections of {order}")
+                tasks.start(self._check_all(queue, on_rejection), "rejections")
                 yield
         finally:
-            if not self._session.is_closed():
+            if not session.is_closed():
                 subscriber.undeclare()
 
-    async def _check_all(self, queue: asyncio.Queue[Rejection], on_rejection: OnRejection) -> None:
+    async def _check_all(self, queue: asyncio.Queue[Rejection], on_rejection: Callable[..., Awaitable[None]]) -> None:
         while True:
             check = partial(self._check, await queue.get(), on_rejection)
-            await self._chain.retrying(check, outages=self._parts.outages)
+            await self._parts.chain.retrying(check, outages=self._parts.outages)
 
-    async def _check(self, rejection: Rejection, on_rejection: OnRejection) -> None:
-        lighthouse = await self._chain.lighthouses.get(self._parts.settings.lighthouse_contract)
+    async def _check(self, rejection: Rejection, on_rejection: Callable[..., Awaitable[None]]) -> None:
+        lighthouse = await self._parts.chain.lighthouses.get(self._parts.settings.lighthouse_contract)
         if rejection.provider in lighthouse.stakes:
             await on_rejection(rejection)
         else:
             facts = log_event("rejection-ignored", signer=rejection.provider, reason=rejection.reason)
             log.warning("%s is no provider, but rejects: %s", rejection.provider, rejection.reason, extra=facts)
 
-
-def _signed_rejection(payload: bytes) -> Rejection | None:
-    try:
-        rejection = Rejection.decode(payload)
-    except InvalidRecord as error:
-        log.debug("an unreadable rejection: %s", error)
-        return None
-    return rejection if rejection.is_signed else None
+    def _signed(self, payload: bytes) -> Rejection | None:
+        """A rejection of an open order, if it is signed. Others' cost no more than reading them."""
+        try:
+            rejection = Rejection.decode(payload)
+        except InvalidRecord as error:
+            log.debug("an unreadable rejection: %s", error)
+            return None
+        return rejection if self._is_open(rejection.order) and rejection.is_signed else None
 
 
 def _put(queue: asyncio.Queue[Rejection], rejection: Rejection) -> None:

@@ -65,7 +65,7 @@ class AgentStatus:
             uptime=round(time.monotonic() - self._started, 3),
             work=Work(
                 jobs=await parts.ledger.jobs_by_phase(),
-                outbox=await parts.ledger.waiting(),
+                outbox=sum((await parts.ledger.waiting_by_kind()).values()),
                 store=StoreUse(files=usage.files, bytes=usage.bytes, quota=usage.quota),
             ),
         )
@@ -110,7 +110,7 @@ class AgentStatus:
         )
 
     async def _outbox(self) -> tuple[MetricFamily, ...]:
-        kinds = {"demand": 0, "offer": 0, "result": 0} | await self._parts.ledger.waiting_by_kind()
+        kinds = {"demand": 0, "offer": 0, "withdrawal": 0, "result": 0} | await self._parts.ledger.waiting_by_kind()
         meaning = "Messages that are sent again until their effect is on the chain"
         return (by_label("aira_outbox_messages", "gauge", meaning, "kind", kinds),)
 

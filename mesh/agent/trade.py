@@ -1,61 +1,49 @@
-"""Trading: signs and posts the orders of an account, and waits for their contracts and for how those end."""
+"""Trading: signs and posts the orders of an account, follows them over restarts, and waits for their contracts."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-import secrets
-from collections import Counter
-from dataclasses import dataclass
+import time
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Final
 
 from mesh.agent.contract import Contract, WatchedContracts, fail_future
-from mesh.agent.errors import OrderExpired, OrderRejected
-from mesh.agent.orders import Allowances, Rejections
+from mesh.agent.errors import OrderClosed, OrderExpired
+from mesh.agent.orders import Order, OrderState, Rejections, TradedOrder
+from mesh.agent.terms import Allowances, TermsWriter, costs_of
+from mesh.background import Background
+from mesh.chain import OrderAlreadyUsed
 from mesh.errors import AiraError, ClosedError
 from mesh.log_context import log_event
 from mesh.market.book import Refusal
 from mesh.role import Lifecycle
-from schemas import ZERO_ADDRESS, Demand, Offer, message_hash
+from mesh.work.database import LedgerUnusable
+from schemas import Demand, Offer, Withdrawal, decode
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Collection
     from contextlib import AsyncExitStack
 
     from mesh.agent.components import AgentComponents
+    from mesh.agent.orders import OnRejection
+    from mesh.agent.terms import Terms
     from schemas import Liability
     from schemas.signing import Rejection
 
-    Terms = Mapping[str, Any]
 
 log = logging.getLogger(__name__)
 
-AnOrder = TypeVar("AnOrder", Demand, Offer)
-
-
-class _Overtaken(Exception):
-    """The nonce of an order of generation 5 was used by another one of the account: it must be signed again."""
-
-
-@dataclass
-class _OpenOrder:
-    """A signed order of ours that can still become a contract."""
-
-    signed: Demand | Offer
-    created: asyncio.Future[Contract] | None = None
-    """What the caller of `Trader.demand` waits for."""
-
-    @property
-    def nonce(self) -> int | None:
-        """In generation 5, which counts an account's orders."""
-        return int(self.signed.nonce) if self.signed.generation == 5 else None
+ENDED: Final = "the agent has ended"
+ENDED_HINT: Final = "run it again: its orders stay open until their deadline"
 
 
 class Trader(Lifecycle):
     """Trades for one account: `async with Trader(components) as trader`.
 
-    Leaving fails everything that is waited for with `ClosedError`. The runtime reports what happens on the chain.
+    The orders of the ledger are open again when it opens: those of an earlier run, which are sent once their allowance
+    is ensured, and those of other programs of the account. Leaving fails everything that is waited for with
+    `ClosedError`; open orders stay in the ledger. The runtime reports what happens on the chain.
     """
 
     title = "trader"
@@ -65,88 +53,103 @@ class Trader(Lifecycle):
         self._chain = parts.chain
         self._address = parts.signer.address
         self._allowances = Allowances(parts.chain, self._address)
-        self._rejections = Rejections(parts)
-        self._orders: dict[str, _OpenOrder] = {}
+        self.writer = TermsWriter(parts)
+        """Fills in and signs orders."""
+        self._orders: dict[str, TradedOrder] = {}
+        self._changing = asyncio.Lock()
         self.contracts = WatchedContracts(parts)
         """The contracts whose end is waited for."""
 
-    @property
-    def open_orders(self) -> frozenset[str]:
-        """The hashes (hexadecimal) of the open orders."""
-        return frozenset(self._orders)
+    def orders(self, *states: OrderState) -> list[Order]:
+        """The orders that can still become contracts, oldest first: open or withdrawn."""
+        chosen = [order for order in self._orders.values() if order.state in states]
+        return [order.shown(self) for order in sorted(chosen, key=lambda order: order.posted)]
 
     async def _open(self, stack: AsyncExitStack) -> None:
         stack.push_async_callback(self._close)
+        resumed = [order for order in await self.load() if order.is_open]
+        for order in resumed:
+            kind, identity, deadline = order.signed.kind, order.identity, order.signed.deadline
+            facts = log_event("order-resumed", order=identity, kind=kind, deadline=deadline)
+            log.info("the %s %s of an earlier run is open until block %d", kind, identity, deadline, extra=facts)
+        rejections = Rejections(self._parts, lambda identity: identity in self._orders)
+        await stack.enter_async_context(rejections.received(self._rejected))
+        self._tasks = await stack.enter_async_context(Background())
+        self._send_when_covered(resumed)
 
     async def _close(self) -> None:
-        ended = ClosedError("the agent has ended", hint="run it again and ask for the contract")
-        demands = {identity: order.created for identity, order in self._orders.items() if order.created is not None}
-        for created in demands.values():
-            fail_future(created, ended)
+        ended = ClosedError(ENDED, hint=ENDED_HINT)
+        for order in self._orders.values():
+            fail_future(order.created, ended)
         self.contracts.fail(ended)
-        for identity in demands:
-            await self._parts.outbox.settle(identity)
 
-    async def terms(self, *, model: str, objective: str, cost: int, token: str, validator: str, lifetime: int) -> Terms:
-        """The fields that a demand and an offer share, with names resolved, valid for `lifetime` blocks."""
-        settings, names = self._parts.settings, self._chain.names
-        return {
-            "model": await names.model(model),
-            "objective": objective,
-            "token": await names.address(token or settings.erc20_token),
-            "cost": cost,
-            "lighthouse": await names.address(settings.lighthouse_contract),
-            "validator": await names.address(validator) if validator else ZERO_ADDRESS,
-            "deadline": await self._chain.block_number() + lifetime,
-            "sender": None if settings.generation == 3 else self._address,
-        }
+    async def post(self, kind: type[Demand | Offer], terms: Terms, **fee: Any) -> Order:
+        """Sign an order, ensure its allowance, and post it. Cancelling withdraws it. Raises `InsufficientTokens`."""
+        order = TradedOrder(await self.writer.sign(kind, terms, **fee), time.time())
+        self._orders[order.identity] = order
+        try:
+            await self._ensure_allowance(order)
+        except BaseException:
+            self._forget(order)
+            raise
+        try:
+            if order.is_open:
+                await self._parts.outbox.post(order.signed)
+        except asyncio.CancelledError:
+            await self.withdraw(order)
+            raise
+        except LedgerUnusable:
+            self._forget(order)
+            raise
+        return order.shown(self)
 
-    def terms_of(self, order: Demand | Offer) -> Terms:
-        """The terms of `order`, for an order of this account in the same generation."""
-        shared = ("model", "objective", "token", "cost", "lighthouse", "validator", "deadline")
-        terms = {field: getattr(order, field) for field in shared}
-        return {**terms, "sender": None if order.generation == 3 else self._address}
-
-    async def sign(self, kind: type[AnOrder], terms: Terms, **fee: Any) -> AnOrder:
-        """An order with these terms and a fresh nonce, signed and not posted. Raises `UnsafeValidator`."""
-        is_counted = terms["sender"] is not None
-        nonce = await self._chain.liabilities.next_nonce(self._address) if is_counted else secrets.token_hex(32)
-        order = kind(**terms, nonce=nonce, **fee)
-        await self._chain.validators.check(order)
-        return self._parts.signer.sign(order)
-
-    async def demand(self, terms: Terms, *, validator_fee: int) -> Contract:
-        """Sign and post a demand, and wait for the contract that is created from it.
-
-        Approves the allowance that it needs. Raises `InsufficientTokens`, `OrderRejected` and `OrderExpired`.
-        Cancelling stops the waiting and the resending; a demand that was sent may still become a contract.
-        """
-        costs = Counter({terms["token"]: terms["cost"]})
-        costs[self._chain.xrt] += validator_fee
-        while True:
-            signed = await self.sign(Demand, terms, validator_fee=validator_fee)
-            try:
-                return await self._contract_of(signed, costs)
-            except _Overtaken:
-                order = message_hash(signed).hex()
-                facts = log_event("demand-overtaken", order=order)
-                log.info("demand %s is signed again: its nonce was used by another order", order, extra=facts)
-
-    async def offer(self, terms: Terms, *, lighthouse_fee: int) -> str:
-        """Sign and post an offer; returns its hash (hexadecimal). It is resent until it is matched or expires.
-
-        Raises `InsufficientTokens`.
-        """
-        signed = await self.sign(Offer, terms, lighthouse_fee=lighthouse_fee)
-        identity = message_hash(signed).hex()
-        await self._allowances.ensure(identity, {self._chain.xrt: lighthouse_fee})
-        self._orders[identity] = _OpenOrder(signed)
-        await self._parts.outbox.post(signed)
-        return identity
+    async def contract_of(self, order: TradedOrder, on_rejection: OnRejection | None) -> Contract:
+        """See `Order.contract`."""
+        match order.state:
+            case OrderState.MATCHED:
+                return await self.contracts.read(order.liability)
+            case OrderState.WITHDRAWN:
+                raise OrderClosed(order.identity, order.state)
+            case OrderState.EXPIRED:
+                raise OrderExpired(order.identity, order.signed.deadline)
+        if not self.is_open:
+            raise ClosedError(ENDED, hint=ENDED_HINT)
+        if order.created is None:
+            order.created = asyncio.get_running_loop().create_future()
+        with order.reporting(on_rejection):
+            return await asyncio.shield(order.created)
 
     async def contract(self, address: str) -> Contract:
         """The contract at `address`, to be waited for. Raises `NotALiability`."""
         return await self.contracts.read(await self._chain.names.address(address))
+
+    async def withdraw(self, order: TradedOrder) -> Order:
+        """See `Order.withdraw`."""
+        if order.state is OrderState.MATCHED:
+            raise OrderClosed(order.identity, order.state, liability=order.liability)
+        if order.is_open:
+            identity, signed = order.identity, order.signed
+            self._set_withdrawn(order)
+            facts = log_event("order-withdrawn", order=identity, deadline=signed.deadline)
+            log.info("the %s %s is withdrawn", signed.kind, identity, extra=facts)
+            withdrawal = Withdrawal(order=identity, lighthouse=signed.lighthouse, deadline=signed.deadline)
+            await self._parts.outbox.withdraw(self._parts.signer.sign(withdrawal))
+        return order.shown(self)
+
+    async def withdraw_on_chain(self, order: TradedOrder) -> Order:
+        """See `Order.withdraw_on_chain`."""
+        await self.withdraw(order)
+        identity = order.identity
+        try:
+            tx = (await self._chain.liabilities.withdraw(order.signed)).tx
+        except OrderAlreadyUsed:
+            await self._parts.chain_head.reached(await self._chain.block_number())
+            if order.state is OrderState.MATCHED:
+                raise OrderClosed(identity, order.state, liability=order.liability) from None
+            tx = "an earlier transaction"
+        await self._parts.ledger.use_up(identity, tx)
+        self._forget(order)
+        return order.shown(self)
 
     async def matched(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
         """A contract was created from these orders: stop sending ours.
@@ -155,80 +158,140 @@ class Trader(Lifecycle):
         """
         demand = demand_hash.hex() if liability.promisee == self._address else ""
         offer = offer_hash.hex() if liability.promisor == self._address else ""
-        taken = self._orders.get(demand)
+        known = self.contracts.created(liability, demand or offer)
         for identity in filter(None, (demand, offer)):
-            self._close_order(identity)
+            if (order := self._orders.get(identity)) is not None:
+                was = "withdrawn " if order.state is OrderState.WITHDRAWN else ""
+                order.state, order.liability = OrderState.MATCHED, liability.address
+                self._forget(order)
             await self._parts.outbox.spend(identity, liability.address)
-        is_known = self.contracts.created(liability, demand)
-        if not is_known and taken is not None and taken.created is not None and not taken.created.done():
-            log.info("created from the demand %s", demand, extra=log_event("contract-created", order=demand))
-            taken.created.set_result(self.contracts.watch(liability, demand=demand))
-        for identity, order in list(self._orders.items()):
-            if order.nonce is not None and isinstance(order.signed, Offer):
-                await self._renew_offer(identity, order.signed)
-        used = None if taken is None else taken.nonce
-        for order in self._orders.values():
-            if used is not None and order.nonce is not None and order.nonce <= used:
-                fail_future(order.created, _Overtaken())
+            if order is None:
+                continue
+            facts = log_event("contract-created", order=identity)
+            log.info("created from our %s%s %s", was, order.signed.kind, identity, extra=facts)
+            if order.created is not None and not order.created.done():
+                order.created.set_result(known or self.contracts.watch(liability, order=identity))
+            await self._renew_overtaken(order.nonce)
 
     async def liability_reverted(self, address: str) -> None:
-        """A reorganisation reverted the contract at `address`: send its orders again, until their deadline."""
-        deadline = await self._parts.outbox.unspend(address)
-        if deadline is not None:
-            self.contracts.reverted(address, deadline)
+        """A reorganisation reverted the contract at `address`: its orders are open again, until their deadline.
 
-    def new_head(self, block: int) -> None:
-        """The chain has block `block`: orders, and reverted contracts, with an earlier deadline have expired."""
-        for identity, order in list(self._orders.items()):
-            if order.signed.deadline <= block:
-                self._close_order(identity)
-                fail_future(order.created, OrderExpired(identity, order.signed.deadline))
-        self.contracts.expire(block)
-
-    async def _contract_of(self, signed: Demand, costs: Mapping[str, int]) -> Contract:
-        """Post a signed demand and wait for its contract."""
-        identity = message_hash(signed).hex()
-        created: asyncio.Future[Contract] = asyncio.get_running_loop().create_future()
-        self._orders[identity] = _OpenOrder(signed, created)
-        try:
-            async with self._rejections.received(identity, partial(self._rejected, identity)):
-                await self._allowances.ensure(identity, costs)
-                await self._parts.outbox.post(signed)
-                return await created
-        finally:
-            self._close_order(identity)
-            if self.is_open:
-                await self._parts.outbox.settle(identity)
-
-    async def _renew_offer(self, identity: str, offer: Offer) -> None:
-        """Sign an offer of generation 5 again: another order of the account was taken first, and used the nonce."""
-        self._close_order(identity)
-        post = partial(self.offer, self.terms_of(offer), lighthouse_fee=offer.lighthouse_fee)
-        try:
-            await self._chain.retrying(post, outages=self._parts.outages)
-        except AiraError as error:
-            facts = log_event("offer-abandoned", order=identity, code=error.code)
-            log.warning("the offer %s can't be signed again: %s", identity, error, extra=facts)
-        if identity not in self._orders:
-            await self._parts.outbox.settle(identity)
-
-    def _close_order(self, identity: str) -> None:
-        self._orders.pop(identity, None)
-        self._allowances.release(identity)
-
-    async def _rejected(self, identity: str, rejection: Rejection) -> None:
-        """A provider rejects an order. That means nothing if the order has become a contract, by any provider.
-
-        Whether it has is known once this agent has read the chain up to the block at which the nonce was read.
+        It may have reverted the approval of their allowance too: they are sent once that is ensured.
         """
+        orders = await self._parts.outbox.unspend(address)
+        if not orders:
+            return
+        self.contracts.reverted(address, min(order.deadline or 0 for order in orders))
+        again = [order for order in await self.load() if order.is_open]
+        self._send_when_covered(again)
+        await self._parts.outbox.release({order.identity for order in orders} - {order.identity for order in again})
+
+    async def new_head(self, block: int) -> None:
+        """The chain has block `block`: orders, and reverted contracts, with an earlier deadline have expired."""
+        for order in list(self._orders.values()):
+            if order.signed.deadline <= block:
+                self._forget(order)
+                if order.is_open:
+                    order.state = OrderState.EXPIRED
+                    fail_future(order.created, OrderExpired(order.identity, order.signed.deadline))
+        self.contracts.expire(block)
+        await self.load()
+
+    async def _ensure_allowance(self, order: TradedOrder) -> None:
+        await self._allowances.ensure(order, costs_of(order.signed, xrt=self._chain.xrt))
+
+    def _send_when_covered(self, orders: Collection[TradedOrder]) -> None:
+        """Send these orders of the ledger when the factory has the allowance for them, in a task."""
+        self._parts.outbox.hold(order.identity for order in orders)
+        for order in orders:
+            self._tasks.start(self._cover_and_send(order), f"resume {order.identity}")
+
+    async def _cover_and_send(self, order: TradedOrder) -> None:
+        try:
+            await self._chain.retrying(partial(self._ensure_allowance, order), outages=self._parts.outages)
+        except AiraError as error:
+            facts = log_event("order-not-covered", order=order.identity, code=error.code)
+            text = "the %s %s is open, but no provider can use it now: %s"
+            log.warning(text, order.signed.kind, order.identity, error, extra=facts)
+        if order.identity not in self._orders:
+            self._allowances.release(order)
+        await self._parts.outbox.release([order.identity])
+
+    async def load(self) -> list[TradedOrder]:
+        """Take up the orders of the ledger that are not known yet, and what other programs have withdrawn."""
+        new = []
+        async with self._changing:
+            for stored in await self._parts.ledger.orders():
+                order, signed = self._orders.get(stored.identity), decode(stored.payload)
+                assert isinstance(signed, Demand | Offer)
+                if signed.deadline <= self._parts.chain_head.head:
+                    continue
+                if order is None:
+                    order = self._orders[stored.identity] = TradedOrder(signed, stored.posted)
+                    self._allowances.count(order, costs_of(signed, xrt=self._chain.xrt))
+                    new.append(order)
+                if stored.is_withdrawn and order.is_open:
+                    self._set_withdrawn(order)
+        return new
+
+    async def _rejected(self, rejection: Rejection) -> None:
+        """A provider says that it can't use an order. The order stays valid, for this provider too.
+
+        In generation 5 the nonce may be used; whether by this order is known once this agent has read the chain up to
+        the block at which the nonce was read.
+        """
+        identity = rejection.order
+        if (order := self._orders.get(identity)) is None or not order.is_open:
+            return
+        facts: dict[str, Any] = {"order": identity, "provider": rejection.provider, "reason": rejection.reason}
         if rejection.reason == Refusal.FULL:
-            facts = log_event("order-deferred", order=identity, provider=rejection.provider, reason=rejection.reason)
-            log.warning("provider %s has no room for the order %s now", rejection.provider, identity, extra=facts)
+            text = "provider %s has no room for the order %s now"
+            log.warning(text, rejection.provider, identity, extra=log_event("order-deferred", **facts))
             return
-        order = self._orders.get(identity)
-        if order is None:
-            return
-        is_overtaken = order.nonce is not None and order.nonce < await self._chain.liabilities.next_nonce(self._address)
+        used = await self._chain.liabilities.next_nonce(self._address) if order.nonce is not None else 0
         await self._parts.chain_head.reached(await self._chain.block_number())
-        if identity in self._orders:
-            fail_future(order.created, _Overtaken() if is_overtaken else OrderRejected(rejection))
+        if (order := self._orders.get(identity)) is None or not order.is_open:
+            return
+        if order.nonce is not None and order.nonce < used:
+            await self._renew_overtaken(used - 1)
+        elif order.reject(rejection):
+            text = "provider %s can't use the order %s now (%s): %s"
+            arguments = (rejection.provider, identity, rejection.reason, rejection.detail)
+            log.warning(text, *arguments, extra=log_event("order-rejected", **facts))
+
+    async def _renew_overtaken(self, used: int | None) -> None:
+        """Sign the orders of generation 5 again whose nonce another order of the account has used."""
+        for order in list(self._orders.values()):
+            if used is None or order.nonce is None or order.nonce > used or not order.is_open:
+                continue
+            try:
+                await self._chain.retrying(partial(self._renew, order), outages=self._parts.outages)
+            except AiraError as error:
+                self._forget(order)
+                await self._parts.outbox.settle(order.identity)
+                fail_future(order.created, error)
+                facts = log_event("order-abandoned", order=order.identity, code=error.code)
+                log.warning("the order %s can't be signed again: %s", order.identity, error, extra=facts)
+
+    async def _renew(self, order: TradedOrder) -> None:
+        """Replace an order by one with the same terms and a fresh nonce."""
+        async with self._changing:
+            signed = await self.writer.sign_again(order.signed)
+            await self._ensure_allowance(order)
+            identity = order.identity
+            if not order.is_open or self._orders.pop(identity, None) is None:
+                return
+            order.signed = signed
+            self._orders[order.identity] = order
+            await self._parts.outbox.replace(identity, signed)
+        facts = log_event("order-renewed", order=identity, renewed=order.identity)
+        log.info("the %s %s is signed again as %s", signed.kind, identity, order.identity, extra=facts)
+
+    def _set_withdrawn(self, order: TradedOrder) -> None:
+        order.state = OrderState.WITHDRAWN
+        self._allowances.withdraw(order)
+        fail_future(order.created, OrderClosed(order.identity, order.state))
+
+    def _forget(self, order: TradedOrder) -> None:
+        self._orders.pop(order.identity, None)
+        self._allowances.release(order)

@@ -22,6 +22,7 @@ COMMANDS: Final = {
     "lighthouse": ("mesh.cli.lighthouse:command", "list and create lighthouses; become a provider"),
     "logs": ("mesh.cli.logs:command", "show the log of an agent, provider, bridge or device"),
     "objective": ("mesh.cli.objective:command", "create, show, check and fetch objectives and recordings"),
+    "order": ("mesh.cli.order:command", "list and withdraw open orders"),
     "peers": ("mesh.cli.status:peers", "list the peers on a lighthouse's channel"),
     "provider": ("mesh.cli.provider:command", "match the orders of a lighthouse and settle them"),
     "replay": ("mesh.cli.replay:command", "publish the messages of a recording again"),

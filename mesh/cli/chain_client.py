@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from mesh.chain import Chain
     from mesh.settings import AccountSettings, Settings
+    from schemas import Order
     from schemas.records import Liability
 
 SLOW: Final = 3.0
@@ -119,13 +120,13 @@ async def unit_of(chain: Chain, token: str | None) -> Unit:
     return Unit(info.symbol or "tokens", info.decimals)
 
 
-async def units_of(chain: Chain, liabilities: Iterable[Liability]) -> dict[str, Unit]:
-    """The units of the tokens that liabilities are paid in, by the tokens' addresses.
+async def units_of(chain: Chain, paid: Iterable[Liability | Order]) -> dict[str, Unit]:
+    """The units of the tokens that liabilities or orders are paid in, by the tokens' addresses.
 
     The symbol of a token other than XRT includes its address, because anyone can choose any symbol. A token without a
     known unit is counted in its smallest one.
     """
-    return {token: await _unit_of(chain, token) for token in {liability.token for liability in liabilities}}
+    return {token: await _unit_of(chain, token) for token in {one.token for one in paid}}
 
 
 async def _unit_of(chain: Chain, token: str) -> Unit:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ import click
 from mesh.cli.amounts import AMOUNT, XRT
 from mesh.cli.errors import FileUnwritable, InvalidOptions, JobNotDone, NotAFileOrCid, OutputFailed
 from mesh.cli.options import with_json, with_settings
+from mesh.cli.order import print_stays_open, report_rejection, take_existing
 from mesh.cli.output import print_json, print_line
 from mesh.errors import AiraError
 from mesh.running import run_to_end
@@ -55,9 +57,12 @@ class Amount(click.ParamType[str]):
 @click.option(
     "--lifetime",
     type=click.IntRange(min=1),
-    default=1000,
-    show_default=True,
-    help="number of blocks for which the demand is valid",
+    help="number of blocks for which the demand is valid [about ten minutes]",
+)
+@click.option(
+    "--existing",
+    type=click.Choice(["wait", "withdraw", "new"]),
+    help="what to do if an equal demand is open: wait for it, withdraw it first, or post another [ask]",
 )
 @click.option("--out", type=click.Path(path_type=Path), help="file to write the recording to")
 @with_json
@@ -70,8 +75,11 @@ class Amount(click.ParamType[str]):
     *options_of(ChainSettings),
 )
 def command(settings: Settings, **order: Any) -> None:
-    """Publish a demand and wait for the contract, the work and the payment. Ctrl-C stops waiting, but does not cancel
-    the demand or the contract.
+    """Publish a demand and wait for the contract, the work and the payment. Ctrl-C stops waiting, but does not withdraw
+    the demand (`aira order withdraw` does) or cancel the contract.
+
+    A demand that was interrupted stays open until its deadline. If an equal one is open, the command asks what to do;
+    without a terminal it needs --existing.
 
     The exit code is 1 if the work was not done and the cost was returned, or if the recording (--out) is not
     available. --json prints one object when the contract has ended; it has an `error` if the exit code is 1.
@@ -80,7 +88,14 @@ def command(settings: Settings, **order: Any) -> None:
 
 
 async def demand(
-    settings: Settings, *, objective: str, validator_fee: str, out: Path | None, as_json: bool, **terms: Any
+    settings: Settings,
+    *,
+    objective: str,
+    validator_fee: str,
+    out: Path | None,
+    as_json: bool,
+    existing: str | None = None,
+    **terms: Any,
 ) -> None:
     from mesh.agent import Agent
 
@@ -93,23 +108,39 @@ async def demand(
         await asyncio.to_thread(_check_writable, out)
     # A server with the same settings may run beside this and serve metrics at the same port.
     async with Agent(terms.pop("model"), settings=replace(settings, metrics_listen="")) as agent:
-        contract = await _contract(agent, source, validator_fee=fee, quiet=as_json, **terms)
+        contract = await _contract(agent, source, validator_fee=fee, existing=existing, quiet=as_json, **terms)
         await _wait_for_end(contract, out, as_json=as_json)
 
 
 async def _contract(
-    agent: Agent, source: str | Path, *, cost: str, validator_fee: int, quiet: bool, **terms: Any
+    agent: Agent,
+    source: str | Path,
+    *,
+    cost: str,
+    validator_fee: int,
+    existing: str | None,
+    quiet: bool,
+    **terms: Any,
 ) -> Contract:
-    """Publish the demand and wait for its contract. Prints both unless `quiet`."""
+    """Publish the demand, or take one that is open, and wait for its contract. Prints both unless `quiet`."""
     from mesh.cli.chain_client import check_balance, unit_of
 
-    chain, token = agent.parts.chain, agent.settings.erc20_token
-    unit = await unit_of(chain, token)
-    amount = unit.parse(cost)
+    unit = await unit_of(agent.parts.chain, agent.settings.erc20_token)
     if not quiet:
         print_line(f"demand by {agent.address} for {agent.model}")
-    await check_balance(chain, unit, amount, token=token)
-    contract = await agent.demand(source, cost=amount, validator_fee=validator_fee, **terms)
+    cid = source if isinstance(source, str) else await agent.add(source)
+    terms |= {"cost": unit.parse(cost), "validator_fee": validator_fee}
+    order = await take_existing(agent, cid, existing, quiet=quiet, **terms)
+    if order is None:
+        await check_balance(agent.parts.chain, unit, terms["cost"], token=agent.settings.erc20_token)
+        order = await agent.order(cid, **terms)
+        if not quiet:
+            print_line(f"posted {order.hash}, valid until block {order.deadline:,}")
+    try:
+        contract = await order.contract(on_rejection=partial(report_rejection, order))
+    except asyncio.CancelledError:
+        print_stays_open(order)
+        raise
     if not quiet:
         print_line(f"contract {contract.address} with {contract.liability.promisor}")
     return contract

@@ -109,6 +109,14 @@ class InvalidSignature(InputError, code="invalid-signature"):
     """A text is not a party's signature of the cancellation."""
 
 
+class DemandExists(ConfigurationError, code="demand-exists"):
+    """An equal demand is open, so that a second one may pay twice. `--existing` says what to do."""
+
+
+class UnknownOrder(InputError, code="unknown-order"):
+    """The ledger has no open order with this hash."""
+
+
 class JobNotDone(RemoteError, code="job-not-done"):
     """The promisor did not do the work; the promisee got the cost back."""
 

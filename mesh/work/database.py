@@ -44,6 +44,14 @@ CREATE TABLE IF NOT EXISTS spent (
     posted REAL NOT NULL,
     liability TEXT NOT NULL
 );
+CREATE TABLE IF NOT EXISTS withdrawn (
+    identity TEXT PRIMARY KEY,
+    kind TEXT NOT NULL,
+    payload BLOB NOT NULL,
+    deadline INTEGER,
+    posted REAL NOT NULL,
+    used_by TEXT NOT NULL DEFAULT ''
+);
 CREATE TABLE IF NOT EXISTS cursors (name TEXT PRIMARY KEY, block INTEGER NOT NULL, history BLOB NOT NULL DEFAULT x'');
 """
 

@@ -102,6 +102,18 @@ class Outgoing(msgspec.Struct, frozen=True, kw_only=True):
     deadline: int | None
 
 
+class StoredOrder(msgspec.Struct, frozen=True, kw_only=True):
+    """An order of ours that can still become a contract: open, or withdrawn and perhaps matched all the same.
+
+    `posted` is Unix time.
+    """
+
+    identity: str
+    payload: bytes
+    posted: float
+    is_withdrawn: bool
+
+
 class Ledger:
     """The ledger in the file at `path`, created if missing: `async with Ledger(path) as ledger`.
 
@@ -179,9 +191,8 @@ class Ledger:
 
     async def phases(self) -> list[tuple[str, int, float]]:
         """Each phase that has jobs: how many, and when (Unix time) the first of them entered it."""
-        return await self._database.rows(
-            "SELECT phase, COUNT(*), MIN(changed) FROM jobs WHERE NOT aside GROUP BY phase"
-        )
+        statement = "SELECT phase, COUNT(*), MIN(changed) FROM jobs WHERE NOT aside GROUP BY phase"
+        return await self._database.rows(statement)
 
     async def post(self, outgoing: Outgoing) -> None:
         """Keep a signed message for sending, until `settle`."""
@@ -196,34 +207,59 @@ class Ledger:
         await self._database.run_together(
             ("INSERT OR REPLACE INTO spent SELECT *, ? FROM outbox WHERE identity = ?", (liability, identity)),
             ("DELETE FROM outbox WHERE identity = ?", (identity,)),
+            ("UPDATE withdrawn SET used_by = ? WHERE identity = ?", (liability, identity)),
             ("DELETE FROM spent WHERE rowid <= (SELECT MAX(rowid) FROM spent) - ?", (self._spent_kept,)),
         )
 
-    async def spent_until(self, liability: str) -> int | None:
-        """The deadline (block) of the orders that became the contract at this address; None if there are none."""
-        ((deadline,),) = await self._database.rows("SELECT MIN(deadline) FROM spent WHERE liability = ?", (liability,))
-        return None if deadline is None else int(deadline)
+    async def spent(self, liability: str) -> list[Outgoing]:
+        """The orders that became the contract at this address, withdrawn ones included."""
+        spent = "SELECT identity, kind, payload, deadline FROM spent WHERE liability = ?"
+        withdrawn = "SELECT identity, kind, payload, deadline FROM withdrawn WHERE used_by = ?"
+        return _outgoing(await self._database.rows(f"{spent} UNION ALL {withdrawn}", (liability, liability)))
 
-    async def unspend(self, liability: str) -> bool:
-        """Move the orders of a reverted contract back into the outbox. False if it had none."""
+    async def unspend(self, liability: str) -> None:
+        """Move the orders of a reverted contract back into the outbox. Withdrawn ones stay withdrawn."""
         columns = "identity, kind, payload, deadline, posted"
-        await self._database.run(
-            f"INSERT OR IGNORE INTO outbox ({columns}) SELECT {columns} FROM spent WHERE liability = ?", (liability,)
+        await self._database.run_together(
+            (f"INSERT OR IGNORE INTO outbox ({columns}) SELECT {columns} FROM spent WHERE liability = ?", (liability,)),
+            ("DELETE FROM spent WHERE liability = ?", (liability,)),
+            ("UPDATE withdrawn SET used_by = '' WHERE used_by = ?", (liability,)),
         )
-        return await self._database.run("DELETE FROM spent WHERE liability = ?", (liability,))
+
+    async def withdraw(self, identity: str, withdrawal: Outgoing) -> None:
+        """Replace an order by its signed withdrawal, and remember the order while it may become a contract."""
+        await self._database.run_together(
+            ("INSERT OR IGNORE INTO withdrawn SELECT *, '' FROM outbox WHERE identity = ?", (identity,)),
+            ("DELETE FROM outbox WHERE identity = ?", (identity,)),
+            (POST, _posted(withdrawal)),
+        )
+
+    async def use_up(self, identity: str, tx: str) -> None:
+        """The transaction `tx` has made sure that a withdrawn order can't become a contract any more."""
+        await self._database.run("UPDATE withdrawn SET used_by = ? WHERE identity = ?", (tx, identity))
+
+    async def replace(self, identity: str, outgoing: Outgoing) -> None:
+        """Keep a message for sending instead of the one called `identity`."""
+        remove = ("DELETE FROM outbox WHERE identity = ?", (identity,))
+        await self._database.run_together(remove, (POST, _posted(outgoing)))
+
+    async def orders(self) -> list[StoredOrder]:
+        """The orders that can still become contracts, oldest first: those in the outbox, then the withdrawn ones."""
+        rows = await self._database.rows(
+            "SELECT identity, payload, posted, 0 FROM outbox WHERE kind IN ('demand', 'offer')"
+            " UNION ALL SELECT identity, payload, posted, 1 FROM withdrawn WHERE used_by = '' ORDER BY 4, 3"
+        )
+        return [StoredOrder(identity=row[0], payload=row[1], posted=row[2], is_withdrawn=bool(row[3])) for row in rows]
 
     async def outbox(self, *, head: int) -> list[Outgoing]:
         """The messages to send, oldest first. Deletes those whose deadline block `head` has reached."""
         await self._database.run("DELETE FROM outbox WHERE deadline <= ?", (head,))
-        rows = await self._database.rows("SELECT identity, kind, payload, deadline FROM outbox ORDER BY rowid")
-        return [Outgoing(identity=row[0], kind=row[1], payload=row[2], deadline=row[3]) for row in rows]
-
-    async def waiting(self) -> int:
-        """The number of messages in the outbox."""
-        return sum((await self.waiting_by_kind()).values())
+        await self._database.run("DELETE FROM withdrawn WHERE deadline <= ?", (head,))
+        statement = "SELECT identity, kind, payload, deadline FROM outbox ORDER BY rowid"
+        return _outgoing(await self._database.rows(statement))
 
     async def waiting_by_kind(self) -> dict[str, int]:
-        """The same for each kind (`demand`, `offer`, `result`) that has any."""
+        """The messages in the outbox of each kind (`demand`, `offer`, `withdrawal`, `result`) that has any."""
         return dict(await self._database.rows("SELECT kind, COUNT(*) FROM outbox GROUP BY kind"))
 
     async def cursor(self, name: str) -> int | None:
@@ -238,9 +274,8 @@ class Ledger:
 
     async def set_cursor(self, name: str, block: int, *, history: bytes = b"") -> None:
         """Save that the reader `name` has handled all of `block`, with its encoded chain history."""
-        await self._database.run(
-            "INSERT OR REPLACE INTO cursors (name, block, history) VALUES (?, ?, ?)", (name, block, history)
-        )
+        statement = "INSERT OR REPLACE INTO cursors (name, block, history) VALUES (?, ?, ?)"
+        await self._database.run(statement, (name, block, history))
 
 
 def _job(row: Any) -> JobRecord:
@@ -253,6 +288,10 @@ def _job(row: Any) -> JobRecord:
         recorded=row[9],
         note=row[6],
     )
+
+
+def _outgoing(rows: Iterable[Any]) -> list[Outgoing]:
+    return [Outgoing(identity=row[0], kind=row[1], payload=row[2], deadline=row[3]) for row in rows]
 
 
 def _posted(outgoing: Outgoing) -> tuple[Any, ...]:

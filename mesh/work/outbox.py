@@ -16,7 +16,7 @@ from mesh.work.ledger import Outgoing
 from schemas import Demand, Offer, Result, SignedMessage, Withdrawal, decode, encode, message_hash
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from mesh.network import Channel, Network
     from mesh.work.ledger import Ledger
@@ -93,6 +93,7 @@ class Outbox:
         self._clock = clock
         self._chance = chance
         self._attempts: dict[str, _Attempts] = {}
+        self._held: set[str] = set()
         self._changed = asyncio.Event()
 
     async def post(self, message: SignedMessage) -> None:
@@ -110,12 +111,33 @@ class Outbox:
         self._attempts.pop(identity, None)
         await self._ledger.spend(identity, liability)
 
-    async def unspend(self, liability: str) -> int | None:
-        """Send the orders of a reverted contract again. Returns their deadline (block), None if none were ours."""
-        deadline = await self._ledger.spent_until(liability)
-        if await self._ledger.unspend(liability):
-            await self.send_new()
-        return deadline
+    async def unspend(self, liability: str) -> list[Outgoing]:
+        """Take back the orders of a reverted contract; they are sent again after `release`. Returns them."""
+        orders = await self._ledger.spent(liability)
+        self.hold(order.identity for order in orders)
+        await self._ledger.unspend(liability)
+        return orders
+
+    async def withdraw(self, withdrawal: Withdrawal) -> None:
+        """Stop sending an order, and send its signed withdrawal until the order's deadline."""
+        self._attempts.pop(withdrawal.order, None)
+        await self._ledger.withdraw(withdrawal.order, outgoing(withdrawal))
+        await self.send_new()
+
+    async def replace(self, identity: str, message: SignedMessage) -> None:
+        """Send a signed message instead of the one called `identity`."""
+        self._attempts.pop(identity, None)
+        await self._ledger.replace(identity, outgoing(message))
+        await self.send_new()
+
+    def hold(self, identities: Iterable[str]) -> None:
+        """Don't send these messages before `release`."""
+        self._held.update(identities)
+
+    async def release(self, identities: Iterable[str]) -> None:
+        """Send messages that were held."""
+        self._held.difference_update(identities)
+        await self.send_new()
 
     async def send_new(self) -> None:
         """Send the messages of the ledger that were not sent yet."""
@@ -154,7 +176,7 @@ class Outbox:
     async def _send(self, is_due: Callable[[str], bool]) -> None:
         unsent = await self._ledger.outbox(head=self._head())
         for one in unsent:
-            if is_due(one.identity):
+            if one.identity not in self._held and is_due(one.identity):
                 message = decode(one.payload)
                 assert isinstance(message, Demand | Offer | Withdrawal | Result)
                 self._channel.publish(message)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from mesh.agent import Agent
-from mesh.agent.errors import LiabilityReverted, OrderExpired, OrderRejected
+from mesh.agent.errors import LiabilityReverted, OrderExpired
 from mesh.chain import XRT, Chain
 from mesh.errors import AiraError
 from mesh.market.provider import Provider
@@ -210,8 +210,6 @@ class PersonRole(Role):
             outcome = await contract.outcome()
             wanted.contract = contract.address
             wanted.told = "paid" if outcome.success else "refunded"
-        except OrderRejected as error:
-            wanted.order, wanted.told = error.rejection.order, "rejected"
         except OrderExpired as error:
             wanted.order, wanted.told = error.order, "expired"
         except LiabilityReverted:

@@ -22,7 +22,7 @@ from mesh.market.provider import Provider
 from mesh.network import Endpoints, Network
 from mesh.retry import RetryPolicy
 from mesh.settings import Settings
-from schemas import cid_of_bytes
+from schemas import Offer, cid_of_bytes
 from tests.support.waiting import until_found
 
 if TYPE_CHECKING:
@@ -160,7 +160,7 @@ def offering_unseen(robot: Agent) -> Agent:
     @robot.on_demand
     async def offer(demand: Verified[Demand]) -> None:
         trader = robot.runtime.trader
-        await trader.offer(trader.terms_of(demand.message), lighthouse_fee=0)
+        await trader.post(Offer, trader.writer.terms_of(demand.message), lighthouse_fee=0)
 
     return robot
 

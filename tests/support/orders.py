@@ -6,7 +6,19 @@ from hashlib import sha256
 from itertools import count
 from typing import Any, Final
 
-from schemas import ZERO_ADDRESS, Demand, Liability, Offer, Result, Signer, Verified, cid_of_bytes, verify_message
+from schemas import (
+    ZERO_ADDRESS,
+    Demand,
+    Liability,
+    Offer,
+    Result,
+    Signer,
+    Verified,
+    Withdrawal,
+    cid_of_bytes,
+    message_hash,
+    verify_message,
+)
 
 MARKET: Final = "airalab.lighthouse.3.robonomics.eth"
 LIGHTHOUSE: Final = "0x19437Cb65760805A0e55339186F03B2d980eBBf9"
@@ -46,6 +58,12 @@ def demand(*, signer: Signer = PERSON, **changes: Any) -> Demand:
 def offer(*, signer: Signer = ROBOT, **changes: Any) -> Offer:
     """A signed offer, which matches a demand with the same changes."""
     return signer.sign(Offer(**({"lighthouse_fee": 0} | terms(**changes))))
+
+
+def withdrawal(order: Demand | Offer, *, signer: Signer = PERSON) -> Withdrawal:
+    """The signed withdrawal of an order."""
+    identity = message_hash(order).hex()
+    return signer.sign(Withdrawal(order=identity, lighthouse=order.lighthouse, deadline=order.deadline))
 
 
 def result(*, signer: Signer = ROBOT, **changes: Any) -> Result:

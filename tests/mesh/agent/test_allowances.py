@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from web3.providers.async_base import AsyncBaseProvider
 
-from mesh.agent.orders import Allowances
+from mesh.agent.terms import Allowances
 from mesh.chain import Chain, InsufficientTokens
 from schemas import Demand, Offer
 from tests.support.market import QUICK

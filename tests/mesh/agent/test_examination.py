@@ -92,7 +92,7 @@ async def test_demands_with_unavailable_objectives_do_not_delay_others(place: Pl
         missing = [
             asyncio.create_task(person.demand(cid_of_bytes(b"nobody has objective %d" % number))) for number in range(5)
         ]
-        await until(lambda: len(person.runtime.trader.open_orders) == 5, seconds=30)
+        await until(lambda: len(person.orders()) == 5, seconds=30)
         fit = await person.demand(place.save(objective(("/go", Empty()))))
         assert (await fit.outcome()).success
         for task in missing:

@@ -71,13 +71,12 @@ async def test_an_overtaken_demand_of_generation_5_is_signed_again_without_a_rej
     """It has no offer, so no provider rejects its used nonce: the person knows from the other demand."""
     robot = place.agent("robot", generation=5)
     async with place.provider(), robot, place.agent("person", generation=5) as person:
-        trader = person.runtime.trader
         lonely = asyncio.create_task(person.demand(cid_of_bytes(b"what nobody offers")))
         await posted(person)
-        (overtaken,) = trader.open_orders
+        (overtaken,) = (order.hash for order in person.orders())
         await robot.offer(objective=OBJECTIVE)
         await person.demand(OBJECTIVE)
-        await until(lambda: len(trader.open_orders) == 1 and overtaken not in trader.open_orders)
+        await until(lambda: [order.hash for order in person.orders()] not in ([], [overtaken]))
         await until_found(lambda: all_posted(person, 1))
         lonely.cancel()
         await asyncio.wait([lonely])
@@ -128,14 +127,14 @@ async def test_a_refused_demand_does_not_count(place: Place) -> None:
         await asyncio.wait([demand])
 
 
-async def test_a_cancelled_demand_is_sent_no_more(place: Place) -> None:
+async def test_a_cancelled_demand_is_withdrawn(place: Place) -> None:
     async with place.agent("person") as person:
         demand = asyncio.create_task(person.demand(OBJECTIVE))
         await posted(person)
         demand.cancel()
         with pytest.raises(asyncio.CancelledError):
             await demand
-        assert await waiting(person) == []
+        assert await waiting(person) == ["withdrawal"]
 
 
 async def test_closing_the_agent_fails_the_wait_for_a_contract(place: Place) -> None:
@@ -145,7 +144,7 @@ async def test_closing_the_agent_fails_the_wait_for_a_contract(place: Place) -> 
     with pytest.raises(ClosedError):
         await asyncio.wait_for(demand, 10)
     async with place.agent("person") as person:
-        assert await waiting(person) == [], "a closed agent does not wait for it"
+        assert [order.kind for order in person.orders()] == ["demand"], "it is open until it is withdrawn or expires"
 
 
 async def test_closing_the_agent_fails_the_wait_for_an_outcome(place: Place) -> None:
@@ -207,7 +206,7 @@ async def test_the_lighthouse_fee_of_an_offer_is_paid_and_then_promised_no_more(
         contract = await person.demand(job(place), cost=100)
         await contract.outcome()
         assert contract.liability.lighthouse_fee == 77
-        await until(lambda: not robot.runtime.trader.open_orders)
+        await until(lambda: not robot.orders())
         assert provider.earnings().fees == 77
     assert await place.balance("robot") == before + 100 - 77
 
@@ -215,7 +214,7 @@ async def test_the_lighthouse_fee_of_an_offer_is_paid_and_then_promised_no_more(
 async def test_an_offer_may_agree_to_a_bare_demand(place: Place) -> None:
     async with place.agent("robot") as robot, place.agent("person") as person:
         cid = await asyncio.to_thread(person.parts.store.put_file, job(place))
-        terms = await person.runtime.trader.terms(
+        terms = await person.runtime.trader.writer.terms(
             model=MODEL, objective=cid, cost=3, token="", validator="", lifetime=50
         )
         demand = person.parts.signer.sign(Demand(**terms, nonce="ab" * 32, validator_fee=0))
@@ -228,7 +227,7 @@ async def test_an_order_of_an_earlier_run_is_settled_when_it_is_taken(place: Pla
     """The person's program was killed while it waited; its demand is sent on, and no more once it has a contract."""
     async with place.agent("person") as person:
         trader = person.runtime.trader
-        terms = await trader.terms(
+        terms = await trader.writer.terms(
             model=MODEL, objective=cid_of_file(job(place)), cost=0, token="", validator="", lifetime=500
         )
         await person.parts.outbox.post(person.parts.signer.sign(Demand(**terms, nonce="cd" * 32, validator_fee=0)))

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from mesh.agent import Agent, LiabilityReverted, OrderExpired, OrderRejected
+from mesh.agent import Agent, LiabilityReverted, OrderExpired
 from mesh.chain import Chain, Timing
 from mesh.network import Endpoints, Network
 from schemas import Demand, Offer, RejectKey, cid_of_bytes, cid_of_file, decode, message_hash
@@ -35,14 +35,44 @@ async def test_a_demand_without_a_match_expires_at_its_deadline(place: Place) ->
         assert await waiting(person) == []
 
 
-async def test_a_demand_that_the_contracts_refuse_is_rejected_with_their_reason(place: Place) -> None:
+async def test_a_rejection_is_information_and_the_order_stays_valid(
+    place: Place, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A provider says that it can't use the demand; a robot offers later, and the contract is created."""
+    heard: list[Rejection] = []
+    async with place.agent("person") as person, Network(Endpoints(connect=(place.endpoint,))) as network:
+        demand = asyncio.create_task(person.demand(cid_of_file(job(place)), on_rejection=heard.append))
+        await posted(person)
+        (order,) = person.orders()
+        key = str(RejectKey(person.channel.lighthouse, order.hash, place.address("provider")))
+        for _ in range(2):
+            network.session.put(key, rejection(place, "provider", order.hash).encode())
+        await until(lambda: heard)
+        facts = {"order": order.hash, "provider": place.address("provider"), "reason": "Unwanted"}
+        assert facts in logged_facts(caplog, "order-rejected")
+        assert not demand.done()
+        again: list[Rejection] = []
+        waiting_too = asyncio.create_task(order.contract(on_rejection=again.append))
+        await until(lambda: again == heard)
+        async with place.provider(), working(place.agent("robot")):
+            contract = await demand
+            assert (await waiting_too).address == contract.address
+        assert (await place.chains["person"].liabilities.order_hashes(contract.address))[0].hex() == order.hash
+        assert len(heard) == 1
+
+
+async def test_the_reason_of_the_contracts_is_reported(place: Place) -> None:
     robot = working(place.agent("robot"))
+    heard: list[Rejection] = []
     async with place.provider(), robot, place.agent("person", generation=5) as person:
-        with pytest.raises(OrderRejected) as caught:
-            await person.demand(OBJECTIVE, validator=place.address("provider"))
-        assert caught.value.rejection.reason == "ValidatorWithoutCode"
-        assert caught.value.rejection.provider == place.address("provider")
-        assert await waiting(person) == []
+        wanted = person.demand(OBJECTIVE, validator=place.address("provider"), on_rejection=heard.append)
+        demand = asyncio.create_task(wanted)
+        await until(lambda: heard)
+        assert (heard[0].reason, heard[0].provider) == ("ValidatorWithoutCode", place.address("provider"))
+        assert not demand.done()
+        assert await waiting(person) == ["demand"]
+        demand.cancel()
+        await asyncio.wait([demand])
 
 
 def rejection(place: Place, role: str, order: str, *, reason: str = "Unwanted") -> Rejection:
@@ -70,7 +100,7 @@ async def test_a_rejection_is_believed_of_the_lighthouses_providers_only(
     async with place.agent("person") as person, Network(Endpoints(connect=(place.endpoint,))) as stranger:
         demand = asyncio.create_task(person.demand(OBJECTIVE))
         await posted(person)
-        (identity,) = person.runtime.trader.open_orders
+        (identity,) = (order.hash for order in person.orders())
         key = str(RejectKey(person.channel.lighthouse, identity, place.address("provider")))
         stranger.session.put(key, b"no rejection at all")
         for untrue in untrue_rejections(place, identity):
@@ -82,10 +112,11 @@ async def test_a_rejection_is_believed_of_the_lighthouses_providers_only(
         ignored = {"signer": place.address("robot"), "reason": "Unwanted"}
         await until(lambda: ignored in logged_facts(caplog, "rejection-ignored"))
         assert not demand.done()
+        assert logged_facts(caplog, "order-rejected") == []
         stranger.session.put(key, rejection(place, "provider", identity).encode())
-        with pytest.raises(OrderRejected) as caught:
-            await demand
-        assert (caught.value.rejection.reason, caught.value.rejection.detail) == ("Unwanted", "go away")
+        await until(lambda: logged_facts(caplog, "order-rejected"))
+        demand.cancel()
+        await asyncio.wait([demand])
 
 
 async def test_a_rejection_of_an_order_that_became_a_contract_is_ignored(place: Place) -> None:
@@ -105,7 +136,7 @@ async def test_a_rejection_of_an_order_that_became_a_contract_is_ignored(place: 
         before = await chain.liabilities.next_nonce(me.address)
         demand = asyncio.create_task(person.demand(OBJECTIVE))
         await posted(person)
-        (identity,) = person.runtime.trader.open_orders
+        (identity,) = (order.hash for order in person.orders())
         async with place.provider() as provider:
             await until(lambda: provider.earnings().created == 1)
             key = str(RejectKey(person.channel.lighthouse, identity, place.address("provider")))
@@ -122,7 +153,7 @@ async def test_an_order_is_sent_again_to_a_provider_whose_book_was_full(
     async with place.agent("person") as person, Network(Endpoints(connect=(place.endpoint,))) as network:
         demand = asyncio.create_task(person.demand(cid_of_file(job(place))))
         await posted(person)
-        (identity,) = person.runtime.trader.open_orders
+        (identity,) = (order.hash for order in person.orders())
         key = str(RejectKey(person.channel.lighthouse, identity, place.address("provider")))
         network.session.put(key, rejection(place, "provider", identity, reason="full").encode())
         await until(lambda: logged_facts(caplog, "order-deferred"))
@@ -222,7 +253,7 @@ async def test_an_offer_that_can_not_be_signed_again_does_not_stop_the_agent(
         await place.chains["robot"].tokens.transfer(place.address("person"), 5)
         async with place.provider():
             await person.demand(OBJECTIVE)
-            await until(lambda: logged_facts(caplog, "offer-abandoned"))
+            await until(lambda: logged_facts(caplog, "order-abandoned"))
             await until_found(lambda: all_posted(robot, 0))
             again = cid_of_bytes(b"something else")
             await robot.offer(objective=again)

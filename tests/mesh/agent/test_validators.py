@@ -54,7 +54,7 @@ async def test_a_robot_does_not_offer_where_its_offer_would_be_a_demand(
         )
         async with robot:
             trader = robot.runtime.trader
-            shared = await trader.terms(
+            shared = await trader.writer.terms(
                 model=MODEL, objective=OBJECTIVE, cost=5, token="", validator=lighthouse, lifetime=100
             )
             stranger = place.market.accounts["person"]
@@ -62,7 +62,7 @@ async def test_a_robot_does_not_offer_where_its_offer_would_be_a_demand(
             demand = stranger.signer.sign(Demand(**(dict(shared) | author), validator_fee=0))
 
             with pytest.raises(UnsafeValidator) as caught:
-                await trader.offer(trader.terms_of(demand), lighthouse_fee=0)
+                await trader.post(Offer, trader.writer.terms_of(demand), lighthouse_fee=0)
             assert (caught.value.code, caught.value.validator) == ("validator-unsafe", lighthouse)
             with pytest.raises(UnsafeValidator):
                 await robot.demand(OBJECTIVE, cost=5, validator=lighthouse)

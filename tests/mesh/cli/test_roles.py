@@ -85,7 +85,8 @@ async def test_a_job_from_up_to_the_recording(tmp_path: Path, printed: Printed) 
     async with offering(moving(Agent(MODEL, settings=robot, account=load_account(robot)))), asyncio.timeout(60):
         await demand(person, objective=str(path), out=out, as_json=False, **order)
         assert f"paid, result {cid_of_file(out)}\nrecording {out}\n" in printed
-        assert f"demand by {load_account(person).address} for {MODEL}\ncontract 0x" in printed
+        assert f"demand by {load_account(person).address} for {MODEL}\nposted " in printed
+        assert "\ncontract 0x" in printed
         printed.text = ""
         await demand(person, objective=cid_of_file(path), out=None, as_json=True, **order)
         assert "}\n" in printed

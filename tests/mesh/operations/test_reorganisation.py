@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 from mesh.agent import Phase
 from tests.mesh.operations.site import FEE, Site, has_event, has_traceback
+from tests.support.log_events import logged_facts
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    import pytest
 
     from mesh.agent import Agent
     from mesh.chain import Chain
@@ -80,3 +83,35 @@ async def test_a_reverted_contract_is_created_again_and_its_job_paid_once(
         assert (made.address, made.is_finalized, made.is_success) == (contract.address, True, True)
         assert await chain.tokens.balance(site.address("robot")) == before + COST - FEE
         assert not has_traceback(provider)
+
+
+async def test_orders_are_sent_again_only_with_their_allowance_when_a_reorganisation_reverted_it(
+    anvil: Anvil, router: EmbeddedRouter, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    site = await Site.found(anvil.url, anvil.private_keys, router.endpoint, tmp_path)
+    async with site.chain("person") as chain:
+        await chain.tokens.approve(chain.factory, 0)
+        founded = await chain.block_number()
+    caplog.set_level("INFO")
+    may_work = asyncio.Event()
+    incoming: list[str] = []
+    done: list[str] = []
+    robot = waiting_robot(site, may_work, incoming, done)
+
+    async with robot, site.agent("person") as person, asyncio.timeout(3 * TIMEOUT):
+        chain = person.parts.chain
+        async with site.provider():
+            contract = await person.demand(site.job("again"), cost=COST)
+            await until(lambda: len(incoming) == 1, what="the job", seconds=TIMEOUT)
+        await until_found(lambda: robot.parts.ledger.job(incoming[0]), what="the job in the ledger", seconds=TIMEOUT)
+        approved = len(logged_facts(caplog, "allowance-approved"))
+
+        await request(chain, "anvil_reorg", await chain.block_number() - founded, [])
+        await request(chain, "evm_mine")
+        assert await chain.tokens.allowance(site.address("person"), chain.factory) == 0
+        async with site.provider():
+            await until(lambda: len(incoming) == 2, what="the contract created again", seconds=TIMEOUT)
+            assert len(logged_facts(caplog, "allowance-approved")) > approved
+            may_work.set()
+            assert (await contract.outcome()).success
+        assert done == ["again"]

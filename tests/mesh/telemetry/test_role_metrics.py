@@ -14,7 +14,7 @@ from mesh.chain import metrics as chain_metrics
 from mesh.market.provider import Provider, ProviderProcess
 from mesh.network import Endpoints, Network
 from mesh.telemetry.serving import Telemetry
-from schemas import Demand, Empty, cid_of_bytes
+from schemas import Demand, Empty, Offer, cid_of_bytes
 from schemas.status import ALIVE
 from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
@@ -236,12 +236,12 @@ async def test_rejected_orders_are_counted_by_reason(place: Place) -> None:
     """The person revoked the allowance that the demand needs."""
     async with provider_at(place) as url, place.agent("robot") as robot, place.agent("person") as person:
         before = await scraped(url)
-        terms = await person.runtime.trader.terms(
+        terms = await person.runtime.trader.writer.terms(
             model=MODEL, objective=cid_of_bytes(b"x"), cost=10**15, token="", validator="", lifetime=1000
         )
-        signed = await person.runtime.trader.sign(Demand, terms, validator_fee=0)
+        signed = await person.runtime.trader.writer.sign(Demand, terms, validator_fee=0)
         person.channel.publish(signed)
-        await robot.runtime.trader.offer(robot.runtime.trader.terms_of(signed), lighthouse_fee=0)
+        await robot.runtime.trader.post(Offer, robot.runtime.trader.writer.terms_of(signed), lighthouse_fee=0)
 
         async def rejected() -> bool:
             changes = (await scraped(url)).changes(before)

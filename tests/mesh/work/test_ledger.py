@@ -12,7 +12,7 @@ from mesh.work import Ledger, Phase
 from mesh.work.outbox import outgoing
 from tests.mesh.work.ledgers import RESULT, ledger, path
 from tests.mesh.work.samples import liability, message
-from tests.support.orders import demand
+from tests.support.orders import demand, offer, withdrawal
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -192,10 +192,12 @@ async def test_a_spent_order_returns_when_its_contract_is_reverted(ledger: Ledge
     await ledger.spend(one.identity, "0xA")
     assert await ledger.outbox(head=0) == [other]
 
-    assert not await ledger.unspend("0xB")
-    assert await ledger.unspend("0xA")
+    assert (await ledger.spent("0xA"), await ledger.spent("0xB")) == ([one], [])
+    await ledger.unspend("0xB")
+    assert await ledger.outbox(head=0) == [other]
+    await ledger.unspend("0xA")
     assert await ledger.outbox(head=0) == [other, one]
-    assert not await ledger.unspend("0xA")
+    assert await ledger.spent("0xA") == []
     assert await ledger.outbox(head=50) == [other], "and it has its deadline as before"
 
 
@@ -205,9 +207,53 @@ async def test_only_the_latest_spent_orders_are_kept(path: Path) -> None:
         for number, order in enumerate(orders):
             await ledger.post(order)
             await ledger.spend(order.identity, f"0x{number}")
-        assert [await ledger.unspend(f"0x{number}") for number in range(4)] == [False, False, True, True]
+        assert [await ledger.spent(f"0x{number}") for number in range(4)] == [[], [], [orders[2]], [orders[3]]]
 
 
 async def test_an_order_that_is_not_in_the_outbox_is_not_spent(ledger: Ledger) -> None:
     await ledger.spend("an order of before", "0xA")
-    assert not await ledger.unspend("0xA")
+    assert await ledger.spent("0xA") == []
+
+
+async def test_a_withdrawn_order_is_replaced_by_its_withdrawal_until_its_deadline(path: Path) -> None:
+    signed = demand(deadline=50)
+    one, other, withdrawn = outgoing(signed), outgoing(offer(deadline=60)), outgoing(withdrawal(signed))
+    async with Ledger(path) as ledger:
+        for order in (one, other):
+            await ledger.post(order)
+        await ledger.withdraw(one.identity, withdrawn)
+    async with Ledger(path) as ledger:
+        assert await ledger.outbox(head=49) == [other, withdrawn]
+        found = [(order.identity, order.is_withdrawn) for order in await ledger.orders()]
+        assert found == [(other.identity, False), (one.identity, True)]
+        assert await ledger.outbox(head=50) == [other]
+        assert [order.identity for order in await ledger.orders()] == [other.identity]
+
+
+async def test_a_withdrawn_order_that_becomes_a_contract_stays_withdrawn_after_a_reorganisation(ledger: Ledger) -> None:
+    signed = demand()
+    order, withdrawn = outgoing(signed), outgoing(withdrawal(signed))
+    await ledger.post(order)
+    await ledger.withdraw(order.identity, withdrawn)
+    await ledger.spend(order.identity, "0xA")
+    assert await ledger.orders() == []
+    assert await ledger.spent("0xA") == [order]
+    await ledger.unspend("0xA")
+    assert [(stored.identity, stored.is_withdrawn) for stored in await ledger.orders()] == [(order.identity, True)]
+    assert await ledger.outbox(head=0) == [withdrawn]
+
+
+async def test_an_order_withdrawn_on_the_chain_can_not_become_a_contract(ledger: Ledger) -> None:
+    signed = demand()
+    order, withdrawn = outgoing(signed), outgoing(withdrawal(signed))
+    await ledger.post(order)
+    await ledger.withdraw(order.identity, withdrawn)
+    await ledger.use_up(order.identity, "0xtransaction")
+    assert await ledger.orders() == []
+
+
+async def test_an_order_is_replaced_at_its_place_in_one_step(ledger: Ledger) -> None:
+    old, new = outgoing(demand()), outgoing(demand())
+    await ledger.post(old)
+    await ledger.replace(old.identity, new)
+    assert await ledger.outbox(head=0) == [new]

@@ -15,9 +15,11 @@ import pytest
 from mesh.errors import ClosedError, ConfigurationError
 from mesh.work import Ledger, Phase
 from mesh.work.database import VERSION, LedgerTooNew, LedgerUnusable
+from mesh.work.outbox import outgoing
 from tests.mesh.work.ledgers import RESULT, ledger, mark_as_version, path
 from tests.mesh.work.samples import liability, message
 from tests.support.disks import file_size_limit
+from tests.support.orders import demand, withdrawal
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -97,6 +99,19 @@ async def test_a_ledger_of_a_newer_version_is_refused_and_not_touched(path: Path
     assert (error.code, error.found, error.known) == ("ledger-too-new", VERSION + 1, VERSION)
     assert error.hint
     assert version_of(path) == VERSION + 1
+
+
+async def test_a_ledger_without_withdrawn_orders_gets_a_place_for_them(path: Path) -> None:
+    signed = demand()
+    async with Ledger(path) as ledger:
+        await ledger.post(outgoing(signed))
+    database = sqlite3.connect(path)
+    database.execute("DROP TABLE withdrawn")
+    database.close()
+    async with Ledger(path) as ledger:
+        (order,) = await ledger.orders()
+        await ledger.withdraw(order.identity, outgoing(withdrawal(signed)))
+        assert [order.is_withdrawn for order in await ledger.orders()] == [True]
 
 
 def own_threads() -> set[threading.Thread]:
@@ -192,14 +207,14 @@ async def test_what_is_not_committed_is_not_read(ledger: Ledger, monkeypatch: py
     async with asyncio.TaskGroup() as tasks:
         completing = tasks.create_task(completed(ledger))
         await reached.wait()
-        sending = tasks.create_task(ledger.waiting())
+        sending = tasks.create_task(ledger.waiting_by_kind())
         await asyncio.wait([sending], timeout=0.2)
         held.set()
         assert isinstance(await completing, LedgerUnusable)
-        assert await sending == 0
+        assert await sending == {}
     monkeypatch.setattr(aiosqlite.Connection, "commit", commit)
     assert not await completed(ledger)
-    assert await ledger.waiting() == 1
+    assert sum((await ledger.waiting_by_kind()).values()) == 1
 
 
 async def completed(ledger: Ledger) -> LedgerUnusable | None:

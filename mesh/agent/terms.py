@@ -1,0 +1,167 @@
+"""The terms of orders: filling them in, signing them, and the allowance that they need."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+from collections import Counter
+from typing import TYPE_CHECKING, Any, Final
+
+from mesh.chain import InsufficientTokens, Reverted
+from mesh.log_context import log_event
+from schemas import ZERO_ADDRESS, Demand, Offer
+
+if TYPE_CHECKING:
+    from collections.abc import Hashable, Iterable, Mapping
+
+    from mesh.agent.components import AgentComponents
+    from mesh.chain import Chain
+
+    Terms = Mapping[str, Any]
+
+log = logging.getLogger(__name__)
+
+REPEATED: Final = ("model", "objective", "token", "cost", "lighthouse", "validator", "sender")
+"""The fields that are the same when an order is posted again; its nonce and perhaps its deadline are new."""
+LIFETIME: Final = 600.0
+"""Seconds for which an order is valid by default."""
+FEWEST_BLOCKS: Final = 50
+MOST_BLOCKS: Final = 20_000
+"""The bounds of that in blocks, whatever time was measured between two blocks."""
+MEASURED_BLOCKS: Final = 100
+"""The latest blocks, from which the time between two blocks is measured."""
+
+
+class TermsWriter:
+    """Fills in and signs the orders of one account, in the generation of its settings."""
+
+    def __init__(self, parts: AgentComponents) -> None:
+        self._settings = parts.settings
+        self._chain = parts.chain
+        self._signer = parts.signer
+
+    async def terms(
+        self, *, model: str, objective: str, cost: int, token: str, validator: str, lifetime: int | None
+    ) -> Terms:
+        """The fields that a demand and an offer share, with names resolved, valid for `lifetime` blocks.
+
+        By default they are valid for about `LIFETIME` seconds.
+        """
+        settings, names = self._settings, self._chain.names
+        blocks = await default_lifetime(self._chain) if lifetime is None else lifetime
+        return {
+            "model": await names.model(model),
+            "objective": objective,
+            "token": await names.address(token or settings.erc20_token),
+            "cost": cost,
+            "lighthouse": await names.address(settings.lighthouse_contract),
+            "validator": await names.address(validator) if validator else ZERO_ADDRESS,
+            "deadline": await self._chain.block_number() + blocks,
+            "sender": None if settings.generation == 3 else self._signer.address,
+        }
+
+    def terms_of(self, order: Demand | Offer) -> Terms:
+        """The terms of `order`, for an order of this account in the same generation."""
+        terms = {field: getattr(order, field) for field in (*REPEATED, "deadline")}
+        return {**terms, "sender": None if order.generation == 3 else self._signer.address}
+
+    async def sign(self, kind: type[Demand | Offer], terms: Terms, **fee: Any) -> Demand | Offer:
+        """An order with these terms and a fresh nonce, signed. Raises `UnsafeValidator`."""
+        is_counted = terms["sender"] is not None
+        nonce = await self._chain.liabilities.next_nonce(self._signer.address) if is_counted else secrets.token_hex(32)
+        order = kind(**terms, nonce=nonce, **fee)
+        await self._chain.validators.check(order)
+        return self._signer.sign(order)
+
+    async def sign_again(self, order: Demand | Offer) -> Demand | Offer:
+        """An order like this one, with a fresh nonce."""
+        if isinstance(order, Demand):
+            return await self.sign(Demand, self.terms_of(order), validator_fee=order.validator_fee)
+        return await self.sign(Offer, self.terms_of(order), lighthouse_fee=order.lighthouse_fee)
+
+
+def is_repeated(demand: Demand, terms: Terms, *, validator_fee: int) -> bool:
+    """Whether a demand differs from these terms in nonce and deadline only."""
+    return demand.validator_fee == validator_fee and all(getattr(demand, field) == terms[field] for field in REPEATED)
+
+
+def costs_of(order: Demand | Offer, *, xrt: str) -> Mapping[str, int]:
+    """What the factory may take for an order, by token, in the token's smallest unit."""
+    if isinstance(order, Offer):
+        return {xrt: order.lighthouse_fee}
+    costs = Counter({order.token: order.cost})
+    costs[xrt] += order.validator_fee
+    return costs
+
+
+async def default_lifetime(chain: Chain) -> int:
+    """How many blocks an order is valid by default: about `LIFETIME`, by the time between the latest blocks."""
+    last = await chain.node.latest_header()
+    first = await chain.node.header(max(1, last.number - MEASURED_BLOCKS))
+    if first is None or first.number >= last.number or first.timestamp >= last.timestamp:
+        return round(LIFETIME)
+    block_time = (last.timestamp - first.timestamp) / (last.number - first.number)
+    return min(max(round(LIFETIME / block_time), FEWEST_BLOCKS), MOST_BLOCKS)
+
+
+class Allowances:
+    """The allowance of the factory: what the orders of `account` may cost, by order and token (smallest unit)."""
+
+    def __init__(self, chain: Chain, account: str) -> None:
+        self._chain = chain
+        self._account = account
+        self._open: dict[Hashable, Mapping[str, int]] = {}
+        self._withdrawn: dict[Hashable, Mapping[str, int]] = {}
+        self._approving = asyncio.Lock()
+
+    async def ensure(self, order: Hashable, amounts: Mapping[str, int]) -> None:
+        """Make sure that the factory may take `amounts` (by token) for `order` and what the other orders may cost.
+
+        The account must own what its open orders cost; withdrawn ones only need the allowance. Raises
+        `InsufficientTokens`; a new order is then not counted.
+        """
+        async with self._approving:
+            for token, amount in amounts.items():
+                if amount:
+                    others = (costs for key, costs in self._open.items() if key != order)
+                    funds = amount + _sum(others, token)
+                    allowance = funds + _sum(self._withdrawn.values(), token)
+                    await self._ensure(token, funds=funds, allowance=allowance)
+            if order not in self._withdrawn:
+                self._open[order] = amounts
+
+    def count(self, order: Hashable, amounts: Mapping[str, int]) -> None:
+        """Count an order of an earlier run, whose allowance was approved then."""
+        self._open[order] = amounts
+
+    def withdraw(self, order: Hashable) -> None:
+        """Count an order that is withdrawn, but may become a contract all the same."""
+        if order in self._open:
+            self._withdrawn[order] = self._open.pop(order)
+
+    def release(self, order: Hashable) -> None:
+        """Stop counting an order that can't become a contract any more. Unknown ones are ignored."""
+        self._open.pop(order, None)
+        self._withdrawn.pop(order, None)
+
+    async def _ensure(self, token: str, *, funds: int, allowance: int) -> None:
+        balance = await self._chain.tokens.balance(self._account, token=token)
+        if balance < funds:
+            raise InsufficientTokens(self._account, token, balance=balance, needed=funds)
+        factory = self._chain.factory
+        while await self._chain.tokens.allowance(self._account, factory, token=token) < allowance:
+            facts = log_event("allowance-approved", token=token, amount=allowance)
+            log.info("approving an allowance of %d of token %s for the factory", allowance, token, extra=facts)
+            try:
+                await self._chain.tokens.approve(factory, allowance, token=token)
+            except Reverted as error:
+                if error.reason != "OutOfGas":
+                    raise
+                # An order became a contract between estimate and block: setting a used-up allowance costs more gas.
+                facts = log_event("allowance-retried", token=token, amount=allowance)
+                log.info("approving the allowance again: %s", error, extra=facts)
+
+
+def _sum(orders: Iterable[Mapping[str, int]], token: str) -> int:
+    return sum(costs.get(token, 0) for costs in orders)

@@ -1,0 +1,295 @@
+"""`aira order`: lists and withdraws open orders; and what `aira demand` does about a demand that is open already."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+import threading
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from mesh.cli.chain_client import notice_when_slow, open_chain, required_address, units_of
+from mesh.cli.errors import DemandExists, InvalidOptions, UnknownOrder
+from mesh.cli.options import with_json, with_settings
+from mesh.cli.output import plural, print_json, print_line, print_table
+from mesh.running import run_to_end
+from mesh.settings import ChainSettings, NetworkSettings, options_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from mesh.agent import Agent, Order
+    from mesh.agent.components import AgentComponents
+    from mesh.chain import Chain
+    from mesh.settings import Settings
+    from mesh.work import StoredOrder
+    from schemas import Demand, Offer
+    from schemas.signing import Rejection
+
+CONFIRMATION: Final = 5.0
+"""Seconds in which providers may confirm a withdrawal."""
+ANSWERS: Final = 256
+CHOICES: Final = {
+    "wait": "wait for it",
+    "withdraw": "withdraw it, and post a new one",
+    "new": "post another one beside it",
+}
+HEAD: Final = ("ORDER", "KIND", "STATE", "COST", "VALID UNTIL")
+
+
+@click.group("order")
+def command() -> None:
+    """The account's orders on this machine: demands and offers, open until they become contracts or expire."""
+
+
+@command.command("list", short_help="list the open and withdrawn orders")
+@with_json
+@with_settings("keyfile", *options_of(ChainSettings))
+def list_orders(settings: Settings, as_json: bool) -> None:
+    """List the orders that may still become contracts: open ones, and withdrawn ones until their deadline.
+
+    A `matched` one became a contract while no agent of the account ran; `aira liability list` shows it.
+    """
+    run_to_end(lambda: _list(settings, as_json))
+
+
+async def _list(settings: Settings, as_json: bool) -> None:
+    from schemas import decode
+
+    address = await asyncio.to_thread(required_address, settings)
+    async with open_chain(settings) as chain:
+        head = await chain.block_number()
+        found = []
+        for stored in await _stored_orders(settings, chain, address):
+            message: Any = decode(stored.payload)
+            if message.deadline > head:
+                found.append((stored, message, await _state(chain, stored, message, address)))
+        units = await units_of(chain, [message for _, message, _ in found])
+    if as_json:
+        print_json([_json(stored, message, state, head) for stored, message, state in found])
+    elif not found:
+        print_line(f"no open orders of {address}")
+    else:
+        rows = []
+        for stored, message, state in found:
+            until = f"block {message.deadline:,}, in {plural(message.deadline - head, 'block')}"
+            rows.append((stored.identity, message.kind, state, units[message.token].show(message.cost), until))
+        print_table(HEAD, rows, numbers=("COST",))
+
+
+async def _stored_orders(settings: Settings, chain: Chain, address: str) -> Sequence[StoredOrder]:
+    """The orders in the account's ledger for this chain; none if it has no ledger."""
+    from mesh.agent.components import LEDGER, state_folder
+    from mesh.work import Ledger
+
+    path = await state_folder(settings, chain, address) / LEDGER
+    if not await asyncio.to_thread(path.exists):
+        return ()
+    async with Ledger(path) as ledger:
+        return await ledger.orders()
+
+
+async def _state(chain: Chain, stored: StoredOrder, message: Demand | Offer, address: str) -> str:
+    if stored.is_withdrawn:
+        return "withdrawn"
+    liabilities = chain.liabilities
+    if message.generation == 3:
+        is_used = await liabilities.is_order_used(bytes.fromhex(stored.identity), address)
+    else:
+        is_used = await liabilities.next_nonce(address) > int(message.nonce)
+    return "matched" if is_used else "open"
+
+
+def _json(stored: StoredOrder, message: Demand | Offer, state: str, head: int) -> dict[str, Any]:
+    from schemas import encode
+
+    fields: dict[str, Any] = json.loads(encode(message))
+    facts = {"hash": stored.identity, "kind": message.kind, "state": state, "posted": stored.posted}
+    return facts | {"blocksLeft": message.deadline - head} | fields
+
+
+@command.command("withdraw", short_help="withdraw open orders")
+@click.argument("hashes", nargs=-1, metavar="[HASH]...")
+@click.option("--all", "everything", is_flag=True, help="withdraw all open orders of the account")
+@click.option("--on-chain", is_flag=True, help="also by a transaction, after which no provider can use the order")
+@with_json
+@with_settings(
+    *options_of(NetworkSettings), "lighthouse_contract", "keyfile", "keyfile_password_file", *options_of(ChainSettings)
+)
+def withdraw(settings: Settings, hashes: tuple[str, ...], everything: bool, on_chain: bool, as_json: bool) -> None:
+    """Withdraw the open orders whose hashes begin with HASH.
+
+    A signed withdrawal tells the providers not to use the order. A provider that is creating its contract now may still
+    finish, and one that the withdrawal does not reach may use the order until its deadline. With --on-chain a
+    transaction of the account excludes that.
+    """
+    if bool(hashes) == everything:
+        raise click.UsageError("give the hashes of orders, or --all")
+    run_to_end(lambda: _withdraw(settings, hashes, everything, on_chain, as_json))
+
+
+async def _withdraw(
+    settings: Settings, hashes: tuple[str, ...], everything: bool, on_chain: bool, as_json: bool
+) -> None:
+    from mesh.agent.components import working
+    from mesh.agent.orders import OrderState
+    from mesh.agent.trade import Trader
+    from mesh.composition import load_account
+
+    account = await asyncio.to_thread(load_account, settings)
+    async with working(settings, account, None) as parts:
+        trader = Trader(parts)
+        await trader.load()
+        orders = trader.orders(OrderState.OPEN, OrderState.WITHDRAWN)
+        parts.outbox.hold(order.hash for order in orders if order.state is OrderState.OPEN)
+        chosen = orders if everything else [_named(orders, digits) for digits in hashes]
+        withdrawn = [await order.withdraw() for order in chosen]
+        providers = len([key for key in await parts.channel.present() if key.role == "provider"])
+        facts = [
+            {
+                "hash": order.hash,
+                "kind": order.kind,
+                "deadline": order.deadline,
+                "providers": providers,
+                "confirmedBy": await _confirmations(parts, order, providers),
+                "tx": await _withdraw_on_chain(parts, order) if on_chain else None,
+            }
+            for order in withdrawn
+        ]
+    if as_json:
+        print_json(facts)
+        return
+    for fact in facts:
+        print_line(f"{fact['kind']} {fact['hash']} is withdrawn\n  {_what_it_means(fact)}")
+    if not facts:
+        print_line("no open orders")
+
+
+def _named(orders: Sequence[Order], digits: str) -> Order:
+    """The order whose hash begins with these digits. Raises `UnknownOrder` and `InvalidOptions`."""
+    found = [order for order in orders if order.hash.startswith(digits.lower().removeprefix("0x"))]
+    if not found:
+        raise UnknownOrder(f"no open order has the hash {digits[:70]}", hint="`aira order list` lists them")
+    if len(found) > 1:
+        raise InvalidOptions(f"{len(found)} orders have hashes that begin with {digits}", hint="give more digits")
+    return found[0]
+
+
+async def _confirmations(parts: AgentComponents, order: Order, providers: int) -> int:
+    """How many providers answer with the withdrawal when they are asked for it."""
+    confirmed, deadline = 0, asyncio.get_running_loop().time() + CONFIRMATION
+    while confirmed < providers and asyncio.get_running_loop().time() < deadline:
+        confirmed = await asyncio.to_thread(_answers, parts, order)
+        await asyncio.sleep(0 if confirmed >= providers else 0.2)
+        await parts.outbox.send_due()
+    return confirmed
+
+
+def _answers(parts: AgentComponents, order: Order) -> int:
+    """How many providers answer with the withdrawal of an order now."""
+    import zenoh
+
+    from schemas import market_selector
+
+    replies = parts.network.session.get(
+        market_selector(parts.channel.lighthouse, "withdrawal", order.hash),
+        zenoh.handlers.FifoChannel(ANSWERS),
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,
+        timeout=CONFIRMATION / 2,
+    )
+    return sum(reply.ok is not None for reply in replies)
+
+
+async def _withdraw_on_chain(parts: AgentComponents, order: Order) -> str:
+    with notice_when_slow():
+        tx = (await parts.chain.liabilities.withdraw(order.message)).tx
+    await parts.ledger.use_up(order.hash, tx)
+    return tx
+
+
+def _what_it_means(fact: dict[str, Any]) -> str:
+    if fact["tx"]:
+        return f"No provider can use it any more: transaction {fact['tx']}."
+    until = f"it may still become a contract before block {fact['deadline']:,}; --on-chain excludes that"
+    if fact["providers"] and fact["confirmedBy"] >= fact["providers"]:
+        return (
+            f"All {plural(fact['providers'], 'provider')} present confirmed it. If another one has the order, {until}."
+        )
+    return f"{fact['confirmedBy']} of {plural(fact['providers'], 'present provider')} confirmed it: {until}."
+
+
+async def take_existing(
+    agent: Agent, objective: str, existing: str | None, *, quiet: bool, lifetime: int | None = None, **terms: Any
+) -> Order | None:
+    """The open demand with these terms if it is to be waited for; None if a new one is to be posted.
+
+    Asks in a terminal unless `existing` says what to do. Raises `DemandExists` without a terminal.
+    """
+    equal = await _equal_demands(agent, objective, **terms)
+    if equal:  # perhaps it became a contract while nothing of the account ran
+        await agent.parts.chain_head.reached(await agent.parts.chain.block_number())
+        equal = await _equal_demands(agent, objective, **terms)
+    if not equal:
+        return None
+    head = agent.parts.chain_head.head
+    for order in equal:
+        left = plural(order.deadline - head, "block")
+        click.echo(f"the equal demand {order.hash} is open until block {order.deadline:,} ({left})", err=True)
+    if existing is None and (quiet or not sys.stdin.isatty()):
+        choices = ", ".join(f"--existing {choice} ({meaning})" for choice, meaning in CHOICES.items())
+        raise DemandExists("an equal demand is open; a second one would be paid too", hint=f"choose: {choices}")
+    choice = existing or await _ask()
+    if choice == "wait":
+        return equal[0]
+    for order in equal if choice == "withdraw" else ():
+        await order.withdraw()
+        click.echo(f"withdrew {order.hash}; a provider that is creating its contract now may still finish", err=True)
+    return None
+
+
+async def _equal_demands(
+    agent: Agent, objective: str, *, cost: int, validator: str = "", validator_fee: int
+) -> list[Order]:
+    from mesh.agent.terms import is_repeated
+    from schemas import Demand
+
+    fields: dict[str, Any] = {"model": agent.model, "objective": objective, "cost": cost, "validator": validator}
+    wanted = await agent.runtime.trader.writer.terms(**fields, token="", lifetime=1)
+    return [
+        order
+        for order in agent.orders()
+        if isinstance(order.message, Demand) and is_repeated(order.message, wanted, validator_fee=validator_fee)
+    ]
+
+
+async def _ask() -> str:
+    """Ask in the terminal what to do, in a thread that does not keep an interrupted program alive."""
+    loop = asyncio.get_running_loop()
+    answer: asyncio.Future[str] = loop.create_future()
+
+    def ask() -> None:
+        click.echo("\n".join(f"  {choice}: {meaning}" for choice, meaning in CHOICES.items()), err=True)
+        try:
+            given = click.prompt("what now?", type=click.Choice(list(CHOICES)), err=True)
+        except click.Abort:
+            loop.call_soon_threadsafe(answer.cancel)
+        else:
+            loop.call_soon_threadsafe(answer.set_result, given)
+
+    threading.Thread(target=ask, name="prompt", daemon=True).start()
+    return await answer
+
+
+def report_rejection(order: Order, rejection: Rejection) -> None:
+    """Tell the person that a provider can't use the order, and that it stays valid."""
+    click.echo(f"provider {rejection.provider} can't use it now: {rejection.detail} ({rejection.reason})", err=True)
+    print_stays_open(order)
+
+
+def print_stays_open(order: Order) -> None:
+    """Tell the person until when the demand can become a contract, and how to withdraw it."""
+    way = f"withdraw it with `aira order withdraw {order.hash[:16]}`"
+    click.echo(f"the demand stays valid until block {order.deadline:,}; {way}", err=True)
