@@ -15,6 +15,8 @@ from eth_abi.exceptions import DecodingError
 from msgspec import Meta, Struct
 from msgspec.structs import force_setattr
 
+from mesh.chain.errors import RequestRefused
+from mesh.errors import ChainError
 from schemas.address import checksum_address
 from schemas.cid import format_cid
 from schemas.errors import InvalidCid
@@ -32,6 +34,14 @@ LONGEST_TEXT: Final = 1_000
 
 class SpoiledAnswer(ValueError):
     """An answer is not what its method returns. Asking again, or another node, may help."""
+
+
+class InvalidAnswer(RequestRefused, code="invalid-answer"):
+    """What a contract or a node returned does not fit the request, or is above a limit."""
+
+    def __init__(self, what: str, why: str) -> None:
+        ChainError.__init__(self, f"{what} returned what can't be used: {why}")
+        self.method, self.rpc_code, self.detail = "eth_call", 0, why
 
 
 class Quantity(int):

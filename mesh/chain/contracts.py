@@ -2,7 +2,7 @@
 
 They share most functions. `ContractVersion` and `OriginalContracts` hold the differences: how a result is finalized,
 the names of a lighthouse's getters, how a liability is recognised. The versions of the originals are tested against
-our contracts, which have both sets of names. `Contracts` is what the parts of an open `Chain` share.
+our contracts, which have both sets of names.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NamedTuple
 
-from mesh.chain.errors import InvalidAnswer, NoAccount, NotOffered, UnknownContracts
+from mesh.chain.answers import InvalidAnswer
+from mesh.chain.errors import NoAccount, NotOffered, UnknownContracts
 from mesh.errors import InvalidMessage
 from schemas.address import ZERO_ADDRESS, parse_address
 from schemas.cid import parse_cid
@@ -31,7 +32,8 @@ ContractKind = Literal["mesh", "original"]
 AGREE: Final = True
 """A provider always agrees with a result; only a validator, who finalizes on its own, can disagree."""
 
-
+RECOGNISED_LIABILITIES: Final = 65_536
+"""Liabilities that are remembered as such; the factory is asked about others."""
 MAX_PROVIDERS: Final = 10_000
 """Providers of one lighthouse that are read."""
 
@@ -90,7 +92,7 @@ class ContractVersion:
         self.generation = generation
         self._node = node
         self._factory = node.contract("Factory", factory).functions
-        self._liabilities: set[str] = set()
+        self._liabilities: dict[str, None] = {}
 
     def check_order(self, order: Order) -> None:
         """Raise `InvalidMessage` for an order that the contracts can't read."""
@@ -132,12 +134,14 @@ class ContractVersion:
 
     def recognise(self, liability: str) -> None:
         """Remember an address as a liability, because the factory named it in an event."""
-        self._liabilities.add(liability)
+        self._liabilities[liability] = None
+        if len(self._liabilities) > RECOGNISED_LIABILITIES:
+            del self._liabilities[next(iter(self._liabilities))]  # the factory still knows it
 
     async def is_liability(self, address: str) -> bool:
         """Whether the factory created the contract at an address."""
         if address not in self._liabilities and await self._asked_is_liability(address):
-            self._liabilities.add(address)
+            self.recognise(address)
         return address in self._liabilities
 
     async def state(self, lighthouse: str) -> LighthouseState:
@@ -234,8 +238,7 @@ def result_arguments(result: Result) -> tuple[bytes, bool, bytes]:
 
 
 async def lighthouse_state(node: Node, address: str, names: LighthouseGetters, *, current: str) -> LighthouseState:
-    """The state of a lighthouse, as of one block. Raises `NoContracts` if there is none,
-    `InvalidAnswer` for one with too many providers, `NodeUnreachable`.
+    """The state of a lighthouse, as of one block. Raises `NoContracts`, `NodeUnreachable`, `InvalidAnswer` (too large).
 
     `current` is the getter for the current provider: of its address, or of its index (`marker`).
     """

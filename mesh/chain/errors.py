@@ -87,14 +87,6 @@ class RequestRefused(ChainError, code="request-refused"):
         self.detail = message
 
 
-class InvalidAnswer(RequestRefused, code="invalid-answer"):
-    """What a contract returned has another type than its ABI says, or is above a limit."""
-
-    def __init__(self, what: str, why: str) -> None:
-        ChainError.__init__(self, f"{what} returned what can't be used: {why}")
-        self.method, self.rpc_code, self.detail = "eth_call", 0, why
-
-
 class NoContracts(ChainError, code="no-contracts"):
     """The chain does not hold the contracts: another network, or nothing deployed yet."""
 

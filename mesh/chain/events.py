@@ -7,9 +7,8 @@ from functools import cache
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 
-from mesh.chain.answers import SpoiledAnswer, decode_values
+from mesh.chain.answers import InvalidAnswer, SpoiledAnswer, decode_values
 from mesh.chain.artifacts import load_artifact, signature_of
-from mesh.chain.errors import InvalidAnswer
 from schemas import keccak256
 from schemas.address import ZERO_ADDRESS
 from schemas.cid import format_cid
@@ -22,6 +21,9 @@ if TYPE_CHECKING:
 
 
 E = TypeVar("E")
+
+LONGEST_NAME: Final = 255
+"""Characters of a lighthouse's name; the original factories take any text."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,13 +169,14 @@ def _first(events: Iterable[ChainEvent | None], kind: type[E]) -> E:
     raise InvalidAnswer("the transaction", f"no event {kind.__name__} is in its receipt")
 
 
-def _event(name: str, emitter: str, values: tuple[Any, ...], tx: str) -> ChainEvent:
+def _event(name: str, emitter: str, values: tuple[Any, ...], tx: str) -> ChainEvent | None:
+    """The event; None for a lighthouse whose name can't be a label."""
     match name, values:
         case "NewLiability", (liability,):
             return NewLiability(liability, tx)
         case "Finalized", (success, result):
             return Finalized(emitter, success, format_cid(result) if result else "", tx)
-        case "NewLighthouse", (lighthouse, label):
+        case "NewLighthouse", (lighthouse, label) if len(label) <= LONGEST_NAME:
             return NewLighthouse(lighthouse, label, tx)
         case "Transfer", (sender, recipient, value):
             return Transfer(sender, recipient, value, tx)
@@ -185,7 +188,7 @@ def _event(name: str, emitter: str, values: tuple[Any, ...], tx: str) -> ChainEv
             return Offline(emitter, provider, tx)
         case "Current", (provider, quota):
             return Current(emitter, provider, quota, tx)
-    raise AssertionError(name)
+    return None
 
 
 EVENTS: Final = {

@@ -36,6 +36,9 @@ MULTIHASH_ABI: Final = (
 )
 """The function of the public resolver of 2018 for names of content; not every resolver has it."""
 
+RESOLVERS_KEPT: Final = 256
+"""Resolvers that are remembered, each for the root of names."""
+
 NAME_RULE: Final = "names end in .eth, .sid or .test, and hold ASCII letters, digits, - and _"
 
 
@@ -113,6 +116,8 @@ class Names:
             resolver = str(await self._node.read(registry.functions.resolver(namehash(root))))
             if resolver == ZERO_ADDRESS:
                 raise UnknownName(name)
+            if len(self._resolvers) >= RESOLVERS_KEPT:  # roots come from strangers' messages, too
+                self._resolvers.clear()
             self._resolvers[root] = parse_address(resolver)
         return self._resolvers[root]
 

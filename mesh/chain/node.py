@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Final, cast
 from web3 import AsyncWeb3
 from web3.providers.async_base import AsyncBaseProvider
 
-from mesh.chain.answers import ANSWERS, SpoiledAnswer, decode_values
+from mesh.chain.answers import ANSWERS, InvalidAnswer, SpoiledAnswer, decode_values
 from mesh.chain.artifacts import load_artifact
-from mesh.chain.errors import METHOD_NOT_FOUND, InvalidAnswer, NoContracts, NodeUnreachable, RequestRefused
+from mesh.chain.errors import METHOD_NOT_FOUND, NoContracts, NodeUnreachable, RequestRefused
 from mesh.chain.metrics import NodeMetrics
 from mesh.chain.pending import PendingTransactions
 from mesh.chain.policy import FeePolicy, Fees, GasMarket, Timing
@@ -116,6 +116,8 @@ class Node:
     async def header(self, block: int | str) -> BlockHeader | None:
         """A block, by its number or `latest`; None if the chain does not have it."""
         header: BlockHeader | None = await self._ask("eth_getBlockByNumber", _block(block), False)
+        if header is not None and block not in ("latest", header.number):
+            raise InvalidAnswer(f"eth_getBlockByNumber for {block}", f"it is block {header.number}")
         return header
 
     async def latest_header(self) -> BlockHeader:
@@ -140,7 +142,10 @@ class Node:
         query: dict[str, Any] = {"fromBlock": hex(first), "toBlock": hex(last), "topics": [list(topics)]}
         if addresses:
             query["address"] = list(addresses)
-        return list(await self._ask("eth_getLogs", query))
+        logs: list[Log] = await self._ask("eth_getLogs", query)
+        if any(not first <= log.block_number <= last for log in logs):
+            raise InvalidAnswer(f"eth_getLogs for the blocks {first} to {last}", "a log is of another block")
+        return logs
 
     async def eth_balance(self, address: str) -> int:
         """Wei of an account."""

@@ -79,6 +79,9 @@ class RangeReader:
                     await self._node.block_number()
                 self._span = (last - first + 1) // 2
                 continue
+            if last < head.number:
+                # A head that the node only claims to have would be read towards for ever.
+                await self._node.block_hash(last)
             for block in blocks:
                 yield _with_hash_of(block, head)
             first = last + 1
@@ -96,8 +99,9 @@ async def read_events(node: Node, sources: EventSources, first: int, last: int) 
         if isinstance(event := decode_log(log), NewLiability) and log.address == sources.factory:
             sources.recognise(event.liability)
     endings = await node.logs(first, last, addresses=(), topics=topics_of("Liability"))
-    endings = [log for log in endings if await sources.is_liability(log.address)]
-    return _by_block((*logs, *endings), last)
+    # Any contract can log the same event, and as often as it likes.
+    ours = {address for address in {log.address for log in endings} if await sources.is_liability(address)}
+    return _by_block((*logs, *(log for log in endings if log.address in ours)), last)
 
 
 async def read_created(node: Node, factory: str, first: int, last: int) -> list[SeenBlock]:

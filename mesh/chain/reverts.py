@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 from eth_abi.abi import decode
 from eth_abi.exceptions import DecodingError
 
+from mesh.chain.answers import LONGEST_TEXT
 from mesh.chain.artifacts import NAMES, load_artifact, signature_of
 from mesh.chain.errors import Reverted
 from schemas import keccak256
@@ -43,7 +44,7 @@ def explain(data: bytes, *, message: str = "") -> Reverted:
     selector, body = data[:4], data[4:]
     try:
         if selector == PLAIN:
-            return Reverted(str(decode(["string"], body)[0]), data=data)
+            return Reverted(str(decode(["string"], body)[0])[:LONGEST_TEXT], data=data)
         if selector == PANIC:
             return Reverted("Panic", arguments=decode(["uint256"], body), data=data)
         if selector in custom_errors():

@@ -12,9 +12,8 @@ import pytest_asyncio
 from aiohttp import web
 
 from mesh.chain import Chain, NoContracts, Node, NodeUnreachable, RequestRefused, TransactionSender
-from mesh.chain.answers import ANSWERS, MAX_ANSWER
+from mesh.chain.answers import ANSWERS, MAX_ANSWER, InvalidAnswer
 from mesh.chain.contracts import MAX_PROVIDERS
-from mesh.chain.errors import InvalidAnswer
 from mesh.errors import AiraError
 from tests.mesh.chain.conftest import QUICK, prepare
 from tests.mesh.chain.senders import unused_address
