@@ -19,7 +19,8 @@ JOBS ?= 3
 # CI measures coverage, which takes time.
 COVERAGE := $(if $(filter true,$(CI)),--cov --cov-report=term --durations=10)
 
-.PHONY: help setup demo test simulate compose-test lint peers bench contracts contracts-check slither firmware lock clean
+.PHONY: help setup demo test simulate compose-test crash-test lint peers bench contracts contracts-check slither \
+	firmware lock clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -53,6 +54,9 @@ simulate: $(INSTALLED) ## whole markets in simulated time, with faults; ARGS="--
 
 compose-test: $(INSTALLED) ## the compose files in real containers (`make peers` installs podman)
 	@$(BIN)/pytest -m compose tests/deploy tests/support $(ARGS)
+
+crash-test: $(INSTALLED) ## the crash matrix: each role fails at each point of a job, by each fault (about an hour)
+	@CRASH_CELLS=$${CRASH_CELLS:-all} $(BIN)/pytest -v tests/crashes $(ARGS)
 
 lint: $(INSTALLED) ## style, types, the import rule, and the built contracts where node is there
 	@$(BIN)/ruff check .

@@ -63,6 +63,11 @@ class Server(ABC):
         """The process id of the running server."""
         return self._running().pid
 
+    @property
+    def is_running(self) -> bool:
+        """Whether the process was started and has not ended."""
+        return self._process is not None and self._process.poll() is None
+
     def start(self) -> None:
         """Start the process and return when it is ready; raise `ServerFailed` if it ends or is not ready in time."""
         if self._process is not None:

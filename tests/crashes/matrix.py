@@ -1,0 +1,108 @@
+"""The table: which role fails at which point by which fault."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import Final, NamedTuple
+
+from tests.crashes.points import Point
+
+BOOK, SETTLEMENT = "mesh.market.book:OrderBook", "mesh.market.settlement:Settlement"
+QUEUE, SENDER = "mesh.market.transaction_queue:TransactionQueue", "mesh.chain.transactions:TransactionSender"
+STORE, CONFIRMATION = "mesh.chain.transaction_store:TransactionStore", "mesh.chain.confirmation:Confirmation"
+TRADER, OUTBOX = "mesh.agent.trade:Trader", "mesh.work.outbox:Outbox"
+LEDGER, LISTENER = "mesh.work.ledger:Ledger", "mesh.agent.listener:ChainListener"
+PLAYBACKS, RUN = "mesh.work.playbacks:Playbacks", "mesh.work.run:JobRun"
+EXECUTOR, CONTENT = "mesh.work.executor:Executor", "mesh.content.store:Store"
+
+POINTS: Final = {
+    "provider": (
+        Point("before", f"{BOOK}.add"),
+        Point("after", f"{BOOK}.add", 2),
+        Point("before", f"{SETTLEMENT}._create"),
+        Point("before", f"{QUEUE}.send"),
+        Point("before", f"{SENDER}._send_numbered"),
+        Point("after", f"{STORE}.add"),
+        Point("after", f"{SENDER}._send_numbered"),
+        Point("before", f"{CONFIRMATION}.wait"),
+        Point("after", f"{CONFIRMATION}.wait"),
+        Point("after", f"{SETTLEMENT}._create"),
+        Point("before", f"{SETTLEMENT}.add_result"),
+        Point("before", f"{SETTLEMENT}._finalize"),
+        Point("after", f"{SENDER}._send_numbered", 2),
+        Point("after", f"{CONFIRMATION}.wait", 2),
+        Point("after", f"{SETTLEMENT}._finalize"),
+    ),
+    "robot": (
+        Point("before", f"{TRADER}.offer"),
+        Point("before", f"{OUTBOX}.post"),
+        Point("after", f"{LEDGER}.post"),
+        Point("before", f"{LISTENER}.new_liability"),
+        Point("after", f"{LEDGER}.add_job"),
+        Point("before", f"{EXECUTOR}._fetch"),
+        Point("after", f"{LEDGER}.set_phase"),
+        Point("before", f"{PLAYBACKS}.begin"),
+        Point("before", f"{RUN}._handle_one", 3),
+        Point("after", f"{PLAYBACKS}._save"),
+        Point("before", f"{PLAYBACKS}.stop"),
+        Point("after", f"{RUN}.close"),
+        Point("after", f"{CONTENT}.put_file"),
+        Point("before", f"{LEDGER}.complete"),
+        Point("after", f"{LEDGER}.complete"),
+        Point("before", f"{LISTENER}.finalized"),
+        Point("after", f"{LISTENER}.finalized"),
+    ),
+    "person": (
+        Point("before", f"{TRADER}.demand"),
+        Point("after", f"{TRADER}.sign"),
+        Point("before", f"{OUTBOX}.post"),
+        Point("before", f"{LEDGER}.post"),
+        Point("after", f"{LEDGER}.post"),
+        Point("after", f"{OUTBOX}.post"),
+        Point("before", f"{LISTENER}.new_liability"),
+        Point("before", f"{TRADER}.matched"),
+        Point("after", f"{OUTBOX}.spend"),
+        Point("after", f"{TRADER}.matched"),
+        Point("after", f"{LEDGER}.set_cursor", 5),
+        Point("before", f"{LISTENER}.finalized"),
+        Point("after", f"{LISTENER}.finalized"),
+    ),
+}
+"""The points of each role, in the order of a job."""
+
+SHARED: Final = (
+    *(("provider", point) for point in POINTS["provider"][::3]),
+    *(("robot", point) for point in POINTS["robot"][1::3]),
+    *(("person", point) for point in POINTS["person"][2::5]),
+)
+"""The points at which the router and the node fail, with the process that reaches them."""
+
+FAULTS: Final = {
+    "provider": ("kill", "stop", "disk", "clock"),
+    "robot": ("kill", "stop", "disk", "clock"),
+    "person": ("kill", "stop", "disk", "clock"),
+    "router": ("kill", "stop"),
+    "node": ("stop", "reorganise"),
+}
+
+
+class Cell(NamedTuple):
+    """`victim` fails by `fault` when the process `at` reaches `point`."""
+
+    victim: str
+    fault: str
+    at: str
+    point: Point
+
+    @property
+    def name(self) -> str:
+        return f"{self.victim}-{self.fault}-{'' if self.at == self.victim else f'{self.at}-'}{self.point.name}"
+
+
+CELLS: Final = tuple(
+    Cell(victim, fault, at, point)
+    for victim, faults in FAULTS.items()
+    for (at, point), fault in product(
+        [(victim, point) for point in POINTS[victim]] if victim in POINTS else SHARED, faults
+    )
+)

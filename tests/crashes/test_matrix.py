@@ -1,0 +1,59 @@
+"""Each cell of the crash matrix: a fault at a point of a job, after which it is paid once or refunded.
+
+`CRASH_CELLS` chooses: `all` (`make crash-test`), `sample` (CI; another one each time), or words of the cells' names.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+from tests.crashes.market import CrashMarket
+from tests.crashes.matrix import CELLS, FAULTS, POINTS, SHARED, Cell
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+SAMPLE: Final = 6
+
+
+def chosen() -> tuple[Cell, ...]:
+    """The cells of this run, which must not be shared by several processes: each would draw another sample."""
+    wanted = os.environ.get("CRASH_CELLS", "")
+    if wanted == "all":
+        return CELLS
+    if wanted == "sample":
+        return tuple(random.sample(CELLS, SAMPLE))
+    return tuple(cell for cell in CELLS if wanted and wanted in cell.name)
+
+
+@pytest.fixture(scope="module")
+def market() -> Iterator[CrashMarket]:
+    with CrashMarket() as market:
+        yield market
+
+
+if CHOSEN := chosen():
+
+    @pytest.mark.parametrize("cell", CHOSEN, ids=lambda cell: cell.name)
+    def test_a_job_survives_the_fault(market: CrashMarket, cell: Cell) -> None:
+        market.play(cell)
+
+
+def test_each_point_is_a_method() -> None:
+    """Whoever renames one of them changes the table."""
+    for points in POINTS.values():
+        for point in points:
+            point.find()
+
+
+def test_the_table_has_at_least_twelve_points_for_each_role() -> None:
+    assert all(len(points) >= 12 for points in POINTS.values())
+    assert len(SHARED) >= 12
+    assert len({cell.name for cell in CELLS}) == len(CELLS)
+    assert {(cell.victim, cell.fault) for cell in CELLS} == {
+        (victim, fault) for victim, faults in FAULTS.items() for fault in faults
+    }
