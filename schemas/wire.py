@@ -42,7 +42,7 @@ def decode(payload: bytes) -> Message:
 
     Raises `InvalidMessage` and nothing else, whatever the bytes are. Its `reason` is one of `too-large`, `not-json`,
     `unknown-kind`, `unknown-field`, `duplicate-field`, `field` (missing or of the wrong type), `address`, `cid`,
-    `nonce`, `range`, `hash` and `signature`.
+    `nonce`, `range`, `hash`, `validator` (an order's lighthouse) and `signature`.
     """
     if len(payload) > MAX_MESSAGE_SIZE:
         raise InvalidMessage("too-large", f"it has {len(payload)} bytes; the limit is {MAX_MESSAGE_SIZE}")

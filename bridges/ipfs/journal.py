@@ -90,7 +90,7 @@ class RelayedMessages:
             self._relayed.popitem(last=False)
 
     def is_due(self, fingerprint: bytes) -> bool | None:
-        """Whether a copy from the side of its sender is to be relayed again; None for a message that never was."""
+        """Whether to relay another copy from its sender; None for a message that was never relayed."""
         if fingerprint not in self._relayed:
             return None
         times, at = self._relayed[fingerprint]

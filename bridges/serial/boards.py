@@ -181,7 +181,7 @@ class SimulatedBoard:
             while not condition():
                 left = deadline - time.monotonic()
                 if left <= 0 or (self._process is not None and self._process.poll() is not None):
-                    raise BoardFailed(f"waited in vain for {what}; the board said: {' | '.join(self.output[-10:])}")
+                    raise BoardFailed(f"gave up waiting for {what}; the board said: {' | '.join(self.output[-10:])}")
                 self._changed.wait(min(left, 0.2))
 
     def wait_for_end(self) -> None:

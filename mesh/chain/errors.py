@@ -235,7 +235,7 @@ class ChainWentBack(ChainError, code="chain-went-back"):
 
 
 class ReorganisedTooDeep(ChainWentBack, code="reorganised-too-deep"):
-    """None of the blocks that are remembered of the chain is on it any more: it is another chain, or started afresh.
+    """None of the remembered blocks is on the chain: it is another chain, or was restarted from its beginning.
 
     `cursor` is the oldest block that is remembered.
     """

@@ -89,7 +89,7 @@ class Unconfirmed:
     def reverted(self, liability: str, *kinds: type[Any]) -> list[Verified[Any]]:
         """An event of the liability was reverted: its messages of these kinds that must be settled again, and leave.
 
-        Those with a transaction that waits stay: whoever sent it notices.
+        Those with a transaction that waits stay: its sender notices.
         """
         again = []
         for entry in self._entries_at(liability, kinds):

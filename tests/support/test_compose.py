@@ -45,7 +45,7 @@ def project(engine: Engine, tmp_path_factory: pytest.TempPathFactory) -> Iterato
 
 def is_answered(project: Project, file: str = "") -> bool:
     try:
-        # A name that nobody has any more is asked for outside, for as long as that takes.
+        # A name that no container has is looked up outside, for as long as that takes.
         return project.execute("asker", "timeout", "3", "python3", "-c", ASK.replace("${FILE}", file)) == "200\n"
     except EngineFailed:
         return False
