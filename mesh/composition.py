@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 from mesh.network import Endpoints
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from mesh.chain import Account, Chain
     from mesh.settings import AccountSettings, ChainSettings, NetworkSettings
 
@@ -46,6 +48,11 @@ def chain_of(settings: ChainSettings, account: Account | None) -> Chain:
         fees=FeePolicy(ceiling=round(settings.max_fee_gwei * GWEI)),
         transactions=settings.state_directory / "transactions",
     )
+
+
+def withdrawals_of(settings: ChainSettings, account: Account, lighthouse: str) -> Path:
+    """The file in which a provider keeps the withdrawals at a lighthouse (ENS name)."""
+    return settings.state_directory / account.address / f"withdrawals-{lighthouse.lower()}.sqlite"
 
 
 def endpoints_of(settings: NetworkSettings) -> Endpoints:

@@ -77,7 +77,7 @@ async def _open_provider(
     settings: Settings, account: Account, telemetry: Telemetry
 ) -> AsyncIterator[tuple[Network, Provider]]:
     """The provider with its chain and network, and its metrics. Raises `AiraError` for what is not ready yet."""
-    from mesh.composition import chain_of, endpoints_of
+    from mesh.composition import chain_of, endpoints_of, withdrawals_of
     from mesh.market.provider import Provider, ProviderProcess, check_account
     from mesh.network import Network
 
@@ -86,7 +86,13 @@ async def _open_provider(
         await check_account(chain, lighthouse)
         async with (
             Network(endpoints_of(settings)) as network,
-            Provider(network.session, chain, lighthouse, limit=settings.open_orders_limit) as provider,
+            Provider(
+                network.session,
+                chain,
+                lighthouse,
+                limit=settings.open_orders_limit,
+                withdrawals=withdrawals_of(settings, account, lighthouse),
+            ) as provider,
         ):
             process = ProviderProcess(network, chain, [provider])
             with telemetry.showing(measure=process.measure, health=process.health):

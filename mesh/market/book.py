@@ -33,7 +33,7 @@ STALE: Final = 4096
 LIMIT: Final = 1_000_000
 """Open orders that a book holds by default."""
 ORDER_USED: Final = "OrderUsed"
-"""The contracts' error for an order that became a liability before."""
+"""The contracts' error for an order that became a liability, or was withdrawn there."""
 UNNAMED_ERROR: Final = "Reverted"
 """The reason of a rejection when the contract's error has no name."""
 
@@ -49,6 +49,8 @@ class Refusal(StrEnum):
     """It names another lighthouse."""
     FULL = "full"
     """The book is full; try again later."""
+    WITHDRAWN = "withdrawn"
+    """Its maker has withdrawn it."""
 
 
 class Match(NamedTuple):
@@ -83,6 +85,8 @@ class OrderBook:
         self._nodes: dict[bytes, QueueNode[Verified[Order]]] = {}
         self._demands: Queues[Terms, Verified[Order]] = Queues()
         self._offers: Queues[Terms, Verified[Order]] = Queues()
+        self._aside: set[bytes] = set()
+        """Orders in the book that are not matched."""
         self._due: dict[int, list[bytes]] = {}
         self._listed = 0
 
@@ -100,12 +104,8 @@ class OrderBook:
     def add(self, order: Verified[Order]) -> Match | Added | Refusal:
         """Add a verified order. Returns a `Match` with the oldest counterpart, `Added`, or the reason of a refusal."""
         message = order.message
-        if message.lighthouse != self._lighthouse:
-            return Refusal.LIGHTHOUSE
-        if message.deadline <= self._head:
-            return Refusal.EXPIRED
-        if order_id(order) in self:
-            return Refusal.DUPLICATE
+        if (refusal := self._refusal(order)) is not None:
+            return refusal
         waiting = self._offers if isinstance(message, Demand) else self._demands
         counterpart = waiting.first(_terms(message))
         if counterpart is not None:
@@ -116,13 +116,24 @@ class OrderBook:
         self._enter(order)
         return Added(order)
 
+    def set_aside(self, order: Verified[Order]) -> bool:
+        """Add an order that is not matched until it is removed and added; False if the book refuses it."""
+        if self._refusal(order) is not None or len(self._nodes) >= self._limit:
+            return False
+        self._aside.add(order_id(order))
+        self._enter(order)
+        return True
+
     def remove(self, identity: bytes) -> Verified[Order] | None:
         """Remove and return the order with this identity; None if it is not in the book."""
         node = self._nodes.pop(self._key(identity), None)
         if node is None:
             return None
         message = node.item.message
-        self._side(message).remove(_terms(message), node)
+        if identity in self._aside:
+            self._aside.remove(identity)
+        else:
+            self._side(message).remove(_terms(message), node)
         return node.item
 
     def expire(self, head: int) -> list[Verified[Order]]:
@@ -149,11 +160,19 @@ class OrderBook:
         """The open orders, oldest first. O(orders); the book must not change during the iteration."""
         return (node.item for node in self._nodes.values())
 
+    def _refusal(self, order: Verified[Order]) -> Refusal | None:
+        message = order.message
+        if message.lighthouse != self._lighthouse:
+            return Refusal.LIGHTHOUSE
+        expired = message.deadline <= self._head
+        return Refusal.EXPIRED if expired else Refusal.DUPLICATE if order_id(order) in self else None
+
     def _enter(self, order: Verified[Order]) -> None:
         message = order.message
         key = order.hash if order.hash not in self._nodes else order_id(order)
         node = self._nodes[key] = QueueNode(order)
-        self._side(message).append(_terms(message), node)
+        if order_id(order) not in self._aside:
+            self._side(message).append(_terms(message), node)
         self._list(key, message.deadline)
         if self._listed > STALE + 2 * len(self._nodes):
             self.compact()

@@ -1,7 +1,8 @@
 """The provider of a lighthouse: matches demands and offers, creates their liabilities, finalizes them by results.
 
-A provider keeps nothing on disk. Orders and results are sent again until their effect is on the chain, and the chain
-refuses an order that was used before; so a provider that was killed starts empty and catches up.
+A provider keeps nothing on disk but withdrawals. Orders and results are sent again until their effect is on the chain,
+and the chain refuses an order that was used before; so a provider that was killed starts empty and catches up. It asks
+the others for open orders and withdrawals.
 """
 
 from __future__ import annotations
@@ -13,19 +14,22 @@ from mesh.chain import InsufficientFunds
 from mesh.log_context import LogSource, source_context
 from mesh.market.book import LIMIT, Match, OrderBook
 from mesh.market.earnings import Earnings, EarningsLedger
+from mesh.market.liability_events import OPEN_LIABILITIES
 from mesh.market.services import OrderBookService, ProviderStatusService
-from mesh.market.settlement import OPEN_LIABILITIES, Settlement
+from mesh.market.settlement import Settlement
 from mesh.market.transaction_queue import LEAST_GAS, RETRY, NoStake, TransactionQueue
+from mesh.market.withdrawals import Withdrawals
 from mesh.network.channel import Channel
 from mesh.network.metrics import link_state, network_families
 from mesh.network.services import Services
 from mesh.role import Role
 from mesh.telemetry.logs import LogService
-from schemas import Demand, Offer, Result
+from schemas import Demand, Offer, Result, Withdrawal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
     from contextlib import AsyncExitStack
+    from pathlib import Path
 
     import zenoh
 
@@ -43,7 +47,8 @@ class Provider(Role):
 
     `lighthouse` is the ENS name; its chain account must have a stake there. `limit` is the most open orders, `matched`
     is called with each match before its liability is created, `retry` is the policy for transactions that fail, and
-    `open_liabilities` the most records of open liabilities in memory. The caller closes session and chain. When `run`
+    `open_liabilities` the most records of open liabilities in memory. Withdrawals are kept in the file
+    `withdrawals`, if given. The caller closes session and chain. When `run`
     is cancelled, a transaction that was sent may still be mined.
     """
 
@@ -59,6 +64,7 @@ class Provider(Role):
         matched: Callable[[Match], None] = lambda match: None,
         retry: RetryPolicy = RETRY,
         open_liabilities: int = OPEN_LIABILITIES,
+        withdrawals: Path | None = None,
     ) -> None:
         if chain.account is None:
             raise ValueError("a provider needs a chain with an account")
@@ -70,6 +76,7 @@ class Provider(Role):
         self._matched = matched
         self._retry = retry
         self._open_liabilities = open_liabilities
+        self.withdrawals = Withdrawals(withdrawals)
         self.ledger = EarningsLedger()
         self._source = LogSource("provider", self.address, self._lighthouse)
 
@@ -78,8 +85,10 @@ class Provider(Role):
         head = max(head - self._chain.node.timing.reorg_depth, 0)  # blocks that may be replaced are read again
         self.book = OrderBook(address, limit=self._limit)
         self.book.expire(head)
+        stack.enter_context(self.withdrawals)
+        self.withdrawals.expire(head)
         self.queue = TransactionQueue(
-            self._chain, address, head=lambda: self.settlement.head, earnings=self.ledger, retry=self._retry
+            self._chain, address, head=lambda: self.settlement.events.head, earnings=self.ledger, retry=self._retry
         )
         self.channel = await stack.enter_async_context(
             Channel(
@@ -88,14 +97,15 @@ class Provider(Role):
                 address=address,
                 resolver=self._chain.names.address,
                 validators=self._chain.validators,
-                head=lambda: self.settlement.head,
+                head=lambda: self.settlement.events.head,
             )
         )
         self._demands = await stack.enter_async_context(self.channel.subscribe(Demand))
         self._offers = await stack.enter_async_context(self.channel.subscribe(Offer))
+        self._withdrawn = await stack.enter_async_context(self.channel.subscribe(Withdrawal))
         self.results = await stack.enter_async_context(self.channel.subscribe(Result))
         self._wire(head)
-        await stack.enter_async_context(OrderBookService(self._session, self._lighthouse, self.book))
+        await stack.enter_async_context(OrderBookService(self._session, self._lighthouse, self.book, self.withdrawals))
         services = await stack.enter_async_context(Services(self._session, self.address))
         with source_context(self._source):
             services.offer("status", self._status.status)
@@ -113,13 +123,14 @@ class Provider(Role):
             head=head,
             matched=self._matched,
             forget=self._forget,
+            withdrawals=self.withdrawals,
             open_limit=self._open_liabilities,
         )
         self._status = ProviderStatusService(
             self._session,
             self._chain,
             self.channel,
-            subscriptions=(self._demands, self._offers, self.results),
+            subscriptions=(self._demands, self._offers, self._withdrawn, self.results),
             book=self.book,
             queue=self.queue,
             settlement=self.settlement,
@@ -130,6 +141,9 @@ class Provider(Role):
         with source_context(self._source):
             async with asyncio.TaskGroup() as tasks:
                 self.settlement.start(tasks)
+                # Before the orders that they concern; one that comes later still stops what was not sent.
+                await self._withdrawn.recall()
+                tasks.create_task(self._take_withdrawals(), name="provider withdrawals")
                 tasks.create_task(self._take_orders(self._demands), name="provider demands")
                 tasks.create_task(self._take_orders(self._offers), name="provider offers")
                 tasks.create_task(self._take_results(), name="provider results")
@@ -154,9 +168,13 @@ class Provider(Role):
 
     def _forget(self, verified: Verified[Any]) -> None:
         """Let the next copy of a message through: it is not handled, or its effect was not confirmed."""
-        for subscription in (self._demands, self._offers, self.results):
+        for subscription in (self._demands, self._offers, self._withdrawn, self.results):
             if subscription.kind == verified.message.kind:
                 subscription.forget(verified)
+
+    async def _take_withdrawals(self) -> None:
+        async for withdrawal in self._withdrawn:
+            self.settlement.withdraw(withdrawal)
 
     async def _take_results(self) -> None:
         async for result in self.results:

@@ -6,7 +6,7 @@ import logging
 from typing import TYPE_CHECKING, Any
 
 from mesh.log_context import log_event
-from mesh.market.book import ORDER_USED
+from mesh.market.book import ORDER_USED, Refusal
 from schemas import RejectKey
 from schemas.signing import Rejection
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mesh.chain import Account
     from mesh.market.earnings import EarningsLedger
     from mesh.network import Channel
-    from schemas import Verified
+    from schemas import Verified, Withdrawal
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +34,17 @@ class RejectionPublisher:
         event = log_event("message-rejected", order=order, signer=message.signer, reason=reason)
         log.warning("rejected %s of %s: %s", order, message.signer, detail, extra=event)
         if reason != ORDER_USED:
-            provider = self._account.address
-            rejection = Rejection(order=order, reason=reason, detail=detail, provider=provider)
-            key = str(RejectKey(self._channel.lighthouse, order, provider))
-            self._channel.put(key, rejection.signed_by(self._account.signer).encode())
+            self._publish(order, reason, detail)
+
+    def honour(self, withdrawal: Verified[Withdrawal]) -> None:
+        """Publish, as a rejection of the withdrawn order, that this provider does not match it."""
+        order = withdrawal.message.order
+        event = log_event("withdrawal-honoured", order=order, signer=withdrawal.signer)
+        log.info("%s withdrew the order %s", withdrawal.signer, order, extra=event)
+        self._publish(order, Refusal.WITHDRAWN.value, "its maker has withdrawn it; this provider does not match it")
+
+    def _publish(self, order: str, reason: str, detail: str) -> None:
+        provider = self._account.address
+        rejection = Rejection(order=order, reason=reason, detail=detail, provider=provider)
+        key = str(RejectKey(self._channel.lighthouse, order, provider))
+        self._channel.put(key, rejection.signed_by(self._account.signer).encode())

@@ -1,4 +1,4 @@
-"""What a provider tells others: its open orders, and its status, health and metrics."""
+"""What a provider tells others: open orders and withdrawals, and its status, health and metrics."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
 
     from mesh.chain import Chain
-    from mesh.market.book import Order, OrderBook
+    from mesh.market.book import OrderBook
     from mesh.market.earnings import EarningsLedger
     from mesh.market.settlement import Settlement
     from mesh.market.transaction_queue import TransactionQueue
+    from mesh.market.withdrawals import Withdrawals
     from mesh.network import Channel, Subscription
     from schemas import Verified
     from schemas.rpc import Nothing
@@ -37,10 +38,10 @@ PENDING: Final = 64
 
 
 class OrderBookService:
-    """Answers queries for the open orders, which a client sends after it has subscribed.
+    """Answers queries for open orders and withdrawals, which a client sends after it has subscribed.
 
-    Inside `async with` it answers on the keys of `lighthouse` (ENS name) from its `book`. At most `limit` queries are
-    pending at a time. Leaving `async with` aborts the answers.
+    Inside `async with` it answers on the keys of `lighthouse` (ENS name) from `book` and `withdrawals`. At most `limit`
+    queries are pending at a time. Leaving `async with` aborts the answers.
     """
 
     def __init__(
@@ -48,6 +49,7 @@ class OrderBookService:
         session: zenoh.Session,
         lighthouse: str,
         book: OrderBook,
+        withdrawals: Withdrawals,
         *,
         limit: int = PENDING,
         threads: ThreadPoolExecutor | None = None,
@@ -55,6 +57,7 @@ class OrderBookService:
         self._session = session
         self._lighthouse = lighthouse
         self._book = book
+        self._withdrawals = withdrawals
         self._limit = limit
         self._threads = threads or ThreadPoolExecutor(THREADS, thread_name_prefix="order book")
         self._answers: set[Future[None]] = set()
@@ -81,20 +84,20 @@ class OrderBookService:
     def answer(self, query: zenoh.Query) -> None:
         """Answer a query in a thread, or drop it. Call it in the event loop's thread, where the book changes."""
         if self._open and len(self._answers) < self._limit:
-            answer = self._threads.submit(self._reply, query, list(self._book.orders()))
+            answer = self._threads.submit(self._reply, query, [*self._withdrawals, *self._book.orders()])
             self._answers.add(answer)
             answer.add_done_callback(self._answers.discard)
         else:
             query.drop()  # type: ignore[no-untyped-call]
 
-    def _reply(self, query: zenoh.Query, orders: list[Verified[Order]]) -> None:
+    def _reply(self, query: zenoh.Query, messages: list[Verified[Any]]) -> None:
         with query:  # leaving it ends the answer
-            for order in orders:
-                key = verified_key(self._lighthouse, order)
+            for message in messages:
+                key = verified_key(self._lighthouse, message)
                 if not self._open:
                     return
                 if query.key_expr.intersects(zenoh.KeyExpr(key)):
-                    query.reply(key, encode(order.message), encoding="application/json")
+                    query.reply(key, encode(message.message), encoding="application/json")
 
 
 class ProviderStatusService:
@@ -135,7 +138,7 @@ class ProviderStatusService:
             zenoh_id=str(self._session.zid()),
             lighthouse=self._channel.lighthouse,
             parts=self.health(),
-            head=self._settlement.head,
+            head=self._settlement.events.head,
             chain_id=self._chain.chain_id,
             xrt=self._chain.xrt,
             uptime=round(time.monotonic() - self._began, 3),
@@ -154,13 +157,13 @@ class ProviderStatusService:
     def health(self) -> dict[str, str]:
         """The state of each part: sending transactions, and following the chain."""
         transactions = ALIVE
-        if self._settlement.reading.is_down:
+        if self._settlement.state.outages.is_down:
             transactions = "wait for the node"
         elif self._queue.is_down:
             transactions = "wait"
         return {
             "transactions": transactions,
-            "listener": "waits for the node" if self._settlement.following.is_down else ALIVE,
+            "listener": "waits for the node" if self._settlement.events.outages.is_down else ALIVE,
         }
 
     async def measure(self) -> tuple[MetricFamily, ...]:
@@ -169,7 +172,7 @@ class ProviderStatusService:
             *message_families(self._subscriptions),
             *self._market_families(),
             *self._earnings_families(),
-            *reading_families(head=self._settlement.head, read_at=self._settlement.read_at),
+            *reading_families(head=self._settlement.events.head, read_at=self._settlement.events.read_at),
             *await self._stake.measure(),
         )
         return labelled(families, lighthouse=self._channel.lighthouse)

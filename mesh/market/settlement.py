@@ -11,45 +11,39 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import time
-from contextlib import aclosing
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.chain import (
-    Finalized,
-    History,
-    NewLiability,
-    NoContracts,
     NodeUnreachable,
-    NotALiability,
-    Reorganisation,
     RequestRefused,
     Reverted,
 )
 from mesh.errors import AiraError, InputError
 from mesh.log_context import liability_context, log_event
-from mesh.market.book import ORDER_USED, Match, Refusal, at_fault, reason_word
+from mesh.market.book import ORDER_USED, Match, Refusal, at_fault, order_id, reason_word
+from mesh.market.chain_state import ChainState
+from mesh.market.creation import Creation, MatchWithdrawn
+from mesh.market.liability_events import OPEN_LIABILITIES, LiabilityEvents
 from mesh.market.rejections import RejectionPublisher
 from mesh.market.unconfirmed import Unconfirmed
-from mesh.outage_log import OutageLog
-from mesh.retry import Backoff
-from schemas import ZERO_ADDRESS, Demand, Offer, Result, address_bytes
+from mesh.market.unfunded import UnfundedOrders
+from mesh.market.withdrawals import withdrawn_id
+from schemas import ZERO_ADDRESS, Result
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from mesh.chain import BlockEvents, Chain
+    from mesh.chain import Chain
     from mesh.market.book import Order, OrderBook
     from mesh.market.earnings import EarningsLedger
     from mesh.market.transaction_queue import TransactionQueue
+    from mesh.market.withdrawals import Withdrawals
     from mesh.network import Channel
-    from schemas import Liability, Verified
+    from schemas import Verified, Withdrawal
 
 log = logging.getLogger(__name__)
 
-OPEN_LIABILITIES: Final = 65_536
-"""Records of liabilities that are kept until they are finalized; others are read when their result arrives."""
 MISSING_CHECKS: Final = 3
 """Checks in a row that find no trace of a mined transaction before it is sent again: one node may be behind another."""
 
@@ -71,16 +65,12 @@ class Settlement:
         head: int,
         matched: Callable[[Match], None],
         forget: Callable[[Verified[Any]], None],
+        withdrawals: Withdrawals,
         open_limit: int = OPEN_LIABILITIES,
     ) -> None:
         assert chain.account is not None
         assert channel.address is not None
-        self.head, self.read_at = head, time.monotonic()
-        """The latest block that was read, and when, on the monotonic clock."""
-        self.following = OutageLog(log, "chain")
-        """Outages of the node while the chain is followed."""
-        self.reading = OutageLog(log, "node")
-        """Outages of the node while the state of liabilities and orders is read."""
+        self.state: Final = ChainState(chain)
         self._chain = chain
         self._lighthouse = channel.address
         self._book = book
@@ -88,23 +78,35 @@ class Settlement:
         self._earnings = earnings
         self._matched = matched
         self._forget = forget
-        self.reject: Final = RejectionPublisher(channel, chain.account, earnings).reject
-        self._open_limit = open_limit
-        self._open: dict[str, Liability] = {}
+        self._withdrawals = withdrawals
+        self._publisher = RejectionPublisher(channel, chain.account, earnings)
+        self.reject: Final = self._publisher.reject
         self._unconfirmed = Unconfirmed(chain.node.timing.reorg_depth)
-        self._history = History(chain.node.timing.reorg_depth)
+        self._unfunded = UnfundedOrders(book, self.state, funded=self.add, interval=chain.node.timing.poll_interval)
+        self.events: Final = LiabilityEvents(
+            chain,
+            channel.address,
+            book=book,
+            unconfirmed=self._unconfirmed,
+            withdrawals=withdrawals,
+            earnings=earnings,
+            head=head,
+            reverted=self._settle_again,
+            open_limit=open_limit,
+        )
 
     def start(self, tasks: asyncio.TaskGroup) -> None:
         """Follow the chain, and from now on settle what is added, in tasks of this group."""
         self._tasks = tasks
-        tasks.create_task(self._follow(), name="provider chain")
+        tasks.create_task(self.events.follow(), name="provider chain")
+        tasks.create_task(self._unfunded.run(), name="provider unfunded orders")
 
     def add(self, order: Verified[Order]) -> Refusal | None:
         """Add an order to the book, and settle the match that it completes.
 
         If the book refuses the order, returns why, and publishes a rejection unless the order is known already.
         """
-        outcome = Refusal.DUPLICATE if order in self._unconfirmed else self._book.add(order)
+        outcome = self._refusal(order) or self._book.add(order)
         if isinstance(outcome, Match):
             demand, offer = outcome.demand.hash.hex(), outcome.offer.hash.hex()
             event = log_event("orders-matched", demand=demand, offer=offer)
@@ -116,14 +118,45 @@ class Settlement:
         elif isinstance(outcome, Refusal):
             if outcome is not Refusal.DUPLICATE:
                 self.reject(order, outcome.value, f"the order book refuses it: {outcome.value}")
+            if outcome not in (Refusal.DUPLICATE, Refusal.WITHDRAWN):
                 self._forget(order)
             return outcome
         return None
 
+    def _settle_again(self, message: Verified[Any]) -> None:
+        if isinstance(message.message, Result):
+            self._tasks.create_task(self.add_result(message))
+        else:
+            self.add(message)
+
+    def _refusal(self, order: Verified[Order]) -> Refusal | None:
+        if order in self._unfunded:
+            self._unfunded.hasten(order)
+            self._forget(order)
+            return Refusal.DUPLICATE
+        if order in self._unconfirmed:
+            return Refusal.DUPLICATE
+        return Refusal.WITHDRAWN if order_id(order) in self._withdrawals else None
+
+    def withdraw(self, withdrawal: Verified[Withdrawal]) -> None:
+        """Honour a withdrawal: its order leaves the book, and is refused until its deadline.
+
+        A transaction that was sent already can't be stopped. If it was not, or fails, the order is refused then.
+        """
+        if not self._withdrawals.add(withdrawal):
+            self.reject(withdrawal, Refusal.FULL.value, "too many withdrawals")
+            self._forget(withdrawal)
+            return
+        identity = withdrawn_id(withdrawal)
+        self._book.remove(identity)
+        if self._unconfirmed.get(identity) is None:
+            self._publisher.honour(withdrawal)
+
     async def add_result(self, result: Verified[Result]) -> None:
         """Finalize the liability that a result names, if the result may do that."""
         with liability_context(result.message.liability):
-            liability = await self._chain.retrying(partial(self._liability, result), outages=self.reading)
+            address = result.message.liability
+            liability = self.events.open.get(address) or await self.state.liability(address)
             if result in self._unconfirmed:
                 return
             if liability is None or liability.is_finalized:  # which may not be confirmed either
@@ -134,22 +167,15 @@ class Settlement:
                 self._unconfirmed.begin(result)
                 self._tasks.create_task(self._finalize(result))
 
-    async def _liability(self, result: Verified[Result]) -> Liability | None:
-        """The record of the liability that a result names; None while the node knows none at that address."""
-        address = result.message.liability
-        try:
-            return self._open.get(address) or await self._chain.liabilities.get(address)
-        except (NotALiability, NoContracts, RequestRefused) as error:
-            log.debug("a result waits to be sent again: %s", error)
-            return None
-
     async def _create(self, match: Match) -> None:
         demand, offer = match
-        create = partial(self._chain.liabilities.create, self._lighthouse, demand.message, offer.message)
         try:
-            created = await self._queue.send(create)
+            created = await self._queue.send(Creation(self._chain, self._lighthouse, match, self._withdrawals).attempt)
+        except MatchWithdrawn:
+            self._put_back(match)
         except Reverted as error:
-            await self._not_created(match, at_fault(match, error.reason, error.arguments), error)
+            if error.reason == ORDER_USED or not await self._set_aside_unfunded(match, error):
+                await self._not_created(match, at_fault(match, error.reason, error.arguments), error)
         except (NodeUnreachable, RequestRefused, InputError) as error:
             await self._not_created(match, match, error)
         else:
@@ -159,10 +185,28 @@ class Settlement:
             with liability_context(created.liability):
                 log.info("created, gas %d", created.gas_used, extra=event)
             if not await self._is_confirmed(match, created.tx):
-                self._contract_reverted(created.liability, created.tx)
-            for order in match:
-                if not self._unconfirmed.end(order):
-                    self.add(order)
+                self.events.creation_reverted(created.liability, created.tx)
+            self._put_back(match)
+
+    def _put_back(self, match: Match) -> None:
+        """No transaction of a match waits any more: put its orders back into the book unless they were used."""
+        for order in match:
+            if not self._unconfirmed.end(order):
+                self.add(order)
+
+    async def _set_aside_unfunded(self, match: Match, error: Reverted) -> bool:
+        """Keep the orders whose makers can't pay in the book, unmatched, and tell them; False if both can."""
+        unfunded = [order for order in match if not await self.state.can_pay(order)]
+        for order in match if unfunded else ():
+            if self._unconfirmed.end(order):
+                continue
+            if order not in unfunded or order_id(order) in self._withdrawals:
+                self.add(order)
+                continue
+            self._unfunded.add(order)
+            self.reject(order, _reason(error), str(error))
+            self._forget(order)
+        return bool(unfunded)
 
     async def _not_created(self, match: Match, rejected: tuple[Verified[Order], ...], error: AiraError) -> None:
         """Reject some orders of a match; put the other one back into the book, unless it was used meanwhile."""
@@ -173,7 +217,7 @@ class Settlement:
                 self.reject(order, reason, str(error))
             if was_used:
                 continue
-            if order in rejected or await self._chain.retrying(partial(self._is_used, order), outages=self.reading):
+            if order in rejected or await self.state.is_used(order):
                 self._forget(order)
             else:
                 self.add(order)
@@ -182,26 +226,14 @@ class Settlement:
         """Wait until the event that used the messages has its confirmations; False if their transaction vanished."""
         timing, missing = self._chain.node.timing, 0
         while missing < MISSING_CHECKS:
-            if all(self._unconfirmed.is_read(one, until=self.head - timing.confirmations + 1) for one in messages):
+            if all(
+                self._unconfirmed.is_read(one, until=self.events.head - timing.confirmations + 1) for one in messages
+            ):
                 return True
             await asyncio.sleep(timing.poll_interval)
-            is_there = all(self._unconfirmed.is_read(one, until=self.head) for one in messages)
-            is_there = is_there or await self._chain.retrying(partial(self._is_on_chain, tx), outages=self.reading)
-            missing = 0 if is_there else missing + 1
+            is_there = all(self._unconfirmed.is_read(one, until=self.events.head) for one in messages)
+            missing = 0 if is_there or await self.state.has_mined(tx) else missing + 1
         return False
-
-    async def _is_on_chain(self, tx: str) -> bool:
-        """Whether the node has a transaction, waiting or mined with success."""
-        receipt = await self._chain.node.receipt(tx)
-        return await self._chain.node.has_transaction(tx) if receipt is None else receipt.status == 1
-
-    async def _is_used(self, order: Verified[Order]) -> bool:
-        try:
-            if order.message.generation == 3:
-                return await self._chain.liabilities.is_order_used(order.hash, order.signer)
-            return await self._chain.liabilities.next_nonce(order.signer) > int(order.message.nonce)
-        except RequestRefused:
-            return False  # a used order is rejected when its next match fails
 
     async def _finalize(self, result: Verified[Result]) -> None:
         message = result.message
@@ -221,77 +253,6 @@ class Settlement:
                     self._earnings.reverted(finalized.tx)
                 if not self._unconfirmed.end(result):
                     await self.add_result(result)
-
-    async def _follow(self) -> None:
-        backoff = Backoff(self._chain.node.timing.outage_retry)
-        while True:
-            try:
-                blocks = self._chain.follow(self.head + 1, history=self._history, outages=self.following)
-                async with aclosing(blocks):
-                    async for block in blocks:
-                        if isinstance(block, Reorganisation):
-                            self._revert(block)
-                        else:
-                            await self._take_block(block)
-                        backoff.reset()
-            except (NodeUnreachable, RequestRefused, NotALiability, NoContracts) as error:
-                # A liability can't be read. If a reorganisation took it away, that is what comes next.
-                self.following.failed(error, f"the chain can't be read on from block {self.head + 1}")
-                await backoff.wait()
-
-    async def _take_block(self, block: BlockEvents) -> None:
-        for event in block.events:
-            if isinstance(event, NewLiability | Finalized):
-                self._earnings.mined(event.tx)
-            if isinstance(event, NewLiability):
-                await self._take_created(event.liability, block.block_number)
-            elif isinstance(event, Finalized):
-                self._open.pop(event.liability, None)
-                self._unconfirmed.finalized(event.liability, block.block_number)
-        self.head, self.read_at = block.block_number, time.monotonic()
-        self._unconfirmed.confirm(self.head)
-        for order in self._book.expire(self.head):
-            expired = log_event("order-expired", order=order.hash.hex(), signer=order.signer)
-            log.info("expired order %s of %s", order.hash.hex(), order.signer, extra=expired)
-
-    async def _take_created(self, address: str, block: int) -> None:
-        """Take the orders of a new liability, created in that block, out of the book."""
-        liability = await self._chain.liabilities.get(address)
-        if liability.lighthouse != self._lighthouse:
-            return
-        demand_hash, offer_hash = await self._chain.liabilities.order_hashes(address)
-        for digest, signer in ((demand_hash, liability.promisee), (offer_hash, liability.promisor)):
-            identity = digest + address_bytes(signer)
-            order = self._book.remove(identity) or self._unconfirmed.get(identity)
-            if order is not None:
-                self._unconfirmed.created(address, block, order)
-        if not liability.is_finalized:
-            self._open[address] = liability
-            if len(self._open) > self._open_limit:
-                del self._open[next(iter(self._open))]
-
-    def _revert(self, block: Reorganisation) -> None:
-        """Settle again what a reorganisation reverted. What happened again by itself, the contracts refuse."""
-        self.head = block.block_number
-        created = [event for event in block.reverted_events if isinstance(event, NewLiability)]
-        finalized = [event for event in block.reverted_events if isinstance(event, Finalized)]
-        counts = {"created": len(created), "finalized": len(finalized)}
-        event = log_event("chain-reorganised", head=self.head, **counts)
-        log.warning("a reorganisation reverted %d new contracts, %d finalizations", *counts.values(), extra=event)
-        for creation in created:
-            self._contract_reverted(creation.liability, creation.tx)
-            self._open.pop(creation.liability, None)
-            for order in self._unconfirmed.reverted(creation.liability, Demand, Offer):
-                self.add(order)
-        for end in finalized:
-            self._earnings.reverted(end.tx)
-            for result in self._unconfirmed.reverted(end.liability, Result):
-                self._tasks.create_task(self.add_result(result))
-
-    def _contract_reverted(self, address: str, tx: str) -> None:
-        with liability_context(address):
-            log.warning("a reorganisation reverted the contract", extra=log_event("contract-reverted"))
-        self._earnings.reverted(tx)
 
 
 def _reason(error: AiraError) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from mesh.market import OrderBook
 from mesh.market.services import THREADS, OrderBookService
+from mesh.market.withdrawals import Withdrawals
 from mesh.network import Endpoints, Network, message_key
 from tests.support.orders import LIGHTHOUSE, MARKET, MODEL, OTHER_MODEL, verified_demand, verified_offer
 from tests.support.waiting import at_most, until, until_answered
@@ -42,7 +43,7 @@ async def test_it_answers_with_the_orders_that_match_the_query(router: EmbeddedR
     async with (
         network(router) as one,
         network(router) as two,
-        OrderBookService(one.session, MARKET, holding(mine, other, offer)),
+        OrderBookService(one.session, MARKET, holding(mine, other, offer), Withdrawals()),
     ):
         await until_answered(two.session, f"aira/{MARKET}/**")
 
@@ -59,7 +60,11 @@ async def test_it_answers_with_the_orders_that_match_the_query(router: EmbeddedR
 
 async def test_it_answers_with_the_book_at_the_time_of_the_query(router: EmbeddedRouter) -> None:
     book = holding(verified_demand())
-    async with network(router) as one, network(router) as two, OrderBookService(one.session, MARKET, book):
+    async with (
+        network(router) as one,
+        network(router) as two,
+        OrderBookService(one.session, MARKET, book, Withdrawals()),
+    ):
         await until_answered(two.session, f"aira/{MARKET}/**")
         book.add(verified_offer())
 
@@ -69,7 +74,7 @@ async def test_it_answers_with_the_book_at_the_time_of_the_query(router: Embedde
 async def test_leaving_aborts_long_answers_and_those_that_wait(router: EmbeddedRouter) -> None:
     book = holding(*(verified_demand() for _ in range(3000)))
     async with network(router) as one, network(router) as two:
-        service = await OrderBookService(one.session, MARKET, book).__aenter__()
+        service = await OrderBookService(one.session, MARKET, book, Withdrawals()).__aenter__()
         await until_answered(two.session, f"aira/{MARKET}/**")
         asking = [asyncio.create_task(asyncio.to_thread(ask, two.session, f"aira/{MARKET}/**")) for _ in range(5)]
         await until(lambda: service.pending > THREADS)
@@ -84,7 +89,7 @@ async def test_leaving_aborts_long_answers_and_those_that_wait(router: EmbeddedR
 async def test_a_query_that_arrives_after_leaving_is_dropped(router: EmbeddedRouter) -> None:
     asked: list[zenoh.Query] = []
     async with network(router) as one, network(router) as two:
-        async with OrderBookService(one.session, MARKET, holding()) as service:
+        async with OrderBookService(one.session, MARKET, holding(), Withdrawals()) as service:
             pass
         with one.session.declare_queryable("test", asked.append):
             await until_answered(two.session, "test")
@@ -103,7 +108,7 @@ async def test_queries_above_the_limit_are_dropped(router: EmbeddedRouter) -> No
     async with (
         network(router) as one,
         network(router) as two,
-        OrderBookService(one.session, MARKET, holding(order), limit=1, threads=threads) as service,
+        OrderBookService(one.session, MARKET, holding(order), Withdrawals(), limit=1, threads=threads) as service,
     ):
         await until_answered(two.session, f"aira/{MARKET}/**")
         await until(lambda: service.pending == 0)
@@ -123,5 +128,5 @@ async def test_queries_above_the_limit_are_dropped(router: EmbeddedRouter) -> No
 async def test_leaving_after_the_session_was_closed_does_not_hang(router: EmbeddedRouter) -> None:
     async with network(router) as one:
         with at_most(2):
-            async with OrderBookService(one.session, MARKET, holding()):
+            async with OrderBookService(one.session, MARKET, holding(), Withdrawals()):
                 one.session.close()  # type: ignore[no-untyped-call]

@@ -1,0 +1,107 @@
+"""Orders whose makers can't pay for now: they stay in the book, unmatched, and are tried again."""
+
+from __future__ import annotations
+
+import asyncio
+import heapq
+from itertools import count
+from typing import TYPE_CHECKING, Final
+
+from mesh.market.book import order_id
+from mesh.retry import Backoff, RetryPolicy
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from mesh.market.book import Order, OrderBook
+    from mesh.market.chain_state import ChainState
+    from schemas import Verified
+
+RETRY: Final = RetryPolicy(initial=2.0, ceiling=60.0)
+"""When an order's maker is asked after again."""
+LIMIT: Final = 4096
+"""Orders that may wait for their makers' funds at the same time."""
+CHECKS: Final = 4
+"""Orders that are looked at in one round, at most: each takes up to four requests to the node."""
+
+
+class UnfundedOrders:
+    """The orders in `book` whose makers can't pay. Those that can again are taken out of it and passed to `funded`.
+
+    `interval` is in seconds between two rounds, of at most `CHECKS` orders each.
+    """
+
+    def __init__(
+        self,
+        book: OrderBook,
+        state: ChainState,
+        *,
+        funded: Callable[[Verified[Order]], object],
+        interval: float,
+        retry: RetryPolicy = RETRY,
+        limit: int = LIMIT,
+    ) -> None:
+        self._book = book
+        self._state = state
+        self._funded = funded
+        self._interval = interval
+        self._retry = retry
+        self._limit = limit
+        self._waiting: dict[bytes, tuple[float, Backoff]] = {}
+        self._queue: list[tuple[float, int, Verified[Order]]] = []
+        self._numbers = count()
+
+    def __contains__(self, order: Verified[Order]) -> bool:
+        return order_id(order) in self._waiting and order_id(order) in self._book
+
+    def add(self, order: Verified[Order]) -> bool:
+        """Keep an order, which is not in the book, in the book without matching it; False if there is no room."""
+        if len(self._waiting) >= self._limit or not self._book.set_aside(order):
+            return False
+        self._schedule(order, Backoff(self._retry))
+        return True
+
+    def hasten(self, order: Verified[Order]) -> None:
+        """Its maker sends the order again, perhaps because it can pay now: look at it in the next round."""
+        due, backoff = self._waiting[order_id(order)]
+        if due > (now := asyncio.get_running_loop().time()):
+            self._enter(order, now, backoff)
+
+    async def run(self) -> None:
+        """Look at the orders when they are due, until cancelled."""
+        while True:
+            await asyncio.sleep(self._interval)
+            for _ in range(CHECKS):
+                if (order := self._next_due()) is not None:
+                    await self._check(order)
+
+    async def _check(self, order: Verified[Order]) -> None:
+        can_pay = await self._state.can_pay(order)
+        waiting = self._waiting.pop(order_id(order), None)
+        if waiting is None or order_id(order) not in self._book:
+            return
+        if can_pay:
+            self._book.remove(order_id(order))
+            self._funded(order)
+        else:
+            self._schedule(order, waiting[1])
+
+    def _next_due(self) -> Verified[Order] | None:
+        """The next order that is due; forgets those that have left the book."""
+        now = asyncio.get_running_loop().time()
+        while self._queue and self._queue[0][0] <= now:
+            at, _, order = heapq.heappop(self._queue)
+            waiting = self._waiting.get(order_id(order))
+            if waiting is None or waiting[0] != at:
+                continue
+            if order_id(order) in self._book:
+                return order
+            del self._waiting[order_id(order)]
+        return None
+
+    def _schedule(self, order: Verified[Order], backoff: Backoff) -> None:
+        self._enter(order, asyncio.get_running_loop().time() + (backoff.next_delay() or 0.0), backoff)
+
+    def _enter(self, order: Verified[Order], at: float, backoff: Backoff) -> None:
+        self._waiting[order_id(order)] = at, backoff
+        heapq.heappush(self._queue, (at, next(self._numbers), order))

@@ -1,0 +1,159 @@
+"""The withdrawals that a provider or a bridge knows: kept until their deadline, also across a restart."""
+
+from __future__ import annotations
+
+import logging
+import sqlite3
+from bisect import bisect_right, insort
+from collections import Counter
+from typing import TYPE_CHECKING, Final, Self
+
+from mesh.errors import AiraError
+from mesh.outage_log import OutageLog
+from schemas import InvalidMessage, Verified, Withdrawal, address_bytes, decode, encode
+from schemas.wire import message_hash
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+log = logging.getLogger(__name__)
+
+LIMIT: Final = 16_384
+"""Withdrawals that are kept, at most; about 15 MB, and what an answer to a query holds."""
+LIMIT_PER_SIGNER: Final = 1024
+_TABLE: Final = """
+    PRAGMA journal_mode=WAL; PRAGMA synchronous=NORMAL;
+    CREATE TABLE IF NOT EXISTS withdrawals (identity BLOB PRIMARY KEY, signer TEXT, payload BLOB) WITHOUT ROWID;
+"""
+
+
+class WithdrawalsNotKept(AiraError, code="withdrawals-not-kept"):
+    """Withdrawals can't be read or written on disk; those that arrive are known until the process ends."""
+
+    def __init__(self, path: Path, why: object) -> None:
+        super().__init__(
+            f"withdrawals can't be kept in {path}: {why}",
+            hint="free space on the disk, or let this user write there; a damaged file can be deleted",
+        )
+        self.path = path
+        self.why = str(why)
+
+
+def withdrawn_id(withdrawal: Verified[Withdrawal]) -> bytes:
+    """The identity of the order that a withdrawal concerns, as `mesh.market.book.order_id` has it."""
+    return bytes.fromhex(withdrawal.message.order) + address_bytes(withdrawal.signer)
+
+
+class Withdrawals:
+    """The known withdrawals: `with Withdrawals(path) as withdrawals`; in memory only if `path` is None.
+
+    At most `limit` are kept. When there are more, those with the latest deadline are forgotten first: strangers can
+    sign any number, but honest orders end soon. Writes take tens of microseconds and run on the event loop; a failing
+    disk is logged as an outage.
+    """
+
+    def __init__(
+        self, path: Path | None = None, *, limit: int = LIMIT, limit_per_signer: int = LIMIT_PER_SIGNER
+    ) -> None:
+        self._path = path
+        self._limit = limit
+        self._limit_per_signer = limit_per_signer
+        self._known: dict[bytes, Verified[Withdrawal]] = {}
+        self._due: list[tuple[int, bytes]] = []
+        """Deadline and order of each, the earliest first."""
+        self._by_signer: Counter[str] = Counter()
+        self._outage = OutageLog(log, "withdrawals")
+        self._database: sqlite3.Connection | None = None
+
+    def __enter__(self) -> Self:
+        if self._path is not None:
+            try:
+                self._path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+                self._database = sqlite3.connect(self._path, isolation_level=None, check_same_thread=False)
+                self._path.chmod(0o600)
+                self._database.executescript(_TABLE)
+            except (OSError, sqlite3.Error) as error:
+                self._failed(error)
+            self._load()
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        if self._database is not None:
+            self._database.close()
+
+    def __contains__(self, order: bytes) -> bool:
+        """Whether the order with this identity is withdrawn."""
+        return order in self._known
+
+    def __len__(self) -> int:
+        return len(self._known)
+
+    def __iter__(self) -> Iterator[Verified[Withdrawal]]:
+        return iter(tuple(self._known.values()))
+
+    def add(self, withdrawal: Verified[Withdrawal]) -> bool:
+        """Know a withdrawal until its deadline; False if there is no room for it. One per order is kept."""
+        identity = withdrawn_id(withdrawal)
+        if identity in self._known:
+            return True
+        if not self._take(identity, withdrawal):
+            return False
+        row = identity, withdrawal.signer, encode(withdrawal.message)
+        self._write("INSERT OR REPLACE INTO withdrawals VALUES (?, ?, ?)", [row])
+        if len(self._known) > self._limit:
+            self._forget([self._due.pop()])
+        return identity in self._known
+
+    def expire(self, head: int) -> None:
+        """Forget the withdrawals whose deadline is not after block `head`: their orders have expired, too."""
+        count = bisect_right(self._due, head, key=lambda due: due[0])
+        if count:
+            expired, self._due = self._due[:count], self._due[count:]
+            self._forget(expired)
+
+    def _take(self, identity: bytes, withdrawal: Verified[Withdrawal]) -> bool:
+        if self._by_signer[withdrawal.signer] >= self._limit_per_signer:
+            return False
+        self._known[identity] = withdrawal
+        self._by_signer[withdrawal.signer] += 1
+        insort(self._due, (withdrawal.message.deadline, identity))
+        return True
+
+    def _forget(self, due: list[tuple[int, bytes]]) -> None:
+        for _, identity in due:
+            signer = self._known.pop(identity).signer
+            self._by_signer[signer] -= 1
+            if not self._by_signer[signer]:
+                del self._by_signer[signer]
+        self._write("DELETE FROM withdrawals WHERE identity = ?", [(identity,) for _, identity in due])
+
+    def _load(self) -> None:
+        if self._database is None:
+            return
+        try:
+            rows = self._database.execute("SELECT identity, signer, payload FROM withdrawals").fetchall()
+            for identity, signer, payload in rows:
+                message = decode(payload)
+                if isinstance(message, Withdrawal):
+                    self._take(identity, Verified(message, message_hash(message), signer))
+        except (sqlite3.Error, InvalidMessage) as error:
+            self._failed(error)
+
+    def _write(self, statement: str, rows: list[tuple[object, ...]]) -> None:
+        if self._database is None:
+            return
+        try:
+            self._database.execute("BEGIN")
+            self._database.executemany(statement, rows)
+            self._database.execute("COMMIT")
+        except sqlite3.Error as error:
+            if self._database.in_transaction:
+                self._database.execute("ROLLBACK")
+            self._failed(error)
+        else:
+            self._outage.recovered("withdrawals are kept on disk again")
+
+    def _failed(self, error: Exception) -> None:
+        assert self._path is not None
+        self._outage.failed(WithdrawalsNotKept(self._path, error), "withdrawals are known until the process ends")

@@ -1,0 +1,130 @@
+"""A provider honours withdrawals: before a match, before its transaction, after a restart, and of others' knowledge."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from mesh.market import order_id
+from mesh.market.withdrawals import withdrawn_id
+from schemas import Withdrawal, verify_message
+from tests.mesh.market.held_node import HeldNode
+from tests.mesh.market.observation import until_read, works_on
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from schemas import Demand, Offer
+    from tests.mesh.market.local_market import LocalMarket
+
+ESTIMATE = "eth_estimateGas"
+
+
+def withdrawal_of(local: LocalMarket, order: Demand | Offer, role: str = "person") -> Withdrawal:
+    digest = verify_message(order).hash.hex()
+    withdrawal = Withdrawal(order=digest, lighthouse=order.lighthouse, deadline=order.deadline)
+    return local.accounts[role].signer.sign(withdrawal)
+
+
+async def test_a_withdrawn_order_leaves_the_book_and_is_refused(local: LocalMarket) -> None:
+    async with local.provider() as provider:
+        local.publish(demand := local.demand())
+        await until(lambda: len(provider.book) == 1)
+        local.publish(withdrawal_of(local, demand))
+
+        honoured = await local.rejection_of(demand)
+        assert (honoured.reason, honoured.provider) == ("withdrawn", provider.address)
+        assert len(provider.book) == 0
+        local.publish(offer := local.offer())
+        await until(lambda: order_id(verify_message(offer)) in provider.book)
+        assert await local.liabilities_of(demand) == []
+        assert provider.earnings().rejected == {}
+
+
+async def test_an_order_that_arrives_after_its_withdrawal_is_refused(local: LocalMarket) -> None:
+    async with local.provider() as provider:
+        demand = local.demand()
+        local.publish(withdrawal_of(local, demand))
+        await local.rejection_of(demand)
+        local.publish(demand, local.offer())
+
+        await until(lambda: provider.earnings().rejected == {"withdrawn": 1})
+        await until(lambda: len(provider.book) == 1)
+        assert await local.liabilities_of(demand) == []
+
+
+async def test_a_withdrawal_by_another_account_changes_nothing(local: LocalMarket) -> None:
+    async with local.provider() as provider:
+        local.publish(demand := local.demand())
+        await until(lambda: len(provider.book) == 1)
+        local.publish(stranger := withdrawal_of(local, demand, "rival"))
+        await until(lambda: withdrawn_id(verify_message(stranger)) in provider.withdrawals)
+
+        local.publish(local.offer())
+        await local.liability_of(demand)
+
+
+async def test_a_match_is_not_made_if_an_order_is_withdrawn_before_its_turn(local: LocalMarket) -> None:
+    await local.create_lighthouse(timeout_blocks=1000, provider=1, rival=1)
+    async with local.provider("rival") as rival:
+        demand, offer = local.demand(), local.offer()
+        local.publish(demand, offer)
+        await until(lambda: len(rival.book) == 0 and rival.queue.waiting == 0 and rival.ledger.turnover().matches == 1)
+        local.publish(withdrawal := withdrawal_of(local, demand))
+        await until(lambda: withdrawn_id(verify_message(withdrawal)) in rival.withdrawals)
+        assert local.rejections == []  # a transaction may be on its way
+
+        async with local.chain_of("provider") as chain:  # gives the turn to the rival
+            await chain.liabilities.create(local.lighthouse, local.demand(cost=0), local.offer(cost=0))
+        assert (await local.rejection_of(demand)).reason == "withdrawn"
+        await until(lambda: list(rival.book.orders()) == [verify_message(offer)])
+        assert await local.liabilities_of(demand) == []
+
+
+async def test_a_transaction_that_was_sent_is_not_stopped(local: LocalMarket) -> None:
+    async with HeldNode(local.node) as node, local.provider(endpoint=node) as provider:
+        demand = local.demand()
+        with node.back("eth_getTransactionReceipt"):
+            local.publish(demand, local.offer())
+            await local.liability_of(demand)
+            local.publish(withdrawal := withdrawal_of(local, demand))
+            await until(lambda: withdrawn_id(verify_message(withdrawal)) in provider.withdrawals)
+        await until(lambda: provider.earnings().created == 1)
+        assert local.rejections == []
+
+
+async def test_withdrawals_survive_a_restart(local: LocalMarket, tmp_path: Path) -> None:
+    path, demand = tmp_path / "withdrawals.sqlite", local.demand()
+    async with local.provider(withdrawals=path):
+        local.publish(withdrawal_of(local, demand))
+        await local.rejection_of(demand)
+
+    async with local.provider(withdrawals=path) as provider:
+        local.publish(demand, local.offer())
+        await until(lambda: provider.earnings().rejected == {"withdrawn": 1})
+        assert await local.liabilities_of(demand) == []
+
+
+async def test_a_provider_that_starts_later_learns_withdrawals_from_others(local: LocalMarket) -> None:
+    async with local.provider():
+        demand = local.demand()
+        local.publish(withdrawal := withdrawal_of(local, demand))
+        await local.rejection_of(demand)
+
+        async with local.provider("rival") as second:
+            await until(lambda: list(second.withdrawals) == [verify_message(withdrawal)])
+        async with local.channel.subscribe(Withdrawal) as withdrawals:
+            await withdrawals.recall()
+            assert (await anext(withdrawals)).message == withdrawal
+
+
+async def test_withdrawals_are_forgotten_at_their_deadline(local: LocalMarket) -> None:
+    async with local.provider() as provider:
+        demand = local.demand(deadline=await local.chain.block_number() + 3)
+        local.publish(withdrawal_of(local, demand))
+        await local.rejection_of(demand)
+        assert len(provider.withdrawals) == 1
+        await local.mine(3)
+        await until_read(local, provider)
+        assert len(provider.withdrawals) == 0
+        assert await works_on(local, provider)

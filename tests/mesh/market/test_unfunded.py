@@ -1,0 +1,136 @@
+"""Orders whose makers can't pay: not matched, kept in the book, tried again when funds return."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+from mesh.background import Background
+from mesh.market import Match, OrderBook, Refusal, order_id
+from mesh.market.unfunded import CHECKS, UnfundedOrders
+from mesh.retry import RetryPolicy
+from schemas import verify_message
+from tests.mesh.market.observation import until_read
+from tests.support.orders import LIGHTHOUSE, verified_demand, verified_offer
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from schemas import Demand, Offer, Verified
+    from tests.mesh.market.local_market import LocalMarket
+
+HOURLY = RetryPolicy(initial=3600.0, ceiling=3600.0)
+OFTEN = RetryPolicy(initial=0.01, ceiling=0.01)
+
+
+class Purse:
+    """Who can pay, instead of a chain. `asked` are the orders whose makers were asked after."""
+
+    def __init__(self) -> None:
+        self.can_pay_now = False
+        self.asked: list[Verified[Demand | Offer]] = []
+
+    async def can_pay(self, order: Verified[Demand | Offer]) -> bool:
+        self.asked.append(order)
+        return self.can_pay_now
+
+
+def unfunded(book: OrderBook, purse: Purse, **options: Any) -> tuple[UnfundedOrders, list[Verified[Demand | Offer]]]:
+    funded: list[Verified[Demand | Offer]] = []
+    made = UnfundedOrders(book, purse, funded=funded.append, **({"interval": 0.01, "retry": OFTEN} | options))  # type: ignore[arg-type]
+    return made, funded
+
+
+def test_an_order_that_is_set_aside_is_in_the_book_and_is_not_matched() -> None:
+    book, demand = OrderBook(LIGHTHOUSE), verified_demand(deadline=10)
+    assert book.set_aside(demand)
+    assert not book.set_aside(demand)
+    assert book.add(demand) is Refusal.DUPLICATE
+    assert list(book.orders()) == [demand]
+    book.add(offer := verified_offer())
+    assert len(book) == 2
+    assert book.remove(order_id(demand)) == demand
+    assert book.add(demand) == Match(demand, offer)
+    book.set_aside(demand)
+    assert book.expire(10) == [demand]
+    assert not book.set_aside(demand)
+
+
+async def test_orders_are_looked_at_again_until_their_makers_can_pay() -> None:
+    book, purse, demand = OrderBook(LIGHTHOUSE), Purse(), verified_demand()
+    waiting, funded = unfunded(book, purse)
+    assert waiting.add(demand)
+    async with Background() as tasks:
+        tasks.start(waiting.run(), "unfunded")
+        await until(lambda: len(purse.asked) > 2)
+        assert demand in waiting
+        assert list(book.orders()) == [demand]
+        purse.can_pay_now = True
+        await until(lambda: funded == [demand])
+    assert demand not in waiting
+    assert len(book) == 0
+
+
+async def test_a_copy_hastens_the_next_look_and_orders_that_left_the_book_are_forgotten() -> None:
+    book, purse, demand, gone = OrderBook(LIGHTHOUSE), Purse(), verified_demand(), verified_demand()
+    waiting, funded = unfunded(book, purse, retry=HOURLY, limit=2)
+    assert waiting.add(demand)
+    assert waiting.add(gone)
+    assert not waiting.add(verified_demand())
+    waiting.hasten(gone)
+    book.remove(order_id(gone))
+    async with Background() as tasks:
+        tasks.start(waiting.run(), "unfunded")
+        waiting.hasten(demand)
+        waiting.hasten(demand)
+        await until(lambda: purse.asked == [demand])
+        purse.can_pay_now = True
+        waiting.hasten(demand)
+        await until(lambda: funded == [demand])
+    assert purse.asked == [demand, demand]
+    assert gone not in waiting
+
+
+async def test_a_limited_number_is_looked_at_in_one_round() -> None:
+    book, purse = OrderBook(LIGHTHOUSE), Purse()
+    waiting, _ = unfunded(book, purse, retry=OFTEN, interval=0.2)
+    for _ in range(5 * CHECKS):
+        waiting.add(verified_demand())
+    async with Background() as tasks:
+        tasks.start(waiting.run(), "unfunded")
+        await until(lambda: purse.asked)
+        await asyncio.sleep(0.05)
+        assert len(purse.asked) <= CHECKS
+        await until(lambda: len(purse.asked) >= 2 * CHECKS)
+
+
+async def test_a_demand_is_matched_when_its_makers_tokens_return(local: LocalMarket) -> None:
+    async with local.chain_of("poor") as poor:
+        await poor.tokens.approve(poor.factory, 1000)
+        await poor.tokens.transfer(local.address("person"), await poor.tokens.balance())
+        async with local.provider() as provider:
+            demand, offer = local.demand("poor", cost=7), local.offer(cost=7)
+            local.publish(demand, offer)
+            assert (await local.rejection_of(demand)).reason == "ERC20InsufficientBalance"
+            await until(lambda: len(provider.book) == 2)
+
+            await local.chain.tokens.transfer(local.address("poor"), 7)
+            assert (await local.liability_of(demand)).promisor == local.address("robot")
+            await until_read(local, provider)
+            assert len(provider.book) == 0
+            await until(lambda: provider.earnings().created == 1)
+        assert [one.order for one in local.rejections] == [verify_message(demand).hash.hex()]
+
+
+async def test_a_demand_is_matched_when_its_allowance_is_raised(local: LocalMarket) -> None:
+    await local.chain.tokens.approve(local.chain.factory, 6)
+    async with local.provider() as provider:
+        demand, offer = local.demand(cost=7), local.offer(cost=7)
+        local.publish(demand, offer)
+        assert (await local.rejection_of(demand)).reason == "ERC20InsufficientAllowance"
+        await until(lambda: len(provider.book) == 2)
+        gas = provider.earnings().gas_used
+
+        await local.chain.tokens.approve(local.chain.factory, 7)
+        local.publish(demand)
+        await local.liability_of(demand)
+        assert gas == 0

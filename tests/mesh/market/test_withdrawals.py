@@ -1,0 +1,84 @@
+"""Withdrawals as a provider keeps them."""
+
+from __future__ import annotations
+
+import stat
+from typing import TYPE_CHECKING
+
+from mesh.market import order_id
+from mesh.market.withdrawals import Withdrawals, withdrawn_id
+from schemas import Signer, Withdrawal, verify_message
+from tests.support.log_events import logged_facts
+from tests.support.orders import LIGHTHOUSE, PERSON, STRANGER, verified_demand
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import pytest
+
+    from schemas import Demand, Offer, Verified
+
+FAR = 2**256 - 1
+
+
+def withdrawal(
+    order: Verified[Demand | Offer] | None = None, *, signer: Signer = PERSON, deadline: int = 100
+) -> Verified[Withdrawal]:
+    digest = (order or verified_demand(deadline=deadline)).hash.hex()
+    return verify_message(signer.sign(Withdrawal(order=digest, lighthouse=LIGHTHOUSE, deadline=deadline)))
+
+
+def test_a_withdrawal_concerns_the_order_of_its_own_signer_only() -> None:
+    with Withdrawals() as withdrawals:
+        order = verified_demand()
+        assert withdrawals.add(withdrawal(order, signer=STRANGER))
+        assert order_id(order) not in withdrawals
+        assert withdrawals.add(withdrawal(order))
+        assert order_id(order) in withdrawals
+        assert len(withdrawals) == 2
+
+
+def test_withdrawals_are_kept_until_their_deadline_also_across_restarts(tmp_path: Path) -> None:
+    path = tmp_path / "folder" / "withdrawals.sqlite"
+    early, late, far = withdrawal(deadline=10), withdrawal(deadline=11), withdrawal(deadline=FAR)
+    with Withdrawals(path) as withdrawals:
+        for one in (far, late, early, late):
+            assert withdrawals.add(one)
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+        withdrawals.expire(9)
+        assert len(withdrawals) == 3
+    with Withdrawals(path) as withdrawals:
+        assert set(withdrawals) == {early, late, far}
+        withdrawals.expire(10)
+        assert set(withdrawals) == {late, far}
+    with Withdrawals(path) as withdrawals:
+        assert set(withdrawals) == {late, far}
+
+
+def test_a_signer_can_have_a_limited_number() -> None:
+    with Withdrawals(limit_per_signer=2) as withdrawals:
+        assert [withdrawals.add(withdrawal(deadline=deadline)) for deadline in (10, 11, 12)] == [True, True, False]
+        assert withdrawals.add(withdrawal(signer=STRANGER))
+        withdrawals.expire(10)
+        assert withdrawals.add(withdrawal(deadline=13))
+
+
+def test_when_there_are_too_many_those_with_the_latest_deadline_are_forgotten() -> None:
+    with Withdrawals(limit=2) as withdrawals:
+        never, soon, sooner = (withdrawal(deadline=deadline) for deadline in (FAR, 20, 10))
+        assert [withdrawals.add(one) for one in (never, soon, sooner)] == [True, True, True]
+        assert set(withdrawals) == {soon, sooner}
+        assert not withdrawals.add(never)
+        assert [withdrawn_id(one) in withdrawals for one in (never, soon, sooner)] == [False, True, True]
+
+
+def test_withdrawals_are_known_without_a_disk(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "withdrawals.sqlite"
+    path.write_bytes(b"not a database, however you look at it" * 100)
+    with Withdrawals(path) as withdrawals:
+        assert withdrawals.add(one := withdrawal())
+        assert withdrawn_id(one) in withdrawals
+        withdrawals.expire(100)
+        assert len(withdrawals) == 0
+    (outage,) = logged_facts(caplog, "withdrawals-outage")
+    assert outage["code"] == "withdrawals-not-kept"
