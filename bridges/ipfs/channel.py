@@ -19,9 +19,9 @@ from bridges.ipfs.relay import QUEUE_LIMIT, MessageRelay, RelayOutcome
 from bridges.ipfs.status import BridgeHealth, changes_between, counters_of
 from mesh.errors import InvalidMessage
 from mesh.log_context import log_event
-from mesh.network import Pump, call_in_loop
+from mesh.network import Channel, NetworkChange, Pump, call_in_loop
 from mesh.role import Role
-from schemas import lighthouse_selector
+from schemas import Withdrawal, lighthouse_selector
 from schemas.keys import market_kind
 from schemas.status import BridgeStatus, bridge_status_key
 
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from bridges.ipfs.journal import RelayJournal
     from bridges.ipfs.pubsub import PubsubMessage
     from bridges.ipfs.validation import RelayMessage, RelayValidator
+    from mesh.market.withdrawals import Withdrawals
     from mesh.network import Network
     from mesh.retry import RetryPolicy
     from schemas.status import ContentMetrics
@@ -108,6 +109,8 @@ class ChannelBridge(Role):
 
     async def _open(self, stack: AsyncExitStack) -> None:
         session = self._network.session
+        channel = await stack.enter_async_context(Channel(session, self.lighthouse, head=self._validator.head))
+        self._withdrawn = await stack.enter_async_context(channel.subscribe(Withdrawal))
         self._pump: Pump[MeshMessage] = await stack.enter_async_context(
             Pump(session, lighthouse_selector(self.lighthouse), _convert)
         )
@@ -126,6 +129,8 @@ class ChannelBridge(Role):
     async def _work(self) -> None:
         async with asyncio.TaskGroup() as tasks:
             self._tasks = tasks
+            tasks.create_task(self._take_withdrawals(), name=f"withdrawals at {self.lighthouse}")
+            tasks.create_task(self._recall_withdrawals(), name=f"known withdrawals at {self.lighthouse}")
             tasks.create_task(self._receive_from_mesh(), name=f"mesh → bridge {self.lighthouse}")
             tasks.create_task(
                 self.link.run(self._receive_from_ipfs, self._link_changed), name=f"IPFS → {self.lighthouse}"
@@ -165,6 +170,26 @@ class ChannelBridge(Role):
         if not self.link.up:
             return "no daemon"
         return "connected" if self.link.listeners else "alone"
+
+    @property
+    def withdrawals(self) -> Withdrawals:
+        """The withdrawals that are known; the orders that they concern are not relayed."""
+        return self._validator.withdrawals
+
+    async def _take_withdrawals(self) -> None:
+        async for withdrawal in self._withdrawn:
+            self.withdrawals.expire(self._validator.head())
+            if self.withdrawals.add(withdrawal):
+                self.relay.drop_withdrawn(withdrawal.message.order, self._validator.is_withdrawn)
+            else:
+                self._withdrawn.forget(withdrawal)
+
+    async def _recall_withdrawals(self) -> None:
+        """Ask the providers for the withdrawals that they know, now and whenever a router is back."""
+        await self._withdrawn.recall()
+        async for change in self._network.changes():
+            if change is not NetworkChange.LOST:
+                await self._withdrawn.recall()
 
     async def _receive_from_mesh(self) -> None:
         dropped = 0
@@ -249,9 +274,9 @@ class ChannelBridge(Role):
 
 
 def _convert(sample: zenoh.Sample) -> MeshMessage | None:
-    """Convert a sample on the pump's thread. Rejections by providers do not exist on the legacy channel."""
+    """Convert a sample on the pump's thread. Rejections and withdrawals do not exist on the legacy channel."""
     key = str(sample.key_expr)
-    if sample.kind != zenoh.SampleKind.PUT or market_kind(key) == "reject":
+    if sample.kind != zenoh.SampleKind.PUT or market_kind(key) in ("reject", "withdrawal"):
         return None
     attachment = sample.attachment
     return MeshMessage(key, sample.payload.to_bytes(), attachment is not None and attachment.to_bytes() == BRIDGE_MARK)

@@ -117,8 +117,14 @@ class PublishQueue:
         return self._own.pop(fingerprint, None) is not None
 
     def drop(self, fingerprint: bytes) -> None:
-        """Remove a message that can't be sent."""
-        self._own.pop(fingerprint, None)
+        """Remove a message that can't be sent, or must not be sent again."""
+        for messages in (self._own, self._left, self._unheard):
+            messages.pop(fingerprint, None)
+
+    def find(self, digest: str) -> list[RelayMessage]:
+        """The messages whose key ends with a hash (hexadecimal). O(messages)."""
+        queued = [*self._own.values(), *self._left.values(), *self._unheard.values()]
+        return [one.message for one in queued if one.message.key.endswith(digest)]
 
     def keep_unheard(self, queued: QueuedMessage) -> QueuedMessage | None:
         """Keep a message that was sent while there were no listeners; returns the oldest such one if it is dropped."""

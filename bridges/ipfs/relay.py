@@ -97,6 +97,14 @@ class MessageRelay:
         self.dropped[side]["refused"] += 1
         self._journal.remove_waiting(queued.message.fingerprint)
 
+    def drop_withdrawn(self, order: str, is_withdrawn: Callable[[RelayMessage], bool]) -> None:
+        """A withdrawal of the order with this hash (hexadecimal) arrived: drop what waits and `is_withdrawn` now."""
+        for side, queue in self.queues.items():
+            for message in filter(is_withdrawn, queue.find(order)):
+                queue.drop(message.fingerprint)
+                self.invalid[side]["withdrawn"] += 1
+                self._journal.remove_waiting(message.fingerprint)
+
     def restore(self) -> None:
         """Read the journal: the messages already relayed, and those that waited when the bridge stopped."""
         for fingerprint, age in self._journal.relayed():

@@ -15,6 +15,7 @@ from bridges.ipfs.transfers import ContentSources, Gateway
 from bridges.ipfs.validation import ChainView, RelayValidator
 from mesh.content import Exchange, Store
 from mesh.errors import ConfigurationError
+from mesh.market.withdrawals import Withdrawals
 from mesh.network.metrics import network_families
 from mesh.role import Role
 from schemas import Demand, Result, decode
@@ -116,7 +117,9 @@ class IpfsBridge(Role):
             ChannelBridge(
                 self._network,
                 self.daemon,
-                self._validator(lighthouse),
+                self._validator(
+                    lighthouse, stack.enter_context(Withdrawals(self._directory / f"withdrawals-{lighthouse}.sqlite"))
+                ),
                 stack.enter_context(RelayJournal(self._directory / f"{lighthouse}.sqlite")),
                 lighthouse=lighthouse,
                 swarm_peers=self._settings.ipfs_swarm_connect,
@@ -126,12 +129,13 @@ class IpfsBridge(Role):
             )
         )
 
-    def _validator(self, lighthouse: str) -> RelayValidator:
+    def _validator(self, lighthouse: str, withdrawals: Withdrawals) -> RelayValidator:
         chain = self._chain
         if chain is None:
-            return RelayValidator(lighthouse)
+            return RelayValidator(lighthouse, withdrawals=withdrawals)
         return RelayValidator(
             lighthouse,
+            withdrawals=withdrawals,
             address=lambda: chain.address(lighthouse),
             resolver=chain.resolve,
             is_safe=chain.is_safe_validator,

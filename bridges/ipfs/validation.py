@@ -11,6 +11,7 @@ import msgspec
 
 from mesh.errors import AiraError, ChainError, InvalidMessage
 from mesh.log_context import log_event
+from mesh.market.withdrawals import Withdrawals
 from mesh.network.validation import key_of
 from mesh.outage_log import OutageLog
 from mesh.retry import REMOTE, Backoff, RetryPolicy
@@ -25,11 +26,14 @@ from schemas import (
     Result,
     SignedMessage,
     TransactionFeedback,
+    Withdrawal,
+    address_bytes,
     decode,
     encode,
     keccak256,
     message_hash,
     names_in,
+    recover,
     resolve_names,
     verify_hashed,
 )
@@ -99,7 +103,7 @@ class RelayValidator:
 
     `address` returns the address that orders must name as their lighthouse, None while it isn't known; `resolver`
     resolves ENS names in messages; `is_safe` says whether orders may name a validator (address); `head` returns the
-    latest block number, or 0 while it isn't known (then no deadline is checked).
+    latest block number, or 0 while it isn't known (then no deadline is checked); `withdrawals` are those known.
     """
 
     def __init__(
@@ -110,27 +114,40 @@ class RelayValidator:
         resolver: Resolver | None = None,
         is_safe: Callable[[str], Awaitable[bool]] | None = None,
         head: Callable[[], int] = lambda: 0,
+        withdrawals: Withdrawals | None = None,
     ) -> None:
+        self.withdrawals: Final = Withdrawals() if withdrawals is None else withdrawals
         self._lighthouse = lighthouse
         self._address = address
         self._resolver = resolver
         self._is_safe = is_safe
-        self._head = head
+        self.head: Final = head
 
     async def validate(self, payload: bytes, *, key: str | None = None) -> RelayMessage:
         """The message in `payload`: well-formed, for this market, before its deadline, correctly signed.
 
         `key`, if given, must be the one that the message requires. The signature of order feedback is not verified,
         because what it covers is undocumented. Raises only `InvalidMessage`; its `reason` is one of `schemas.decode`,
-        or `name`, `lighthouse`, `validator`, `deadline`, `signature`, `sender`, `key`.
+        or `name`, `lighthouse`, `validator`, `deadline`, `signature`, `sender`, `withdrawn`, `key`, and `kind` for a
+        message that the legacy network does not have.
         """
         message = decode(payload)
+        if isinstance(message, Withdrawal):
+            raise InvalidMessage("kind", "the legacy network has no withdrawals")
         canonical = encode(message)
         own_key = await self._key(message, canonical)
         if key is not None and not _is_key_of(message, key, own_key):
             raise InvalidMessage("key", f"the message does not belong on {key}")
         fingerprint = sha256(canonical).digest()[:FINGERPRINT_BYTES]
         return RelayMessage(fingerprint, key or own_key, canonical, legacy_json(message))
+
+    def is_withdrawn(self, message: RelayMessage) -> bool:
+        """Whether a message that was valid is an order that is withdrawn now."""
+        if not self.withdrawals or message.kind not in ("demand", "offer"):
+            return False
+        digest, order = bytes.fromhex(message.key.rpartition("/")[2]), decode(message.payload)
+        assert isinstance(order, Demand | Offer)
+        return digest + address_bytes(recover(digest, order.signature)) in self.withdrawals
 
     async def _key(self, message: Message, canonical: bytes) -> str:
         match message:
@@ -141,8 +158,10 @@ class RelayValidator:
         resolved = await self._resolved(message)
         self._check_order(resolved)
         digest = message_hash(resolved)
-        verify_hashed(resolved, digest)
+        verified = verify_hashed(resolved, digest)
         if isinstance(resolved, Demand | Offer):
+            if digest + address_bytes(verified.signer) in self.withdrawals:
+                raise InvalidMessage("withdrawn", "its maker has withdrawn it")
             await self._check_validator(resolved.validator)
         return key_of(self._lighthouse, resolved, digest)
 
@@ -173,7 +192,7 @@ class RelayValidator:
             return
         if (address := self._address()) is not None and order.lighthouse != address:
             raise InvalidMessage("lighthouse", f"made for {order.lighthouse}, not for this market")
-        if order.deadline <= self._head():
+        if order.deadline <= self.head():
             raise InvalidMessage("deadline", f"block {order.deadline} has passed")
 
 

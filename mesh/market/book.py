@@ -4,8 +4,8 @@ A demand and an offer match when model, objective, token, cost, lighthouse, vali
 serves one lighthouse, and has a queue of orders for each set of the other terms. Adding, matching and removing take
 the same time at a thousand open orders and at a million; an order takes little more memory than its text.
 
-For each deadline there is a list of the keys of orders that expire then. An order that leaves earlier stays in its
-list, by its key only, until the deadline, or until the lists are rebuilt because most of their orders have left.
+For each deadline there is a list of the keys of orders that expire then. The key of one that left earlier stays there
+until the deadline, or until the lists are rebuilt because most of their orders have left.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def order_id(order: Verified[Order]) -> bytes:
 class OrderBook:
     """The open orders of the lighthouse at `lighthouse` (EIP-55 address), `limit` of them at most.
 
-    Not thread-safe. Every method is O(1) in the number of open orders, unless it says otherwise.
+    Not thread-safe. Methods are O(1) in the number of open orders, unless they say otherwise.
     """
 
     def __init__(self, lighthouse: str, *, limit: int = LIMIT) -> None:
@@ -182,10 +182,7 @@ class OrderBook:
         self._listed += 1
 
     def compact(self) -> None:
-        """Rebuild the lists without the keys of orders that left, whose deadlines may be as late as their sender likes.
-
-        O(open orders), but so rare that its share for each added order is small.
-        """
+        """Rebuild the lists without the keys of orders that left. O(open orders), but rare."""
         self._due.clear()
         self._listed = 0
         for key, node in self._nodes.items():

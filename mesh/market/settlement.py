@@ -22,10 +22,10 @@ from mesh.chain import (
 from mesh.errors import AiraError, InputError
 from mesh.log_context import liability_context, log_event
 from mesh.market.book import ORDER_USED, Match, Refusal, at_fault, order_id, reason_word
-from mesh.market.chain_state import ChainState
 from mesh.market.creation import Creation, MatchWithdrawn
 from mesh.market.liability_events import OPEN_LIABILITIES, LiabilityEvents
 from mesh.market.rejections import RejectionPublisher
+from mesh.market.settlement_state import SettlementState
 from mesh.market.unconfirmed import Unconfirmed
 from mesh.market.unfunded import UnfundedOrders
 from mesh.market.withdrawals import withdrawn_id
@@ -70,7 +70,7 @@ class Settlement:
     ) -> None:
         assert chain.account is not None
         assert channel.address is not None
-        self.state: Final = ChainState(chain)
+        self.state: Final = SettlementState(chain)
         self._chain = chain
         self._lighthouse = channel.address
         self._book = book

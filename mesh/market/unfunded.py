@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from mesh.market.book import Order, OrderBook
-    from mesh.market.chain_state import ChainState
+    from mesh.market.settlement_state import SettlementState
     from schemas import Verified
 
 RETRY: Final = RetryPolicy(initial=2.0, ceiling=60.0)
@@ -34,7 +34,7 @@ class UnfundedOrders:
     def __init__(
         self,
         book: OrderBook,
-        state: ChainState,
+        state: SettlementState,
         *,
         funded: Callable[[Verified[Order]], object],
         interval: float,

@@ -19,10 +19,19 @@ if TYPE_CHECKING:
 
     import zenoh
 
+    from mesh.market.withdrawals import Withdrawals
+
 
 @asynccontextmanager
 async def bridging(
-    endpoint: str, api: str, topic: str, journal: Path, *, call_timeout: float = CALL_TIMEOUT, **options: Any
+    endpoint: str,
+    api: str,
+    topic: str,
+    journal: Path,
+    *,
+    call_timeout: float = CALL_TIMEOUT,
+    withdrawals: Withdrawals | None = None,
+    **options: Any,
 ) -> AsyncIterator[ChannelBridge]:
     """A running bridge between the router at `endpoint` and the daemon at `api`."""
     async with AsyncExitStack() as stack:
@@ -32,7 +41,7 @@ async def bridging(
         bridge = ChannelBridge(
             network,
             daemon,
-            RelayValidator(topic, address=lambda: LIGHTHOUSE),
+            RelayValidator(topic, address=lambda: LIGHTHOUSE, withdrawals=withdrawals),
             relay_journal,
             lighthouse=topic,
             **options,

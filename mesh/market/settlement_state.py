@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-class ChainState:
+class SettlementState:
     """The state of the chain. Each question is asked again until the node answers; see `outages`."""
 
     def __init__(self, chain: Chain) -> None:
