@@ -19,8 +19,8 @@ JOBS ?= 3
 # CI measures coverage, which takes time.
 COVERAGE := $(if $(filter true,$(CI)),--cov --cov-report=term --durations=10)
 
-.PHONY: help setup demo test simulate compose-test crash-test lint peers bench contracts contracts-check slither \
-	firmware lock clean
+.PHONY: help setup demo test simulate simulate-mutants compose-test crash-test lint peers bench contracts contracts-check \
+	slither firmware lock clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -51,6 +51,9 @@ test: $(INSTALLED) ## the tests, without containers; ARGS="-k name" chooses some
 
 simulate: $(INSTALLED) ## whole markets in simulated time, with faults; ARGS="--seed N --jobs J --json"
 	@$(BIN)/python -m tests.simulation $(ARGS)
+
+simulate-mutants: $(INSTALLED) ## whether the simulator finds the bugs planted by tests/simulation/mutations.py
+	@$(BIN)/python -m tests.simulation --mutants --seed 1 $(ARGS)
 
 compose-test: $(INSTALLED) ## the compose files in real containers (`make peers` installs podman)
 	@$(BIN)/pytest -m compose tests/deploy tests/support $(ARGS)

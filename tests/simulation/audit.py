@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from tests.simulation.market import Market
 
 INVALID: Final = frozenset(
-    {"played", "sequence", "statistics", "readable", "result-file", "objective-file", "signature"}
+    {"played", "sequence", "statistics", "readable", "result-file", "objective-file", "signature", "times"}
 )
 """The findings of `aira verify` that no job of an honest robot may have."""
 
@@ -100,6 +100,8 @@ class Audit:
                 record = await chain.liabilities.get(address)
                 self._told(address, told.get(address), record)
                 if record.is_finalized and record.is_success:
+                    if self._market.fails(address):
+                        self._market.violated("failed-job-paid", address)
                     self._evidence(record)
         for address, order in told.items():
             if order.told in ("paid", "refunded") and address not in self.liabilities():

@@ -15,7 +15,7 @@ import traceback
 from asyncio import Queue
 from collections import Counter
 from dataclasses import asdict, fields
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from tests.simulation import history, router, threads
 from tests.simulation.history import Report
@@ -27,6 +27,7 @@ from mesh.chain.web3_provider import ReliableProvider  # noqa: E402, F401
 from tests.simulation.chain import SimulatedChain  # noqa: E402
 from tests.simulation.deployment import found  # noqa: E402
 from tests.simulation.faults import FaultPlan  # noqa: E402
+from tests.simulation.mutations import MUTATIONS, SEEDS, Mutation  # noqa: E402
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 
 JOBS: Final = 6
 """Jobs in one history, at most."""
+MUTANT_JOBS: Final = 3
+"""Jobs in a history with a planted bug."""
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -46,6 +49,8 @@ def main(arguments: Sequence[str]) -> None:
     began = REAL_TIME()
     deployed = found(SimulatedChain(), threads.begin(0))
     gc.collect()
+    if options.mutants:
+        _find_mutants(deployed, options)
     total = Report(options.seed)
     for jobs, report in _histories(deployed, options):
         _add(total, report)
@@ -74,6 +79,8 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--json", action="store_true", help="print one object at the end")
     parser.add_argument("--trace", action="store_true", help="print what happened in each history")
     parser.add_argument("--switches", metavar="FILE", help="write each switch of threads to a file")
+    parser.add_argument("--mutants", action="store_true", help="plant each bug in turn, and search until it is found")
+    parser.add_argument("--mutant", default="", help="only planted bugs whose name contains this")
     parser.add_argument("--keep-going", action="store_true", help="do not stop at the first failure")
     parser.add_argument("--only", default="", help="the kinds of faults, with commas; `none` for none")
     parser.add_argument("--without", default="", help="kinds of faults that do not happen, with commas")
@@ -97,7 +104,28 @@ def _histories(deployed: Deployed, options: argparse.Namespace) -> Iterator[tupl
         left, seed = left - jobs, seed + 1
 
 
-def _in_child(deployed: Deployed, seed: int, jobs: int, options: argparse.Namespace) -> Report:
+def _find_mutants(deployed: Deployed, options: argparse.Namespace) -> NoReturn:
+    """Plant each bug in turn, until a history violates an invariant that holds without it. Ends with 1 if one hides."""
+    missed, chosen = 0, [one for one in MUTATIONS if options.mutant in one.name]
+    options.without = frozenset()
+    for mutation in chosen:
+        options.only = frozenset(mutation.faults.split(","))
+        for attempt in range(1, SEEDS + 1):
+            seed = options.seed + attempt - 1
+            report = _in_child(deployed, seed, MUTANT_JOBS, options, mutation)
+            if report.violations and not _in_child(deployed, seed, MUTANT_JOBS, options).violations:
+                print(f"found with seed {report.seed} ({attempt}): {mutation.name}: {report.violations[0]}", flush=True)
+                break
+        else:
+            missed += 1
+            print(f"NOT FOUND within {SEEDS} seeds: {mutation.name}", flush=True)
+    print(f"{len(chosen) - missed} of {len(chosen)} planted bugs found", flush=True)
+    os._exit(1 if missed else 0)
+
+
+def _in_child(
+    deployed: Deployed, seed: int, jobs: int, options: argparse.Namespace, mutation: Mutation | None = None
+) -> Report:
     """Run a history in a process of its own: nothing is left of it for the next one."""
     reading, writing = os.pipe()
     child = os.fork()
@@ -105,6 +133,8 @@ def _in_child(deployed: Deployed, seed: int, jobs: int, options: argparse.Namesp
         os.close(reading)
         code = 1
         try:
+            if mutation is not None:
+                mutation.apply()
             plan = history.plan_of(seed, only=options.only, without=options.without)
             report, lines = history.run_history(deployed, seed, jobs, plan, switches=options.switches)
             if options.trace:

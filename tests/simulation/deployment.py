@@ -18,8 +18,8 @@ BLOCK_SECONDS: Final = 6.0
 TIMING: Final = Timing(poll_interval=3.0, receipt_interval=1.0, replace_after=30.0)
 PEOPLE: Final = 2
 ROBOTS: Final = 2
-LIFETIME: Final = 60
-"""Blocks for which an order is valid."""
+LIFETIMES: Final = (4, 8, 60, 60, 60)
+"""Blocks for which an order is valid: sometimes so few that it expires while it is matched."""
 
 
 @dataclass(frozen=True)

@@ -73,8 +73,8 @@ RANGES: Final[dict[str, tuple[float, float]]] = {
 def choose(
     chance: random.Random, *, only: frozenset[str] | None = None, without: frozenset[str] = frozenset()
 ) -> FaultPlan:
-    """The faults of a history: of some kinds `only`, or `without` some."""
-    plan, level = FaultPlan(), chance.choice(SHARES)
+    """The faults of a history: all of the kinds in `only`, or of all kinds but `without` some."""
+    plan, level = FaultPlan(), chance.choice(SHARES) if only is None else 1.0
     for field in fields(plan):
         is_chosen, value = chance.random() < level, chance.uniform(*RANGES[field.name])
         if is_chosen and (only is None or field.name in only) and field.name not in without:

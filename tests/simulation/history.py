@@ -15,16 +15,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from tests.simulation import loop, threads
+from tests.simulation.audit import Audit
+from tests.simulation.faults import Faults, choose
+from tests.simulation.market import Market
 from tests.simulation.scheduler import REAL_TIME, SECOND, HistoryFailed, Process
 
 if TYPE_CHECKING:
     from tests.simulation.deployment import Deployed
     from tests.simulation.faults import FaultPlan
-    from tests.simulation.market import Market
 
 CHAOS_SECONDS: Final = 400
 """How long faults happen, for each job of a person."""
-CALM_SECONDS: Final = 3600
+CALM_SECONDS: Final = 900
 """How long everything has after that to end: the bound within which each accepted job is paid or refunded."""
 FOLDER: Final = Path("/dev/shm" if Path("/dev/shm").is_dir() else tempfile.gettempdir()) / "aira-simulation"
 
@@ -50,8 +52,6 @@ class Report:
 
 def plan_of(seed: int, *, only: frozenset[str] | None = None, without: frozenset[str] = frozenset()) -> FaultPlan:
     """The faults of a seed, of some kinds `only`, or `without` some."""
-    from tests.simulation.faults import choose
-
     return choose(random.Random(f"faults {seed}"), only=only, without=without)
 
 
@@ -62,8 +62,6 @@ def run_history(
 
     Each switch of threads is written to the file `switches`: where two runs of a seed differ, it shows where it begins.
     """
-    from tests.simulation.market import Market
-
     began, cpu = REAL_TIME(), time.process_time()
     scheduler = threads.begin(seed)
     scheduler.now_ns = 2_000 * SECOND
@@ -95,9 +93,6 @@ def run_history(
 
 
 def _play(market: Market, plan: FaultPlan) -> None:
-    from tests.simulation.audit import Audit
-    from tests.simulation.faults import Faults
-
     scheduler = market.scheduler
     market.disk.install()
     faults = Faults(market, plan)
@@ -111,7 +106,7 @@ def _play(market: Market, plan: FaultPlan) -> None:
     scheduler.run(lambda: _is_settled(market, audit), until_ns=scheduler.now_ns + CALM_SECONDS * SECOND)
     for person in market.people:
         for order in person.orders:
-            if order.told in ("", "accepted"):
+            if not order.is_over:
                 market.violated("not-told", f"{order.person} waits for job {order.number} ({order.told or 'ordered'})")
     errors: list[BaseException | None] = []
     loop.start(scheduler, Process(scheduler, "audit"), audit.promises, errors.append)
@@ -125,11 +120,8 @@ def _play(market: Market, plan: FaultPlan) -> None:
     market.is_over = True
 
 
-def _is_settled(market: Market, audit: object) -> bool:
+def _is_settled(market: Market, audit: Audit) -> bool:
     """Whether people have been told everything and all liabilities have ended, for some blocks."""
-    from tests.simulation.audit import Audit
-
-    assert isinstance(audit, Audit)
     head = market.deployed.chain.evm.head
     if head == market.settled_head:
         return False

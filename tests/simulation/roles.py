@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
-from mesh.agent import Agent
-from mesh.agent.errors import LiabilityReverted, OrderExpired
+from mesh.agent import Agent, JobFailed
+from mesh.agent.errors import LiabilityReverted, OrderClosed, OrderExpired
 from mesh.chain import XRT, Chain
 from mesh.errors import AiraError
 from mesh.market.provider import Provider
@@ -16,12 +16,19 @@ from mesh.settings import Settings
 from schemas import String
 from tests.simulation import loop
 from tests.simulation.chain import NodeFaults, SimulatedNode
-from tests.simulation.deployment import ENDPOINT, LIFETIME, MODEL, TIMING
+from tests.simulation.deployment import ENDPOINT, LIFETIMES, MODEL, TIMING
 from tests.simulation.scheduler import Process
 
 if TYPE_CHECKING:
+    from collections.abc import Coroutine
+
+    from mesh.agent import Contract
     from mesh.market.book import Match
     from tests.simulation.market import Market
+
+
+WITHDRAWN: Final = 0.15
+"""How many orders people withdraw."""
 
 
 @dataclass
@@ -34,7 +41,16 @@ class Ordered:
     order: str = ""
     contract: str = ""
     told: str = ""
-    """The last thing: accepted, rejected, expired, paid, refunded, reverted, or the code of another error."""
+    """The last thing: ordered, accepted, withdrawn, expired, paid, refunded, reverted, or an error's code."""
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing more is expected."""
+        return self.told not in ("", "ordered", "accepted")
+
+
+class NothingFound(AiraError, code="nothing-found"):
+    """A person's order of before a crash is not open, and they know no contract."""
 
 
 class Role:
@@ -154,7 +170,8 @@ class RobotRole(Role):
 
             @agent.on("*")
             async def play(job: Any, message: Any) -> None:
-                market.played(self, job.liability.address, job.position)
+                if market.fails(job.liability.address):
+                    raise JobFailed("the lamp is broken")
                 job.publish("/led", String("on"))
                 await asyncio.sleep(0.05)
 
@@ -182,38 +199,61 @@ class PersonRole(Role):
     @property
     def is_done(self) -> bool:
         """Whether the person wants nothing more."""
-        return len(self.orders) >= self.wanted and bool(self.orders[-1].told not in ("", "accepted"))
+        return len(self.orders) >= self.wanted and self.orders[-1].is_over
 
     async def main(self) -> None:
-        """Order the jobs that are left."""
-        market = self.market
-        if self.orders and self.orders[-1].told in ("", "accepted"):
-            self.orders[-1].told += "+crashed"
+        """Take up what was ordered before a crash, then order the jobs that are left."""
+        chance = self.market.scheduler.random
         async with self.chain() as chain:
             self.agent = agent = Agent(MODEL, settings=self.settings(), account=self.account, chain=chain)
             async with agent:
+                if self.orders and not self.orders[-1].is_over:
+                    await self._finish(agent, self.orders[-1], self._take_up(agent, self.orders[-1]))
                 while len(self.orders) < self.wanted:
-                    await asyncio.sleep(market.scheduler.random.uniform(0.1, 30))
-                    wanted = Ordered(self.name, len(self.orders), cost=market.scheduler.random.randint(1, 50) * XRT)
+                    await asyncio.sleep(chance.uniform(0.1, 30))
+                    wanted = Ordered(self.name, len(self.orders), cost=chance.randint(1, 50) * XRT)
                     self.orders.append(wanted)
-                    await self._order(agent, wanted)
+                    await self._finish(agent, wanted, self._order(agent, wanted))
                 await asyncio.Event().wait()
 
-    async def _order(self, agent: Agent, wanted: Ordered) -> None:
-        market = self.market
-        objective = market.objective(market.scheduler.random.randint(2, 12))
-        market.trace(self.name, "demands", number=wanted.number, cost=wanted.cost)
+    async def _order(self, agent: Agent, wanted: Ordered) -> Contract:
+        """Post an order, and wait for its contract; some are withdrawn."""
+        chance = self.market.scheduler.random
+        objective, lifetime = self.market.objective(chance.randint(2, 12)), chance.choice(LIFETIMES)
+        self.market.trace(self.name, "demands", number=wanted.number, cost=wanted.cost)
+        order = await agent.order(objective, cost=wanted.cost, lifetime=lifetime)
+        wanted.order, wanted.told = order.hash, "ordered"
+        if chance.random() < WITHDRAWN:
+            await asyncio.sleep(chance.uniform(0.1, 20))
+            await order.withdraw_on_chain()
+            self.market.trace(self.name, "withdrew", order=order.hash[:12])
+        return await order.contract()
+
+    async def _take_up(self, agent: Agent, wanted: Ordered) -> Contract:
+        """What a person finds after a crash: the contract, the open order that the agent says it has, or nothing."""
+        if wanted.contract:
+            return await agent.contract(wanted.contract)
+        known = {order.order for order in self.orders if order is not wanted}
+        for order in agent.orders():
+            if order.kind == "demand" and order.hash not in known:
+                wanted.order = order.hash
+                return await order.contract()
+        raise NothingFound("no order of before the crash is open")
+
+    async def _finish(self, agent: Agent, wanted: Ordered, contract_of: Coroutine[Any, Any, Contract]) -> None:
+        """Wait for a contract and its end, and note what the person was told."""
         try:
-            contract = await agent.demand(objective, cost=wanted.cost, lifetime=LIFETIME)
+            contract = await contract_of
             wanted.contract, wanted.told = contract.address, "accepted"
-            market.trace(self.name, "accepted", liability=contract.address)
+            self.market.trace(self.name, "accepted", liability=contract.address)
             outcome = await contract.outcome()
-            wanted.contract = contract.address
-            wanted.told = "paid" if outcome.success else "refunded"
-        except OrderExpired as error:
-            wanted.order, wanted.told = error.order, "expired"
+            wanted.contract, wanted.told = contract.address, "paid" if outcome.success else "refunded"
+        except OrderExpired:
+            wanted.told = "expired"
+        except OrderClosed as error:
+            wanted.told = error.state
         except LiabilityReverted:
             wanted.told = "reverted"
         except AiraError as error:
             wanted.told = error.code
-        market.trace(self.name, wanted.told, number=wanted.number)
+        self.market.trace(self.name, wanted.told, number=wanted.number)

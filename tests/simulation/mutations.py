@@ -1,0 +1,192 @@
+"""Planted bugs: changes of production code. `make simulate-mutants` proves that the simulator finds them."""
+
+from __future__ import annotations
+import __future__
+
+import importlib
+import inspect
+import textwrap
+from dataclasses import dataclass
+from typing import Any, Final
+
+SEEDS: Final = 8
+"""Within so many seeds each is found."""
+
+
+@dataclass(frozen=True)
+class Mutation:
+    """A bug: in the function `target` (module:Class.method), the text `old` becomes `new`.
+
+    `faults` are the kinds that bring it to light; the histories of its search have these only.
+    """
+
+    name: str
+    target: str
+    old: str
+    new: str
+    faults: str
+
+    def apply(self) -> None:
+        """Plant the bug in this process."""
+        module_name, _, path = self.target.partition(":")
+        module = importlib.import_module(module_name)
+        owner: Any = module
+        *parents, name = path.split(".")
+        for parent in parents:
+            owner = getattr(owner, parent)
+        source = textwrap.dedent(inspect.getsource(getattr(owner, name)))
+        if self.old not in source:
+            raise LookupError(f"{self.name}: {self.target} has no {self.old!r} any more")
+        changed: dict[str, Any] = {}
+        flags = __future__.annotations.compiler_flag
+        code = compile(source.replace(self.old, self.new, 1), f"<{self.name}>", "exec", flags=flags)
+        exec(code, module.__dict__, changed)
+        setattr(owner, name, changed[name])
+
+
+CRASHES: Final = "crash,crash_every"
+REORGANISATIONS: Final = "reorganise_every"
+
+MUTATIONS: Final = (
+    Mutation(
+        "the outbox sends nothing again after a restart",
+        "mesh.work.outbox:Outbox.run",
+        "await self.send_all()",
+        "pass",
+        CRASHES,
+    ),
+    Mutation(
+        "the outbox sends everything once",
+        "mesh.work.outbox:Outbox.send_due",
+        "await self._send(",
+        "0 and (",
+        "drop,partition_every",
+    ),
+    Mutation(
+        "the listener's cursor runs ahead of what it has handled",
+        "mesh.agent.listener:ChainListener.run",
+        "for event in block.events:",
+        "await self._ledger.set_cursor(self.CURSOR, block.block_number, history=history.encode())\n"
+        "            for event in block.events:",
+        CRASHES,
+    ),
+    Mutation(
+        "the listener ignores reorganisations",
+        "mesh.agent.listener:ChainListener.run",
+        "in block.reverted_events",
+        "in ()",
+        REORGANISATIONS + ",forget",
+    ),
+    Mutation(
+        "the provider trusts a receipt",
+        "mesh.market.settlement:Settlement._is_confirmed",
+        "timing, missing =",
+        "return True\n    timing, missing =",
+        REORGANISATIONS + ",forget",
+    ),
+    Mutation(
+        "the provider does not see a reorganisation",
+        "mesh.market.settlement:Settlement._revert",
+        "created = [",
+        "return\n    created = [",
+        REORGANISATIONS,
+    ),
+    Mutation(
+        "the ledger's position runs ahead of the recording",
+        "mesh.work.playbacks:Playbacks._save",
+        "synced.position, recorded=synced.messages",
+        "run.position + 1, recorded=0",
+        CRASHES,
+    ),
+    Mutation(
+        "an interrupted job is played again from its beginning, into the same recording",
+        "mesh.work.playbacks:Playbacks.begin",
+        "position=position, recorded=job.recorded)",
+        "position=0, recorded=job.recorded)",
+        CRASHES,
+    ),
+    Mutation(
+        "a job that failed is a success",
+        "mesh.work.executor:Executor._run_job",
+        "success, note = False, str(error)",
+        "success, note = True, str(error)",
+        "late",
+    ),
+    Mutation(
+        "the result is signed before the objective was played",
+        "mesh.work.executor:Executor._run_job",
+        "await self._playbacks.play_and_save(run, None if self._handlers is None else self._handlers.handle)",
+        "pass",
+        "late",
+    ),
+    Mutation(
+        "orders of a reverted contract are forgotten",
+        "mesh.agent.trade:Trader.liability_reverted",
+        "await self._parts.outbox.unspend(address)",
+        "None",
+        REORGANISATIONS,
+    ),
+    Mutation(
+        "a job that was set aside is never taken up again",
+        "mesh.work.ledger:Ledger.add_job",
+        " DO UPDATE SET aside = 0 WHERE aside",
+        " DO NOTHING",
+        REORGANISATIONS,
+    ),
+    Mutation(
+        "the job of a reverted contract goes on",
+        "mesh.work.ledger:Ledger.set_aside",
+        "aside = 1",
+        "aside = 0",
+        REORGANISATIONS + ",forget",
+    ),
+    Mutation(
+        "a result is not stored with the end of its job",
+        "mesh.work.ledger:Ledger.complete",
+        ", (POST, _posted(outgoing))",
+        "",
+        "late",
+    ),
+    Mutation(
+        "an order is declared dead before its deadline",
+        "mesh.agent.trade:Trader.new_head",
+        "order.signed.deadline <= block",
+        "order.signed.deadline <= block + 3",
+        "delay,leave_out,partition_every",
+    ),
+    Mutation(
+        "a reorganisation is not looked for",
+        "mesh.chain.following:_Follower._find_replaced",
+        "known = [",
+        "return None\n    known = [",
+        REORGANISATIONS,
+    ),
+    Mutation(
+        "a reverted payment is not asked for again",
+        "mesh.agent.listener:ChainListener.finalization_reverted",
+        "await self._owe_result(job)",
+        "pass",
+        REORGANISATIONS + ",forget",
+    ),
+    Mutation(
+        "the recording is stamped with the time of day",
+        "mesh.recording.recorder:Recorder.record",
+        "self._epoch + self._clock.monotonic_ns()",
+        "self._clock.time_ns()",
+        "clock_every",
+    ),
+    Mutation(
+        "a provider forgets what it could not settle",
+        "mesh.market.settlement:Settlement._finalize",
+        "if not self._unconfirmed.end(result):\n                self._forget(result)",
+        "pass",
+        "unreachable,outage_every,price_every",
+    ),
+    Mutation(
+        "a transaction whose answer is lost is sent with the next number",
+        "mesh.chain.transactions:TransactionSender._sent_before",
+        "if not pending.abandoned:",
+        "if True:",
+        "lost_after_sending,outage_every",
+    ),
+)
