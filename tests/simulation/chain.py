@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from web3.providers.async_base import AsyncBaseProvider
 
+from mesh.devchain.bounded_vm import GAS_LIMIT
+from mesh.devchain.calls import Call, parse_call
 from mesh.devchain.evm import Evm
 from mesh.devchain.jsonrpc import SERVER_ERROR, RpcError, parse_data
 from mesh.devchain.methods import Methods
@@ -102,6 +104,8 @@ class SimulatedChain:
         return json.loads(json.dumps(found)) if isinstance(found, dict | list) else found
 
     def _answer(self, method: str, params: Any) -> Any:
+        if method == "eth_estimateGas":
+            return hex(self._estimate(parse_call(params[0])))
         if method == "eth_getTransactionCount" and params[1:] == ["pending"]:
             return hex(self._next_nonce(parse_data(params[0], length=20)))
         if method in ("eth_gasPrice", "eth_maxPriorityFeePerGas"):
@@ -112,6 +116,13 @@ class SimulatedChain:
                 nonce, sender = hex(waiting.nonce), "0x" + waiting.sender.hex()
                 return {"hash": params[0], "blockHash": None, "blockNumber": None, "from": sender, "nonce": nonce}
         return self.methods.answer(method, params)
+
+    def _estimate(self, fields: Call) -> int:
+        """Enough gas for a transaction, from one run: the embedded node takes several to find the least."""
+        computation = self.evm.calls._run(fields, self.evm.head, gas=GAS_LIMIT)
+        if computation.is_error:
+            self.evm.calls.call(fields, self.evm.head)  # raises
+        return (GAS_LIMIT - int(computation.get_gas_remaining())) * 5 // 4
 
     def submit(self, raw: bytes) -> bytes:
         """Take a signed transaction into the pool; its hash. Raises `RpcError`."""

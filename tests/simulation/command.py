@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 JOBS: Final = 6
 """Jobs in one history, at most."""
-MUTANT_JOBS: Final = 3
+MUTANT_JOBS: Final = 2
 """Jobs in a history with a planted bug."""
 
 
