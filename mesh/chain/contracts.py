@@ -8,7 +8,7 @@ our contracts, which have both sets of names.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 from mesh.chain.answers import InvalidAnswer
 from mesh.chain.errors import NoAccount, NotOffered, UnknownContracts
@@ -84,9 +84,6 @@ class LighthouseState:
 
 class ContractVersion:
     """Our own contracts. `factory` is the address of the factory; `generation` names the root of its names."""
-
-    refuses_lighthouses: ClassVar[bool] = True
-    """Whether the contracts refuse an order whose validator is a lighthouse."""
 
     def __init__(self, node: Node, factory: str, generation: int) -> None:
         self.generation = generation
@@ -166,8 +163,6 @@ class OriginalContracts(ContractVersion):
     They give no reasons when they refuse, pay nobody back, and don't say whose liability a contract is: a liability is
     recognised by an event of the factory that names it, or by the gas that the factory has counted for it.
     """
-
-    refuses_lighthouses = False
 
     def check_order(self, order: Order) -> None:
         if order.generation != self.generation:

@@ -13,6 +13,7 @@ import time
 from collections import OrderedDict
 from typing import TYPE_CHECKING, Final
 
+from mesh.chain.contracts import OriginalContracts
 from mesh.chain.lighthouses import Lighthouses
 from mesh.errors import InputError
 from schemas.address import ZERO_ADDRESS
@@ -87,7 +88,7 @@ class Validators:
         node = self._contracts.node
         if await node.code(validator):
             return True, True
-        if self._contracts.version.refuses_lighthouses:
+        if not isinstance(self._contracts.version, OriginalContracts):
             return True, False
         has_sent = await node.transaction_count(validator) > 0
         return has_sent, has_sent

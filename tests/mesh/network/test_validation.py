@@ -5,18 +5,14 @@ from __future__ import annotations
 import json
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
-from msgspec.structs import replace
 
-from mesh.chain import UnknownName
-from mesh.errors import RemoteError
-from mesh.network import MessageValidator, ValidationStatistics, message_key
-from mesh.network.validation import Unresolved
-from schemas import Demand, Offer, Result, SignedMessage, Verified, encode, message_hash
+from mesh.network import ValidationStatistics, message_key
+from schemas import Demand, Offer, Result, Verified, encode, message_hash
+from tests.mesh.network.validating import HEAD, check, counted, validator
 from tests.support.orders import (
-    LIGHTHOUSE,
     MARKET,
     OTHER_MODEL,
     PERSON,
@@ -27,27 +23,6 @@ from tests.support.orders import (
     result,
     terms,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
-
-HEAD = 100
-NAME = "xrt.3.robonomics.eth"
-
-
-def validator(kind: type[Any] = Demand, **options: Any) -> MessageValidator[Any]:
-    given: dict[str, Any] = {"lighthouse": MARKET, "address": LIGHTHOUSE, "head": lambda: HEAD} | options
-    return MessageValidator(kind, **given)
-
-
-def counted(checked: MessageValidator[Any]) -> dict[str, int]:
-    return dict(checked.statistics(received=0, dropped=0).invalid)
-
-
-def check(checked: MessageValidator[Any], message: SignedMessage, key: str | None = None) -> Verified[Any] | None:
-    accepted = checked.check(key or message_key(MARKET, message), encode(message))
-    assert not isinstance(accepted, Unresolved)
-    return accepted
 
 
 @pytest.mark.parametrize(("kind", "make"), [(Demand, demand), (Offer, offer), (Result, result)])
@@ -210,104 +185,6 @@ def test_the_deduplication_window_is_limited_and_drops_the_oldest() -> None:
 
     assert check(checked, messages[2]) is None
     assert check(checked, messages[0]) is not None
-
-
-def resolving(addresses: dict[str, str]) -> Callable[[str], Awaitable[str]]:
-    async def resolve(name: str) -> str:
-        if name not in addresses:
-            raise UnknownName(name)
-        return addresses[name]
-
-    return resolve
-
-
-class Known:
-    """Verdicts on validators, which are known once they were asked for."""
-
-    def __init__(self, **verdicts: bool) -> None:
-        self._verdicts = verdicts
-        self.asked: list[str] = []
-
-    def known(self, validator: str) -> bool | None:
-        return self._verdicts.get(validator) if validator in self.asked else None
-
-    async def is_safe(self, validator: str) -> bool:
-        self.asked.append(validator)
-        if validator not in self._verdicts:
-            raise RemoteError("the node is lost")
-        return self._verdicts[validator]
-
-
-async def test_a_message_with_a_name_is_accepted_once_the_name_is_resolved() -> None:
-    checked, message = validator(resolver=resolving({NAME: STRANGER.address})), demand(token=STRANGER.address)
-    named = json.loads(encode(message)) | {"token": NAME.upper()}
-    key = message_key(MARKET, message)
-
-    waiting = checked.check(key, json.dumps(named).encode())
-
-    assert isinstance(waiting, Unresolved)
-    assert waiting.message.token == NAME
-    assert await checked.complete(waiting) == Verified(message, message_hash(message), PERSON.address)
-    assert checked.check(key, json.dumps(named).encode()) is None, "a duplicate is not resolved again"
-    assert await checked.complete(waiting) is None, "it was accepted meanwhile"
-    assert checked.statistics(received=0, dropped=0).duplicate == 2
-
-
-@pytest.mark.parametrize(
-    ("addresses", "reason"), [({NAME: ROBOT.address}, "key"), ({}, "name")], ids=["wrong", "unknown"]
-)
-async def test_a_name_that_resolves_to_another_address_is_counted(addresses: dict[str, str], reason: str) -> None:
-    checked, message = validator(resolver=resolving(addresses)), demand(token=STRANGER.address)
-    named = json.loads(encode(message)) | {"token": NAME}
-    waiting = checked.check(message_key(MARKET, message), json.dumps(named).encode())
-    assert isinstance(waiting, Unresolved)
-
-    assert await checked.complete(waiting) is None
-    assert counted(checked) == {reason: 1}
-
-
-async def test_an_order_is_accepted_once_its_validator_is_known_to_be_safe() -> None:
-    known = Known(**{STRANGER.address: True})
-    checked, message = validator(validators=known), demand(validator=STRANGER.address)
-    key = message_key(MARKET, message)
-
-    waiting = checked.check(key, encode(message))
-    assert isinstance(waiting, Unresolved)
-    assert await checked.complete(waiting) == Verified(message, message_hash(message), PERSON.address)
-    assert check(checked, message) is None, "a duplicate"
-    assert check(checked, demand(validator=STRANGER.address)) is not None
-    assert known.asked == [STRANGER.address], "once for each validator"
-
-
-async def test_an_order_whose_validator_is_a_lighthouse_is_counted() -> None:
-    known = Known(**{STRANGER.address: False})
-    checked = validator(Offer, validators=known)
-    message = offer(validator=STRANGER.address)
-    waiting = checked.check(message_key(MARKET, message), encode(message))
-    assert isinstance(waiting, Unresolved)
-
-    assert await checked.complete(waiting) is None
-    assert check(checked, offer(validator=STRANGER.address)) is None, "known now"
-    assert (counted(checked), known.asked) == ({"validator": 2}, [STRANGER.address])
-
-
-async def test_an_order_whose_validator_can_t_be_checked_is_counted_and_may_come_again() -> None:
-    known = Known()
-    checked, message = validator(validators=known), demand(validator=STRANGER.address)
-    for _ in range(2):
-        waiting = checked.check(message_key(MARKET, message), encode(message))
-        assert isinstance(waiting, Unresolved)
-        assert await checked.complete(waiting) is None
-    assert counted(checked) == {"validator": 2}
-
-
-def test_the_chain_is_asked_about_no_order_without_a_validator_or_with_a_wrong_signature() -> None:
-    checked = validator(validators=Known())
-    forged = replace(demand(validator=STRANGER.address), signature="ff" * 65)
-
-    assert check(checked, demand()) is not None
-    assert check(checked, forged) is None
-    assert counted(checked) == {"signature": 1}
 
 
 def test_many_threads_accept_each_message_once_and_count_exactly() -> None:

@@ -1,0 +1,28 @@
+"""Message validators of tests, and what they make of messages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mesh.network import MessageValidator, message_key
+from mesh.network.validation import Unresolved
+from schemas import Demand, SignedMessage, Verified, encode
+from tests.support.orders import LIGHTHOUSE, MARKET
+
+HEAD = 100
+NAME = "xrt.3.robonomics.eth"
+
+
+def validator(kind: type[Any] = Demand, **options: Any) -> MessageValidator[Any]:
+    given: dict[str, Any] = {"lighthouse": MARKET, "address": LIGHTHOUSE, "head": lambda: HEAD} | options
+    return MessageValidator(kind, **given)
+
+
+def counted(checked: MessageValidator[Any]) -> dict[str, int]:
+    return dict(checked.statistics(received=0, dropped=0).invalid)
+
+
+def check(checked: MessageValidator[Any], message: SignedMessage, key: str | None = None) -> Verified[Any] | None:
+    accepted = checked.check(key or message_key(MARKET, message), encode(message))
+    assert not isinstance(accepted, Unresolved)
+    return accepted
