@@ -29,6 +29,7 @@ from mesh.chain import (
     Transfer,
 )
 from mesh.log_context import liability_context, log_event, with_liability_context
+from mesh.retry import Backoff
 from mesh.work.ledger import TO_BE_DONE, Phase, advance
 from mesh.work.outbox import result_identity
 from schemas.agent_keys import EthEventKey
@@ -46,8 +47,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-READ_ERRORS: Final = (NodeUnreachable, RequestRefused, NoContracts)
-"""Errors after which a liability is read again. `NoContracts`: the node is behind another one that had its block."""
+READ_ERRORS: Final = (NodeUnreachable, RequestRefused)
+"""Errors after which a liability is read again."""
 REVERTED_KEPT: Final = 1_000
 """Most reverted token events that are remembered, because they may happen again."""
 
@@ -73,8 +74,21 @@ class ChainListener:
         settings, chain, outages = self._parts.settings, self._chain, self._parts.outages
         find_token = partial(chain.names.address, settings.erc20_token)
         token = await chain.retrying(find_token, outages=outages) if settings.erc20_token else ""
+        backoff = Backoff(chain.node.timing.outage_retry)
+        while True:
+            try:
+                await self._follow(token, backoff)
+            except NoContracts as error:
+                # A contract is not there whose event is: its block was replaced, or another node is behind. Both are
+                # found when the block is read again.
+                log.info("the block is read again: %s", error, extra=log_event("block-read-again", code=error.code))
+                await backoff.wait()
+
+    async def _follow(self, token: str, backoff: Backoff) -> None:
+        """Read on from the position in the ledger."""
         cursor, history = await self._position()
-        async with aclosing(chain.follow(cursor, history=history, token=token, outages=outages)) as blocks:
+        following = self._chain.follow(cursor, history=history, token=token, outages=self._parts.outages)
+        async with aclosing(following) as blocks:
             async for block in blocks:
                 if isinstance(block, Reorganisation):
                     facts = log_event("chain-reorganised", block=block.block_number, events=len(block.reverted_events))
@@ -88,6 +102,7 @@ class ChainListener:
                     await self.handle(event)
                 await self._ledger.set_cursor(self.CURSOR, block.block_number, history=history.encode())
                 await self.new_head(block.block_number)
+                backoff.reset()
 
     async def finalize_ended(self) -> None:
         """Finalize the jobs that ended while the agent was away, before any of them is continued.
@@ -98,7 +113,7 @@ class ChainListener:
             read = partial(self._chain.liabilities.get, job.liability.address)
             try:
                 now = await self._chain.retrying(read, outages=self._parts.outages, errors=READ_ERRORS)
-            except NotALiability:  # reverted, which the listener will find
+            except (NotALiability, NoContracts):  # reverted, which the listener will find
                 continue
             if now.is_finalized:
                 await self.finalized(now.address, success=now.is_success, result=now.result)

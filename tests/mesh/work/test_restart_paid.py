@@ -11,6 +11,7 @@ import pytest
 from msgspec.structs import replace
 
 from mesh.agent import Phase
+from mesh.chain.liabilities import Liabilities
 from mesh.recording import open_objective
 from mesh.work.outbox import outgoing
 from schemas import String, cid_of_file
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.agent import Agent
+    from schemas import Liability
     from tests.support.market import Place
 
 __all__ = ["paid"]
@@ -217,6 +219,27 @@ async def test_a_contract_created_again_at_another_address_is_paid_once(place: P
             await in_phase(robot, contract, Phase.FINALIZED)
     assert said == WORDS
     assert await paid.once()
+
+
+async def test_a_contract_that_is_gone_when_it_is_read_does_not_stop_the_reading(
+    place: Place, paid: Paying, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A reorganisation took it after its event was read; the provider makes it again at another address."""
+    said: list[str] = []
+    get, gone = Liabilities.get, list[str]()
+
+    async def get_too_late(liabilities: Liabilities, address: str) -> Liability:
+        if not gone and liabilities._contracts.own_address == place.address("robot"):
+            gone.append(address)
+            await place.forget_blocks(1)
+        return await get(liabilities, address)
+
+    monkeypatch.setattr(Liabilities, "get", get_too_late)
+    async with place.agent("person") as person, place.provider(), speaking(offering(place.agent("robot")), said):
+        await person.demand(words(place), cost=COST)
+        await until_found(paid.once, what="the payment")
+    assert gone
+    assert said == WORDS
 
 
 async def test_no_recording_of_an_ended_job_is_left(place: Place) -> None:
