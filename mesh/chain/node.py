@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from mesh.chain.web3_provider import Endpoint
 
 CONTRACTS_KEPT: Final = 1024
+READ_ATTEMPTS: Final = 3
+"""How often a contract's function is called while what it returns does not decode."""
 READ_AT_ONCE: Final = 100
 """Contract functions that `read_all` calls at the same time."""
 
@@ -155,9 +157,9 @@ class Node:
         """How many transactions an account has on the chain; with `pending`, also those that wait to be mined."""
         return int(await self._ask("eth_getTransactionCount", address, "pending" if pending else "latest"))
 
-    async def code(self, address: str) -> bytes:
-        """The code of the contract at an address; empty if there is none."""
-        return bytes(await self._ask("eth_getCode", address, "latest"))
+    async def code(self, address: str, *, block: int | str = "latest") -> bytes:
+        """The code of the contract at an address, in the state after a block; empty if there is none."""
+        return bytes(await self._ask("eth_getCode", address, _block(block)))
 
     async def gas_price(self) -> int:
         """The price of a unit of gas that the node suggests, wei."""
@@ -197,18 +199,23 @@ class Node:
         return receipt
 
     async def read(self, call: AsyncContractFunction, *, block: int | str = "latest") -> Any:
-        """What a contract's function returns.
+        """What a contract's function returns; asked again if it does not decode.
 
         Raises `Reverted`, `NoContracts` if there is no such contract, `InvalidAnswer` for other data.
         """
-        returned = await self.call({"to": call.address, "data": call._encode_transaction_data()}, block=block)
-        if not returned:
-            raise NoContracts(f"contract with {call.fn_name} at {call.address}", self.chain_id)
-        try:
-            (value,) = decode_values([output["type"] for output in call.abi["outputs"]], returned)
-        except SpoiledAnswer as error:
-            raise InvalidAnswer(f"{call.fn_name} of {call.address}", str(error)) from None
-        return value
+        request = {"to": call.address, "data": call._encode_transaction_data()}
+        types = [output["type"] for output in call.abi["outputs"]]
+        for attempt in range(READ_ATTEMPTS):
+            returned = await self.call(request, block=block)
+            try:
+                (value,) = decode_values(types, returned)
+            except SpoiledAnswer as error:
+                failure = error
+            else:
+                return value
+            if not attempt and not returned and not await self.code(call.address, block=block):
+                raise NoContracts(f"contract with {call.fn_name} at {call.address}", self.chain_id)
+        raise InvalidAnswer(f"{call.fn_name} of {call.address}", str(failure))
 
     async def read_all(self, calls: Iterable[AsyncContractFunction], *, block: int | str) -> list[Any]:
         """What several functions return in the state of one block, `READ_AT_ONCE` at a time. Raises as `read` does."""

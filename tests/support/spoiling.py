@@ -43,6 +43,11 @@ def truncated(response: dict[str, Any], chance: random.Random) -> bytes:
     return body[: chance.randrange(1, len(body))]
 
 
+def emptied(response: dict[str, Any], chance: random.Random) -> bytes:
+    """What a node says of a contract that it does not have."""
+    return json.dumps(response | {"result": "0x"} if "result" in response else response).encode()
+
+
 KINDS: Final = {spoil.__name__: spoil for spoil in (null, missing, mistyped, truncated)}
 
 
@@ -95,7 +100,7 @@ class SpoilingProxy:
         if (self._methods is None or method in self._methods) and chance.random() < self.rate:
             kind = chance.choice(self._kinds)
             self.spoiled[method, kind] += 1
-            response = KINDS[kind](json.loads(response), chance)
+            response = {**KINDS, "emptied": emptied}[kind](json.loads(response), chance)
         return web.Response(body=response, content_type="application/json")
 
 

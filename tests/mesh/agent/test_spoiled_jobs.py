@@ -67,13 +67,28 @@ def _going(robot: Agent) -> Agent:
 async def test_jobs_are_done_and_paid_once(
     founded: Founded, anvil: Anvil, router: EmbeddedRouter, tmp_path: Path, nodes: int, rate: float, seed: int
 ) -> None:
+    await _do_jobs(founded, anvil, router, tmp_path, nodes=nodes, seed=seed, rate=rate)
+
+
+@pytest.mark.parametrize("seed", range(3))
+async def test_jobs_survive_a_node_that_at_times_lacks_the_contracts(
+    founded: Founded, anvil: Anvil, router: EmbeddedRouter, tmp_path: Path, seed: int
+) -> None:
+    lacking: dict[str, Any] = {"methods": frozenset({"eth_call"}), "kinds": ("emptied",), "rate": 0.1}
+    await _do_jobs(founded, anvil, router, tmp_path, nodes=1, seed=seed, **lacking)
+
+
+async def _do_jobs(
+    founded: Founded, anvil: Anvil, router: EmbeddedRouter, tmp_path: Path, *, nodes: int, seed: int, **spoiling: Any
+) -> None:
+    """Do some jobs over proxies with these options, one after another."""
     async with Chain(anvil.url, ens=founded.market.deployment.ens, timing=QUICK) as chain:
         first = await chain.block_number() + 1
         robot_account = founded.market.accounts["robot"].address
         before = await chain.tokens.balance(robot_account)
         async with AsyncExitStack() as stack:
             proxies = [
-                await stack.enter_async_context(SpoilingProxy(anvil.url, seed=100 * seed + number, rate=rate))
+                await stack.enter_async_context(SpoilingProxy(anvil.url, seed=100 * seed + number, **spoiling))
                 for number in range(nodes)
             ]
             place = _SpoiledPlace(founded, router.endpoint, tmp_path)
