@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import shutil
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,8 +12,8 @@ import click
 
 from mesh.cli.amounts import AMOUNT, XRT
 from mesh.cli.errors import FileUnwritable, InvalidOptions, JobNotDone, NotAFileOrCid, OutputFailed
+from mesh.cli.existing_demand import take_existing, wait_for_contract
 from mesh.cli.options import with_json, with_settings
-from mesh.cli.order import print_stays_open, report_rejection, take_existing
 from mesh.cli.output import print_json, print_line
 from mesh.errors import AiraError
 from mesh.running import run_to_end
@@ -130,17 +129,13 @@ async def _contract(
         print_line(f"demand by {agent.address} for {agent.model}")
     cid = source if isinstance(source, str) else await agent.add(source)
     terms |= {"cost": unit.parse(cost), "validator_fee": validator_fee}
-    order = await take_existing(agent, cid, existing, quiet=quiet, **terms)
-    if order is None:
+    existing_one = await take_existing(agent, cid, existing, quiet=quiet, **terms)
+    if existing_one is None:
         await check_balance(agent.parts.chain, unit, terms["cost"], token=agent.settings.erc20_token)
-        order = await agent.order(cid, **terms)
+        existing_one = await agent.order(cid, **terms)
         if not quiet:
-            print_line(f"posted {order.hash}, valid until block {order.deadline:,}")
-    try:
-        contract = await order.contract(on_rejection=partial(report_rejection, order))
-    except asyncio.CancelledError:
-        print_stays_open(order)
-        raise
+            print_line(f"posted {existing_one.hash}, valid until block {existing_one.deadline:,}")
+    contract = await wait_for_contract(existing_one)
     if not quiet:
         print_line(f"contract {contract.address} with {contract.liability.promisor}")
     return contract

@@ -1,17 +1,15 @@
-"""`aira order`: lists and withdraws open orders; and what `aira demand` does about a demand that is open already."""
+"""`aira order`: lists and withdraws open orders."""
 
 from __future__ import annotations
 
 import asyncio
 import json
-import sys
-import threading
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
 from mesh.cli.chain_client import notice_when_slow, open_chain, required_address, units_of
-from mesh.cli.errors import DemandExists, InvalidOptions, UnknownOrder
+from mesh.cli.errors import InvalidOptions, UnknownOrder
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import plural, print_json, print_line, print_table
 from mesh.running import run_to_end
@@ -20,22 +18,16 @@ from mesh.settings import ChainSettings, NetworkSettings, options_of
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from mesh.agent import Agent, Order
+    from mesh.agent import Order
     from mesh.agent.components import AgentComponents
     from mesh.chain import Chain
     from mesh.settings import Settings
     from mesh.work import StoredOrder
     from schemas import Demand, Offer
-    from schemas.signing import Rejection
 
 CONFIRMATION: Final = 5.0
 """Seconds in which providers may confirm a withdrawal."""
 ANSWERS: Final = 256
-CHOICES: Final = {
-    "wait": "wait for it",
-    "withdraw": "withdraw it, and post a new one",
-    "new": "post another one beside it",
-}
 HEAD: Final = ("ORDER", "KIND", "STATE", "COST", "VALID UNTIL")
 
 
@@ -219,77 +211,3 @@ def _what_it_means(fact: dict[str, Any]) -> str:
             f"All {plural(fact['providers'], 'provider')} present confirmed it. If another one has the order, {until}."
         )
     return f"{fact['confirmedBy']} of {plural(fact['providers'], 'present provider')} confirmed it: {until}."
-
-
-async def take_existing(
-    agent: Agent, objective: str, existing: str | None, *, quiet: bool, lifetime: int | None = None, **terms: Any
-) -> Order | None:
-    """The open demand with these terms if it is to be waited for; None if a new one is to be posted.
-
-    Asks in a terminal unless `existing` says what to do. Raises `DemandExists` without a terminal.
-    """
-    equal = await _equal_demands(agent, objective, **terms)
-    if equal:  # perhaps it became a contract while nothing of the account ran
-        await agent.parts.chain_head.reached(await agent.parts.chain.block_number())
-        equal = await _equal_demands(agent, objective, **terms)
-    if not equal:
-        return None
-    head = agent.parts.chain_head.head
-    for order in equal:
-        left = plural(order.deadline - head, "block")
-        click.echo(f"the equal demand {order.hash} is open until block {order.deadline:,} ({left})", err=True)
-    if existing is None and (quiet or not sys.stdin.isatty()):
-        choices = ", ".join(f"--existing {choice} ({meaning})" for choice, meaning in CHOICES.items())
-        raise DemandExists("an equal demand is open; a second one would be paid too", hint=f"choose: {choices}")
-    choice = existing or await _ask()
-    if choice == "wait":
-        return equal[0]
-    for order in equal if choice == "withdraw" else ():
-        await order.withdraw()
-        click.echo(f"withdrew {order.hash}; a provider that is creating its contract now may still finish", err=True)
-    return None
-
-
-async def _equal_demands(
-    agent: Agent, objective: str, *, cost: int, validator: str = "", validator_fee: int
-) -> list[Order]:
-    from mesh.agent.terms import is_repeated
-    from schemas import Demand
-
-    fields: dict[str, Any] = {"model": agent.model, "objective": objective, "cost": cost, "validator": validator}
-    wanted = await agent.runtime.trader.writer.terms(**fields, token="", lifetime=1)
-    return [
-        order
-        for order in agent.orders()
-        if isinstance(order.message, Demand) and is_repeated(order.message, wanted, validator_fee=validator_fee)
-    ]
-
-
-async def _ask() -> str:
-    """Ask in the terminal what to do, in a thread that does not keep an interrupted program alive."""
-    loop = asyncio.get_running_loop()
-    answer: asyncio.Future[str] = loop.create_future()
-
-    def ask() -> None:
-        click.echo("\n".join(f"  {choice}: {meaning}" for choice, meaning in CHOICES.items()), err=True)
-        try:
-            given = click.prompt("what now?", type=click.Choice(list(CHOICES)), err=True)
-        except click.Abort:
-            loop.call_soon_threadsafe(answer.cancel)
-        else:
-            loop.call_soon_threadsafe(answer.set_result, given)
-
-    threading.Thread(target=ask, name="prompt", daemon=True).start()
-    return await answer
-
-
-def report_rejection(order: Order, rejection: Rejection) -> None:
-    """Tell the person that a provider can't use the order, and that it stays valid."""
-    click.echo(f"provider {rejection.provider} can't use it now: {rejection.detail} ({rejection.reason})", err=True)
-    print_stays_open(order)
-
-
-def print_stays_open(order: Order) -> None:
-    """Tell the person until when the demand can become a contract, and how to withdraw it."""
-    way = f"withdraw it with `aira order withdraw {order.hash[:16]}`"
-    click.echo(f"the demand stays valid until block {order.deadline:,}; {way}", err=True)

@@ -1,5 +1,4 @@
-"""The ledger: an agent's jobs with their phases, its unsent messages, and how far it has read the chain, in one SQLite
-file.
+"""The ledger: an agent's jobs, its unsent messages, and how far it has read the chain, in one SQLite file.
 
 Every write is synced before the call returns, so it survives `kill -9`. Writes are idempotent: handling the same block
 or message twice changes nothing.
@@ -103,10 +102,7 @@ class Outgoing(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class StoredOrder(msgspec.Struct, frozen=True, kw_only=True):
-    """An order of ours that can still become a contract: open, or withdrawn and perhaps matched all the same.
-
-    `posted` is Unix time.
-    """
+    """An order of ours that may still become a contract, even if it is withdrawn. `posted` is Unix time."""
 
     identity: str
     payload: bytes
@@ -216,6 +212,11 @@ class Ledger:
         spent = "SELECT identity, kind, payload, deadline FROM spent WHERE liability = ?"
         withdrawn = "SELECT identity, kind, payload, deadline FROM withdrawn WHERE used_by = ?"
         return _outgoing(await self._database.rows(f"{spent} UNION ALL {withdrawn}", (liability, liability)))
+
+    async def contracts(self, kind: str) -> list[tuple[bytes, str]]:
+        """The 64 latest orders of a kind that became contracts: their payloads, and the contracts' addresses."""
+        statement = "SELECT payload, liability FROM spent WHERE kind = ? ORDER BY rowid DESC LIMIT 64"
+        return await self._database.rows(statement, (kind,))
 
     async def unspend(self, liability: str) -> None:
         """Move the orders of a reverted contract back into the outbox. Withdrawn ones stay withdrawn."""

@@ -103,8 +103,9 @@ def test_a_job_is_done_and_paid_between_processes(development: Development, tmp_
     with watcher, development.agent(EXAMPLES / "robot.py", says="account 0x") as robot:
         done = development.demand(*order, "--out", out)
         assert (done.returncode, done.stderr) == (0, "")
-        first, second, third, fourth = done.stdout.splitlines()
+        first, posted, second, third, fourth = done.stdout.splitlines()
         assert first.startswith("demand by 0x")
+        assert posted.startswith("posted ")
         assert re.fullmatch(r"contract 0x\w{40} with 0x\w{40}", second)
         assert third == f"paid, result {cid_of_file(out)}"
         assert fourth == f"recording {out}"

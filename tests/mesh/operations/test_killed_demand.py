@@ -17,7 +17,7 @@ from tests.support.waiting import until_found
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from schemas import Liability
+    from schemas import Demand, Liability, Verified
     from tests.support.nodes import Anvil
     from tests.support.routers import EmbeddedRouter
 
@@ -130,6 +130,34 @@ async def test_run_again_it_can_post_another_demand_with_allowance_for_both(pers
     async with person.site.chain("person") as chain:
         hashes = {(await chain.liabilities.order_hashes(contract.address))[0].hex() for contract in contracts}
     assert killed in hashes
+
+
+async def test_run_again_it_can_wait_for_the_contract_of_the_killed_demand(person: Person) -> None:
+    """It was killed after the match: a second demand would pay for the work twice."""
+    may_work = asyncio.Event()
+    robot = person.site.agent("robot")
+
+    @robot.on_demand
+    async def offer(demand: Verified[Demand]) -> None:
+        await robot.offer(demand)
+
+    @robot.on("/say")
+    async def say(job: object, message: object) -> None:
+        await may_work.wait()
+
+    first = person.demand(says="contract 0x")
+    async with person.site.provider(), robot:
+        await asyncio.to_thread(first.start)
+        await asyncio.to_thread(first.end, signal.SIGKILL)
+        (contract,) = await person.contracts()
+        refused = await asyncio.to_thread(aira, *person.words(), **person.site.variables("person"))
+        assert refused.returncode == 2
+        assert contract.address in refused.stderr
+        again = person.demand("--existing", "wait", says=f"contract {contract.address}")
+        await asyncio.to_thread(again.start)
+        may_work.set()
+        assert await asyncio.to_thread(again.wait) == 0
+        assert [one.is_success for one in await person.ended(1)] == [True]
 
 
 async def test_an_interrupted_demand_stays_open_until_it_is_withdrawn(person: Person) -> None:

@@ -1,0 +1,120 @@
+"""`aira order`, and what `aira demand` says about orders."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.cli.demand import demand
+from mesh.cli.errors import InvalidOptions, UnknownOrder
+from mesh.cli.order import _list, _withdraw
+from mesh.network import Endpoints, Network
+from schemas import RejectKey
+from schemas.signing import Rejection
+from tests.mesh.operations.site import MODEL, Site
+from tests.support.commands import invoke
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mesh.settings import Settings
+    from tests.support.nodes import Anvil
+    from tests.support.routers import EmbeddedRouter
+
+
+@pytest.fixture
+async def site(anvil: Anvil, router: EmbeddedRouter, tmp_path: Path) -> Site:
+    return await Site.found(anvil.url, anvil.private_keys, router.endpoint, tmp_path)
+
+
+def settings_of(site: Site, role: str) -> Settings:
+    """A role's settings, with its keyfile."""
+    variables = site.variables(role)
+    keyfile, password = variables["AIRA_KEYFILE"], variables["AIRA_KEYFILE_PASSWORD_FILE"]
+    return site.settings(role, keyfile=keyfile, keyfile_password_file=password)
+
+
+async def test_an_account_without_a_ledger_has_no_orders(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
+    await _list(settings_of(site, "poor"), as_json=False)
+    assert capsys.readouterr().out == f"no open orders of {site.address('poor')}\n"
+    await _list(settings_of(site, "poor"), as_json=True)
+    assert json.loads(capsys.readouterr().out) == []
+    assert not (site.folder / "state" / site.address("poor")).exists()
+
+
+async def test_orders_are_listed_and_withdrawn_by_their_hash(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = settings_of(site, "person")
+    async with site.agent("person") as person:
+        orders = [await person.order(site.job("one"), cost=cost) for cost in (5, 6)]
+    await _list(settings, as_json=True)
+    listed = json.loads(capsys.readouterr().out)
+    assert [(one["hash"], one["kind"], one["state"], one["cost"]) for one in listed] == [
+        (order.hash, "demand", "open", order.message.cost) for order in orders
+    ]
+    assert all(0 < one["blocksLeft"] <= one["deadline"] for one in listed)
+    with pytest.raises(UnknownOrder):
+        await _withdraw(settings, ("00" * 32,), everything=False, on_chain=False, as_json=True)
+    with pytest.raises(InvalidOptions):
+        await _withdraw(settings, ("",), everything=False, on_chain=False, as_json=True)
+    await _withdraw(settings, (orders[0].hash[:20],), everything=False, on_chain=False, as_json=True)
+    (fact,) = json.loads(capsys.readouterr().out)
+    assert fact == {
+        "hash": orders[0].hash,
+        "kind": "demand",
+        "deadline": orders[0].deadline,
+        "providers": 0,
+        "confirmedBy": 0,
+        "tx": None,
+    }
+    await _list(settings, as_json=False)
+    printed = capsys.readouterr().out
+    assert all(order.hash in printed for order in orders)
+    assert [word for word in printed.split() if word in ("open", "withdrawn")] == ["open", "withdrawn"]
+    await _withdraw(settings, (), everything=True, on_chain=False, as_json=False)
+    said = capsys.readouterr().out
+    assert f"demand {orders[1].hash} is withdrawn" in said
+    assert "may still become a contract" in said
+
+
+def test_withdraw_needs_hashes_or_all() -> None:
+    assert invoke("order", "withdraw").returncode == 2
+    assert invoke("order", "withdraw", "ab", "--all").returncode == 2
+
+
+async def test_a_rejection_is_told_with_what_it_means(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = settings_of(site, "person")
+    order = {"model": MODEL, "objective": str(site.job("word")), "cost": "7wn", "validator_fee": "0", "validator": ""}
+    waiting = asyncio.create_task(demand(settings, **order, out=None, as_json=True, lifetime=100))
+    provider = site.accounts["provider"]
+    async with Network(Endpoints(connect=(site.endpoint,))) as network:
+        orders: list[str] = []
+
+        def hear(key: str) -> None:
+            orders.append(key.rpartition("/")[2])
+
+        network.session.declare_subscriber(
+            f"aira/{site.lighthouse}/demand/*/*", lambda sample: hear(str(sample.key_expr))
+        )
+        await until(lambda: orders, what="the demand", seconds=60)
+        unsigned = Rejection(order=orders[0], reason="Unwanted", detail="not today", provider=provider.address)
+        key = str(RejectKey(site.lighthouse, orders[0], provider.address))
+        network.session.put(key, unsigned.signed_by(provider.signer).encode())
+        said: list[str] = []
+
+        def is_told() -> bool:
+            said.append(capsys.readouterr().err)
+            return "not today" in "".join(said)
+
+        await until(is_told)
+    text = "".join(said)
+    assert f"provider {provider.address} can't use the demand now" in text
+    assert "stays valid until block" in text
+    assert f"aira order withdraw {orders[0][:16]}" in text
+    assert not waiting.done()
+    waiting.cancel()
+    await asyncio.wait([waiting])
+    assert "stays valid" in capsys.readouterr().err
