@@ -11,6 +11,7 @@ import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final
 
+from eth._utils.address import force_bytes_to_address
 from eth.constants import GAS_JUMPDEST
 from eth.vm import mnemonics, opcode_values
 from eth.vm.forks.prague import PragueVM
@@ -21,12 +22,18 @@ from eth.vm.opcode import as_opcode
 from mesh.devchain.jsonrpc import SERVER_ERROR, RpcError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from eth.abc import ComputationAPI
 
 GAS_LIMIT: Final = 30_000_000
 """Gas that a block may use, and a call."""
+
+
+SLOW_PRECOMPILES: Final = (0x08, 0x0C, 0x0E, 0x0F)
+"""Pairings and sums over elliptic curves, which take a second for each pair and can't be interrupted."""
+MAX_PAIRING_BYTES: Final = 1_536
+"""Input of such a contract: eight pairs on bn128, four on BLS12-381."""
 
 
 class _RunTooLong(Exception):
@@ -60,10 +67,27 @@ def _check_time(computation: object = None) -> None:
         raise _RunTooLong
 
 
+def _bounded_input(precompile: Callable[[ComputationAPI], Any]) -> Callable[[ComputationAPI], Any]:
+    def run(computation: ComputationAPI) -> Any:
+        if len(computation.msg.data) > MAX_PAIRING_BYTES:
+            raise _RunTooLong
+        return precompile(computation)
+
+    return run
+
+
+PRECOMPILES: Final = dict(PragueComputation.get_precompiles())
+for _number in SLOW_PRECOMPILES:
+    _address = force_bytes_to_address(bytes([_number]))
+    PRECOMPILES[_address] = _bounded_input(PRECOMPILES[_address])
+
+
 class _BoundedComputation(PragueComputation):
     opcodes = PragueComputation.opcodes | {
         opcode_values.JUMPDEST: as_opcode(logic_fn=_check_time, mnemonic=mnemonics.JUMPDEST, gas_cost=GAS_JUMPDEST)
     }
+
+    _precompiles = PRECOMPILES
 
     @classmethod
     def apply_computation(cls, *args: Any, **kwargs: Any) -> ComputationAPI:

@@ -38,16 +38,25 @@ async def refusal(request: Awaitable[Any]) -> RpcError:
 
 
 @pytest.mark.parametrize("method", ["eth_call", "eth_estimateGas"])
-async def test_other_requests_are_answered_during_an_endless_call(node: EmbeddedChain, method: str) -> None:
-    endless = [asyncio.create_task(node.request(method, [{"data": ENDLESS}])) for _ in range(4)]
-    done, _ = await asyncio.wait(endless, timeout=0.2)
-    assert not done, "the calls ended before they could be in the way"
-    assert await node.request("eth_blockNumber", []) == "0x0"
-    await node.mine(3)
-    assert await node.request("eth_blockNumber", []) == "0x3"
-    assert not any(call.done() for call in endless)
-    for call in endless:
-        assert (await refusal(call)).code == SERVER_ERROR
+async def test_other_requests_are_answered_during_an_endless_call(method: str) -> None:
+    async with EmbeddedChain(run_seconds=1.0) as node:
+        endless = [asyncio.create_task(node.request(method, [{"data": ENDLESS}])) for _ in range(3)]
+        assert await node.request("eth_blockNumber", []) == "0x0"
+        await node.mine(3)
+        assert await node.request("eth_blockNumber", []) == "0x3"
+        assert not any(call.done() for call in endless)
+        for call in endless:
+            assert (await refusal(call)).code == SERVER_ERROR
+
+
+@pytest.mark.parametrize("precompile", ["08", "0c", "0e", "0f"])
+async def test_a_long_pairing_is_refused(node: EmbeddedChain, precompile: str) -> None:
+    """No loop of the EVM, and a second and more for each pair."""
+    call = {"to": "0x" + precompile.rjust(40, "0"), "data": "0x" + "00" * 384 * 20}
+    refused = await refusal(node.request("eth_call", [call]))
+    assert (refused.code, refused.message) == (SERVER_ERROR, "execution aborted (timeout = 5s)")
+    short = await node.request("eth_call", [{"to": "0x" + "08".rjust(40, "0"), "data": "0x" + "00" * 384}])
+    assert int(short, 16) == 1
 
 
 async def test_a_call_gets_no_more_gas_than_a_block_has(node: EmbeddedChain) -> None:
@@ -136,7 +145,7 @@ async def log_times(node: EmbeddedChain, times: int) -> None:
 
 
 async def test_too_many_requests_at_once_are_refused() -> None:
-    async with EmbeddedChain(max_requests=3) as node:
+    async with EmbeddedChain(max_requests=3, run_seconds=0.2) as node:
         endless = [asyncio.create_task(node.request("eth_call", [{"data": ENDLESS}])) for _ in range(3)]
         await asyncio.sleep(0)
         assert (await refusal(node.request("eth_blockNumber", []))).code == LIMIT_EXCEEDED
