@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from mesh.agent import OrderState
 from mesh.cli.demand import demand
 from mesh.cli.errors import InvalidOptions, UnknownOrder
 from mesh.cli.order import _list, _withdraw
@@ -78,6 +79,24 @@ async def test_orders_are_listed_and_withdrawn_by_their_hash(site: Site, capsys:
     said = capsys.readouterr().out
     assert f"demand {orders[1].hash} is withdrawn" in said
     assert "may still become a contract" in said
+
+
+async def test_the_provider_confirms_a_withdrawal_and_does_not_match_the_order(
+    site: Site, capsys: pytest.CaptureFixture[str]
+) -> None:
+    done: list[str] = []
+    async with site.provider():
+        async with site.agent("person") as person:
+            old = await person.order(site.job("withdrawn"), cost=5)
+        await _withdraw(settings_of(site, "person"), (old.hash,), everything=False, on_chain=False, as_json=True)
+        (fact,) = json.loads(capsys.readouterr().out)
+        assert (fact["providers"], fact["confirmedBy"]) == (1, 1)
+        async with site.robot(done) as robot, site.agent("person") as person:
+            await robot.offer(objective=old.message.objective, cost=5)
+            contract = await person.demand(site.job("wanted"), cost=5)
+            assert (await contract.outcome()).success
+            assert [order.hash for order in person.orders(OrderState.WITHDRAWN)] == [old.hash]
+    assert done == ["wanted"]
 
 
 def test_withdraw_needs_hashes_or_all() -> None:

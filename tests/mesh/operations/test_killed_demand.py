@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.cli.errors import DemandExists
-from tests.mesh.operations.site import MODEL, Site
+from tests.mesh.operations.site import MODEL, Site, has_event
 from tests.support.commands import AIRA, Serving, aira
-from tests.support.waiting import until_found
+from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -98,15 +98,18 @@ async def test_run_again_it_can_wait_for_the_killed_demand(person: Person) -> No
 
 
 async def test_run_again_it_can_withdraw_the_killed_demand(person: Person) -> None:
-    killed = await person.killed()
+    """The provider has the killed one, and would match it first."""
     done: list[str] = []
-    again = person.demand("--existing", "withdraw")
-    await asyncio.to_thread(again.start)
-    assert killed not in again.log().split("posted ")[1]
-    assert [state for _, state in await person.orders()] == ["open", "withdrawn"]
-    async with person.site.provider(), person.site.robot(done):
-        assert await asyncio.to_thread(again.wait) == 0
-        (contract,) = await person.ended(1)
+    async with person.site.provider() as provider:
+        killed = await person.killed()
+        again = person.demand("--existing", "withdraw")
+        await asyncio.to_thread(again.start)
+        assert killed not in again.log().split("posted ")[1]
+        assert [state for _, state in await person.orders()] == ["open", "withdrawn"]
+        await until(lambda: has_event(provider, "withdrawal-honoured", order=killed), seconds=TIMEOUT)
+        async with person.site.robot(done):
+            assert await asyncio.to_thread(again.wait) == 0
+            (contract,) = await person.ended(1)
     assert (contract.is_success, done) == (True, ["work"])
     async with person.site.chain("person") as chain:
         demand_hash, _ = await chain.liabilities.order_hashes(contract.address)
