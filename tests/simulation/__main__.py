@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging  # noqa: F401 - before the locks are replaced: it keeps real ones
 import os
 import sys
+import traceback
 
 if os.environ.get("PYTHONHASHSEED") != "0":
     os.environ["PYTHONHASHSEED"] = "0"
@@ -14,6 +15,15 @@ from tests.simulation import threads
 
 threads.install()
 
-from tests.simulation.command import main  # noqa: E402 - after the clock and the threads were replaced
+try:
+    from tests.simulation.command import main
 
-main(sys.argv[1:])
+    main(sys.argv[1:])
+except SystemExit as end:
+    code = end.code if isinstance(end.code, int) else 1
+except BaseException:
+    traceback.print_exc()
+    code = 1
+sys.stdout.flush()
+sys.stderr.flush()
+os._exit(code)  # Python's own end would wait for simulated threads
