@@ -149,7 +149,9 @@ class CrashMarket:
             self._revive(work, cell)
             liabilities = self._runner.run(self._liabilities(cid))
             if len(liabilities) == 1 and liabilities[0].is_finalized:
-                return liabilities[0]
+                # Read again: while anvil mines, it may show a part of the next block in the state of the last one.
+                (liability,) = self._runner.run(self._liabilities(cid))
+                return liability
             assert len(liabilities) < 2, f"the order was made into {len(liabilities)} contracts"
             assert time.monotonic() < deadline, f"the job did not end: {liabilities}"
             time.sleep(0.2)

@@ -34,7 +34,7 @@ POINTS: Final = {
         Point("after", f"{SETTLEMENT}._finalize"),
     ),
     "robot": (
-        Point("before", f"{TRADER}.offer"),
+        Point("before", f"{TRADER}.post"),
         Point("before", f"{OUTBOX}.post"),
         Point("after", f"{LEDGER}.post"),
         Point("before", f"{LISTENER}.new_liability"),
@@ -53,8 +53,8 @@ POINTS: Final = {
         Point("after", f"{LISTENER}.finalized"),
     ),
     "person": (
-        Point("before", f"{TRADER}.demand"),
-        Point("after", f"{TRADER}.sign"),
+        Point("before", f"{TRADER}.post"),
+        Point("after", f"{TRADER}.post"),
         Point("before", f"{OUTBOX}.post"),
         Point("before", f"{LEDGER}.post"),
         Point("after", f"{LEDGER}.post"),

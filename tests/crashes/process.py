@@ -67,14 +67,12 @@ async def _demand(objective: Path) -> None:
 
 async def _demanded(agent: Agent, objective: str) -> Contract | None:
     """The contract that was demanded before a restart, once it is made; None if the ledger has no demand."""
-    ledger, liabilities = agent.parts.ledger, agent.parts.chain.liabilities
-    while True:
-        for liability in await liabilities.list(promisee=agent.address):
-            if liability.objective == objective:
-                return await agent.contract(liability.address)
-        if not any(outgoing.kind == "demand" for outgoing in await ledger.outbox(head=0)):
-            return None
-        await asyncio.sleep(0.1)
+    for order in agent.orders():
+        return await order.contract()
+    for liability in await agent.parts.chain.liabilities.list(promisee=agent.address):
+        if liability.objective == objective:
+            return await agent.contract(liability.address)
+    return None
 
 
 ROLES: Final = {"provider": provider, "robot": robot, "person": person}
