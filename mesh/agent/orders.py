@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from mesh.background import Background
 from mesh.log_context import log_event
+from mesh.market.book import Refusal
 from mesh.network import call_in_loop
 from schemas import InvalidRecord, market_selector, message_hash
 from schemas.signing import Rejection
@@ -157,8 +158,14 @@ class Order:
         """The block before which it can become a contract."""
         return self.message.deadline
 
+    @property
+    def honoured_by(self) -> frozenset[str]:
+        """The providers (addresses) that have signed that they honour its withdrawal, as of now."""
+        said = self._traded.rejections.items()
+        return frozenset(provider for provider, rejection in said if rejection.reason == Refusal.WITHDRAWN)
+
     async def withdraw(self) -> Order:
-        """Withdraw the order; returns it in its new state.
+        """Withdraw the order; returns it in its new state. `honoured_by` tells which providers obey.
 
         A signed withdrawal is sent until the order's deadline, and the order no more. It may still become a contract:
         by a provider that is creating it now, that the withdrawal does not reach, or that does not obey. Until the

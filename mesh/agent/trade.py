@@ -235,13 +235,16 @@ class Trader(Lifecycle):
         return new
 
     async def _rejected(self, rejection: Rejection) -> None:
-        """A provider says that it can't use an order. The order stays valid, for this provider too.
+        """A provider says that it can't use an order, or honours its withdrawal. An order that is open stays valid.
 
         In generation 5 the nonce may be used; whether by this order is known once this agent has read the chain up to
         the block at which the nonce was read.
         """
         identity = rejection.order
-        if (order := self._orders.get(identity)) is None or not order.is_open:
+        order = self._orders.get(identity)
+        if order is not None and rejection.reason == Refusal.WITHDRAWN:
+            order.reject(rejection)
+        if order is None or not order.is_open:
             return
         facts: dict[str, Any] = {"order": identity, "provider": rejection.provider, "reason": rejection.reason}
         if rejection.reason == Refusal.FULL:

@@ -129,6 +129,17 @@ async def test_a_withdrawn_order_is_sent_no_more_and_its_withdrawal_until_the_de
         await until_found(lambda: all_posted(person, 0))
 
 
+async def test_a_provider_confirms_that_it_honours_a_withdrawal(place: Place) -> None:
+    async with place.provider() as provider, place.agent("person", enable_executor=False) as person:
+        order = await person.order(OBJECTIVE, cost=0)
+        await until(lambda: len(provider.book) == 1)
+        assert order.honoured_by == frozenset()
+        withdrawn = await order.withdraw()
+        await until(lambda: withdrawn.honoured_by == {provider.address})
+        assert len(provider.book) == 0
+        assert withdrawn.state is OrderState.WITHDRAWN
+
+
 async def test_the_allowance_of_a_withdrawn_order_is_kept_and_its_tokens_are_free(place: Place) -> None:
     balance = await place.balance("person")
     async with place.agent("person") as person:
