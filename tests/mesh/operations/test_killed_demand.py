@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import signal
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,7 @@ import pytest
 
 from mesh.cli.errors import DemandExists
 from tests.mesh.operations.site import MODEL, Site, has_event
-from tests.support.commands import AIRA, Serving, aira
+from tests.support.commands import AIRA, Serving, aira, environment
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
@@ -161,6 +162,28 @@ async def test_run_again_it_can_wait_for_the_contract_of_the_killed_demand(perso
         may_work.set()
         assert await asyncio.to_thread(again.wait) == 0
         assert [one.is_success for one in await person.ended(1)] == [True]
+
+
+async def test_run_again_in_a_terminal_it_asks(person: Person) -> None:
+    killed = await person.killed()
+    terminal, inside = os.openpty()
+    command = await asyncio.create_subprocess_exec(
+        *AIRA, *person.words(), stdin=inside, stdout=inside, stderr=inside,
+        env=environment(person.site.variables("person")),
+    )  # fmt: skip
+    os.close(inside)
+    said = b""
+    while b"what now?" not in said:
+        said += await asyncio.to_thread(os.read, terminal, 4096)
+    assert killed.encode() in said
+    assert all(choice in said for choice in (b"wait: ", b"withdraw: ", b"new: "))
+    os.write(terminal, b"withdraw\n")
+    while b"posted " not in said:
+        said += await asyncio.to_thread(os.read, terminal, 4096)
+    assert f"withdrew {killed}".encode() in said
+    command.send_signal(signal.SIGINT)
+    assert await asyncio.wait_for(command.wait(), TIMEOUT) == 130
+    os.close(terminal)
 
 
 async def test_an_interrupted_demand_stays_open_until_it_is_withdrawn(person: Person) -> None:
