@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from mesh.cli.errors import DemandExists
+from mesh.cli.output import plural
 
 if TYPE_CHECKING:
     from mesh.agent import Agent, Contract, Order
@@ -33,6 +34,9 @@ async def take_existing(
     if demands:  # perhaps one became a contract while nothing of the account ran
         await agent.parts.chain_head.reached(await agent.parts.chain.block_number())
         demands, contract = await _equal(agent, objective, **terms)
+    if others := len(agent.orders()) - len(demands):
+        also = f"{plural(others, 'other order')} of this account may become contracts"
+        click.echo(f"{also}, and are sent again; see `aira order list`", err=True)
     if not demands and contract is None:
         return None
     for order in demands:

@@ -107,13 +107,16 @@ def test_withdraw_needs_hashes_or_all() -> None:
 async def test_a_rejection_is_told_with_what_it_means(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
     settings = settings_of(site, "person")
     order = {"model": MODEL, "objective": str(site.job("word")), "cost": "7wn", "validator_fee": "0", "validator": ""}
+    async with site.agent("person") as person:
+        another = await person.order(site.job("another"), cost=3)
     waiting = asyncio.create_task(demand(settings, **order, out=None, as_json=True, lifetime=100))
     provider = site.accounts["provider"]
     async with Network(Endpoints(connect=(site.endpoint,))) as network:
         orders: list[str] = []
 
         def hear(key: str) -> None:
-            orders.append(key.rpartition("/")[2])
+            if key.rpartition("/")[2] != another.hash:
+                orders.append(key.rpartition("/")[2])
 
         network.session.declare_subscriber(
             f"aira/{site.lighthouse}/demand/*/*", lambda sample: hear(str(sample.key_expr))
@@ -132,6 +135,7 @@ async def test_a_rejection_is_told_with_what_it_means(site: Site, capsys: pytest
     text = "".join(said)
     assert f"provider {provider.address} can't use the demand now" in text
     assert "stays valid until block" in text
+    assert "1 other order of this account" in text
     assert f"aira order withdraw {orders[0][:16]}" in text
     assert not waiting.done()
     waiting.cancel()
