@@ -70,7 +70,7 @@ class Withdrawals:
         if self._path is not None:
             try:
                 self._path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-                self._database = sqlite3.connect(self._path, isolation_level=None, check_same_thread=False)
+                self._database = sqlite3.connect(self._path, timeout=0.1, isolation_level=None, check_same_thread=False)
                 self._path.chmod(0o600)
                 self._database.executescript(_TABLE)
             except (OSError, sqlite3.Error) as error:
