@@ -109,6 +109,8 @@ def _find_mutants(deployed: Deployed, options: argparse.Namespace) -> NoReturn:
     missed, chosen = 0, [one for one in MUTATIONS if options.mutant in one.name]
     options.without = frozenset()
     for mutation in chosen:
+        mutation.source()
+    for mutation in chosen:
         options.only = frozenset(mutation.faults.split(","))
         for attempt in range(1, SEEDS + 1):
             seed = options.seed + attempt - 1

@@ -65,7 +65,7 @@ RANGES: Final[dict[str, tuple[float, float]]] = {
     "spoilt": (0.002, 0.03),
     "lost_after_sending": (0.05, 0.3),
     "outage_every": (60, 400),
-    "clock_every": (60, 400),
+    "clock_every": (2, 200),
     "preempt": (0.01, 0.1),
 }
 

@@ -7,7 +7,10 @@ import importlib
 import inspect
 import textwrap
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from types import ModuleType
 
 SEEDS: Final = 10
 """Within so many seeds each is found."""
@@ -28,20 +31,30 @@ class Mutation:
 
     def apply(self) -> None:
         """Plant the bug in this process."""
+        module, owner, name = self._find()
+        planted: dict[str, Any] = {}
+        flags = __future__.annotations.compiler_flag
+        exec(compile(self.source(), f"<{self.name}>", "exec", flags=flags), module.__dict__, planted)
+        setattr(owner, name, planted[name])
+
+    def source(self) -> str:
+        """The changed function. Raises `LookupError` if production code has changed and the mutation must follow."""
+        _, owner, name = self._find()
+        source = textwrap.dedent(inspect.getsource(getattr(owner, name)))
+        if self.old not in source:
+            raise LookupError(f"{self.name}: {self.target} has no {self.old!r}")
+        return source.replace(self.old, self.new, 1)
+
+    def _find(self) -> tuple[ModuleType, Any, str]:
         module_name, _, path = self.target.partition(":")
         module = importlib.import_module(module_name)
         owner: Any = module
         *parents, name = path.split(".")
         for parent in parents:
-            owner = getattr(owner, parent)
-        source = textwrap.dedent(inspect.getsource(getattr(owner, name)))
-        if self.old not in source:
-            raise LookupError(f"{self.name}: {self.target} has no {self.old!r} any more")
-        changed: dict[str, Any] = {}
-        flags = __future__.annotations.compiler_flag
-        code = compile(source.replace(self.old, self.new, 1), f"<{self.name}>", "exec", flags=flags)
-        exec(code, module.__dict__, changed)
-        setattr(owner, name, changed[name])
+            owner = getattr(owner, parent, None)
+        if not hasattr(owner, name):
+            raise LookupError(f"{self.name}: there is no {self.target}")
+        return module, owner, name
 
 
 CRASHES: Final = "crash,crash_every"
@@ -64,15 +77,14 @@ MUTATIONS: Final = (
     ),
     Mutation(
         "the listener's cursor runs ahead of what it has handled",
-        "mesh.agent.listener:ChainListener.run",
-        "for event in block.events:",
-        "await self._ledger.set_cursor(self.CURSOR, block.block_number, history=history.encode())\n"
-        "            for event in block.events:",
+        "mesh.agent.listener:ChainListener._follow",
+        "self.CURSOR, block.block_number - 1, history",
+        "self.CURSOR, block.block_number, history",
         CRASHES,
     ),
     Mutation(
         "the listener ignores reorganisations",
-        "mesh.agent.listener:ChainListener.run",
+        "mesh.agent.listener:ChainListener._follow",
         "in block.reverted_events",
         "in ()",
         REORGANISATIONS + ",forget",
@@ -86,7 +98,7 @@ MUTATIONS: Final = (
     ),
     Mutation(
         "the provider does not see a reorganisation",
-        "mesh.market.settlement:Settlement._revert",
+        "mesh.market.liability_events:LiabilityEvents._revert",
         "created = [",
         "return\n    created = [",
         REORGANISATIONS,
@@ -101,8 +113,8 @@ MUTATIONS: Final = (
     Mutation(
         "an interrupted job is played again from its beginning, into the same recording",
         "mesh.work.playbacks:Playbacks.begin",
-        "position=position, recorded=job.recorded)",
-        "position=0, recorded=job.recorded)",
+        "await self.create(job, objective)",
+        "await self.create(job, objective)\n    run.position = 0",
         CRASHES,
     ),
     Mutation(
@@ -167,6 +179,13 @@ MUTATIONS: Final = (
         "await self._owe_result(job)",
         "pass",
         REORGANISATIONS + ",forget",
+    ),
+    Mutation(
+        "a withdrawal is not sent to the chain",
+        "mesh.agent.trade:Trader.withdraw_on_chain",
+        "tx = (await self._chain.liabilities.withdraw(order.signed)).tx",
+        'tx = ""',
+        "drop,leave_out,partition_every",
     ),
     Mutation(
         "the recording is stamped with the time of day",

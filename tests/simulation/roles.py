@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from tests.simulation.market import Market
 
 
-WITHDRAWN: Final = 0.15
+WITHDRAWN: Final = 0.2
 """How many orders people withdraw."""
 
 

@@ -7,6 +7,8 @@ import subprocess
 import sys
 from typing import Any
 
+from tests.simulation.mutations import MUTATIONS
+
 FAULTS = "crash,crash_every,delay,drop,duplicate,late,leave_out,lost_after_sending,partition_every,preempt"
 
 
@@ -36,3 +38,16 @@ def test_no_invariant_is_violated() -> None:
     assert found["violations"] == [], said
     assert found["lost"] == found["paid_twice"] == 0
     assert found["faults"]
+
+
+def test_planted_bugs_fit_the_sources() -> None:
+    assert len({mutation.name for mutation in MUTATIONS}) == len(MUTATIONS)
+    for mutation in MUTATIONS:
+        compile(mutation.source(), mutation.name, "exec")
+
+
+def test_a_planted_bug_is_found() -> None:
+    command = [sys.executable, "-m", "tests.simulation", "--mutants", "--seed", "1", "--mutant", "before the objective"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    assert "recording-incomplete" in ended.stdout
