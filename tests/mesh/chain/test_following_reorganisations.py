@@ -150,6 +150,22 @@ async def test_without_a_history_earlier_reorganisations_go_unnoticed(fork: Fork
         assert await anext(events) == BlockEvents(head + 1, ())
 
 
+async def test_a_reorganisation_that_begins_before_the_start_is_followed(fork: Fork) -> None:
+    for value in (1, 2):
+        head = await fork.approve(value)
+    async with aclosing(fork.chain.follow(head + 1)) as events:
+        await fork.request("evm_mine")
+        await _until(events, _reaches(head + 1))
+        await fork.replace_last(2)
+        *_, back = await _until(events, _is_reorganised)
+        assert isinstance(back, Reorganisation)
+        assert back.block_number < head
+        assert back.reverted_events == ()
+        head = await fork.approve(3)
+        new = await _until(events, _reaches(head))
+    assert [value for block in new for value in _values(block.events)][-1] == 3
+
+
 async def test_a_reorganisation_of_blocks_without_events_reverts_nothing(fork: Fork) -> None:
     start = await fork.approve(1)
     async with aclosing(fork.chain.follow(start)) as events:
