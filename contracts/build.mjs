@@ -19,6 +19,7 @@ const wanted = {
   "src/Liability.sol": { Liability: suite },
   "src/Jury.sol": { Jury: suite },
   "fixtures/Tokens.sol": { FeeToken: tests, SilentToken: tests, RefusingToken: tests, HookedToken: tests },
+  "fixtures/Crowd.sol": { Crowd: tests },
   "fixtures/Validators.sol": { OneSigner: tests, BrokenValidator: tests },
 };
 

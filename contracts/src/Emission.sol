@@ -39,7 +39,7 @@ abstract contract Emission {
     }
 
     /// Counts a liability that has ended and pays the provider who finalized it.
-    /// @param provider zero when it was none: a validator, or whoever asked for a refund.
+    /// @param provider zero when it was none: a validator, or whoever finalized without a turn or asked for a refund.
     function _credit(Terms memory terms, bool success, address provider) internal {
         uint256 gas = _gasOf(terms);
         totalGasConsumed += gas;

@@ -74,7 +74,8 @@ interface LighthouseErrors {
 }
 
 interface RegistrationErrors {
-    /// A name is one ENS label: 1 to 32 of `a-z`, `0-9` and `-`.
+    /// A name is one ENS label: 1 to 32 of `a-z`, `0-9` and `-`, with no `-` at its ends and not two as its third and
+    /// fourth letter.
     error InvalidName(string name);
     error NameTaken(string name);
     /// The minimal stake is 1 to 2^128-1 wn.

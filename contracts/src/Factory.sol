@@ -62,7 +62,7 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission, ILighthouseFact
     /// @notice Makes a lighthouse and registers its names; anybody may.
     /// @param minimalStake wn for one transaction a turn.
     /// @param timeoutInBlocks silence after which the turn passes on.
-    /// @param name ENS label: 1 to 32 of `a-z`, `0-9` and `-`.
+    /// @param name ENS label: 1 to 32 of `a-z`, `0-9` and `-` (see InvalidName).
     function createLighthouse(uint256 minimalStake, uint256 timeoutInBlocks, string calldata name)
         external
         returns (address lighthouse)
@@ -111,16 +111,15 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission, ILighthouseFact
     {
         Terms memory terms = _termsOf(liability);
         if (msg.sender != terms.lighthouse) revert WrongLighthouse(terms.lighthouse, msg.sender);
-        (bytes32 digest, address signer) = _readResult(liability, result, success, signature);
-        if (terms.validator == address(0)) {
-            _requireSigner(terms.promisor, signer);
-        } else if (terms.generation == 3) {
-            revert NotTheValidator(_provider());
-        } else {
-            Liability(liability).askValidator(terms.validator, signer);
-        }
-        _end(liability, terms, digest, success);
-        _credit(terms, success, _provider());
+        _finalize(liability, terms, result, success, signature, _provider());
+    }
+
+    /// @notice Ends a liability with a signed result, without a lighthouse and its turns; anybody may call. So nobody can
+    /// keep the turn until the promisor's time is over. Nothing is minted.
+    /// @param result 34-byte multihash.
+    /// @param signature as for `finalizeLiability`.
+    function finalize(address liability, bytes calldata result, bool success, bytes calldata signature) external {
+        _finalize(liability, _termsOf(liability), result, success, signature, address(0));
     }
 
     /// @notice Ends a generation-3 liability with a validator; for the liability itself.
@@ -260,6 +259,28 @@ contract Factory is RobonomicsErrors, LighthouseNames, Emission, ILighthouseFact
         if (_hasValidatorFee(terms)) xrt.transferFrom(terms.promisee, address(this), terms.validatorFee);
     }
     // slither-disable-end arbitrary-send-erc20,unchecked-transfer
+
+    /// Ends the liability with a result of the promisor's or, in generation 5, of one whom the validator accepts.
+    /// @param provider zero when nobody is to be credited.
+    function _finalize(
+        address liability,
+        Terms memory terms,
+        bytes calldata result,
+        bool success,
+        bytes calldata signature,
+        address provider
+    ) private {
+        (bytes32 digest, address signer) = _readResult(liability, result, success, signature);
+        if (terms.validator == address(0)) {
+            _requireSigner(terms.promisor, signer);
+        } else if (terms.generation == 3) {
+            revert NotTheValidator(provider == address(0) ? msg.sender : provider);
+        } else {
+            Liability(liability).askValidator(terms.validator, signer);
+        }
+        _end(liability, terms, digest, success);
+        _credit(terms, success, provider);
+    }
 
     /// Ends the liability, then pays: the promisor for success, or the promisee; and the validator for judging.
     function _end(address liability, Terms memory terms, bytes32 digest, bool success) private {

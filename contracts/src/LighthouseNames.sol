@@ -34,9 +34,12 @@ abstract contract LighthouseNames is RegistrationErrors {
         ens.setSubnodeRecord(FIFTH, label, lighthouse, resolver, 0);
     }
 
-    /// Only what every ENS client leaves as it is when it normalises a name, and no dots, which would hide the name.
+    /// Only what every ENS client leaves as it is when it normalises a name (UTS 46, as eth-ens-namehash does), and no
+    /// dots, which would hide the name. Two hyphens after two letters are for encoded names, such as `xn--`.
     function _isLabel(bytes calldata name) private pure returns (bool) {
         if (name.length == 0 || name.length > 32) return false;
+        if (name[0] == "-" || name[name.length - 1] == "-") return false;
+        if (name.length > 3 && name[2] == "-" && name[3] == "-") return false;
         for (uint256 i = 0; i < name.length; ++i) {
             bytes1 letter = name[i];
             bool known = (letter >= "a" && letter <= "z") || (letter >= "0" && letter <= "9") || letter == "-";

@@ -8,28 +8,34 @@ import {LighthouseErrors} from "./Errors.sol";
 struct Turn {
     /// Who may send transactions.
     address provider;
-    /// The block of the last one.
+    /// The block from which silence counts: that of the last transaction, or a later one.
     uint256 keepAliveBlock;
     /// How many are left.
     uint256 quota;
-    /// The provider's place, counted from 1; 0 when there is no provider.
-    uint256 marker;
+}
+
+/// @notice A provider in the queue. The queue is a ring: the current provider follows the last one.
+struct Place {
+    address next;
+    /// Where the provider is in the list, counted from 1; 0 for others.
+    uint96 index;
+    address previous;
 }
 
 /// @title Providers and their turns.
-/// @notice A provider has `stake / minimalStake` transactions a turn, then the next one follows. Silence passes the
-/// turn on: after each `timeoutInBlocks` one more of the providers that follow may take it. So nobody can stop a
-/// lighthouse, and nobody gets another turn before each of the others has had a timeout's time to take theirs.
+/// @notice A provider has `stake / minimalStake` transactions a turn, then the next one in the queue follows. After
+/// `timeoutInBlocks` of silence the next one may take the turn, after twice that time anybody; then both silent ones go
+/// to the end of the queue. So each new turn brings all who wait forward, but for one who had a whole timeout alone to
+/// take it. Nothing here takes more gas where there are more providers.
 abstract contract Turns is LighthouseErrors {
-    /// A Turn in one word: provider 160 bits, keepAliveBlock 40, quota 32, marker 24. A transaction within a turn
-    /// reads and writes nothing else of the lighthouse.
+    /// A Turn in one word: provider 160 bits, keepAliveBlock 64, quota 32. A transaction within a turn reads and writes
+    /// nothing else of the lighthouse.
     uint256 private _turn;
     address[] private _providers;
+    mapping(address provider => Place) private _places;
 
     /// @notice wn that a provider has staked.
     mapping(address provider => uint256) public stakes;
-    /// @notice A provider's place, counted from 1; 0 for others.
-    mapping(address provider => uint256) public indexOf;
 
     event Online(address indexed provider);
     event Offline(address indexed provider);
@@ -38,8 +44,7 @@ abstract contract Turns is LighthouseErrors {
 
     /// @notice Whether `provider` may send a transaction in this block.
     function isTurnOf(address provider) external view returns (bool) {
-        uint256 index = indexOf[provider];
-        return index != 0 && _mayTake(_load(), index);
+        return indexOf(provider) != 0 && _mayTake(_load(), provider);
     }
 
     /// @notice The provider whose turn it is; zero when there is none.
@@ -47,9 +52,9 @@ abstract contract Turns is LighthouseErrors {
         return _load().provider;
     }
 
-    /// @notice Place of the provider whose turn it is, counted from 1; 0 when there is none.
+    /// @notice Place in the list of the provider whose turn it is, counted from 1; 0 when there is none.
     function marker() external view returns (uint256) {
-        return _load().marker;
+        return indexOf(_load().provider);
     }
 
     /// @notice Transactions left in this turn.
@@ -57,7 +62,8 @@ abstract contract Turns is LighthouseErrors {
         return _load().quota;
     }
 
-    /// @notice Block of the last transaction.
+    /// @notice Block from which silence counts: that of the last transaction; a later one if after two timeouts of
+    /// silence another provider has become the next one.
     function keepAliveBlock() public view returns (uint256) {
         return _load().keepAliveBlock;
     }
@@ -68,7 +74,7 @@ abstract contract Turns is LighthouseErrors {
         return whole < type(uint32).max ? whole : type(uint32).max;
     }
 
-    /// @notice The provider at `index`, counted from 0.
+    /// @notice The provider at `index` of the list, counted from 0. The list has no order; `queue` has.
     function providers(uint256 index) public view returns (address) {
         if (index >= _providers.length) revert NoSuchProvider(index);
         return _providers[index];
@@ -76,6 +82,39 @@ abstract contract Turns is LighthouseErrors {
 
     function providersLength() public view returns (uint256) {
         return _providers.length;
+    }
+
+    /// @notice A provider's place in the list, counted from 1; 0 for others.
+    function indexOf(address provider) public view returns (uint256) {
+        return _places[provider].index;
+    }
+
+    /// @notice Up to `limit` providers and their stakes in the order of their turns.
+    /// @param first where to begin; zero for the current one.
+    /// @return accounts the providers.
+    /// @return staked their stakes in wn.
+    /// @return next where to go on; zero after the last one.
+    function queue(address first, uint256 limit)
+        external
+        view
+        returns (address[] memory accounts, uint256[] memory staked, address next)
+    {
+        address head = _load().provider;
+        if (first == address(0)) first = head;
+        if (indexOf(first) != 0) next = first;
+        uint256 most = limit < _providers.length ? limit : _providers.length;
+        (accounts, staked) = (new address[](most), new uint256[](most));
+        uint256 found = 0;
+        while (found < most && next != address(0)) {
+            (accounts[found], staked[found]) = (next, stakes[next]);
+            ++found;
+            next = _places[next].next;
+            if (next == head) next = address(0);
+        }
+        assembly ("memory-safe") {
+            mstore(accounts, found)
+            mstore(staked, found)
+        }
     }
 
     /// @notice wn for one transaction a turn, and the least that a provider stakes.
@@ -93,7 +132,7 @@ abstract contract Turns is LighthouseErrors {
         Turn memory turn = _load();
         if (turn.provider != msg.sender) _take(turn);
         if (turn.quota > 1) --turn.quota;
-        else _begin(turn, turn.marker % _providers.length + 1);
+        else _begin(turn, _places[turn.provider].next);
         turn.keepAliveBlock = block.number;
         _store(turn);
     }
@@ -103,95 +142,120 @@ abstract contract Turns is LighthouseErrors {
     function _setStake(address provider, uint256 stake) internal {
         if (stake < minimalStake()) revert StakeTooSmall(stake, minimalStake());
         stakes[provider] = stake;
-        if (indexOf[provider] == 0) _enter(provider);
+        if (indexOf(provider) == 0) _enter(provider);
         Turn memory turn = _load();
         if (turn.provider != provider || turn.quota <= quotaOf(provider)) return;
         turn.quota = quotaOf(provider);
         _store(turn);
     }
 
-    /// Nobody jumps the queue when a provider leaves. In his own turn it passes to the next one, and the silence so far
-    /// still counts: who leaves and comes back can't keep the others waiting.
+    /// The others keep their order. If it is the provider's turn, the next one follows, and the silence so far still
+    /// counts: who leaves and comes back can't keep the others waiting.
     function _leave(address provider) internal {
-        uint256 index = indexOf[provider];
-        uint256 last = _providers.length;
-        for (uint256 place = index; place < last; ++place) _put(_providers[place], place);
-        _providers.pop();
-        delete indexOf[provider];
+        Turn memory turn = _load();
+        Place memory place = _places[provider];
+        _unlist(place.index);
+        _unlink(provider);
+        delete _places[provider];
         delete stakes[provider];
         emit Offline(provider);
-        if (last == 1) {
+        if (_providers.length == 0) {
             _turn = 0;
             return;
         }
-        Turn memory turn = _load();
-        if (turn.marker < index) return;
-        // slither-disable-next-line incorrect-equality (places in a list)
-        if (turn.marker == index) _begin(turn, index < last ? index : 1);
-        else --turn.marker;
+        if (turn.provider == provider) _begin(turn, place.next);
+        else if (turn.provider != place.previous) return;
+        _shortenSilence(turn);
         _store(turn);
     }
 
-    /// Who comes waits until each of the others has had a turn: his place is the one before that whose turn it is.
+    /// Who comes goes to the end of the queue.
     function _enter(address provider) private {
         Turn memory turn = _load();
-        uint256 last = _providers.length + 1;
-        uint256 index = turn.marker > 1 ? turn.marker : last;
         _providers.push(provider);
-        for (uint256 place = last; place > index; --place) _put(_providers[place - 2], place);
-        _put(provider, index);
+        _places[provider].index = uint96(_providers.length);
         emit Online(provider);
-        if (last == 1) {
-            _begin(turn, 1);
+        if (turn.provider == address(0)) {
+            _places[provider].next = provider;
+            _places[provider].previous = provider;
+            _begin(turn, provider);
             turn.keepAliveBlock = block.number;
-        } else if (index < last) {
-            ++turn.marker;
+        } else {
+            address last = _places[turn.provider].previous;
+            _link(provider, last);
+            if (last == turn.provider) _shortenSilence(turn);
         }
         _store(turn);
     }
 
-    /// The provider's place is now `index`, counted from 1.
-    function _put(address provider, uint256 index) private {
-        _providers[index - 1] = provider;
-        indexOf[provider] = index;
-    }
-
+    /// Gives the caller the turn. Who passes by the next one had to be silent for two timeouts: the next one, who had
+    /// the second of them alone, goes to the end of the queue with the current one. Otherwise two accounts could pass
+    /// the turn to each other over the heads of the rest.
     function _take(Turn memory turn) private {
-        uint256 index = indexOf[msg.sender];
-        // slither-disable-next-line incorrect-equality (0 is no place in the list)
-        if (index == 0) revert NotAProvider(msg.sender);
-        if (!_mayTake(turn, index)) revert NotYourTurn(turn.provider, turn.quota);
-        _begin(turn, index);
+        if (indexOf(msg.sender) == 0) revert NotAProvider(msg.sender);
+        if (!_mayTake(turn, msg.sender)) revert NotYourTurn(turn.provider, turn.quota);
+        address next = _places[turn.provider].next;
+        if (msg.sender != next) {
+            _unlink(msg.sender);
+            _link(msg.sender, next);
+        }
+        _begin(turn, msg.sender);
     }
 
-    /// Whether so many timeouts have passed in silence as there are turns before that of the provider at `index`.
-    function _mayTake(Turn memory turn, uint256 index) private view returns (bool) {
+    /// Whether a provider has the turn or may take it.
+    function _mayTake(Turn memory turn, address provider) private view returns (bool) {
+        if (turn.provider == provider) return true;
+        uint256 passed = _timeouts(turn);
+        return passed > 1 || (passed == 1 && _places[turn.provider].next == provider);
+    }
+
+    /// How many timeouts have passed in silence.
+    function _timeouts(Turn memory turn) private view returns (uint256) {
         uint256 silence = block.number - turn.keepAliveBlock;
-        uint256 passed = silence > 0 ? (silence - 1) / timeoutInBlocks() : 0;
-        uint256 count = _providers.length;
-        return (index + count - turn.marker) % count <= passed;
+        return silence > 0 ? (silence - 1) / timeoutInBlocks() : 0;
     }
 
-    /// Gives the turn, with a whole quota, to the provider at `index`, counted from 1.
-    function _begin(Turn memory turn, uint256 index) private {
-        turn.marker = index;
-        turn.provider = _providers[index - 1];
-        turn.quota = quotaOf(turn.provider);
-        emit Current(turn.provider, turn.quota);
+    /// Who has become the next one without a new turn gets a timeout alone, as every other.
+    function _shortenSilence(Turn memory turn) private view {
+        if (_timeouts(turn) > 1) turn.keepAliveBlock = block.number - timeoutInBlocks() - 1;
+    }
+
+    /// Gives the turn, with a whole quota, to a provider.
+    function _begin(Turn memory turn, address provider) private {
+        turn.provider = provider;
+        turn.quota = quotaOf(provider);
+        emit Current(provider, turn.quota);
+    }
+
+    /// Puts a provider behind another one in the queue.
+    function _link(address provider, address previous) private {
+        address next = _places[previous].next;
+        (_places[provider].previous, _places[provider].next) = (previous, next);
+        (_places[previous].next, _places[next].previous) = (provider, provider);
+    }
+
+    function _unlink(address provider) private {
+        (address previous, address next) = (_places[provider].previous, _places[provider].next);
+        (_places[previous].next, _places[next].previous) = (next, previous);
+    }
+
+    /// Removes a place from the list; the last provider of the list moves there.
+    function _unlist(uint256 index) private {
+        address last = _providers[_providers.length - 1];
+        _providers[index - 1] = last;
+        _places[last].index = uint96(index);
+        _providers.pop();
     }
 
     function _load() private view returns (Turn memory) {
         uint256 word = _turn;
         return Turn({
-            provider: address(uint160(word >> 96)),
-            keepAliveBlock: uint40(word >> 56),
-            quota: uint32(word >> 24),
-            marker: uint24(word)
+            provider: address(uint160(word >> 96)), keepAliveBlock: uint64(word >> 32), quota: uint32(word)
         });
     }
 
     function _store(Turn memory turn) private {
-        _turn = uint256(uint160(turn.provider)) << 96 | turn.keepAliveBlock << 56 | turn.quota << 24 | turn.marker;
+        _turn = uint256(uint160(turn.provider)) << 96 | turn.keepAliveBlock << 32 | turn.quota;
     }
 
     /// minimalStake 16 bytes, timeoutInBlocks 4 bytes: what the factory put behind the proxy's code, before the name.

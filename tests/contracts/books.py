@@ -76,7 +76,7 @@ class Books:
         )
 
     def finish(self, terms: Terms, *, paid: bool, provider: str | None) -> None:
-        """Pay for a liability that ends with a result; `provider` is None when a validator ended it by itself."""
+        """Pay for a liability that ends with a result; `provider` is None if it was ended without a turn."""
         self._give(terms.token, self.factory, terms.promisor if paid else terms.promisee, terms.cost)
         self._give(self.xrt, self.factory, terms.validator, terms.judging)
         self.gas += terms.gas

@@ -90,6 +90,11 @@ class Market:
         carried = liability.encode_abi(FINALIZE, [data, result.success, signature, True])
         return called.functions.to(result.liability, carried)
 
+    def finalization_without_turn(self, result: Result) -> Any:
+        """The call by which anybody ends a liability."""
+        data, signature = parse_cid(result.result), bytes.fromhex(result.signature)
+        return self.suite.factory.functions.finalize(result.liability, data, result.success, signature)
+
     def finalize(self, liability: Contract, *, success: bool = True) -> TxReceipt:
         """End a liability with the promisor's result."""
         return self.suite.send(self.finalization(self.result(liability, success=success)), self.provider)

@@ -132,6 +132,12 @@ class Stage:
         finalize = "finalizeLiability(address,bytes,bool,bytes)"
         return self.evm.call(self.lighthouse, finalize, work.address, result, success, signature, sender=provider)
 
+    def finish_without_turn(self, work: Work, success: bool, signer: str, caller: str, *, altered: bool) -> Answer:
+        """End a liability as anybody can."""
+        result, signature = self._result(work, success, signer, altered)
+        finalize = "finalize(address,bytes,bool,bytes)"
+        return self.evm.call(self.factory, finalize, work.address, result, success, signature, sender=caller)
+
     def judge_result(
         self, work: Work, verdict: tuple[bool, bool], signer: str, caller: str, *, altered: bool
     ) -> Answer:

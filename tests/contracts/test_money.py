@@ -158,6 +158,20 @@ class Histories(RuleBasedStateMachine):
         if self.ends(work, answer, refusal, paid=success):
             self.books.finish(terms, paid=success, provider=provider)
 
+    @rule(work=works, caller=ANYBODY, success=MOSTLY, forged=st.sampled_from((None, None, None, "signer", "result")))
+    def finishes_without_turn(self, work: Work, caller: str, success: bool, forged: str | None) -> None:
+        terms = work.terms
+        right = terms.promisor if terms.validator == ZERO_ADDRESS else self.stage.judge
+        signer = self.somebody_but(right) if forged == "signer" else right
+        refusal = None
+        if terms.validator != ZERO_ADDRESS and terms.generation == 3:
+            refusal = "NotTheValidator"
+        elif forged:
+            refusal = "WrongSigner" if terms.validator == ZERO_ADDRESS else "RefusedByValidator"
+        answer = self.stage.finish_without_turn(work, success, signer, caller, altered=forged == "result")
+        if self.ends(work, answer, refusal, paid=success):
+            self.books.finish(terms, paid=success, provider=None)
+
     @rule(
         work=works.filter(lambda work: work.terms.generation == 3),
         success=MOSTLY,
@@ -257,7 +271,7 @@ class Histories(RuleBasedStateMachine):
         elif turn is not None:
             self.finishes(work, turn, success=True, forged=None)
         else:
-            self.cancels(work, self.stage.judge, forged=None)
+            self.finishes_without_turn(work, self.stage.judge, success=True, forged=None)
 
     def ends(self, work: Work, answer: Answer, refusal: str | None, *, paid: bool) -> bool:
         """Whether a call ended the liability; it must have been refused for `refusal`, or if it has ended before."""
