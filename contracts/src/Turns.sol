@@ -217,7 +217,7 @@ abstract contract Turns is LighthouseErrors {
 
     /// Who has become the next one without a new turn gets a timeout alone, as every other.
     function _shortenSilence(Turn memory turn) private view {
-        if (_timeouts(turn) > 1) turn.keepAliveBlock = block.number - timeoutInBlocks() - 1;
+        if (_timeouts(turn) > 1) turn.keepAliveBlock = block.number - timeoutInBlocks();
     }
 
     /// Gives the turn, with a whole quota, to a provider.

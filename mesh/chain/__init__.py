@@ -20,7 +20,6 @@ from mesh.chain.accounts import (
 )
 from mesh.chain.answers import BlockHeader
 from mesh.chain.client import Chain
-from mesh.chain.contracts import LighthouseState
 from mesh.chain.deploy import XRT, Deployment, DeploymentPlan, deploy
 from mesh.chain.errors import (
     ChainWentBack,
@@ -55,6 +54,7 @@ from mesh.chain.events import (
 )
 from mesh.chain.following import BlockEvents, History, Reorganisation
 from mesh.chain.liabilities import Created, RefundState, Settled
+from mesh.chain.lighthouse_state import LighthouseState
 from mesh.chain.names import namehash
 from mesh.chain.node import Node
 from mesh.chain.policy import GWEI, FeePolicy, Timing

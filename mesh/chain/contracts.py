@@ -8,12 +8,11 @@ our contracts, which have both sets of names.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal
 
-from mesh.chain.answers import InvalidAnswer
 from mesh.chain.errors import NoAccount, NotOffered, UnknownContracts
+from mesh.chain.lighthouse_state import GETTERS, LighthouseState, lighthouse_state, original_state
 from mesh.errors import InvalidMessage
-from schemas.address import ZERO_ADDRESS, parse_address
 from schemas.cid import parse_cid
 from schemas.wire import message_hash
 
@@ -34,52 +33,8 @@ AGREE: Final = True
 
 RECOGNISED_LIABILITIES: Final = 65_536
 """Liabilities that are remembered as such; the factory is asked about others."""
-MAX_PROVIDERS: Final = 10_000
-"""Providers of one lighthouse that are read."""
 
-
-class LighthouseGetters(NamedTuple):
-    """The names of a lighthouse's getters, and how its turns are counted."""
-
-    length: str
-    at: str
-    stake: str
-    minimal_stake: str
-    timeout_blocks: str
-    keep_alive_block: str
-    first: int
-    """The marker of the first provider."""
-
-
-GETTERS: Final = {
-    3: LighthouseGetters(
-        "membersLength", "members", "balances", "minimalFreeze", "timeoutBlocks", "keepaliveBlock", first=0
-    ),
-    5: LighthouseGetters(
-        "providersLength", "providers", "stakes", "minimalStake", "timeoutInBlocks", "keepAliveBlock", first=1
-    ),
-}
 GAS_OF: Final = {3: "gasUtilizing", 5: "gasConsumedOf"}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LighthouseState:
-    """The state of a lighthouse. Stakes are wn, `timeout_blocks` and `keep_alive_block` count blocks."""
-
-    address: str
-    minimal_stake: int
-    timeout_blocks: int
-    keep_alive_block: int
-    """The last block in which the current provider sent a transaction."""
-
-    quota: int
-    """How many transactions are left in the turn."""
-
-    current: str
-    """The provider that has the turn; the zero address if there is none."""
-
-    stakes: dict[str, int]
-    """Providers and their stakes, in the order of their turns."""
 
 
 class ContractVersion:
@@ -97,6 +52,10 @@ class ContractVersion:
     def finalization(self, lighthouse: AsyncContractFunctions, result: Result) -> AsyncContractFunction:
         """The call by which a provider finalizes a liability with its result."""
         return lighthouse.finalizeLiability(result.liability, *result_arguments(result))
+
+    def finalization_without_turn(self, result: Result) -> AsyncContractFunction:
+        """The call by which anybody finalizes a liability with its result. Raises `NotOffered`."""
+        return self._factory.finalize(result.liability, *result_arguments(result))
 
     def validation(self, result: Result, *, agree: bool) -> AsyncContractFunction:
         """The call by which a generation-3 validator finalizes. Raises `NotOffered`."""
@@ -143,7 +102,7 @@ class ContractVersion:
 
     async def state(self, lighthouse: str) -> LighthouseState:
         """The state of a lighthouse, as of one block. Raises `NoContracts` if there is none."""
-        return await lighthouse_state(self._node, lighthouse, GETTERS[5], current="current")
+        return await lighthouse_state(self._node, lighthouse)
 
     async def is_turn(self, lighthouse: str, provider: str) -> bool:
         """Whether a provider may send in the next block."""
@@ -177,6 +136,9 @@ class OriginalContracts(ContractVersion):
         call = super().validation(result, agree=AGREE)
         return lighthouse.to(result.liability, bytes.fromhex(call._encode_transaction_data()[2:]))
 
+    def finalization_without_turn(self, result: Result) -> AsyncContractFunction:
+        raise NotOffered("finalization without a turn", self.generation)
+
     def validation(self, result: Result, *, agree: bool) -> AsyncContractFunction:
         if self.generation == 5:
             raise NotOffered("finalization by a validator's own account", self.generation)
@@ -204,7 +166,7 @@ class OriginalContracts(ContractVersion):
         return bool(await self._node.read(self._factory.isHashConsumed(order_hash)))
 
     async def state(self, lighthouse: str) -> LighthouseState:
-        return await lighthouse_state(self._node, lighthouse, GETTERS[self.generation], current="marker")
+        return await original_state(self._node, lighthouse, GETTERS[self.generation])
 
     async def is_turn(self, lighthouse: str, provider: str) -> bool:
         """By the rule of the originals: the provider at the marker, or any provider after a timeout of silence."""
@@ -230,34 +192,6 @@ def contract_version(kind: ContractKind, node: Node, factory: str, generation: i
 def result_arguments(result: Result) -> tuple[bytes, bool, bytes]:
     """A signed result as arguments of the contracts."""
     return parse_cid(result.result), result.success, bytes.fromhex(result.signature)
-
-
-async def lighthouse_state(node: Node, address: str, names: LighthouseGetters, *, current: str) -> LighthouseState:
-    """The state of a lighthouse, as of one block. Raises `NoContracts`, `NodeUnreachable`, `InvalidAnswer` (too large).
-
-    `current` is the getter for the current provider: of its address, or of its index (`marker`).
-    """
-    block = await node.block_number()
-    functions = node.contract("Lighthouse", address).functions
-    count = await node.read(functions[names.length](), block=block)
-    if count > MAX_PROVIDERS:
-        raise InvalidAnswer(f"{names.length} of {address}", f"{count} providers, and {MAX_PROVIDERS} are read at most")
-    found = await node.read_all((functions[names.at](index) for index in range(count)), block=block)
-    stakes = await node.read_all((functions[names.stake](provider) for provider in found), block=block)
-    getters = (names.minimal_stake, names.timeout_blocks, names.keep_alive_block, "quota", current)
-    values = await node.read_all((functions[getter]() for getter in getters), block=block)
-    minimal_stake, timeout_blocks, keep_alive_block, quota, whose = values
-    if current == "marker":
-        whose = found[(whose - names.first) % count] if count else ZERO_ADDRESS
-    return LighthouseState(
-        address=address,
-        minimal_stake=minimal_stake,
-        timeout_blocks=timeout_blocks,
-        keep_alive_block=keep_alive_block,
-        quota=quota,
-        current=parse_address(whose),
-        stakes={parse_address(provider): stake for provider, stake in zip(found, stakes, strict=True)},
-    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -30,7 +30,7 @@ REVERT_HINTS: Final[Mapping[str, str]] = MappingProxyType(
         "AlreadyFinalized": "it has ended; its record says how",
         "RefundTooEarly": "wait for that block: until then the promisor may bring a result",
         "NameTaken": "choose another name",
-        "InvalidName": "a name is one label of a to z, 0 to 9 and -, of 32 characters at most",
+        "InvalidName": "a name is 1 to 32 of a to z, 0 to 9 and -; no - at its ends, nor -- after two characters",
         "InvalidStake": "the minimal stake is at least 1 wn",
         "InvalidTimeout": "the timeout is at least 1 block",
         "StakeTooSmall": "stake the lighthouse's minimum at least",

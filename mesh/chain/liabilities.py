@@ -27,19 +27,8 @@ if TYPE_CHECKING:
     from schemas.messages import Demand, Offer, Order, Result
 
 GETTERS: Final = (
-    "model",
-    "objective",
-    "result",
-    "promisee",
-    "promisor",
-    "lighthouse",
-    "lighthouseFee",
-    "token",
-    "cost",
-    "validator",
-    "validatorFee",
-    "isSuccess",
-    "isFinalized",
+    *("model", "objective", "result", "promisee", "promisor", "lighthouse", "lighthouseFee"),
+    *("token", "cost", "validator", "validatorFee", "isSuccess", "isFinalized"),
 )
 
 READ_AT_ONCE: Final = 8
@@ -183,6 +172,14 @@ class Liabilities:
         """Finalize a liability by its signed result, as a provider of the lighthouse."""
         functions = (await self._contracts.lighthouse_contract(lighthouse)).functions
         receipt = await self._contracts.send(self._contracts.version.finalization(functions, result))
+        return self._settled(receipt)
+
+    async def finalize_without_turn(self, result: Result) -> Settled:
+        """Finalize a liability by its signed result as any account, when no provider does; nothing is minted.
+
+        Raises `NotOffered` for the original contracts, `Reverted` (`WrongSigner`, `AlreadyFinalized`, …).
+        """
+        receipt = await self._contracts.send(self._contracts.version.finalization_without_turn(result))
         return self._settled(receipt)
 
     async def validate(self, result: Result, *, agree: bool) -> Settled:

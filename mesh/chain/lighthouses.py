@@ -15,7 +15,8 @@ from mesh.chain.tokens import Tokens
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Sequence
 
-    from mesh.chain.contracts import Contracts, LighthouseState
+    from mesh.chain.contracts import Contracts
+    from mesh.chain.lighthouse_state import LighthouseState
 
 
 class Lighthouses:
@@ -64,7 +65,7 @@ class Lighthouses:
                         yield event
 
     async def create(self, *, minimal_stake: int, timeout_blocks: int, name: str) -> NewLighthouse:
-        """Create a lighthouse. `minimal_stake` is in wn; `name` is one label of a to z, 0 to 9 and -."""
+        """Create a lighthouse. `minimal_stake` is in wn; `name` is one label of ENS, of a to z, 0 to 9 and -."""
         function = self._contracts.factory_contract().functions.createLighthouse
         return lighthouse_created((await self._contracts.send(function(minimal_stake, timeout_blocks, name))).logs)
 

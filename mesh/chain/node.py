@@ -199,7 +199,7 @@ class Node:
         return receipt
 
     async def read(self, call: AsyncContractFunction, *, block: int | str = "latest") -> Any:
-        """What a contract's function returns; asked again if it does not decode.
+        """What a contract's function returns, several values as a tuple; asked again if it does not decode.
 
         Raises `Reverted`, `NoContracts` if there is no such contract, `InvalidAnswer` for other data.
         """
@@ -208,11 +208,11 @@ class Node:
         for attempt in range(READ_ATTEMPTS):
             returned = await self.call(request, block=block)
             try:
-                (value,) = decode_values(types, returned)
+                values = decode_values(types, returned)
             except SpoiledAnswer as error:
                 failure = error
             else:
-                return value
+                return values[0] if len(values) == 1 else values
             if not attempt and not returned and not await self.code(call.address, block=block):
                 raise NoContracts(f"contract with {call.fn_name} at {call.address}", self.chain_id)
         raise InvalidAnswer(f"{call.fn_name} of {call.address}", str(failure))

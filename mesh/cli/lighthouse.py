@@ -142,7 +142,7 @@ def _turn(state: LighthouseState) -> str | None:
 @with_json
 @with_signing_settings()
 def create(settings: Settings, **plan: Any) -> None:
-    """Create a lighthouse named NAME (1 to 32 characters of a to z, 0 to 9 and -).
+    """Create a lighthouse named NAME (1 to 32 characters of a to z, 0 to 9 and -, without - at the ends).
 
     Anyone can stake there as a provider."""
     run_to_end(lambda: _create(settings, **plan))
@@ -181,7 +181,8 @@ async def _check_free(chain: Chain, name: str) -> None:
     raise NameTaken(f"the name {name} is taken by {taken}", hint="choose another name")
 
 
-LABEL: Final = re.compile(r"[a-z0-9-]{1,32}", re.ASCII)
+LABEL: Final = re.compile(r"(?!-|..--)[a-z0-9-]{1,32}(?<!-)", re.ASCII)
+"""Names that ENS clients leave as they are."""
 
 
 LARGEST_STAKE: Final = 2**128 - 1
@@ -192,7 +193,7 @@ def check_lighthouse(name: str, *, minimal_stake: int) -> None:
     if not LABEL.fullmatch(name):
         raise InvalidLighthouse(
             f"{name[:40]!r} is not a valid name for a lighthouse",
-            hint="use 1 to 32 characters of a to z, 0 to 9 and -, such as `airalab`",
+            hint="use 1 to 32 of a to z, 0 to 9 and - (not at the ends, nor twice after two), such as `airalab`",
         )
     if not 1 <= minimal_stake <= LARGEST_STAKE:
         raise InvalidLighthouse(

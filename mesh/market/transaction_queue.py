@@ -233,7 +233,7 @@ class Turns:
 
     The contract lets other providers send after a timeout without transactions. But there may have been nothing to
     send: if all providers sent the next job's transactions at once, all but one would pay for a refusal. So a provider
-    whose turn it is not waits, from when it had work, for one timeout per turn before its own. It counts mined blocks
+    whose turn it is not waits, from when it had work, so that those before it have their time. It counts mined blocks
     only, as a transaction of another provider may be mined after one that is sent now.
     """
 
@@ -265,7 +265,9 @@ class Turns:
         self._left = 0
 
     async def _is_left_to_us(self, state: LighthouseState, since: int) -> bool:
-        """Whether the providers before this one had their time."""
+        """Whether the providers before this one had their time: the first two a timeout each, the others a block."""
         providers = list(state.stakes)
         before = (providers.index(self._provider) - providers.index(state.current)) % len(providers)
-        return await self._chain.block_number() - since >= before * state.timeout_blocks
+        # After two timeouts the contract lets all of them send. Those far behind don't wait for each silent one.
+        behind = min(max(before - 2, 0), state.timeout_blocks)
+        return await self._chain.block_number() - since >= min(before, 2) * state.timeout_blocks + behind

@@ -36,9 +36,8 @@ class Crowded:
         for first in range(0, count, AT_ONCE):
             some = min(AT_ONCE, count - first)
             call = crowd.functions.join(self.suite.xrt.address, self.lighthouse.address, XRT, some)
-            fields = {"from": self.suite.deployer.address, "gas": 29_000_000}
-            receipt = self.suite.web3.eth.wait_for_transaction_receipt(call.transact(fields), poll_latency=0.005)
-            assert receipt["status"] == 1
+            tx = call.transact({"from": self.suite.deployer.address, "gas": 29_000_000})
+            assert self.suite.web3.eth.wait_for_transaction_receipt(tx, poll_latency=0.005)["status"] == 1
 
     def gas(self) -> dict[str, int]:
         """What two providers' transactions take: they join, the first leaves, the second passes over the silent."""

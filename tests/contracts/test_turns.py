@@ -98,7 +98,7 @@ def test_the_refusal_out_of_turn_names_the_current_provider(market: Market) -> N
     assert market.refusal(call, turns.providers[1]) == ("NotYourTurn", turns.providers[0].address, 2)
 
 
-def test_silence_passes_the_turn_on_one_provider_a_timeout(market: Market) -> None:
+def test_silence_lets_the_next_provider_send_and_then_all(market: Market) -> None:
     turns = Round(market, [2, 1, 1])
     people = first, _, third = turns.providers[:3]
     turns.send(first)
@@ -233,6 +233,44 @@ def test_two_providers_that_leave_and_return_do_not_keep_a_third_from_its_turn(m
         turns.suite.send(turns.lighthouse.functions.withdraw(XRT), leaver)
         turns.suite.join(turns.lighthouse, leaver, XRT)
     raise AssertionError("the honest provider never had a turn")
+
+
+@pytest.mark.parametrize("leaver", [0, 1])
+def test_who_becomes_the_next_one_has_a_timeout_alone(market: Market, leaver: int) -> None:
+    """Else two accounts could pass the turn to each other over the heads of the others, by leaving in between."""
+    turns = Round(market, [1, 1, 1, 1])
+    people = list(turns.providers[:4])
+    turns.suite.chain.mine(2 * TIMEOUT)
+    assert turns.may_send(*people) == [True] * 4
+    turns.suite.send(turns.lighthouse.functions.withdraw(XRT), people.pop(leaver))
+    assert turns.may_send(*people) == [True, True, False]
+    turns.suite.chain.mine(TIMEOUT - 1)
+    assert turns.may_send(*people) == [True, True, False]
+    turns.suite.chain.mine(1)
+    assert turns.may_send(*people) == [True, True, True]
+
+
+def test_two_providers_do_not_pass_the_turn_to_each_other(market: Market) -> None:
+    """Each lets the other's turn time out and takes it, faster than the others; but who was next was silent as well."""
+    turns = Round(market, [2, 1, 1, 2])
+    one, idle, honest, two = turns.providers[:4]
+    for rogue in [two, one] * 4:
+        turns.suite.chain.mine(TIMEOUT)
+        if turns.may_send(honest, one, idle, two).count(True) == 2 and turns.may_send(honest) == [True]:
+            return
+        turns.suite.chain.mine(TIMEOUT)
+        turns.send(rogue)
+    raise AssertionError("the honest provider never had a timeout for itself")
+
+
+def test_who_passes_over_silent_providers_sends_them_to_the_end(market: Market) -> None:
+    turns = Round(market, [1, 1, 1, 1])
+    first, second, third, fourth = turns.providers[:4]
+    turns.suite.chain.mine(2 * TIMEOUT)
+    turns.send(fourth)
+    for person in (third, first, second, fourth):
+        assert turns.read("current") == person.address
+        turns.send(person)
 
 
 def test_a_provider_can_come_back(market: Market) -> None:

@@ -96,7 +96,7 @@ class Queue:
 
     def _shorten(self) -> None:
         if self.timeouts > 1:
-            self.alive = self.block - TIMEOUT - 1
+            self.alive = self.block - TIMEOUT
 
     def advance(self, blocks: int) -> None:
         """Let blocks pass, and count in which the next one had its chance."""
@@ -142,7 +142,13 @@ class Providers(RuleBasedStateMachine):
         self.queue.stake(account, quota + times if how == "refill" else quota - times)
         self.nobody_is_set_back(waiting, account, {})
 
-    @rule(blocks=st.sampled_from((1, TIMEOUT - 1, TIMEOUT, TIMEOUT + 1, 2 * TIMEOUT)))
+    @rule(person=PERSON)
+    def leaves(self, person: int) -> None:
+        quota = self.queue.quotas.get(self.stage.people[person], 0)
+        if quota:
+            self.stakes(person, quota, "withdraw")
+
+    @rule(blocks=st.sampled_from((1, TIMEOUT - 1, TIMEOUT, TIMEOUT + 1, 2 * TIMEOUT + 1, 2 * TIMEOUT + 1)))
     def is_silent(self, blocks: int) -> None:
         self.stage.evm.advance(blocks)
         self.queue.advance(blocks)

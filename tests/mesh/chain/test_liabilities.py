@@ -69,6 +69,25 @@ async def test_a_signature_for_another_liability_is_refused(market: DeployedMark
             await chain.liabilities.cancel(one, promisee_signature=signatures[0], promisor_signature=signatures[1])
 
 
+@pytest.mark.parametrize("success", [True, False])
+async def test_anybody_finalizes_without_a_turn(market: DeployedMarket, success: bool) -> None:
+    liability = await _made(market, cost=XRT)
+    async with market.chain(market.stranger) as chain:
+        before = await chain.tokens.balance(market.promisor.address)
+        settled = await chain.liabilities.finalize_without_turn(market.result(liability, success=success))
+        assert settled.minted == 0
+        record = await chain.liabilities.get(liability)
+        assert (record.is_finalized, record.is_success, record.result) == (True, success, cid(3))
+        assert await chain.tokens.balance(market.promisor.address) == before + XRT * success
+
+
+async def test_the_originals_need_a_turn_to_finalize(market: DeployedMarket) -> None:
+    liability = await _made(market)
+    async with market.chain(market.stranger, contracts="original", generation=5) as chain:
+        with raises_with(NotOffered, what="finalization without a turn", generation=5):
+            await chain.liabilities.finalize_without_turn(market.result(liability))
+
+
 async def test_only_liabilities_can_be_cancelled_and_watched(market: DeployedMarket) -> None:
     unused = Account.from_key(new_private_key()).address
     signature = _signed(market.promisee, unused)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from contextlib import aclosing
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -23,8 +23,10 @@ from mesh.chain import (
     TransactionTimeout,
     Transfer,
     deploy,
+    lighthouse_state,
     new_private_key,
 )
+from mesh.chain.answers import InvalidAnswer
 from mesh.devchain import EmbeddedChain
 from mesh.errors import InputError
 from schemas.address import ZERO_ADDRESS
@@ -67,6 +69,41 @@ async def test_becoming_a_provider_approves_and_stakes_exactly_the_stake(market:
     assert [event.value for event in events if isinstance(event, Approval)] == [STAKE]
     assert [event.value for event in events if isinstance(event, Transfer)] == [STAKE]
     assert [event.provider for event in events if isinstance(event, Online)] == [account.address]
+
+
+async def test_providers_are_read_in_the_order_of_their_turns(
+    market: DeployedMarket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await _beacon(market, "queue")
+    accounts = [await _newcomer(market, holding=XRT) for _ in range(4)]
+    for number, account in enumerate(accounts):
+        async with market.chain(account) as chain:
+            await chain.lighthouses.become_provider("queue", STAKE + number)
+    async with market.chain(accounts[0]) as chain:
+        await chain.lighthouses.withdraw("queue", STAKE)
+        await chain.lighthouses.become_provider("queue", STAKE)
+        for page in (1, 2, 3, 250):
+            monkeypatch.setattr(lighthouse_state, "PAGE", page)
+            state = await chain.lighthouses.get("queue")
+            stakes = {account.address: STAKE + number for number, account in enumerate(accounts)}
+            in_turn = [*accounts[1:], accounts[0]]
+            assert list(state.stakes.items()) == [(one.address, stakes[one.address]) for one in in_turn]
+            assert state.current == accounts[1].address
+
+
+async def test_a_queue_that_never_ends_is_an_invalid_answer(
+    market: DeployedMarket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with market.chain() as chain:
+        read = chain.node.read
+
+        async def lying(call: Any, **options: Any) -> Any:
+            value = await read(call, **options)
+            return (*value[:2], market.provider.address) if call.fn_name == "queue" else value
+
+        monkeypatch.setattr(chain.node, "read", lying)
+        with pytest.raises(InvalidAnswer):
+            await chain.lighthouses.get("airalab")
 
 
 async def test_a_provider_that_stakes_enough_already_sends_nothing(market: DeployedMarket) -> None:
@@ -204,7 +241,7 @@ async def test_creating_a_lighthouse_returns_its_event(market: DeployedMarket) -
 
 async def test_an_address_that_is_not_a_lighthouse_is_an_error(market: DeployedMarket) -> None:
     async with market.chain() as chain:
-        with no_contracts("providersLength"):
+        with no_contracts("queue"):
             await chain.lighthouses.get(market.promisee.address)
         functions = chain.node.contract("Liability", market.promisee.address).functions
         with pytest.raises(NoContracts):

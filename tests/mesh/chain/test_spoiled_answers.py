@@ -13,7 +13,7 @@ from aiohttp import web
 
 from mesh.chain import Chain, NoContracts, Node, NodeUnreachable, RequestRefused, TransactionSender
 from mesh.chain.answers import ANSWERS, MAX_ANSWER, InvalidAnswer
-from mesh.chain.contracts import MAX_PROVIDERS
+from mesh.chain.lighthouse_state import MAX_PROVIDERS
 from mesh.errors import AiraError
 from tests.mesh.chain.conftest import QUICK, prepare
 from tests.mesh.chain.senders import unused_address

@@ -78,6 +78,18 @@ async def test_the_provider_after_next_waits_for_two_timeouts(local: LocalMarket
         assert await last.has_come(since=posted)
 
 
+async def test_further_providers_wait_for_two_timeouts_and_a_block_each(local: LocalMarket) -> None:
+    """However many silent ones are before them."""
+    await local.create_lighthouse(timeout_blocks=5, provider=1, rival=1, robot=1, person=1)
+    await local.mine(50)
+    posted = await head(local)
+    async with turns(local, "person") as last:
+        await local.mine(10)
+        assert not await last.has_come(since=posted)
+        await local.mine(1)
+        assert await last.has_come(since=posted)
+
+
 async def test_an_old_job_does_not_shorten_the_contracts_timeout(local: LocalMarket) -> None:
     await local.create_lighthouse(timeout_blocks=20, provider=2, rival=1)
     await send_one(local, "provider")
