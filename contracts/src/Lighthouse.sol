@@ -72,7 +72,6 @@ contract Lighthouse is RobonomicsErrors, Turns {
     /// leaves.
     /// @param value wn.
     function withdraw(uint256 value) external returns (bool) {
-        // slither-disable-next-line incorrect-equality (0 is no place in the list)
         if (indexOf(msg.sender) == 0) revert NotAProvider(msg.sender);
         uint256 stake = stakes[msg.sender];
         if (value > stake) revert InsufficientStake(stake, value);

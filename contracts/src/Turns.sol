@@ -206,7 +206,7 @@ abstract contract Turns is LighthouseErrors {
     function _mayTake(Turn memory turn, address provider) private view returns (bool) {
         if (turn.provider == provider) return true;
         uint256 passed = _timeouts(turn);
-        return passed > 1 || (passed == 1 && _places[turn.provider].next == provider);
+        return passed > 1 || (passed > 0 && _places[turn.provider].next == provider);
     }
 
     /// How many timeouts have passed in silence.

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import json
+import shutil
+import subprocess
+from itertools import product
+from random import Random
+from typing import Final
 
 import pytest
 from web3.logs import DISCARD
 
+from mesh.cli.lighthouse import LABEL
 from schemas import keccak256
-from tests.contracts.suite import XRT, namehash
-
-if TYPE_CHECKING:
-    from tests.contracts.suite import Suite
+from tests.contracts.chains import py_evm
+from tests.contracts.evm import Evm
+from tests.contracts.suite import XRT, Suite, namehash
+from tests.support.peers import require
 
 ZERO = "0x" + "00" * 20
 
@@ -65,10 +71,44 @@ def test_a_name_is_taken_once(suite: Suite) -> None:
     assert receipt["gasUsed"] < 60_000, "a refusal must not take the whole limit"
 
 
-@pytest.mark.parametrize("name", ["", "Airalab", "a.b", "a b", "aira_lab", "é", "a" * 33])
+NOT_NORMAL = ["-", "-a", "a-", "--", "ab--", "ab--cd", "xn--a", "xn--nxasmq6b", "a---b"]
+
+
+@pytest.mark.parametrize("name", ["", "Airalab", "a.b", "a b", "aira_lab", "é", "a" * 33, *NOT_NORMAL])
 def test_a_name_is_one_plain_label(suite: Suite, name: str) -> None:
     call = suite.factory.functions.createLighthouse(XRT, 10, name)
     assert suite.chain.refusal(call, suite.deployer.address) == ("InvalidName", name)
+
+
+NORMALIZE: Final = """
+const { normalize } = require("eth-ens-namehash");
+const names = JSON.parse(require("fs").readFileSync(0, "utf8"));
+const unchanged = (name) => { try { return normalize(name) === name; } catch { return false; } };
+console.log(JSON.stringify(names.map(unchanged)));
+"""
+
+
+def test_names_are_those_that_ens_normalization_leaves_unchanged() -> None:
+    """The JavaScript library of the legacy clients, asked about all short names and some at random."""
+    folder, node = require("robonomics-5"), shutil.which("node")
+    assert node
+    chance = Random(5)
+    names = ["".join(letters) for size in range(1, 5) for letters in product("a0-x", repeat=size)]
+    names += ["".join(chance.choices("abn0-x_", k=chance.randint(1, 32))) for _ in range(100)]
+    names += [*NOT_NORMAL, *(chr(code) for code in range(33, 127) if chr(code) != "."), "a" * 32, "ab-cd", "a--b"]
+    asked = subprocess.run(
+        [node, "-e", NORMALIZE], input=json.dumps(names), cwd=folder, capture_output=True, text=True, check=True
+    )
+    unchanged = dict(zip(names, json.loads(asked.stdout), strict=True))
+
+    suite = Suite(py_evm())
+    evm, caller = Evm(suite.chain), suite.deployer.address
+    for name, is_normal in unchanged.items():
+        evm.rewind()
+        create = "createLighthouse(uint256,uint256,string)"
+        answer = evm.call(suite.factory.address, create, XRT, 10, name, sender=caller)
+        assert answer.refusal == (None if is_normal else "InvalidName"), name
+        assert bool(LABEL.fullmatch(name)) == is_normal, name
 
 
 @pytest.mark.parametrize(
