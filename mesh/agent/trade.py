@@ -139,15 +139,14 @@ class Trader(Lifecycle):
     async def withdraw_on_chain(self, order: TradedOrder) -> Order:
         """See `Order.withdraw_on_chain`."""
         await self.withdraw(order)
-        identity = order.identity
         try:
             tx = (await self._chain.liabilities.withdraw(order.signed)).tx
         except OrderAlreadyUsed:
             await self._parts.chain_head.reached(await self._chain.block_number())
             if order.state is OrderState.MATCHED:
-                raise OrderClosed(identity, order.state, liability=order.liability) from None
+                raise OrderClosed(order.identity, order.state, liability=order.liability) from None
             tx = "an earlier transaction"
-        await self._parts.ledger.use_up(identity, tx)
+        await self._parts.ledger.use_up(order.identity, tx)
         self._forget(order)
         return order.shown(self)
 
