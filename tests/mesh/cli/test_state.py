@@ -31,7 +31,7 @@ def test_show_lists_the_state_of_agents(folder: Folder) -> None:
     head, row, content, transactions = done.stdout.splitlines()
     assert head.split("  ")[0] == "ACCOUNT"
     assert row.split() == [ADDRESS, CHAIN, "99", "1", "running", "1", "1"]
-    assert content == f"{ADDRESS}  2 files, 35 bytes (18 bytes pinned)"
+    assert content == f"{ADDRESS}  2 files, 27 bytes (10 bytes pinned)"
     assert transactions == "pending transactions  1"
 
 
