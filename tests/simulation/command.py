@@ -27,7 +27,7 @@ from mesh.chain.web3_provider import ReliableProvider  # noqa: E402, F401
 from tests.simulation.chain import SimulatedChain  # noqa: E402
 from tests.simulation.deployment import found  # noqa: E402
 from tests.simulation.faults import FaultPlan  # noqa: E402
-from tests.simulation.mutations import MUTATIONS, SEEDS, Mutation  # noqa: E402
+from tests.simulation.mutations import CANDIDATES, MUTATIONS, SEEDS, Mutation  # noqa: E402
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -106,7 +106,10 @@ def _histories(deployed: Deployed, options: argparse.Namespace) -> Iterator[tupl
 
 def _find_mutants(deployed: Deployed, options: argparse.Namespace) -> NoReturn:
     """Plant each bug in turn, until a history violates an invariant that holds without it. Ends with 1 if one hides."""
-    missed, chosen = 0, [one for one in MUTATIONS if options.mutant in one.name]
+    missed, chosen = (
+        0,
+        [one for one in (*MUTATIONS, *(CANDIDATES if options.mutant else ())) if options.mutant in one.name],
+    )
     options.without = frozenset()
     for mutation in chosen:
         mutation.source()
