@@ -169,12 +169,12 @@ class Confirmation:
             raise NonceLost
 
     async def _unblock(self) -> None:
-        """Replace the transaction that holds up the account's others, if it is this one or an abandoned one."""
+        """Replace the transaction that holds up the account's others, if it is this one or nothing waits for it."""
         nonce = await self._node.transaction_count(self._account.address)
         if nonce == self._entry.nonce:
             await self._replace(self._entry)
         elif nonce < self._entry.nonce:
-            blocking = next((entry for entry in self._pending.abandoned if entry.nonce == nonce), None)
+            blocking = self._pending.blocking(nonce)
             if blocking is not None and await self._pending.take_over(blocking):
                 try:
                     await self._replace(blocking)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections import OrderedDict
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
@@ -12,6 +13,9 @@ if TYPE_CHECKING:
     from mesh.chain.transaction_store import LockedEntry, PendingTransaction, TransactionStore
 
 T = TypeVar("T")
+
+MINED_KEPT: Final = 256
+"""Mined transactions of an account that are remembered: a reorganisation may send them back to the pool."""
 
 
 class PendingTransactions:
@@ -26,6 +30,7 @@ class PendingTransactions:
         self._store = store
         self._entries: dict[int, PendingTransaction] = {}
         self._elsewhere: frozenset[int] = frozenset()
+        self._mined: OrderedDict[int, PendingTransaction] = OrderedDict()
 
     async def refresh(self) -> None:
         """See what other processes did to the store."""
@@ -46,6 +51,14 @@ class PendingTransactions:
     def abandoned(self) -> tuple[PendingTransaction, ...]:
         """Transactions that nothing waits for any more, by nonce: their sender lost the node, gave up or ended."""
         return tuple(entry for _, entry in sorted(self._entries.items()) if not entry.is_watched)
+
+    def blocking(self, nonce: int) -> PendingTransaction | None:
+        """The transaction with that nonce that nothing waits for, though others wait for it: to be replaced.
+
+        It is abandoned, or was mined and a reorganisation sent it back to the pool.
+        """
+        entry = self._entries.get(nonce, self._mined.get(nonce))
+        return None if entry is None or entry.is_watched else entry
 
     async def add(self, entry: PendingTransaction) -> bool:
         """Take the entry's nonce, also from an abandoned one; False if another process was faster."""
@@ -68,7 +81,10 @@ class PendingTransactions:
             await _in_thread(lambda: locked.append(entry))
 
     async def take_over(self, entry: PendingTransaction) -> bool:
-        """Wait for an abandoned transaction from now on; False if another process was faster, or it is settled."""
+        """Wait for a transaction of `abandoned` or `blocking` from now on; False if another process was faster."""
+        if self._mined.get(entry.nonce) is entry:
+            entry.is_watched = True
+            return await self.add(entry)
         if self._store is not None and entry.locked is None:
             await self._lock_entry(entry, self._store.lock)
             if entry.locked is None:
@@ -84,8 +100,15 @@ class PendingTransactions:
             entry.locked.release()
             entry.locked = None
 
+    async def settle(self, entry: PendingTransaction) -> None:
+        """Drop a transaction that is mined and confirmed."""
+        await self.forget(entry)
+        self._mined[entry.nonce] = entry
+        if len(self._mined) > MINED_KEPT:
+            self._mined.popitem(last=False)
+
     async def forget(self, entry: PendingTransaction) -> None:
-        """Drop a transaction that is settled, or that the node never accepted."""
+        """Drop a transaction that can't be mined any more, or that the node never accepted."""
         if self._entries.get(entry.nonce) is entry:
             del self._entries[entry.nonce]
         if self._store is not None and entry.locked is None:

@@ -95,7 +95,7 @@ class TransactionSender:
             entry = await self._sent_before(pending, fields) or await self._send_new(pending, fields)
             try:
                 signed, receipt = await Confirmation(self._node, self.account, pending, entry).wait()
-                await pending.forget(entry)
+                await pending.settle(entry)
             except NonceLost:
                 log.info(
                     "nonce %d was used by another transaction; sending with the next",

@@ -8,6 +8,7 @@ import concurrent.futures
 import concurrent.futures.thread as executors
 import gc
 import json
+import logging
 import os
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from tests.simulation import history, router, threads
 from tests.simulation.history import Report
-from tests.simulation.scheduler import REAL_TIME
+from tests.simulation.scheduler import REAL_TIME, SECOND
 
 router.install(lambda: history.CURRENT[-1])  # type: ignore[arg-type,return-value]
 
@@ -78,6 +79,7 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--seconds", type=float, default=0.0, help="begin no history after so many real seconds")
     parser.add_argument("--json", action="store_true", help="print one object at the end")
     parser.add_argument("--trace", action="store_true", help="print what happened in each history")
+    parser.add_argument("--log", action="store_true", help="print what the processes log, with their time and name")
     parser.add_argument("--switches", metavar="FILE", help="write each switch of threads to a file")
     parser.add_argument("--mutants", action="store_true", help="plant each bug in turn, and search until it is found")
     parser.add_argument("--mutant", default="", help="only planted bugs whose name contains this")
@@ -93,7 +95,23 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
     if (only | without) - names - {"none"}:
         parser.error(f"faults are {', '.join(sorted(names))}")
     options.only, options.without = only or None, without
+    if options.log:
+        _print_logs()
     return options
+
+
+def _print_logs() -> None:
+    class SimulatedHandler(logging.StreamHandler[Any]):
+        def createLock(self) -> None:  # noqa: N802
+            self.lock = None  # where a simulated lock is taken, threads may switch
+
+        def format(self, record: logging.LogRecord) -> str:
+            scheduler = threads.scheduler()
+            process = scheduler.process.name if scheduler.process else "-"
+            return f"{scheduler.now_ns / SECOND:.3f} {process} {record.levelname} {record.name}: {record.getMessage()}"
+
+    logging.getLogger("mesh").setLevel(logging.INFO)
+    logging.getLogger("mesh").addHandler(SimulatedHandler(sys.stdout))
 
 
 def _histories(deployed: Deployed, options: argparse.Namespace) -> Iterator[tuple[int, Report]]:

@@ -14,6 +14,8 @@ from tests.mesh.chain.conftest import QUICK
 from tests.mesh.chain.senders import SHORT, anvil, open_sender, until_pending, unused_address
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from web3.types import RPCEndpoint, RPCResponse
 
     from tests.support.nodes import Anvil
@@ -113,6 +115,47 @@ async def test_a_transaction_whose_block_was_replaced_is_sent_again(anvil: Anvil
             await node.request("evm_mine")
         assert (await sending).block_number == 3
         assert await node.eth_balance(friend) == 5
+
+
+class _Recording(HttpTransport):
+    """A node whose transactions are kept."""
+
+    def __init__(self, url: str) -> None:
+        super().__init__(url)
+        self.sent: list[str] = []
+
+    async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
+        if method == "eth_sendRawTransaction":
+            self.sent.append(params[0])
+        return await super().make_request(method, params)
+
+
+@pytest.mark.parametrize("kept", [False, True])
+async def test_a_confirmed_transaction_that_a_reorganisation_left_in_the_pool_is_replaced(
+    anvil: Anvil, tmp_path: Path, kept: bool
+) -> None:
+    wire, friends = _Recording(anvil.url), (unused_address(), unused_address())
+    timing = replace(QUICK, replace_after=0.1)
+    async with Node(wire, timing=timing, transactions=tmp_path if kept else None) as node:
+        sender = TransactionSender(node, Account.from_key(anvil.private_keys[0]))
+        before = await node.request("evm_snapshot")
+        sending = asyncio.create_task(sender.send(to=friends[0], data=b"", value=5))
+        first = (await until_pending(node, 1))[0]
+        await node.request("evm_mine")
+        await sending
+        offered = int((await node.request("eth_getTransactionByHash", first))["maxFeePerGas"], 16)
+        await node.request("evm_revert", before)
+        await node.request("eth_sendRawTransaction", wire.sent[0])
+        sending = asyncio.create_task(sender.send(to=friends[1], data=b"", value=7))
+        await until_pending(node, 2)
+        await node.request("anvil_setNextBlockBaseFeePerGas", hex(offered + 1))
+        async with asyncio.timeout(10):
+            while not sending.done():
+                await node.request("evm_mine")
+                await asyncio.sleep(0.05)
+        await sending
+        assert [await node.eth_balance(friend) for friend in friends] == [5, 7]
+    await wire.close()
 
 
 class _Indexing(HttpTransport):
