@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import pytest
+from msgspec.structs import force_setattr, replace
 
-from schemas import order_abi, parse_cid
+from schemas import Demand, Offer, message_hash, order_abi, parse_cid
 from tests.contracts.market import RESULT
 from tests.contracts.suite import REFUND_DELAY, XRT
 
@@ -15,6 +16,9 @@ if TYPE_CHECKING:
     from web3.types import TxReceipt
 
     from tests.contracts.market import Market
+    from tests.contracts.suite import Person
+
+AnOrder = TypeVar("AnOrder", Demand, Offer)
 
 COST = 5 * XRT
 FEE = XRT
@@ -103,6 +107,14 @@ def test_a_validator_that_does_not_answer_locks_nothing(market: Market) -> None:
     assert suite.balance(suite.factory) == 0
 
 
+def judged_by(order: AnOrder, person: Person, validator: str) -> AnOrder:
+    """The order with that validator, signed again; our own messages refuse their lighthouse as validator."""
+    order = replace(order)
+    force_setattr(order, "validator", validator)
+    force_setattr(order, "signature", person.signer.sign_hash(message_hash(order)).hex())
+    return order
+
+
 @pytest.mark.parametrize("own", [False, True], ids=["the same lighthouse", "a lighthouse of the thief"])
 def test_an_offer_is_not_taken_for_a_demand_of_the_robot(market: Market, own: bool) -> None:
     """An offer on lighthouse L with validator V has the bytes of a demand on lighthouse V with validator L."""
@@ -112,8 +124,8 @@ def test_an_offer_is_not_taken_for_a_demand_of_the_robot(market: Market, own: bo
         trap = suite.create_lighthouse(name="trap")
     suite.join(trap, thief, XRT)
     before = suite.balance(robot)
-    as_demand = order_abi(market.offer(cost=COST, validator=trap.address))
-    counter = market.offer(by=thief, cost=COST, lighthouse=trap.address, validator=market.lighthouse.address)
+    as_demand = order_abi(judged_by(market.offer(cost=COST), robot, trap.address))
+    counter = judged_by(market.offer(by=thief, cost=COST, lighthouse=trap.address), thief, market.lighthouse.address)
     while not trap.functions.isTurnOf(thief.address).call():
         suite.chain.mine(1)
 
@@ -127,5 +139,6 @@ def test_an_offer_is_not_taken_for_a_demand_of_the_robot(market: Market, own: bo
 def test_no_order_names_a_lighthouse_as_validator(market: Market) -> None:
     other = market.suite.create_lighthouse(name="other")
     for lighthouse in (market.lighthouse, other):
-        call = market.creation(*market.pair(cost=COST, validator=lighthouse.address))
-        assert market.refusal(call) == ("ValidatorIsLighthouse", lighthouse.address)
+        demand = judged_by(market.demand(cost=COST), market.promisee, lighthouse.address)
+        offer = judged_by(market.offer(cost=COST), market.promisor, lighthouse.address)
+        assert market.refusal(market.creation(demand, offer)) == ("ValidatorIsLighthouse", lighthouse.address)
