@@ -6,6 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.agent.handlers import call
+from mesh.agent.late_results import LateResults
 from mesh.agent.listener import ChainListener
 from mesh.agent.services import offer_services
 from mesh.agent.status import AgentStatus
@@ -76,6 +77,7 @@ class AgentRuntime(Role):
                 tasks.create_task(self._do_jobs(), name="executor")
             tasks.create_task(self.parts.outbox.run(), name="outbox")
             tasks.create_task(self.listener.run(), name="listener")
+            tasks.create_task(LateResults(self.parts).run(), name="late results")
 
     async def _do_jobs(self) -> None:
         await self.listener.finalize_ended()

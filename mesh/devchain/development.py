@@ -42,6 +42,7 @@ ALLOWANCE: Final = 1_000 * XRT
 STAKE: Final = 100 * XRT
 """What the provider stakes, wn: a hundred transactions a turn."""
 TIMING: Final = Timing(poll_interval=0.1)
+PLAN: Final = DeploymentPlan(timeout_blocks=100)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,10 +109,12 @@ class DevelopmentChain:
         }
 
 
-async def deploy_market(endpoint: str | AsyncBaseProvider, keys: Sequence[bytes]) -> DevelopmentMarket:
+async def deploy_market(
+    endpoint: str | AsyncBaseProvider, keys: Sequence[bytes], *, plan: DeploymentPlan = PLAN
+) -> DevelopmentMarket:
     """Deploy the contracts with the first of `keys`, give each role its tokens, and stake for the provider."""
     accounts = _accounts_of(keys)
-    deployment = await deploy(endpoint, accounts["provider"], plan=DeploymentPlan(timeout_blocks=100))
+    deployment = await deploy(endpoint, accounts["provider"], plan=plan)
     market = DevelopmentMarket(deployment=deployment, accounts=accounts)
     async with market.chain(endpoint, "provider") as chain:
         for role in ("robot", "person"):

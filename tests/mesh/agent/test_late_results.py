@@ -1,0 +1,61 @@
+"""Results that no provider brings to the chain."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mesh.agent import Phase
+from mesh.chain import DeploymentPlan
+from mesh.devchain.development import deploy_market
+from mesh.devchain.embedded import EmbeddedChain
+from tests.mesh.work.restarts import COST, made_by_a_provider_that_leaves, speaking
+from tests.support.market import Founded, Place, in_phase, offering
+from tests.support.waiting import until_found
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from mesh.agent import Agent
+    from tests.support.routers import EmbeddedRouter
+
+REFUND_DELAY = 200
+
+
+@pytest.fixture
+async def place(router: EmbeddedRouter, tmp_path: Path) -> AsyncIterator[Place]:
+    """A market whose liabilities can be refunded soon."""
+    plan = DeploymentPlan(timeout_blocks=100, refund_delay=REFUND_DELAY)
+    async with EmbeddedChain() as node:
+        market = await deploy_market(node.provider, node.funded_keys, plan=plan)
+        async with Place(Founded(node, market), router.endpoint, tmp_path) as place:
+            yield place
+
+
+async def test_a_robot_brings_its_own_result_before_the_refund_if_no_provider_does(
+    place: Place, caplog: pytest.LogCaptureFixture
+) -> None:
+    before = await place.balance("robot")
+    async with place.agent("person") as person, speaking(offering(place.agent("robot")), []) as robot:
+        contract = await made_by_a_provider_that_leaves(place, person)
+        await in_phase(robot, contract, Phase.COMPLETE)
+        liabilities = place.chains["person"].liabilities
+        refundable = await liabilities.refundable_from(contract.address)
+        head = await place.chains["person"].block_number()
+        await place.node.mine((refundable - head) // 2)
+        await until_found(lambda: _has_read(robot, place), what="half of the time read")
+        assert not (await liabilities.get(contract.address)).is_finalized, "a provider may still come"
+        await place.node.mine((refundable - head) // 3)
+        async with asyncio.timeout(60):
+            assert (await contract.outcome()).success
+        await in_phase(robot, contract, Phase.FINALIZED)
+        assert await place.chains["person"].block_number() < refundable
+    assert await place.balance("robot") == before + COST
+    assert "late-result-finalized" in [getattr(record, "event", "") for record in caplog.records]
+
+
+async def _has_read(robot: Agent, place: Place) -> bool:
+    return robot.parts.chain_head.head == await place.chains["person"].block_number()
