@@ -255,12 +255,15 @@ class SimulatedNode(AsyncBaseProvider):
 
 
 def spoil(response: dict[str, Any]) -> Any:
-    """A response in which something is wrong."""
+    """A response in which something is wrong, and can be seen to be: not an empty list in place of events."""
     chance = scheduler().random
     result = response.get("result")
+    others: list[Any] = [None, "", "0x", {}, "0xzz", 7]
+    if not isinstance(result, list):
+        others.append([])
     if isinstance(result, list) and result and isinstance(result[0], dict):
         result = result[0]
     if isinstance(result, dict) and chance.random() < 0.7:
         del result[chance.choice(sorted(result))]
         return response
-    return {"jsonrpc": "2.0", "id": 0, "result": chance.choice([None, "", "0x", [], {}, "0xzz", 7])}
+    return {"jsonrpc": "2.0", "id": 0, "result": chance.choice(others)}
