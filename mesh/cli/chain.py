@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from mesh.settings import Settings
 
 
-DEPLOYMENT_GAS: Final = 9_500_000
+DEPLOYMENT_GAS: Final = 10_000_000
 """Slightly more than a whole deployment uses. An account that can't pay for it is rejected at the start."""
 
 

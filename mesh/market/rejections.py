@@ -32,7 +32,8 @@ class RejectionPublisher:
         self._earnings.rejected(reason)
         order = message.hash.hex()
         event = log_event("message-rejected", order=order, signer=message.signer, reason=reason)
-        log.warning("rejected %s of %s: %s", order, message.signer, detail, extra=event)
+        level = logging.INFO if reason == Refusal.WITHDRAWN else logging.WARNING
+        log.log(level, "rejected %s of %s: %s", order, message.signer, detail, extra=event)
         if reason != ORDER_USED:
             self._publish(order, reason, detail)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from typing import TYPE_CHECKING
 
 import pytest
@@ -223,6 +224,7 @@ def test_errors_name_files_that_are_no_identity(tmp_path: Path, site: Path) -> N
 
 def test_an_expired_site_signs_nothing(tmp_path: Path) -> None:
     invoke("identity", "site", tmp_path / "site", "--days", "0.000001")
+    time.sleep(1.1)  # certificates are valid for whole seconds
 
     done = new(tmp_path / "arm", tmp_path / "site", "--address", ARM, "--role", "agent")
 

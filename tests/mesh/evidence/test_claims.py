@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mesh.evidence import Claim
-from schemas import Demand, cid_of_bytes, encode
+from schemas import ZERO_ADDRESS, Demand, cid_of_bytes, encode
 from tests.mesh.evidence.jobs import OTHER, ROBOT, THIEF, JobFiles, failures
 
 
@@ -45,7 +45,7 @@ def test_a_demand_is_not_a_result(job: JobFiles) -> None:
         token=OTHER,
         cost=1,
         lighthouse=OTHER,
-        validator=OTHER,
+        validator=ZERO_ADDRESS,
         validator_fee=0,
         deadline=1,
         nonce="0" * 64,

@@ -87,7 +87,14 @@ async def test_agent_and_provider_serve_the_events_of_a_liability(place: Place, 
     words = [entry.message for entry in reply.entries]
     assert {"the lamp is on", "the lamp is off"} <= set(words)
     events = [entry.event for entry in reply.entries if entry.event]
-    assert events == ["job-accepted", "job-ready", "job-started", "job-finished", "job-finalized"]
+    assert events == [
+        "contract-created",
+        "job-accepted",
+        "job-ready",
+        "job-started",
+        "job-finished",
+        "job-finalized",
+    ]
     assert [one for one in words if one.startswith("it is")] == [
         f"it is {phase}" for phase in ("incoming", "ready", "running", "complete", "finalized")
     ]
