@@ -39,8 +39,9 @@ class LateResults:
         """Look at the unsettled Results after each block, until cancelled."""
         head = self._parts.chain_head
         while True:
-            unsettled = [decode(one.payload) for one in await self._parts.ledger.outbox(head=head.head)]
-            results = {one.liability: one for one in unsettled if isinstance(one, Result)}
+            unsettled = await self._parts.ledger.outbox(head=head.head)
+            decoded = [decode(one.payload) for one in unsettled if one.kind == Result.kind]
+            results = {result.liability: result for result in decoded if isinstance(result, Result)}
             self._late_from = {address: block for address, block in self._late_from.items() if address in results}
             for result in results.values():
                 with liability_context(result.liability):

@@ -165,7 +165,7 @@ class Order:
         return frozenset(provider for provider, rejection in said if rejection.reason == Refusal.WITHDRAWN)
 
     async def withdraw(self) -> Order:
-        """Withdraw the order; returns it in its new state. `honoured_by` tells which providers obey.
+        """Withdraw the order; returns it in its new state. `honoured_by` names the providers that obey.
 
         A signed withdrawal is sent until the order's deadline, and the order no more. It may still become a contract:
         by a provider that is creating it now, that the withdrawal does not reach, or that does not obey. Until the

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import secrets
-from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.chain import InsufficientTokens, Reverted
@@ -84,15 +83,6 @@ class TermsWriter:
 def is_repeated(demand: Demand, terms: Terms, *, validator_fee: int) -> bool:
     """Whether a demand differs from these terms in nonce and deadline only."""
     return demand.validator_fee == validator_fee and all(getattr(demand, field) == terms[field] for field in REPEATED)
-
-
-def costs_of(order: Demand | Offer, *, xrt: str) -> Mapping[str, int]:
-    """What the factory may take for an order, by token, in the token's smallest unit."""
-    if isinstance(order, Offer):
-        return {xrt: order.lighthouse_fee}
-    costs = Counter({order.token: order.cost})
-    costs[xrt] += order.validator_fee
-    return costs
 
 
 async def default_lifetime(chain: Chain) -> int:

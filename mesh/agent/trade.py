@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 from mesh.agent.contract import Contract, WatchedContracts, fail_future
 from mesh.agent.errors import OrderClosed, OrderExpired
 from mesh.agent.orders import Order, OrderState, Rejections, TradedOrder
-from mesh.agent.terms import Allowances, TermsWriter, costs_of
+from mesh.agent.terms import Allowances, TermsWriter
 from mesh.background import Background
 from mesh.chain import OrderAlreadyUsed
 from mesh.errors import AiraError, ClosedError
@@ -197,7 +197,7 @@ class Trader(Lifecycle):
         await self.load()
 
     async def _ensure_allowance(self, order: TradedOrder) -> None:
-        await self._allowances.ensure(order, costs_of(order.signed, xrt=self._chain.xrt))
+        await self._allowances.ensure(order, self._chain.tokens.costs_of(order.signed))
 
     def _send_when_covered(self, orders: Collection[TradedOrder]) -> None:
         """Send these orders of the ledger when the factory has the allowance for them, in a task."""
@@ -227,7 +227,7 @@ class Trader(Lifecycle):
                     continue
                 if order is None:
                     order = self._orders[stored.identity] = TradedOrder(signed, stored.posted)
-                    self._allowances.count(order, costs_of(signed, xrt=self._chain.xrt))
+                    self._allowances.count(order, self._chain.tokens.costs_of(signed))
                     new.append(order)
                 if stored.is_withdrawn and order.is_open:
                     self._set_withdrawn(order)

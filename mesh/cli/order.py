@@ -113,7 +113,7 @@ def _json(stored: StoredOrder, message: Demand | Offer, state: str, head: int) -
 def withdraw(settings: Settings, hashes: tuple[str, ...], everything: bool, on_chain: bool, as_json: bool) -> None:
     """Withdraw the open orders whose hashes begin with HASH.
 
-    A signed withdrawal tells the providers not to use the order. A provider that is creating its contract now may still
+    A signed withdrawal asks the providers not to use the order. A provider that is creating its contract now may still
     finish, and one that the withdrawal does not reach may use the order until its deadline. With --on-chain a
     transaction of the account excludes that.
     """

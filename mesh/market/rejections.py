@@ -1,4 +1,4 @@
-"""Rejections: what a provider tells the sender of a message that it can't use, and why."""
+"""Rejections: why a provider can't use a message, signed and published for its sender."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a provider tells others: open orders and withdrawals, and its status, health and metrics."""
+"""What a provider publishes: open orders and withdrawals, and its status, health and metrics."""
 
 from __future__ import annotations
 

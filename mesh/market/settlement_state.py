@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections import Counter
 from functools import partial
 from typing import TYPE_CHECKING
 
 from mesh.chain import NoContracts, NotALiability, RequestRefused, Reverted
 from mesh.outage_log import OutageLog
-from schemas import Demand
 
 if TYPE_CHECKING:
     from mesh.chain import Chain
@@ -68,7 +66,7 @@ class SettlementState:
     async def _can_pay(self, order: Verified[Order]) -> bool:
         tokens = self._chain.tokens
         try:
-            for token, amount in _costs(order.message, self._chain.xrt).items():
+            for token, amount in tokens.costs_of(order.message).items():
                 if amount and (
                     await tokens.balance(order.signer, token=token) < amount
                     or await tokens.allowance(order.signer, self._chain.factory, token=token) < amount
@@ -77,10 +75,3 @@ class SettlementState:
         except (Reverted, RequestRefused, NoContracts):
             return True
         return True
-
-
-def _costs(order: Order, xrt: str) -> Counter[str]:
-    """What a contract takes from the maker of an order, by token."""
-    if isinstance(order, Demand):
-        return Counter({order.token: order.cost}) + Counter({xrt: order.validator_fee})
-    return Counter({xrt: order.lighthouse_fee})
