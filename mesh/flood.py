@@ -1,0 +1,200 @@
+"""Protection against floods: what strangers may use is bounded per sender and in total, and what is dropped is counted.
+
+A sender is whoever can be told apart where the limit is: the signer of a message, the Zenoh session that sent it, the
+replier of a query. Everything here remembers a bounded number of senders, since a flood may come from fresh ones.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+from collections import Counter, OrderedDict, deque
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
+
+from mesh.clock import SYSTEM_CLOCK
+from mesh.log_context import log_event
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from mesh.clock import Clock
+
+log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+SENDERS: Final = 4096
+"""Senders that a limit remembers."""
+REPORT_INTERVAL: Final = 60.0
+"""Seconds between two log lines about drops."""
+HEAVIEST: Final = 3
+"""Senders that a log line names for each reason."""
+
+
+class Rate(NamedTuple):
+    """`per_second` on average, and up to `burst` at once."""
+
+    per_second: float
+    burst: float
+
+
+class _Bucket:
+    """A token bucket."""
+
+    __slots__ = ("at", "left")
+
+    def __init__(self, rate: Rate, now: float) -> None:
+        self.left = rate.burst
+        self.at = now
+
+    def refill(self, rate: Rate, now: float) -> float:
+        self.left = min(rate.burst, self.left + (now - self.at) * rate.per_second)
+        self.at = now
+        return self.left
+
+
+class RateLimiter:
+    """Token buckets: one for each sender and one for all. Not thread-safe.
+
+    The least recently seen of more than `senders` senders is forgotten, and would start with a full bucket. So `total`,
+    not `per_sender`, is what bounds a flood from fresh senders.
+    """
+
+    def __init__(
+        self, *, per_sender: Rate, total: Rate | None = None, senders: int = SENDERS, clock: Clock = SYSTEM_CLOCK
+    ) -> None:
+        self._per_sender = per_sender
+        self._total = total
+        self._senders = senders
+        self._clock = clock
+        self._buckets: OrderedDict[str, _Bucket] = OrderedDict()
+        self._all = None if total is None else _Bucket(total, clock.monotonic())
+
+    def allow(self, sender: str, cost: float = 1.0) -> bool:
+        """Take `cost` from the sender's bucket and from the total; False, and nothing taken, if either lacks it."""
+        now = self._clock.monotonic()
+        bucket = self._buckets.pop(sender, None) or _Bucket(self._per_sender, now)
+        self._buckets[sender] = bucket
+        if len(self._buckets) > self._senders:
+            self._buckets.popitem(last=False)
+        if bucket.refill(self._per_sender, now) < cost:
+            return False
+        if self._all is not None and self._total is not None:
+            if self._all.refill(self._total, now) < cost:
+                return False
+            self._all.left -= cost
+        bucket.left -= cost
+        return True
+
+
+class FairQueue(Generic[T]):
+    """A bounded queue that serves senders in turn: one item of each before the second of any.
+
+    At most `per_sender` items of one sender and `total` items wait. Use it in one event loop.
+    """
+
+    def __init__(self, *, per_sender: int, total: int) -> None:
+        self._per_sender = per_sender
+        self._total = total
+        self._waiting: OrderedDict[str, deque[T]] = OrderedDict()
+        self._size = 0
+        self._arrived = asyncio.Event()
+
+    def __len__(self) -> int:
+        return self._size
+
+    def put(self, sender: str, item: T) -> list[T]:
+        """Add an item; returns what was dropped for it: the item itself if the sender has too many, or, when the queue
+        is full, the newest one of the sender that has the most."""
+        if len(self._waiting.get(sender, ())) >= self._per_sender:
+            return [item]
+        self._waiting.setdefault(sender, deque()).append(item)
+        self._size += 1
+        self._arrived.set()
+        return [self._take_newest()] if self._size > self._total else []
+
+    async def get(self) -> T:
+        """Wait for the next item and take it."""
+        while not self._size:
+            self._arrived.clear()
+            await self._arrived.wait()
+        return self.get_nowait()
+
+    def get_nowait(self) -> T:
+        """Take the next item. Raises `IndexError` when none waits."""
+        if not self._size:
+            raise IndexError("the queue is empty")
+        sender, items = self._waiting.popitem(last=False)
+        item = items.popleft()
+        if items:
+            self._waiting[sender] = items  # behind all others
+        self._size -= 1
+        return item
+
+    def _take_newest(self) -> T:
+        sender, items = max(self._waiting.items(), key=lambda entry: len(entry[1]))
+        item = items.pop()
+        if not items:
+            del self._waiting[sender]
+        self._size -= 1
+        return item
+
+
+class Drops:
+    """Counts what was dropped, by reason and by sender. Thread-safe.
+
+    Of each reason it remembers the `senders` heaviest senders, by estimate: a newcomer takes the place, and the count,
+    of the lightest. `run` logs one line a minute while something is dropped.
+    """
+
+    def __init__(self, *, senders: int = 64, interval: float = REPORT_INTERVAL) -> None:
+        self._senders = senders
+        self._interval = interval
+        self._lock = threading.Lock()
+        self._totals: Counter[str] = Counter()
+        self._by_sender: dict[str, Counter[str]] = {}
+        self._reported: Counter[str] = Counter()
+
+    def count(self, reason: str, sender: str = "", number: int = 1) -> None:
+        """Count `number` drops for `reason` (a fixed word, `too-large`), of `sender` if it is known."""
+        with self._lock:
+            self._totals[reason] += number
+            if not sender:
+                return
+            counts = self._by_sender.setdefault(reason, Counter())
+            inherited = 0
+            if sender not in counts and len(counts) >= self._senders:
+                lightest = min(counts, key=counts.__getitem__)
+                inherited = counts.pop(lightest)
+            counts[sender] += inherited + number
+
+    def totals(self) -> Mapping[str, int]:
+        """How much was dropped, by reason."""
+        with self._lock:
+            return dict(self._totals)
+
+    def heaviest(self, reason: str, number: int = HEAVIEST) -> list[tuple[str, int]]:
+        """The senders with the most drops for `reason`, and their estimated counts since the last log line."""
+        with self._lock:
+            return self._by_sender.get(reason, Counter()).most_common(number)
+
+    def report(self) -> bool:
+        """Log what was dropped since the last report, and begin to count senders again; False if nothing was."""
+        with self._lock:
+            new = self._totals - self._reported
+            self._reported = self._totals.copy()
+            senders = {reason: dict(self._by_sender[reason].most_common(HEAVIEST)) for reason in self._by_sender}
+            self._by_sender.clear()
+        if not new:
+            return False
+        parts = ", ".join(f"{number} {reason}" for reason, number in new.most_common())
+        facts = log_event("flood", dropped=dict(new), senders=senders)
+        log.warning("dropped in the last %d s: %s", self._interval, parts, extra=facts)
+        return True
+
+    async def run(self) -> None:
+        """Report at each interval, until cancelled."""
+        while True:
+            await asyncio.sleep(self._interval)
+            self.report()

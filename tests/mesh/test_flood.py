@@ -1,0 +1,83 @@
+"""Limits that strangers share: rates, queues and counts of drops."""
+
+from __future__ import annotations
+
+import asyncio
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mesh.flood import Drops, FairQueue, Rate, RateLimiter
+
+
+class Clock:
+    """A clock that tests set."""
+
+    now = 0.0
+
+    def time(self) -> float:
+        return self.now
+
+    def time_ns(self) -> int:
+        return int(self.now * 1e9)
+
+    monotonic, monotonic_ns = time, time_ns
+
+
+def test_each_sender_has_a_share_and_all_have_a_total() -> None:
+    clock = Clock()
+    limiter = RateLimiter(per_sender=Rate(1, 2), total=Rate(2, 3), clock=clock)
+    assert [limiter.allow("a") for _ in range(3)] == [True, True, False]
+    assert [limiter.allow("b"), limiter.allow("c")] == [True, False]  # the total is used up
+    clock.now = 1.0
+    assert [limiter.allow("a"), limiter.allow("a"), limiter.allow("c")] == [True, False, True]
+
+
+@given(st.lists(st.tuples(st.sampled_from("abc"), st.floats(0, 5)), max_size=200))
+def test_nobody_gets_more_than_the_rate(calls: list[tuple[str, float]]) -> None:
+    clock = Clock()
+    limiter = RateLimiter(per_sender=Rate(1, 2), total=Rate(2, 4), clock=clock)
+    allowed = []
+    for sender, wait in calls:
+        clock.now += wait
+        if limiter.allow(sender):
+            allowed.append(sender)
+    assert len(allowed) <= 4 + 2 * clock.now + 1e-6
+    assert all(allowed.count(sender) <= 2 + clock.now + 1e-6 for sender in "abc")
+
+
+async def test_senders_are_served_in_turn_and_a_flood_displaces_itself() -> None:
+    queue: FairQueue[str] = FairQueue(per_sender=3, total=4)
+    assert [queue.put("flood", f"f{n}") for n in range(4)] == [[], [], [], ["f3"]]
+    assert queue.put("alice", "a0") == []
+    assert queue.put("bob", "b0") == ["f2"]
+    assert [await queue.get() for _ in range(4)] == ["f0", "a0", "b0", "f1"]
+    waiting = asyncio.ensure_future(queue.get())
+    await asyncio.sleep(0)
+    queue.put("bob", "b1")
+    assert await waiting == "b1"
+
+
+@given(st.lists(st.tuples(st.sampled_from("abcd"), st.booleans()), max_size=300))
+def test_the_queue_stays_within_its_limits(steps: list[tuple[str, bool]]) -> None:
+    queue: FairQueue[int] = FairQueue(per_sender=3, total=6)
+    inside: set[int] = set()
+    for number, (sender, takes) in enumerate(steps):
+        if takes and inside:
+            inside.remove(queue.get_nowait())
+        else:
+            inside.add(number)
+            inside.difference_update(queue.put(sender, number))
+        assert len(queue) == len(inside) <= 6
+
+
+def test_the_heaviest_senders_are_known_among_many() -> None:
+    drops = Drops(senders=8)
+    for number in range(1000):
+        drops.count("garbage", f"fresh{number}")
+        drops.count("garbage", "heavy")
+    drops.count("too-large")
+    assert drops.heaviest("garbage", 1)[0][0] == "heavy"
+    assert drops.totals() == {"garbage": 2000, "too-large": 1}
+    assert drops.report()
+    assert not drops.report()
