@@ -266,10 +266,13 @@ _AnyMessage = TypeVar("_AnyMessage", bound=Message)
 
 def names_in(message: Message) -> frozenset[str]:
     """The ENS names in the address fields of a message, in lower case."""
-    # Every ENS name has a dot, and no address has one. Every message passes here.
-    texts = (getattr(message, field) for field in message.address_fields)
-    names = [text for text in texts if text is not None and "." in text]
-    return frozenset(names) if names else _NO_NAMES
+    # Every ENS name has a dot, and no address has one. Every message passes here, so no generator is created.
+    names = _NO_NAMES
+    for field in message.address_fields:
+        text = getattr(message, field)
+        if text is not None and "." in text:
+            names |= {text}
+    return names
 
 
 def resolve_names(message: _AnyMessage, addresses: Mapping[str, str]) -> _AnyMessage:

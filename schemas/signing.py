@@ -9,10 +9,13 @@ travel under two texts.
 
 from __future__ import annotations
 
+import threading
 from functools import lru_cache
-from typing import Final, Generic, Self, TypeVar
+from typing import Any, Final, Generic, Self, TypeVar
 
-from coincurve import PrivateKey, PublicKey
+from coincurve import PrivateKey
+from coincurve._libsecp256k1 import ffi, lib  # type: ignore[import-not-found]
+from coincurve.context import GLOBAL_CONTEXT
 from msgspec import Struct
 from msgspec.structs import replace
 
@@ -30,6 +33,8 @@ _PREFIX: Final = b"\x19Ethereum Signed Message:\n32"
 _CURVE_ORDER: Final = 0xFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFEBAAEDCE6AF48A03BBFD25E8CD0364141
 _HIGHEST_S: Final = (_CURVE_ORDER // 2).to_bytes(32, "big")
 _V_OFFSET: Final = 27
+_RECOVERY_IDS: Final = {27: 0, 28: 1}
+_CONTEXT: Final = GLOBAL_CONTEXT.ctx
 _CACHED: Final = 8192
 _REJECTION_DOMAIN: Final = b"aira rejection\0"
 """The prefix of what a rejection's signature covers; no message of the market begins like this."""
@@ -55,7 +60,7 @@ class Signer:
         if len(private_key) != 32 or not 0 < int.from_bytes(private_key, "big") < _CURVE_ORDER:
             raise InputError("a private key is 32 bytes, neither zero nor beyond the order of secp256k1")
         self.__key = PrivateKey(private_key)
-        self.address: Final = _address_of(self.__key.public_key.format(compressed=False))
+        self.address: Final = _address_of(ffi.buffer(self.__key.public_key.public_key)[:])
 
     def __repr__(self) -> str:
         return f"Signer({self.address})"
@@ -94,17 +99,33 @@ def recover(digest: bytes, signature: str | bytes) -> str:
             raise InvalidMessage("signature", "not hexadecimal") from None
     if len(signature) != SIGNATURE_SIZE:
         raise InvalidMessage("signature", f"{len(signature)} bytes, expected {SIGNATURE_SIZE}")
-    recovery_id = signature[64] - _V_OFFSET
-    if recovery_id not in (0, 1):
+    if (recovery_id := _RECOVERY_IDS.get(signature[64])) is None:
         raise InvalidMessage("signature", f"v is {signature[64]}, expected 27 or 28")
     if signature[32:64] > _HIGHEST_S:
         raise InvalidMessage("signature", "s is in the upper half of the curve's order")
-    compact = signature[:64] + (b"\1" if recovery_id else b"\0")
-    try:
-        key = PublicKey.from_signature_and_message(compact, keccak256(_PREFIX + digest), hasher=None)
-    except ValueError:  # coincurve's error for r or s out of range and for points off the curve
-        raise InvalidMessage("signature", "no key could have made it") from None
-    return _address_of(key.format(compressed=False))
+    buffers = _buffers
+    digest = keccak256(_PREFIX + digest)
+    # Zero means that r or s is out of range, or that r belongs to no point of the curve.
+    if not _parse(_CONTEXT, buffers.signature, signature, recovery_id) or not _recover(
+        _CONTEXT, buffers.key, buffers.signature, digest
+    ):
+        raise InvalidMessage("signature", "no key could have made it")
+    return _address_of(buffers.key_bytes[:])
+
+
+class _Buffers(threading.local):
+    """What libsecp256k1 writes to: one set for each thread, because it runs without Python's lock."""
+
+    def __init__(self) -> None:
+        self.signature: Any = ffi.new("secp256k1_ecdsa_recoverable_signature *")
+        self.key: Any = ffi.new("secp256k1_pubkey *")
+        self.key_bytes: Any = ffi.buffer(self.key)
+
+
+# Coincurve's `PublicKey.from_signature_and_message` makes these calls, too, but allocates three objects for each.
+_buffers: Final = _Buffers()
+_parse: Final = lib.secp256k1_ecdsa_recoverable_signature_parse_compact
+_recover: Final = lib.secp256k1_ecdsa_recover
 
 
 def verify(payload: bytes) -> Verified[SignedMessage]:
@@ -171,9 +192,12 @@ def _check_sender(message: SignedMessage, signer: str) -> None:
 
 
 @lru_cache(maxsize=_CACHED)
-def _address_of(public_key: bytes) -> str:
-    """The address of an uncompressed public key of 65 bytes."""
-    address = checksum_address(keccak256(public_key[1:])[12:])
+def _address_of(key: bytes) -> str:
+    """The address of a public key, given as the bytes of libsecp256k1's `secp256k1_pubkey`, equal for equal keys."""
+    source, text, size = ffi.new("secp256k1_pubkey *"), ffi.new("unsigned char[65]"), ffi.new("size_t *", 65)
+    ffi.memmove(source, key, len(key))
+    lib.secp256k1_ec_pubkey_serialize(_CONTEXT, text, size, source, lib.SECP256K1_EC_UNCOMPRESSED)
+    address = checksum_address(keccak256(ffi.buffer(text)[1:])[12:])
     if address == ZERO_ADDRESS:
         raise InvalidMessage("signature", "the signer is the zero address")
     return address
