@@ -157,7 +157,7 @@ class ProviderStatusService:
     def health(self) -> dict[str, str]:
         """The state of each part: sending transactions, and following the chain."""
         transactions = ALIVE
-        if self._settlement.state.outages.is_down:
+        if self._settlement.events.lookups.is_down:
             transactions = "wait for the node"
         elif self._queue.is_down:
             transactions = "wait"

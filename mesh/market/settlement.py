@@ -9,43 +9,39 @@ its subscription, so that the copy that its sender repeats next gets through.
 
 from __future__ import annotations
 
-import asyncio
 import logging
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from mesh.chain import (
-    NodeUnreachable,
-    RequestRefused,
-    Reverted,
-)
-from mesh.errors import AiraError, InputError
+from mesh.chain import NodeUnreachable, NotALiability, RequestRefused, Reverted, TransactionTimeout
+from mesh.errors import AiraError, ChainError, InputError
 from mesh.log_context import liability_context, log_event
 from mesh.market.book import ORDER_USED, Match, Refusal, at_fault, order_id, reason_word
-from mesh.market.creation import Creation, MatchWithdrawn
-from mesh.market.liability_events import OPEN_LIABILITIES, LiabilityEvents
+from mesh.market.liability_events import OPEN_LIABILITIES, LiabilityEvents, Unconfirmed
 from mesh.market.rejections import RejectionPublisher
-from mesh.market.settlement_state import SettlementState
-from mesh.market.unconfirmed import Unconfirmed
-from mesh.market.unfunded import UnfundedOrders
+from mesh.market.unfunded import Funds, UnfundedOrders
 from mesh.market.withdrawals import withdrawn_id
 from schemas import ZERO_ADDRESS, Result
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    import asyncio
+    from collections.abc import Awaitable, Callable
 
-    from mesh.chain import Chain
+    from mesh.chain import Chain, Created
     from mesh.market.book import Order, OrderBook
     from mesh.market.earnings import EarningsLedger
     from mesh.market.transaction_queue import TransactionQueue
     from mesh.market.withdrawals import Withdrawals
     from mesh.network import Channel
-    from schemas import Verified, Withdrawal
+    from schemas import Liability, Verified, Withdrawal
 
 log = logging.getLogger(__name__)
 
-MISSING_CHECKS: Final = 3
-"""Checks in a row that find no trace of a mined transaction before it is sent again: one node may be behind another."""
+T = TypeVar("T")
+
+
+class MatchWithdrawn(ChainError, code="match-withdrawn"):
+    """An order of a match was withdrawn before a transaction was sent: no liability is created."""
 
 
 class Settlement:
@@ -70,7 +66,6 @@ class Settlement:
     ) -> None:
         assert chain.account is not None
         assert channel.address is not None
-        self.state: Final = SettlementState(chain)
         self._chain = chain
         self._lighthouse = channel.address
         self._book = book
@@ -82,7 +77,6 @@ class Settlement:
         self._publisher = RejectionPublisher(channel, chain.account, earnings)
         self.reject: Final = self._publisher.reject
         self._unconfirmed = Unconfirmed(chain.node.timing.reorg_depth)
-        self._unfunded = UnfundedOrders(book, self.state, funded=self.add, interval=chain.node.timing.poll_interval)
         self.events: Final = LiabilityEvents(
             chain,
             channel.address,
@@ -94,6 +88,8 @@ class Settlement:
             reverted=self._settle_again,
             open_limit=open_limit,
         )
+        self._funds = Funds(chain, self.events.lookups)
+        self._unfunded = UnfundedOrders(book, self._funds, funded=self.add, interval=chain.node.timing.poll_interval)
 
     def start(self, tasks: asyncio.TaskGroup) -> None:
         """Follow the chain, and from now on settle what is added, in tasks of this group."""
@@ -156,7 +152,7 @@ class Settlement:
         """Finalize the liability that a result names, if the result may do that."""
         with liability_context(result.message.liability):
             address = result.message.liability
-            liability = self.events.open.get(address) or await self.state.liability(address)
+            liability = self.events.open.get(address) or await self._liability(address)
             if result in self._unconfirmed:
                 return
             if liability is None or liability.is_finalized:  # which may not be confirmed either
@@ -167,10 +163,18 @@ class Settlement:
                 self._unconfirmed.begin(result)
                 self._tasks.create_task(self._finalize(result))
 
+    async def _liability(self, address: str) -> Liability | None:
+        """The record of a liability; None while the node knows none at that address."""
+        try:
+            return await self._when_reachable(partial(self._chain.liabilities.get, address))
+        except (NotALiability, RequestRefused) as error:
+            log.debug("a result waits to be sent again: %s", error)
+            return None
+
     async def _create(self, match: Match) -> None:
         demand, offer = match
         try:
-            created = await self._queue.send(Creation(self._chain, self._lighthouse, match, self._withdrawals).attempt)
+            created = await self._queue.send(self._creation(match))
         except MatchWithdrawn:
             self._put_back(match)
         except Reverted as error:
@@ -184,9 +188,28 @@ class Settlement:
             event = log_event("contract-created", gas=created.gas_used, **orders)
             with liability_context(created.liability):
                 log.info("created, gas %d", created.gas_used, extra=event)
-            if not await self._is_confirmed(match, created.tx):
+            if not await self.events.is_confirmed(match, created.tx):
                 self.events.creation_reverted(created.liability, created.tx)
             self._put_back(match)
+
+    def _creation(self, match: Match) -> Callable[[], Awaitable[Created]]:
+        """What sends the transaction of a match. It raises as `Liabilities.create`, and `MatchWithdrawn`.
+
+        The latter if an order is withdrawn, and no earlier attempt may still be mined.
+        """
+        may_be_sent = False
+
+        async def attempt() -> Created:
+            nonlocal may_be_sent
+            if not may_be_sent and any(order_id(order) in self._withdrawals for order in match):
+                raise MatchWithdrawn("an order was withdrawn before its contract was created")
+            try:
+                return await self._chain.liabilities.create(self._lighthouse, match.demand.message, match.offer.message)
+            except (NodeUnreachable, TransactionTimeout):
+                may_be_sent = True
+                raise
+
+        return attempt
 
     def _put_back(self, match: Match) -> None:
         """No transaction of a match waits any more: put its orders back into the book unless they were used."""
@@ -196,7 +219,7 @@ class Settlement:
 
     async def _set_aside_unfunded(self, match: Match, error: Reverted) -> bool:
         """Keep the orders whose makers can't pay in the book, unmatched, and tell them; False if both can."""
-        unfunded = [order for order in match if not await self.state.can_pay(order)]
+        unfunded = [order for order in match if not await self._funds.can_pay(order)]
         for order in match if unfunded else ():
             if self._unconfirmed.end(order):
                 continue
@@ -217,23 +240,25 @@ class Settlement:
                 self.reject(order, reason, str(error))
             if was_used:
                 continue
-            if order in rejected or await self.state.is_used(order):
+            if order in rejected or await self._chain.retrying(
+                partial(self._is_used, order), outages=self.events.lookups
+            ):
                 self._forget(order)
             else:
                 self.add(order)
 
-    async def _is_confirmed(self, messages: Sequence[Verified[Any]], tx: str) -> bool:
-        """Wait until the event that used the messages has its confirmations; False if their transaction vanished."""
-        timing, missing = self._chain.node.timing, 0
-        while missing < MISSING_CHECKS:
-            if all(
-                self._unconfirmed.is_read(one, until=self.events.head - timing.confirmations + 1) for one in messages
-            ):
-                return True
-            await asyncio.sleep(timing.poll_interval)
-            is_there = all(self._unconfirmed.is_read(one, until=self.events.head) for one in messages)
-            missing = 0 if is_there or await self.state.has_mined(tx) else missing + 1
-        return False
+    async def _is_used(self, order: Verified[Order]) -> bool:
+        """Whether an order became a liability, or was withdrawn on the chain."""
+        liabilities = self._chain.liabilities
+        try:
+            if order.message.generation == 3:
+                return await self._when_reachable(partial(liabilities.is_order_used, order.hash, order.signer))
+            return await self._when_reachable(partial(liabilities.next_nonce, order.signer)) > int(order.message.nonce)
+        except RequestRefused:
+            return False  # a used order is rejected when its next match fails
+
+    async def _when_reachable(self, question: Callable[[], Awaitable[T]]) -> T:
+        return await self._chain.retrying(question, outages=self.events.lookups, errors=(NodeUnreachable,))
 
     async def _finalize(self, result: Verified[Result]) -> None:
         message = result.message
@@ -249,7 +274,7 @@ class Settlement:
                 self._earnings.finalized(finalized)
                 event = log_event("contract-finalized", success=message.success, gas=finalized.gas_used)
                 log.info("finalized, success %s, gas %d", message.success, finalized.gas_used, extra=event)
-                if not await self._is_confirmed((result,), finalized.tx):
+                if not await self.events.is_confirmed((result,), finalized.tx):
                     self._earnings.reverted(finalized.tx)
                 if not self._unconfirmed.end(result):
                     await self.add_result(result)

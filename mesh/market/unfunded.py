@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import heapq
+from functools import partial
 from itertools import count
 from typing import TYPE_CHECKING, Final
 
+from mesh.chain import NoContracts, RequestRefused, Reverted
 from mesh.market.book import order_id
 from mesh.retry import Backoff, RetryPolicy
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from mesh.chain import Chain
     from mesh.market.book import Order, OrderBook
-    from mesh.market.settlement_state import SettlementState
+    from mesh.outage_log import OutageLog
     from schemas import Verified
 
 RETRY: Final = RetryPolicy(initial=2.0, ceiling=60.0)
@@ -23,6 +26,34 @@ LIMIT: Final = 4096
 """Orders that may wait for their makers' funds at the same time."""
 CHECKS: Final = 4
 """Orders that are looked at in one round, at most: each takes up to four requests to the node."""
+
+
+class Funds:
+    """What the makers of orders can pay, asked of the chain. Outages of the node are logged to `outages`."""
+
+    def __init__(self, chain: Chain, outages: OutageLog) -> None:
+        self._chain = chain
+        self._outages = outages
+
+    async def can_pay(self, order: Verified[Order]) -> bool:
+        """Whether an order's maker has, and allows the factory to take, what the order costs it.
+
+        True if that can't be read: tokens are contracts of strangers. Asked again until the node answers.
+        """
+        return await self._chain.retrying(partial(self._can_pay, order), outages=self._outages)
+
+    async def _can_pay(self, order: Verified[Order]) -> bool:
+        tokens = self._chain.tokens
+        try:
+            for token, amount in tokens.costs_of(order.message).items():
+                if amount and (
+                    await tokens.balance(order.signer, token=token) < amount
+                    or await tokens.allowance(order.signer, self._chain.factory, token=token) < amount
+                ):
+                    return False
+        except (Reverted, RequestRefused, NoContracts):
+            return True
+        return True
 
 
 class UnfundedOrders:
@@ -34,7 +65,7 @@ class UnfundedOrders:
     def __init__(
         self,
         book: OrderBook,
-        state: SettlementState,
+        funds: Funds,
         *,
         funded: Callable[[Verified[Order]], object],
         interval: float,
@@ -42,7 +73,7 @@ class UnfundedOrders:
         limit: int = LIMIT,
     ) -> None:
         self._book = book
-        self._state = state
+        self._funds = funds
         self._funded = funded
         self._interval = interval
         self._retry = retry
@@ -76,7 +107,7 @@ class UnfundedOrders:
                     await self._check(order)
 
     async def _check(self, order: Verified[Order]) -> None:
-        can_pay = await self._state.can_pay(order)
+        can_pay = await self._funds.can_pay(order)
         waiting = self._waiting.pop(order_id(order), None)
         if waiting is None or order_id(order) not in self._book:
             return

@@ -129,7 +129,7 @@ CANDIDATES: Final = (
     ),
     Mutation(
         "the provider trusts a receipt",
-        "mesh.market.settlement:Settlement._is_confirmed",
+        "mesh.market.liability_events:LiabilityEvents.is_confirmed",
         "timing, missing =",
         "return True\n    timing, missing =",
         REORGANISATIONS + ",forget",
