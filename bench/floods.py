@@ -1,0 +1,208 @@
+"""What attackers without money do to a market: each flood is a coroutine, which `bench/flood.py` runs by its name.
+
+A flood prepares what it sends, waits at `Attacker.begin`, and then attacks until it is cancelled, or returns when it
+has done all. An attacker has a session at the market's router, and no account.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import secrets
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import zenoh
+from msgspec.structs import replace
+
+from mesh.network import message_key
+from schemas import ZERO_ADDRESS, Demand, Offer, Result, RpcKey, Signer, cid_of_digest, encode
+from schemas.selectors import market_selector
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Coroutine, Iterable
+
+    Flood = Callable[["Attacker"], Coroutine[Any, Any, None]]
+
+PREPARED: Final = 10_000
+"""Messages that a flood prepares; it sends them again and again."""
+SLOWLY: Final = 0.1
+"""Seconds between the messages of a flood that takes its time."""
+BURST: Final = 64
+"""Messages that are put between two turns of the event loop."""
+QUERIES: Final = 256
+"""Queries of a flood that are open at a time."""
+
+
+@dataclass(kw_only=True)
+class Attacker:
+    """What an attacker knows of the market, and its session."""
+
+    session: zenoh.Session
+    lighthouse: str
+    """The ENS name of the market."""
+    address: str
+    """The lighthouse's address."""
+    xrt: str
+    model: str
+    """The model that the robot serves."""
+    objective: str
+    """The CID of an objective that the honest person has."""
+    deadline: int
+    """A block that is near enough for a valid order."""
+    robot: str
+    """The robot's address."""
+    begin: Callable[[], Awaitable[None]]
+    """Report that everything is prepared, and wait for the beginning of the attack."""
+
+    def demand(self, **changes: Any) -> Demand:
+        """An unsigned demand that is valid on this market, for an objective that nobody has."""
+        fields: dict[str, Any] = {
+            "model": self.model,
+            "objective": cid_of_digest(secrets.token_bytes(32)),
+            "token": self.xrt,
+            "cost": 1,
+            "lighthouse": self.address,
+            "validator": ZERO_ADDRESS,
+            "validator_fee": 0,
+            "deadline": self.deadline,
+            "nonce": secrets.token_hex(32),
+        }
+        return Demand(**(fields | changes))
+
+    def put(self, message: Demand | Offer | Result) -> None:
+        """Publish a message on its key."""
+        self.session.put(message_key(self.lighthouse, message), encode(message))
+
+    async def put_all(self, wire: Iterable[tuple[str, bytes]]) -> None:
+        """Put payloads on keys as fast as this process can."""
+        for number, (key, payload) in enumerate(wire):
+            self.session.put(key, payload)
+            if number % BURST == 0:
+                await asyncio.sleep(0)
+
+    async def put_again_and_again(self, wire: list[tuple[str, bytes]]) -> None:
+        """The same, without end."""
+        await self.begin()
+        await self.put_all(itertools.cycle(wire))
+
+    def wire(self, messages: Iterable[Demand | Offer | Result]) -> list[tuple[str, bytes]]:
+        """Keys and payloads of messages."""
+        return [(message_key(self.lighthouse, message), encode(message)) for message in messages]
+
+
+FLOODS: Final[dict[str, Flood]] = {}
+"""The floods by their names."""
+
+
+def flood(function: Flood) -> Flood:
+    """Register a flood under its name, with dashes."""
+    FLOODS[function.__name__.replace("_", "-")] = function
+    return function
+
+
+def sign(message: Any) -> Any:
+    """The message, signed by an account that nobody has seen before."""
+    return Signer(secrets.token_bytes(32)).sign(message)
+
+
+@flood
+async def dead_objectives(attacker: Attacker) -> None:
+    """Valid demands of fresh keys for objectives that nobody has: 10 a second for a while, then all at once."""
+    wire = attacker.wire(sign(attacker.demand()) for _ in range(PREPARED))
+    await attacker.begin()
+    for number in range(100):
+        await attacker.put_all([wire[number]])
+        await asyncio.sleep(SLOWLY)
+    await attacker.put_all(wire[100:])
+
+
+@flood
+async def random_signatures(attacker: Attacker) -> None:
+    """Valid demands with random signatures: half of them recover some signer, at the full price of a verification."""
+    order = attacker.demand()
+
+    def one() -> Demand:
+        signature = secrets.token_bytes(32) + b"\1" + secrets.token_bytes(31) + b"\x1b"
+        return replace(order, nonce=secrets.token_hex(32), signature=signature.hex())
+
+    await attacker.begin()
+    await attacker.put_all(attacker.wire([one()])[0] for _ in itertools.count())
+
+
+@flood
+async def unfunded_pairs(attacker: Attacker) -> None:
+    """Demands and offers that match, by accounts without tokens."""
+    messages = []
+    for _ in range(PREPARED // 2):
+        terms = attacker.demand()
+        shared = {name: getattr(terms, name) for name in terms.__struct_fields__ if name != "validator_fee"}
+        offer = Offer(**shared | {"nonce": secrets.token_hex(32)}, lighthouse_fee=0)
+        messages += [sign(terms), sign(offer)]
+    await attacker.put_again_and_again(attacker.wire(messages))
+
+
+@flood
+async def duplicates(attacker: Attacker) -> None:
+    """One valid demand, again and again."""
+    await attacker.put_again_and_again(attacker.wire([sign(attacker.demand())]))
+
+
+@flood
+async def garbage(attacker: Attacker) -> None:
+    """Bytes that are no messages, and messages with a wrong field, on the keys of messages."""
+    ((key, payload),) = attacker.wire([sign(attacker.demand())])
+    broken = [payload.replace(b'"cost":1', b'"cost":-%d' % number) for number in range(PREPARED)]
+    await attacker.put_again_and_again([(key, each) for text in broken for each in (secrets.token_bytes(700), text)])
+
+
+@flood
+async def large(attacker: Attacker) -> None:
+    """Payloads of 60 KiB on the keys of demands, offers and results."""
+    terms = attacker.demand()
+    keys = [market_selector(attacker.lighthouse, kind, terms.model) for kind in ("demand", "offer")]
+    keys.append(
+        message_key(attacker.lighthouse, Result(liability=attacker.robot, result=terms.objective, success=True))
+    )
+    await attacker.put_again_and_again([(key, secrets.token_bytes(60 * 1024)) for key in keys])
+
+
+@flood
+async def unknown_names(attacker: Attacker) -> None:
+    """Demands with validators by ENS names that do not exist, each another one."""
+    signature = secrets.token_hex(64) + "1b"
+    orders = [attacker.demand(validator=f"{secrets.token_hex(8)}.eth", signature=signature) for _ in range(PREPARED)]
+    await attacker.put_again_and_again(attacker.wire(orders))
+
+
+async def query_all(attacker: Attacker, queries: Iterable[tuple[str, bytes]]) -> None:
+    """Query without waiting for answers, `QUERIES` at a time."""
+    await attacker.begin()
+    loop, limit = asyncio.get_running_loop(), asyncio.Semaphore(QUERIES)
+
+    def ignore(_: zenoh.Reply) -> None:
+        pass
+
+    def done() -> None:
+        loop.call_soon_threadsafe(limit.release)
+
+    for key, payload in queries:
+        await limit.acquire()
+        attacker.session.get(key, zenoh.handlers.Callback(ignore, done), payload=payload, timeout=1.0)
+
+
+@flood
+async def balance_queries(attacker: Attacker) -> None:
+    """Calls of the robot's service for balances, each for another account: each would be a call of the node."""
+    key = str(RpcKey(attacker.robot, "eth/account_xrt_balance"))
+    await query_all(
+        attacker, ((key, b'{"account":"0x%s"}' % secrets.token_hex(20).encode()) for _ in itertools.count())
+    )
+
+
+@flood
+async def recall_queries(attacker: Attacker) -> None:
+    """Queries for the whole order book, after 10,000 demands have filled it."""
+    await attacker.put_all(attacker.wire(sign(attacker.demand()) for _ in range(PREPARED)))
+    await asyncio.sleep(1)
+    await query_all(attacker, ((f"aira/{attacker.lighthouse}/**", b"") for _ in itertools.count()))
