@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
+
+import click
 
 from mesh.cli.errors import InvalidAmount
 
@@ -68,3 +70,17 @@ class Unit:
 
 XRT: Final = Unit("XRT", 9, "wn")
 ETH: Final = Unit("ETH", 18, "wei")
+
+
+class AmountText(click.ParamType[str]):
+    """An option with an amount. Its syntax is checked here; its value depends on the token."""
+
+    name = "amount"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Return the text. Fails for one that is not an amount."""
+        if AMOUNT.fullmatch(str(value).strip()) is None:
+            self.fail(
+                f"{str(value)[:40]!r} is not an amount; write 1.5 for one and a half XRT, or 1500000wn", param, ctx
+            )
+        return str(value)

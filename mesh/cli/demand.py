@@ -4,39 +4,33 @@ from __future__ import annotations
 
 import asyncio
 import shutil
+import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from mesh.cli.amounts import AMOUNT, XRT
-from mesh.cli.errors import FileUnwritable, InvalidOptions, JobNotDone, NotAFileOrCid, OutputFailed
-from mesh.cli.existing_demand import take_existing, wait_for_contract
+from mesh.cli.amounts import XRT, AmountText
+from mesh.cli.errors import DemandExists, InvalidOptions, JobNotDone, OutputFailed
+from mesh.cli.files import file_or_cid, require_readable, require_writable
 from mesh.cli.options import with_json, with_settings
-from mesh.cli.output import print_json, print_line
+from mesh.cli.output import plural, print_json, print_line
 from mesh.errors import AiraError
 from mesh.running import run_to_end
 from mesh.settings import ChainSettings, NetworkSettings, options_of
-from schemas import InvalidCid, parse_cid
 
 if TYPE_CHECKING:
-    from mesh.agent import Agent, Contract
+    from mesh.agent import Agent, Contract, Order
     from mesh.settings import Settings
+    from schemas.signing import Rejection
 
-
-class Amount(click.ParamType[str]):
-    """An amount. Its syntax is checked here; its value depends on the token."""
-
-    name = "amount"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Return the text. Fails for one that is not an amount."""
-        if AMOUNT.fullmatch(str(value).strip()) is None:
-            self.fail(
-                f"{str(value)[:40]!r} is not an amount; write 1.5 for one and a half XRT, or 1500000wn", param, ctx
-            )
-        return str(value)
+CHOICES: Final = {
+    "wait": "wait for it",
+    "withdraw": "withdraw it, and post a new one",
+    "new": "post another one beside it",
+}
 
 
 @click.command("demand")
@@ -44,14 +38,14 @@ class Amount(click.ParamType[str]):
 @click.option("--objective", required=True, help="objective to play: a file or a CID")
 @click.option(
     "--cost",
-    type=Amount(),
+    type=AmountText(),
     default="0",
     show_default=True,
     help="what you pay: whole tokens (1.5), or the smallest unit (1500000000wn for XRT, 15units for other tokens)",
 )
 @click.option("--validator", default="", help="address or ENS name of the validator of the result [none]")
 @click.option(
-    "--validator-fee", type=Amount(), default="0", show_default=True, help="the validator's fee, in XRT (or wn)"
+    "--validator-fee", type=AmountText(), default="0", show_default=True, help="the validator's fee, in XRT (or wn)"
 )
 @click.option(
     "--lifetime",
@@ -99,12 +93,12 @@ async def demand(
     from mesh.agent import Agent
 
     settings.keyfile_and_password()
-    source = await asyncio.to_thread(_file_or_cid, objective)
+    source = await asyncio.to_thread(_source, objective)
     fee = XRT.parse(validator_fee)
     if fee and not terms["validator"]:
         raise InvalidOptions("--validator-fee needs --validator", hint="give --validator, or omit the fee")
     if out is not None:
-        await asyncio.to_thread(_check_writable, out)
+        await asyncio.to_thread(require_writable, out)
     # A server with the same settings may run beside this and serve metrics at the same port.
     async with Agent(terms.pop("model"), settings=replace(settings, metrics_listen="")) as agent:
         contract = await _contract(agent, source, validator_fee=fee, existing=existing, quiet=as_json, **terms)
@@ -129,16 +123,108 @@ async def _contract(
         print_line(f"demand by {agent.address} for {agent.model}")
     cid = source if isinstance(source, str) else await agent.add(source)
     terms |= {"cost": unit.parse(cost), "validator_fee": validator_fee}
-    existing_one = await take_existing(agent, cid, existing, quiet=quiet, **terms)
+    existing_one = await _take_existing(agent, cid, existing, quiet=quiet, **terms)
     if existing_one is None:
         await check_balance(agent.parts.chain, unit, terms["cost"], token=agent.settings.erc20_token)
         existing_one = await agent.order(cid, **terms)
         if not quiet:
             print_line(f"posted {existing_one.hash}, valid until block {existing_one.deadline:,}")
-    contract = await wait_for_contract(existing_one)
+    contract = await _wait_for_contract(existing_one)
     if not quiet:
         print_line(f"contract {contract.address} with {contract.liability.promisor}")
     return contract
+
+
+async def _take_existing(
+    agent: Agent, objective: str, existing: str | None, *, quiet: bool, lifetime: int | None = None, **terms: Any
+) -> Order | Contract | None:
+    """What to wait for instead of a new demand: the open one with these terms, or its contract. None: post a new one.
+
+    `existing` is the choice; without one, the user is asked in a terminal. Raises `DemandExists` without a terminal.
+    """
+    demands, contract = await _equal(agent, objective, **terms)
+    if demands:  # perhaps one became a contract while nothing of the account ran
+        await agent.parts.chain_head.reached(await agent.parts.chain.block_number())
+        demands, contract = await _equal(agent, objective, **terms)
+    if others := len(agent.orders()) - len(demands):
+        also = f"{plural(others, 'other order')} of this account may become contracts"
+        click.echo(f"{also}, and are sent again; see `aira order list`", err=True)
+    if not demands and contract is None:
+        return None
+    for order in demands:
+        click.echo(f"the equal demand {order.hash} is open until block {order.deadline:,}", err=True)
+    if contract is not None:
+        click.echo(f"an equal demand became the contract {contract.address}, which has not ended", err=True)
+    if existing is None and (quiet or not sys.stdin.isatty()):
+        choices = ", ".join(f"--existing {choice} ({meaning})" for choice, meaning in CHOICES.items())
+        raise DemandExists("an equal demand is open; a second one would be paid too", hint=f"choose: {choices}")
+    choice = existing or await _ask()
+    if choice == "wait":
+        return contract or demands[0]
+    for order in demands if choice == "withdraw" else ():
+        await order.withdraw()
+        click.echo(f"withdrew {order.hash}; a provider that is creating its contract now may still finish", err=True)
+    return None
+
+
+async def _equal(
+    agent: Agent, objective: str, *, cost: int, validator: str = "", validator_fee: int
+) -> tuple[list[Order], Contract | None]:
+    """The open demands with these terms, and the latest contract of one if it has not ended."""
+    from mesh.agent.terms import is_repeated
+    from schemas import Demand, decode
+
+    fields: dict[str, Any] = {"model": agent.model, "objective": objective, "cost": cost, "validator": validator}
+    wanted = await agent.runtime.trader.writer.terms(**fields, token="", lifetime=1)
+
+    def is_equal(message: object) -> bool:
+        return isinstance(message, Demand) and is_repeated(message, wanted, validator_fee=validator_fee)
+
+    contracts = await agent.parts.ledger.contracts("demand")
+    latest = next((address for payload, address in contracts if is_equal(decode(payload))), "")
+    demands = [order for order in agent.orders() if is_equal(order.message)]
+    liabilities = agent.parts.chain.liabilities
+    if not latest or not await liabilities.exists(latest) or (await liabilities.get(latest)).is_finalized:
+        return demands, None
+    return demands, await agent.contract(latest)
+
+
+async def _ask() -> str:
+    """Ask in the terminal what to do, in a thread that does not keep an interrupted program alive."""
+    loop = asyncio.get_running_loop()
+    answer: asyncio.Future[str] = loop.create_future()
+
+    def ask() -> None:
+        click.echo("\n".join(f"  {choice}: {meaning}" for choice, meaning in CHOICES.items()), err=True)
+        try:
+            given = click.prompt("what now?", type=click.Choice(list(CHOICES)), err=True)
+        except click.Abort:
+            loop.call_soon_threadsafe(answer.cancel)
+        else:
+            loop.call_soon_threadsafe(answer.set_result, given)
+
+    threading.Thread(target=ask, name="prompt", daemon=True).start()
+    return await answer
+
+
+async def _wait_for_contract(order: Order | Contract) -> Contract:
+    """Wait until an order is a contract. Prints which providers can't use it meanwhile."""
+    from mesh.agent import Contract
+
+    if isinstance(order, Contract):
+        return order
+    withdraw = f"withdraw it with `aira order withdraw {order.hash[:16]}`"
+    stays = f"the demand stays valid until block {order.deadline:,}; {withdraw}"
+
+    def report(rejection: Rejection) -> None:
+        why = f"{rejection.detail} ({rejection.reason})"
+        click.echo(f"provider {rejection.provider} can't use the demand now: {why}\n{stays}", err=True)
+
+    try:
+        return await order.contract(on_rejection=report)
+    except asyncio.CancelledError:
+        click.echo(stays, err=True)
+        raise
 
 
 async def _wait_for_end(contract: Contract, out: Path | None, *, as_json: bool) -> None:
@@ -169,6 +255,12 @@ async def _wait_for_end(contract: Contract, out: Path | None, *, as_json: bool) 
         raise failure
 
 
+def _source(objective: str) -> str | Path:
+    """The file with that name if there is one, else the CID. Raises `NotAFileOrCid`, `FileUnreadable`."""
+    source = file_or_cid(objective)
+    return require_readable(source) if isinstance(source, Path) else source
+
+
 def _failure_hint(contract: Contract, result: str) -> str:
     """Where to find the reason of a failure."""
     if result:
@@ -185,28 +277,3 @@ async def _save_recording(contract: Contract, out: Path) -> None:
         raise OutputFailed(
             f"can't write the recording to {out}: {error.strerror}", hint=f"the store has it: {recording}"
         ) from None
-
-
-def _file_or_cid(objective: str) -> str | Path:
-    """The path of the file with that name if there is one, else the CID. Raises `NotAFileOrCid`."""
-    path = Path(objective)
-    if path.is_file():
-        return path
-    try:
-        parse_cid(objective)
-    except InvalidCid:
-        raise NotAFileOrCid(f"the objective {objective!r} is neither a file nor a CID") from None
-    return objective
-
-
-def _check_writable(out: Path) -> None:
-    """Check that a file can be written there, before anything is paid. Leaves no file behind."""
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        existed = out.exists()
-        with out.open("ab"):
-            pass
-        if not existed:
-            out.unlink()
-    except OSError as error:
-        raise FileUnwritable(f"can't write the recording to {out}: {error.strerror}") from None

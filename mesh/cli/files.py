@@ -47,6 +47,19 @@ def require_new_file(path: Path) -> Path:
     return path
 
 
+def require_writable(path: Path) -> None:
+    """Check that a file can be written there. Leaves no file behind. Raises `FileUnwritable`."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        existed = path.exists()
+        with path.open("ab"):
+            pass
+        if not existed:
+            path.unlink()
+    except OSError as error:
+        raise write_error(path, error) from None
+
+
 def write_error(path: Path, error: OSError) -> FileUnwritable:
     """The error for a file that the system refuses to write."""
     return FileUnwritable(f"can't write {path}: {error.strerror}")
