@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from mesh.chain.accounts import Account, SignedTransaction
     from mesh.chain.answers import MinedTransaction
     from mesh.chain.node import Node
-    from mesh.chain.pending import PendingTransactions
-    from mesh.chain.transaction_store import PendingTransaction
+    from mesh.chain.pending import PendingTransaction, PendingTransactions
 
 log = logging.getLogger(__name__)
 

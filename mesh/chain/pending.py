@@ -3,19 +3,80 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections import OrderedDict
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
+
+from mesh.chain.accounts import SignedTransaction
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
-    from mesh.chain.accounts import SignedTransaction
-    from mesh.chain.transaction_store import LockedEntry, PendingTransaction, TransactionStore
+    from mesh.chain.transaction_store import LockedEntry, TransactionStore
 
 T = TypeVar("T")
 
 MINED_KEPT: Final = 256
 """Mined transactions of an account that are remembered: a reorganisation may send them back to the pool."""
+
+Effect: TypeAlias = tuple[str, str, int]
+"""What a transaction does: its recipient (empty: it deploys), its data (0x…) and its wei."""
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class PendingTransaction:
+    """A nonce of the account, and the transaction that was sent with it, in one or several versions.
+
+    The versions differ in their fees only; at most one of them is ever mined.
+    """
+
+    nonce: int
+    fields: dict[str, Any]
+    """Of the newest version, ready to be signed."""
+
+    versions: list[SignedTransaction]
+    sent_at: float = field(default_factory=time.time)
+    """When the first version was sent (Unix time, seconds)."""
+
+    is_watched: bool = True
+    """Whether a task of this process waits for it."""
+
+    locked: LockedEntry | None = None
+    """Its file in the store, while this process has it."""
+
+    @property
+    def newest(self) -> SignedTransaction:
+        """The version that was signed last."""
+        return self.versions[-1]
+
+    @property
+    def version(self) -> dict[str, Any]:
+        """The newest version for the store."""
+        fields = self.fields | {"to": self.fields["to"] or ""}
+        return {"sentAt": self.sent_at, "hash": self.newest.hash, "raw": self.newest.raw.hex(), "fields": fields}
+
+    @classmethod
+    def stored(cls, nonce: int, versions: list[dict[str, Any]]) -> PendingTransaction:
+        """The transaction whose versions are in the store, and which no process waits for."""
+        return cls(
+            nonce=nonce,
+            fields=versions[-1]["fields"] | {"to": versions[-1]["fields"]["to"] or b""},
+            versions=[SignedTransaction(raw=bytes.fromhex(one["raw"]), hash=one["hash"]) for one in versions],
+            sent_at=versions[0]["sentAt"],
+            is_watched=False,
+        )
+
+    @property
+    def effect(self) -> Effect:
+        """What it does."""
+        return effect_of(self.fields)
+
+
+def effect_of(fields: dict[str, Any]) -> Effect:
+    """What a transaction with these fields does."""
+    return fields["to"] or "", fields["data"], fields["value"]
 
 
 class PendingTransactions:
@@ -37,10 +98,9 @@ class PendingTransactions:
         if self._store is None:
             return
         mine = {nonce for nonce, entry in self._entries.items() if entry.is_watched}
-        store = self._store
-        left, self._elsewhere = await _in_thread(lambda: store.read(mine))
+        left, self._elsewhere = await _in_thread(partial(self._store.read, mine))
         watched = {nonce: self._entries[nonce] for nonce in mine if nonce in self._entries}
-        self._entries = {entry.nonce: entry for entry in left} | watched
+        self._entries = {nonce: PendingTransaction.stored(nonce, left[nonce]) for nonce in left} | watched
 
     @property
     def taken(self) -> Collection[int]:
@@ -66,7 +126,7 @@ class PendingTransactions:
             abandoned = self._entries.get(entry.nonce)
             if abandoned is not None:
                 await self.forget(abandoned)
-            await self._lock_entry(entry, self._store.add)
+            await self._lock_entry(entry, partial(self._store.add, entry.nonce, entry.version))
             if entry.locked is None:
                 return False
         self._entries[entry.nonce] = entry
@@ -77,8 +137,7 @@ class PendingTransactions:
         entry.fields = fields
         entry.versions.append(signed)
         if entry.locked is not None:
-            locked = entry.locked
-            await _in_thread(lambda: locked.append(entry))
+            await _in_thread(partial(entry.locked.append, entry.version))
 
     async def take_over(self, entry: PendingTransaction) -> bool:
         """Wait for a transaction of `abandoned` or `blocking` from now on; False if another process was faster."""
@@ -86,7 +145,7 @@ class PendingTransactions:
             entry.is_watched = True
             return await self.add(entry)
         if self._store is not None and entry.locked is None:
-            await self._lock_entry(entry, self._store.lock)
+            await self._lock_entry(entry, partial(self._store.lock, entry.nonce))
             if entry.locked is None:
                 self._entries.pop(entry.nonce, None)
                 return False
@@ -112,16 +171,14 @@ class PendingTransactions:
         if self._entries.get(entry.nonce) is entry:
             del self._entries[entry.nonce]
         if self._store is not None and entry.locked is None:
-            await self._lock_entry(entry, self._store.lock)
+            await self._lock_entry(entry, partial(self._store.lock, entry.nonce))
         if entry.locked is not None:
             locked, entry.locked = entry.locked, None
             await _in_thread(locked.remove)
 
-    async def _lock_entry(
-        self, entry: PendingTransaction, lock: Callable[[PendingTransaction], LockedEntry | None]
-    ) -> None:
+    async def _lock_entry(self, entry: PendingTransaction, lock: Callable[[], LockedEntry | None]) -> None:
         def work() -> None:
-            entry.locked = lock(entry)
+            entry.locked = lock()
 
         try:
             await _in_thread(work)

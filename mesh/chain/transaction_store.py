@@ -13,10 +13,8 @@ import os
 import tempfile
 import time
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-from mesh.chain.accounts import SignedTransaction
 from mesh.chain.errors import TransactionDamaged, TransactionsNotKept
 from mesh.private_files import make_private_folder
 
@@ -30,45 +28,8 @@ LOCK_ATTEMPTS: Final = 5
 LOCK_PAUSE: Final = 0.01
 """Seconds between two attempts to lock a file, which a reader holds for a moment only."""
 
-Effect: TypeAlias = tuple[str, str, int]
-"""What a transaction does: its recipient (empty: it deploys), its data (0x…) and its wei."""
-
-
-@dataclass(slots=True, kw_only=True, eq=False)
-class PendingTransaction:
-    """A nonce of the account, and the transaction that was sent with it, in one or several versions.
-
-    The versions differ in their fees only; at most one of them is ever mined.
-    """
-
-    nonce: int
-    fields: dict[str, Any]
-    """Of the newest version, ready to be signed."""
-
-    versions: list[SignedTransaction]
-    sent_at: float = field(default_factory=time.time)
-    """When the first version was sent (Unix time, seconds)."""
-
-    is_watched: bool = True
-    """Whether a task of this process waits for it."""
-
-    locked: LockedEntry | None = None
-    """Its file in the store, while this process has it."""
-
-    @property
-    def newest(self) -> SignedTransaction:
-        """The version that was signed last."""
-        return self.versions[-1]
-
-    @property
-    def effect(self) -> Effect:
-        """What it does."""
-        return effect_of(self.fields)
-
-
-def effect_of(fields: dict[str, Any]) -> Effect:
-    """What a transaction with these fields does."""
-    return fields["to"] or "", fields["data"], fields["value"]
+Version: TypeAlias = dict[str, Any]
+"""A version of a transaction, as JSON."""
 
 
 class LockedEntry:
@@ -78,14 +39,14 @@ class LockedEntry:
         self._path = path
         self._descriptor = descriptor
 
-    def append(self, entry: PendingTransaction) -> None:
+    def append(self, version: Version) -> None:
         """Write the newest version of the transaction."""
         with _on_disk(self._path):
             # A line that a crash or a full disk cut off would make the next one unreadable too.
             end = os.pread(self._descriptor, os.fstat(self._descriptor).st_size, 0).rfind(b"\n") + 1
             os.ftruncate(self._descriptor, end)
             os.lseek(self._descriptor, end, os.SEEK_SET)
-            left = memoryview(_line(entry))
+            left = memoryview(json.dumps(version).encode() + b"\n")
             while left:  # a disk that is nearly full takes a part
                 left = left[os.write(self._descriptor, left) :]
             os.fsync(self._descriptor)
@@ -114,14 +75,14 @@ class TransactionStore:
         with _on_disk(folder / "x"):
             make_private_folder(folder)
 
-    def add(self, entry: PendingTransaction) -> LockedEntry | None:
+    def add(self, nonce: int, version: Version) -> LockedEntry | None:
         """Create and lock the file of a nonce; None if it exists."""
-        path = self._path(entry.nonce)
+        path = self._path(nonce)
         with _on_disk(path):
             descriptor, unfinished = tempfile.mkstemp(suffix=UNFINISHED, dir=self._folder)
         locked = LockedEntry(path, descriptor)
         try:
-            locked.append(entry)
+            locked.append(version)
             with _on_disk(path):
                 fcntl.flock(descriptor, fcntl.LOCK_EX)
                 # The file is complete and locked before others can see it.
@@ -136,9 +97,9 @@ class TransactionStore:
                 os.unlink(unfinished)
         return locked
 
-    def lock(self, entry: PendingTransaction) -> LockedEntry | None:
+    def lock(self, nonce: int) -> LockedEntry | None:
         """Lock the file of a nonce; None if there is none, or another process has locked it."""
-        path = self._path(entry.nonce)
+        path = self._path(nonce)
         for attempt in range(LOCK_ATTEMPTS):
             with _on_disk(path):
                 descriptor = lock_file(path, fcntl.LOCK_EX)
@@ -149,12 +110,12 @@ class TransactionStore:
             time.sleep(LOCK_PAUSE)
         return None
 
-    def read(self, mine: Collection[int]) -> tuple[list[PendingTransaction], frozenset[int]]:
-        """The transactions that no process has locked, and the nonces of those that others have.
+    def read(self, mine: Collection[int]) -> tuple[dict[int, list[Version]], frozenset[int]]:
+        """The versions of the transactions that no process has locked, by nonce, and the nonces that others have.
 
         `mine` are the nonces that this process has locked; they are left out.
         """
-        left, elsewhere = [], set()
+        left, elsewhere = {}, set()
         for path in sorted(self._folder.glob(f"*{SUFFIX}")):
             nonce = int(path.stem)
             if nonce in mine:
@@ -164,7 +125,7 @@ class TransactionStore:
             if descriptor is not None:
                 try:
                     with _on_disk(path):
-                        left.append(_parse(nonce, path))
+                        left[nonce] = _parse(path)
                 finally:
                     os.close(descriptor)
             elif path.exists():
@@ -208,22 +169,12 @@ def _linked(unfinished: str, path: Path) -> bool:
     return True
 
 
-def _line(entry: PendingTransaction) -> bytes:
-    fields = entry.fields | {"to": entry.fields["to"] or ""}
-    line = {"sentAt": entry.sent_at, "hash": entry.newest.hash, "raw": entry.newest.raw.hex(), "fields": fields}
-    return json.dumps(line).encode() + b"\n"
-
-
-def _parse(nonce: int, path: Path) -> PendingTransaction:
-    """The transaction in a file. A last line that was cut off was not sent; the first line never is cut off."""
-    lines: list[dict[str, Any]] = []
+def _parse(path: Path) -> list[Version]:
+    """The versions in a file. A last line that was cut off was not sent; the first line never is cut off."""
+    versions: list[Version] = []
     with suppress(ValueError):
         for line in path.read_text(encoding="utf-8").splitlines():
-            lines.append(json.loads(line))
-    if not lines:
+            versions.append(json.loads(line))
+    if not versions:
         raise TransactionDamaged(path)
-    fields = lines[-1]["fields"] | {"to": lines[-1]["fields"]["to"] or b""}
-    versions = [SignedTransaction(raw=bytes.fromhex(line["raw"]), hash=line["hash"]) for line in lines]
-    return PendingTransaction(
-        nonce=nonce, fields=fields, versions=versions, sent_at=lines[0]["sentAt"], is_watched=False
-    )
+    return versions

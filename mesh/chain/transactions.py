@@ -24,7 +24,7 @@ from mesh.chain.confirmation import (
 )
 from mesh.chain.errors import FeeTooHigh, InsufficientFunds, NodeUnreachable, RequestRefused, Reverted
 from mesh.chain.metrics import TransactionOutcome
-from mesh.chain.transaction_store import PendingTransaction, effect_of
+from mesh.chain.pending import PendingTransaction, effect_of
 from mesh.log_context import log_event
 from mesh.retry import Backoff, RetryPolicy
 

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from bridges.ipfs.journal import RelayJournal
-from mesh.chain.accounts import SignedTransaction
-from mesh.chain.transaction_store import PendingTransaction, TransactionStore
+from mesh.chain.transaction_store import TransactionStore
 from mesh.clock import SYSTEM_CLOCK
 from mesh.content import Store
 from mesh.private_files import make_private_folder
@@ -63,8 +62,7 @@ async def recovered_recording(folder: Path) -> None:
 
 async def transactions(folder: Path) -> None:
     store = TransactionStore(folder / "transactions")
-    signed = SignedTransaction(raw=b"raw", hash="0x" + "11" * 32)
-    locked = store.add(PendingTransaction(nonce=0, fields={"to": ""}, versions=[signed]))
+    locked = store.add(0, {"hash": "0x" + "11" * 32})
     if locked is not None:
         os.close(locked._descriptor)
 
