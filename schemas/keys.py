@@ -5,8 +5,12 @@ line ends and NUL in a key. Each key has exactly one text. `schemas.selectors` h
 queries.
 
 A lighthouse is given by its ENS name in lower case, or by its address if it has none. Addresses are in lower case (the
-classes accept any case), hashes are 64 hexadecimal digits in lower case without `0x`. A topic is written as in ROS,
-`/a/b`, and becomes the chunks `a/b`. To add a family of keys, add its class, its pattern in `_parse`, and a selector.
+classes accept any case). A topic is written as in ROS, `/a/b`, and becomes the chunks `a/b`. To add a family of keys,
+add its class, its pattern in `_parse`, and a selector.
+
+A market's keys name only what subscribers select by: the model of an order, the maker of what is rejected. Hashes are
+not in them. A router looks up a key that somebody subscribed to, but compares a new one with all its siblings, so the
+cost of a message would grow with the number of models.
 """
 
 from __future__ import annotations
@@ -52,108 +56,83 @@ def cid_chunk(text: str) -> str:
     return text
 
 
-def hash_chunk(text: str) -> str:
-    """A 32-byte hash: 64 hexadecimal digits in lower case, without `0x`."""
-    try:
-        # This also rejects upper case and the blanks that bytes.fromhex() skips.
-        if len(text) == 64 and bytes.fromhex(text).hex() == text:
-            return text
-    except ValueError:
-        pass
-    raise InvalidKey(text, "a hash is 64 hexadecimal digits in lower case, without 0x")
-
-
 class _Key(BaseKey, frozen=True, gc=False):
     """The base of the keys that are not an agent's."""
 
     checks: ClassVar[Mapping[str, Callable[[str], str]]] = {
         "lighthouse": lighthouse_chunk,
         "agent": address_chunk,
-        "liability": address_chunk,
-        "provider": address_chunk,
+        "maker": address_chunk,
         "model": cid_chunk,
         "cid": cid_chunk,
-        "hash": hash_chunk,
-        "order": hash_chunk,
-        "tx": hash_chunk,
         "role": name_chunk,
     }
 
 
 class DemandKey(_Key, frozen=True):
-    """A Demand for `model` with this message hash; put by the promisee."""
+    """The Demands for `model`; put by promisees."""
 
     lighthouse: str
     model: str
-    hash: str
 
     def __str__(self) -> str:
-        return f"aira/{self.lighthouse}/demand/{self.model}/{self.hash}"
+        return f"aira/{self.lighthouse}/demand/{self.model}"
 
 
 class OfferKey(_Key, frozen=True):
-    """An Offer of `model` with this message hash; put by the promisor."""
+    """The Offers of `model`; put by promisors."""
 
     lighthouse: str
     model: str
-    hash: str
 
     def __str__(self) -> str:
-        return f"aira/{self.lighthouse}/offer/{self.model}/{self.hash}"
+        return f"aira/{self.lighthouse}/offer/{self.model}"
 
 
 class WithdrawalKey(_Key, frozen=True):
-    """A Withdrawal of the order with the hash `order`; `hash` is its own. Put by the order's maker."""
+    """The Withdrawals of orders; put by the orders' makers."""
 
     lighthouse: str
-    order: str
-    hash: str
 
     def __str__(self) -> str:
-        return f"aira/{self.lighthouse}/withdrawal/{self.order}/{self.hash}"
+        return f"aira/{self.lighthouse}/withdrawal"
 
 
 class ResultKey(_Key, frozen=True):
-    """A Result of `liability` with this message hash; put by the promisor."""
+    """The Results of liabilities; put by promisors."""
 
     lighthouse: str
-    liability: str
-    hash: str
 
     def __str__(self) -> str:
-        return f"aira/{self.lighthouse}/result/{self.liability}/{self.hash}"
+        return f"aira/{self.lighthouse}/result"
 
 
 class FeedbackKey(_Key, frozen=True):
-    """A generation-5 provider's feedback on the order with the hash `order`; `hash` distinguishes several."""
+    """The feedback of generation-5 providers on orders."""
 
     lighthouse: str
-    order: str
-    hash: str
 
     def __str__(self) -> str:
-        return f"aira/{self.lighthouse}/feedback/{self.order}/{self.hash}"
+        return f"aira/{self.lighthouse}/feedback"
 
 
 class PendingKey(_Key, frozen=True):
-    """A generation-5 provider's note of the transaction `tx` that it has sent."""
+    """The notes of generation-5 providers of the transactions that they have sent."""
 
     lighthouse: str
-    tx: str
 
     def __str__(self) -> str:
-        return f"aira/{self.lighthouse}/pending/{self.tx}"
+        return f"aira/{self.lighthouse}/pending"
 
 
 class RejectKey(_Key, frozen=True):
-    """The reason why `provider` rejects the order or result with the hash `order`."""
+    """The providers' rejections of orders and results that `maker` has signed."""
 
     lighthouse: str
-    order: str
-    provider: str
+    maker: str
 
     def __str__(self) -> str:
-        return f"aira/{self.lighthouse}/reject/{self.order}/{self.provider}"
+        return f"aira/{self.lighthouse}/reject/{self.maker}"
 
 
 class PresenceKey(_Key, frozen=True):
@@ -180,12 +159,9 @@ MarketKey: TypeAlias = DemandKey | OfferKey | WithdrawalKey | ResultKey | Feedba
 Key: TypeAlias = MarketKey | AgentKey | PresenceKey | CidKey
 
 
-def market_key(lighthouse: str, kind: MarketKind, chunk: str, digest: str) -> str:
-    """The key of a message whose parts are canonical already, without the checks.
-
-    `chunk` is its model, order or liability.
-    """
-    return f"aira/{lighthouse}/{kind}/{chunk}/{digest}"
+def market_key(lighthouse: str, kind: MarketKind, model: str) -> str:
+    """The key of a message whose parts are canonical already, without the checks. `model` is empty but for orders."""
+    return f"aira/{lighthouse}/{kind}/{model}" if model else f"aira/{lighthouse}/{kind}"
 
 
 def market_kind(text: str) -> str:
@@ -201,24 +177,24 @@ def parse_key(text: str) -> Key:
 
 def _parse(text: str) -> Key:
     match text.split("/"):
-        case ["aira", lighthouse, "demand", model, digits]:
-            return DemandKey(lighthouse, model, digits)
-        case ["aira", lighthouse, "offer", model, digits]:
-            return OfferKey(lighthouse, model, digits)
-        case ["aira", lighthouse, "withdrawal", order, digits]:
-            return WithdrawalKey(lighthouse, order, digits)
-        case ["aira", lighthouse, "result", liability, digits]:
-            return ResultKey(lighthouse, liability, digits)
+        case ["aira", lighthouse, "demand", model]:
+            return DemandKey(lighthouse, model)
+        case ["aira", lighthouse, "offer", model]:
+            return OfferKey(lighthouse, model)
+        case ["aira", lighthouse, "withdrawal"]:
+            return WithdrawalKey(lighthouse)
+        case ["aira", lighthouse, "result"]:
+            return ResultKey(lighthouse)
         case ["aira", "agent", *_]:
             return parse_agent_key(text)
         case ["aira", "cid", cid]:
             return CidKey(cid)
-        case ["aira", lighthouse, "feedback", order, digits]:
-            return FeedbackKey(lighthouse, order, digits)
-        case ["aira", lighthouse, "pending", tx]:
-            return PendingKey(lighthouse, tx)
-        case ["aira", lighthouse, "reject", order, provider]:
-            return RejectKey(lighthouse, order, provider)
+        case ["aira", lighthouse, "feedback"]:
+            return FeedbackKey(lighthouse)
+        case ["aira", lighthouse, "pending"]:
+            return PendingKey(lighthouse)
+        case ["aira", lighthouse, "reject", maker]:
+            return RejectKey(lighthouse, maker)
         case ["aira", lighthouse, "@agent", role, agent]:
             return PresenceKey(lighthouse, role, agent)
     raise InvalidKey(text, "there is no such family")

@@ -43,9 +43,9 @@ class _Message(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, om
     """The fields that hold an address or an ENS name."""
 
     @property
-    def key_chunk(self) -> str:
-        """What its key names before the message's hash."""
-        raise NotImplementedError
+    def key_model(self) -> str:
+        """The model that its key names; empty for all but orders."""
+        return ""
 
 
 class _Order(_Message, frozen=True, kw_only=True, rename="camel"):
@@ -65,7 +65,7 @@ class _Order(_Message, frozen=True, kw_only=True, rename="camel"):
     signature: str = ""
 
     @property
-    def key_chunk(self) -> str:
+    def key_model(self) -> str:
         """The model's CID."""
         return self.model
 
@@ -158,11 +158,6 @@ class Withdrawal(_Message, frozen=True, kw_only=True, rename={"order": "withdraw
     deadline: int
     signature: str = ""
 
-    @property
-    def key_chunk(self) -> str:
-        """The order's hash."""
-        return self.order
-
     def __post_init__(self) -> None:
         set_hash(self, "order", self.order)
         try:
@@ -189,11 +184,6 @@ class Result(_Message, frozen=True, kw_only=True):
     success: bool
     signature: str = ""
 
-    @property
-    def key_chunk(self) -> str:
-        """The liability's address, in lower case."""
-        return self.liability.lower()
-
     def __post_init__(self) -> None:
         try:
             set_address(self, "liability", self.liability)
@@ -218,11 +208,6 @@ class OrderFeedback(_Message, frozen=True, kw_only=True):
     accepted: int
     signature: str
 
-    @property
-    def key_chunk(self) -> str:
-        """The order's hash."""
-        return self.order
-
     def __post_init__(self) -> None:
         set_hash(self, "order", self.order)
         check_uint256("accepted", self.accepted)
@@ -236,11 +221,6 @@ class TransactionFeedback(_Message, frozen=True, kw_only=True):
     mark: ClassVar[str] = "tx"
 
     tx: str
-
-    @property
-    def key_chunk(self) -> str:
-        """The transaction's hash."""
-        return self.tx
 
     def __post_init__(self) -> None:
         set_hash(self, "tx", self.tx)

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Final
 
 from schemas.agent_keys import address_chunk, name_chunk, topic_chunks
 from schemas.errors import InvalidKey
-from schemas.keys import cid_chunk, hash_chunk, lighthouse_chunk
+from schemas.keys import cid_chunk, lighthouse_chunk
+from schemas.message_fields import hex_digits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -20,31 +21,43 @@ if TYPE_CHECKING:
 CID_SELECTOR: Final = "aira/cid/*"
 """All blocks and files."""
 
-_SUBJECTS: Final[Mapping[str, Callable[[str], str]]] = MappingProxyType(
+ORDER: Final = "order"
+"""The parameter of a query for the withdrawals of one order."""
+
+_SUBJECTS: Final[Mapping[str, Callable[[str], str] | None]] = MappingProxyType(
     {
         "demand": cid_chunk,
         "offer": cid_chunk,
-        "withdrawal": hash_chunk,
-        "result": address_chunk,
-        "feedback": hash_chunk,
-        "pending": hash_chunk,
-        "reject": hash_chunk,
+        "withdrawal": None,
+        "result": None,
+        "feedback": None,
+        "pending": None,
+        "reject": address_chunk,
     }
 )
-"""The check of the chunk behind each kind of message."""
+"""The check of the chunk behind each kind of message; None where there is no such chunk."""
 
 
 def market_selector(lighthouse: str, kind: MarketKind, subject: str = "*") -> str:
     """All messages of a kind on a lighthouse, or those of one subject.
 
-    The subject is the model of a demand or offer, the liability of a result, the order of a withdrawal, of
-    feedback or of a rejection, the transaction of a pending note.
+    The subject is the model of a demand or offer, or the maker (an address) of what is rejected. Other kinds have none.
     """
-    check = _SUBJECTS.get(kind)
-    if check is None:
+    if kind not in _SUBJECTS:
         raise InvalidKey(kind, f"it is not one of the kinds {', '.join(_SUBJECTS)}")
-    rest = "" if kind == "pending" else "/*"
-    return f"aira/{lighthouse_chunk(lighthouse)}/{kind}/{_any_or(check, subject)}{rest}"
+    check, base = _SUBJECTS[kind], f"aira/{lighthouse_chunk(lighthouse)}/{kind}"
+    if check is not None:
+        return f"{base}/{_any_or(check, subject)}"
+    if subject != "*":
+        raise InvalidKey(subject, f"the key of a {kind} has no such part")
+    return base
+
+
+def withdrawal_selector(lighthouse: str, order: str) -> str:
+    """For a query: the withdrawals of the order with this hash (64 hexadecimal digits)."""
+    if hex_digits(order, 32) != order:
+        raise InvalidKey(order, "a hash is 64 hexadecimal digits in lower case, without 0x")
+    return f"{market_selector(lighthouse, 'withdrawal')}?{ORDER}={order}"
 
 
 def lighthouse_selector(lighthouse: str) -> str:

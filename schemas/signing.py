@@ -153,7 +153,7 @@ def verify_hashed(message: _M, digest: bytes) -> Verified[_M]:
 
 
 class Rejection(Record, frozen=True, kw_only=True):
-    """A provider's statement that it can't use an order or a result; put on `aira/{lighthouse}/reject/…`.
+    """A provider's statement that it can't use an order or a result; put on `aira/{lighthouse}/reject/{maker}`.
 
     `order` is the message's hash (64 hexadecimal digits), `reason` a word for programs (a rejection by the order book,
     or the name of the contracts' error), `detail` is for people, `provider` the EIP-55 address of the provider, and

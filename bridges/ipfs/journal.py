@@ -16,6 +16,7 @@ from bridges.ipfs.validation import RelayMessage
 from mesh.errors import ConfigurationError
 from mesh.private_files import make_private_database, make_private_folder, open_private
 from mesh.retry import RetryPolicy
+from schemas.keys import market_key
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -31,7 +32,7 @@ DEDUPLICATION_LIMIT: Final = 131_072
 _TABLES: Final = """
     CREATE TABLE IF NOT EXISTS crossed (fingerprint BLOB PRIMARY KEY, at REAL NOT NULL) WITHOUT ROWID;
     CREATE TABLE IF NOT EXISTS waiting (
-        fingerprint BLOB, key TEXT, payload BLOB, legacy BLOB, side TEXT, shared INTEGER,
+        fingerprint BLOB, key TEXT, payload BLOB, legacy BLOB, side TEXT, shared INTEGER, hash TEXT NOT NULL DEFAULT '',
         PRIMARY KEY (fingerprint, side));
 """
 
@@ -130,8 +131,9 @@ class RelayJournal:
 
     def add_waiting(self, to: Side, queued: QueuedMessage) -> None:
         """The message waits to be sent to side `to`."""
-        row = (*queued.message, to.value, queued.shared)
-        self._do("INSERT OR REPLACE INTO waiting VALUES (?, ?, ?, ?, ?, ?)", *row)
+        one = queued.message
+        row = (one.fingerprint, one.key, one.payload, one.legacy, to.value, queued.shared, one.hash)
+        self._do("INSERT OR REPLACE INTO waiting VALUES (?, ?, ?, ?, ?, ?, ?)", *row)
 
     def mark_relayed(self, fingerprint: bytes) -> None:
         """The message is on both sides."""
@@ -154,7 +156,7 @@ class RelayJournal:
 
     def waiting(self) -> Iterator[tuple[Side, QueuedMessage]]:
         """The waiting messages with their destination, in their order of arrival."""
-        rows = self._do("SELECT fingerprint, key, payload, legacy, side, shared FROM waiting ORDER BY rowid")
+        rows = self._do("SELECT fingerprint, key, payload, legacy, hash, side, shared FROM waiting ORDER BY rowid")
         for *message, side, shared in rows:
             yield Side(side), QueuedMessage(RelayMessage(*message), bool(shared), None, 0.0)
 
@@ -168,13 +170,34 @@ class RelayJournal:
         self._database = sqlite3.connect(self._path, isolation_level=None, check_same_thread=False)
         try:
             self._database.executescript("PRAGMA journal_mode=WAL; PRAGMA synchronous=NORMAL;" + _TABLES)
+            self._convert_old_keys()
             self.prune()
         except sqlite3.Error as error:
             self._database.close()
             raise JournalFailed(self._path, str(error)) from error
+
+    def _convert_old_keys(self) -> None:
+        """In files of version 0, keys end with the message's hash."""
+        if self._do("PRAGMA user_version")[0][0]:
+            return
+        if "hash" not in (row[1] for row in self._do("PRAGMA table_info(waiting)")):
+            self._do("ALTER TABLE waiting ADD COLUMN hash TEXT NOT NULL DEFAULT ''")
+            for rowid, key in self._do("SELECT rowid, key FROM waiting"):
+                self._do("UPDATE waiting SET key = ?, hash = ? WHERE rowid = ?", *_key_and_hash(key), rowid)
+        self._do("PRAGMA user_version = 1")
 
     def _do(self, statement: str, *values: object) -> list[tuple[Any, ...]]:
         try:
             return self._database.execute(statement, values).fetchall()
         except sqlite3.Error as error:
             raise JournalFailed(self._path, str(error)) from error
+
+
+def _key_and_hash(old: str) -> tuple[str, str]:
+    """The key and the hash of a message, from a key that ends with the hash."""
+    match old.split("/"):
+        case ["aira", lighthouse, ("demand" | "offer") as kind, model, digest]:
+            return market_key(lighthouse, kind, model), digest
+        case ["aira", lighthouse, "result", _, digest]:
+            return market_key(lighthouse, "result", ""), digest
+    return old.rsplit("/", 2 if "/feedback/" in old else 1)[0], ""

@@ -122,9 +122,9 @@ class PublishQueue:
             messages.pop(fingerprint, None)
 
     def find(self, digest: str) -> list[RelayMessage]:
-        """The messages whose key ends with a hash (hexadecimal). O(messages)."""
+        """The messages with a hash (hexadecimal). O(messages)."""
         queued = [*self._own.values(), *self._left.values(), *self._unheard.values()]
-        return [one.message for one in queued if one.message.key.endswith(digest)]
+        return [one.message for one in queued if one.message.hash == digest]
 
     def keep_unheard(self, queued: QueuedMessage) -> QueuedMessage | None:
         """Keep a message that was sent while there were no listeners; returns the oldest such one if it is dropped."""

@@ -12,17 +12,14 @@ import msgspec
 from mesh.errors import AiraError, ChainError, InvalidMessage
 from mesh.log_context import log_event
 from mesh.market.withdrawals import Withdrawals
-from mesh.network.validation import key_of
 from mesh.outage_log import OutageLog
 from mesh.retry import REMOTE, Backoff, RetryPolicy
 from schemas import (
     ZERO_ADDRESS,
     Demand,
-    FeedbackKey,
     Message,
     Offer,
     OrderFeedback,
-    PendingKey,
     Result,
     SignedMessage,
     TransactionFeedback,
@@ -30,14 +27,13 @@ from schemas import (
     address_bytes,
     decode,
     encode,
-    keccak256,
     message_hash,
     names_in,
     recover,
     resolve_names,
     verify_hashed,
 )
-from schemas.keys import market_kind
+from schemas.keys import market_key, market_kind
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -84,13 +80,15 @@ def legacy_json(message: Message) -> bytes:
 class RelayMessage(NamedTuple):
     """A valid message. Its fingerprint is the same on both sides, whatever the encoding.
 
-    `key` and `payload` are for the mesh, `legacy` is the JSON for IPFS.
+    `key` and `payload` are for the mesh, `legacy` is the JSON for IPFS. `hash` is the message's hash if it is signed:
+    64 hexadecimal digits, else empty.
     """
 
     fingerprint: bytes
     key: str
     payload: bytes
     legacy: bytes
+    hash: str
 
     @property
     def kind(self) -> str:
@@ -135,26 +133,23 @@ class RelayValidator:
         if isinstance(message, Withdrawal):
             raise InvalidMessage("kind", "the legacy network has no withdrawals")
         canonical = encode(message)
-        own_key = await self._key(message, canonical)
-        if key is not None and not _is_key_of(message, key, own_key):
+        own_key = market_key(self._lighthouse, message.kind, message.key_model)
+        if key is not None and key != own_key:
             raise InvalidMessage("key", f"the message does not belong on {key}")
+        digest = "" if isinstance(message, OrderFeedback | TransactionFeedback) else await self._verified(message)
         fingerprint = sha256(canonical).digest()[:FINGERPRINT_BYTES]
-        return RelayMessage(fingerprint, key or own_key, canonical, legacy_json(message))
+        return RelayMessage(fingerprint, own_key, canonical, legacy_json(message), digest)
 
     def is_withdrawn(self, message: RelayMessage) -> bool:
         """Whether a message that was valid is an order that is withdrawn now."""
         if not self.withdrawals or message.kind not in ("demand", "offer"):
             return False
-        digest, order = bytes.fromhex(message.key.rpartition("/")[2]), decode(message.payload)
+        digest, order = bytes.fromhex(message.hash), decode(message.payload)
         assert isinstance(order, Demand | Offer)
         return digest + address_bytes(recover(digest, order.signature)) in self.withdrawals
 
-    async def _key(self, message: Message, canonical: bytes) -> str:
-        match message:
-            case OrderFeedback():
-                return str(FeedbackKey(self._lighthouse, message.order, keccak256(canonical).hex()))
-            case TransactionFeedback():
-                return str(PendingKey(self._lighthouse, message.tx))
+    async def _verified(self, message: SignedMessage) -> str:
+        """The hash of a message that may be relayed. Raises `InvalidMessage`."""
         resolved = await self._resolved(message)
         self._check_order(resolved)
         digest = message_hash(resolved)
@@ -163,7 +158,7 @@ class RelayValidator:
             if digest + address_bytes(verified.signer) in self.withdrawals:
                 raise InvalidMessage("withdrawn", "its maker has withdrawn it")
             await self._check_validator(resolved.validator)
-        return key_of(self._lighthouse, resolved, digest)
+        return digest.hex()
 
     async def _resolved(self, message: SignedMessage) -> SignedMessage:
         names = names_in(message)
@@ -194,13 +189,6 @@ class RelayValidator:
             raise InvalidMessage("lighthouse", f"made for {order.lighthouse}, not for this market")
         if order.deadline <= self.head():
             raise InvalidMessage("deadline", f"block {order.deadline} has passed")
-
-
-def _is_key_of(message: Message, key: str, own_key: str) -> bool:
-    """The end of a feedback's key is its sender's choice; every other key follows from the content."""
-    if isinstance(message, OrderFeedback):
-        return key.rpartition("/")[0] == own_key.rpartition("/")[0]
-    return key == own_key
 
 
 class ChainAwaited(ChainError, code="chain-awaited"):

@@ -213,7 +213,8 @@ class Rejections:
                 call_in_loop(loop, _put, queue, rejection)
 
         session = self._parts.network.session
-        subscriber: Any = session.declare_subscriber(market_selector(self._parts.channel.lighthouse, "reject"), receive)
+        selector = market_selector(self._parts.channel.lighthouse, "reject", self._parts.signer.address)
+        subscriber: Any = session.declare_subscriber(selector, receive)
         try:
             async with Background() as tasks:
                 tasks.start(self._check_all(queue, on_rejection), "rejections")

@@ -183,16 +183,29 @@ def _answers(parts: AgentComponents, order: Order) -> int:
     """How many providers answer with the withdrawal of an order now."""
     import zenoh
 
-    from schemas import market_selector
+    from schemas.selectors import withdrawal_selector
 
     replies = parts.network.session.get(
-        market_selector(parts.channel.lighthouse, "withdrawal", order.hash),
+        withdrawal_selector(parts.channel.lighthouse, order.hash),
         zenoh.handlers.FifoChannel(ANSWERS),
         target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE,
         timeout=CONFIRMATION / 2,
     )
-    return sum(reply.ok is not None for reply in replies)
+    confirming = (reply for reply in replies if reply.ok is not None and _withdraws(reply.ok, parts, order))
+    return len({str(reply.replier_id) for reply in confirming})
+
+
+def _withdraws(sample: Any, parts: AgentComponents, order: Order) -> bool:
+    """Whether a reply is the account's own withdrawal of the order. Others may withdraw equal terms of their own."""
+    from schemas import InvalidMessage, Withdrawal, verify
+
+    try:
+        withdrawal = verify(sample.payload.to_bytes())
+    except InvalidMessage:
+        return False
+    is_own = withdrawal.signer == parts.signer.address
+    return isinstance(withdrawal.message, Withdrawal) and withdrawal.message.order == order.hash and is_own
 
 
 async def _withdraw_on_chain(parts: AgentComponents, order: Order) -> str:

@@ -81,7 +81,7 @@ def _grant(rights: str, *keys: str) -> Grant:
 
 def _orders(*kinds: str) -> Grant:
     """Publish messages of these kinds; their signatures identify the author."""
-    return _grant("put", *(f"aira/{{market}}/{kind}/{'*' if kind == 'pending' else '*/*'}" for kind in kinds))
+    return _grant("put", *(f"aira/{{market}}/{kind}{'/*' if kind in ('demand', 'offer') else ''}" for kind in kinds))
 
 
 def _presence(*roles: str) -> Grant:
@@ -117,7 +117,7 @@ ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
             _OWN_SPACE,
             *_READ_MARKET,
             _orders("feedback", "pending"),
-            _grant("put", "aira/{market}/reject/*/{own}"),
+            _grant("put", "aira/{market}/reject/*"),
             # The provider serves its order book to late subscribers.
             _grant("serve", "aira/{market}/**"),
             _presence("provider"),

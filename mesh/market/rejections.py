@@ -35,17 +35,18 @@ class RejectionPublisher:
         level = logging.INFO if reason == Refusal.WITHDRAWN else logging.WARNING
         log.log(level, "rejected %s of %s: %s", order, message.signer, detail, extra=event)
         if reason != ORDER_USED:
-            self._publish(order, reason, detail)
+            self._publish(message.signer, order, reason, detail)
 
     def honour(self, withdrawal: Verified[Withdrawal]) -> None:
         """Publish, as a rejection of the withdrawn order, that this provider does not match it."""
         order = withdrawal.message.order
         event = log_event("withdrawal-honoured", order=order, signer=withdrawal.signer)
         log.info("%s withdrew the order %s", withdrawal.signer, order, extra=event)
-        self._publish(order, Refusal.WITHDRAWN.value, "its maker has withdrawn it; this provider does not match it")
+        detail = "its maker has withdrawn it; this provider does not match it"
+        self._publish(withdrawal.signer, order, Refusal.WITHDRAWN.value, detail)
 
-    def _publish(self, order: str, reason: str, detail: str) -> None:
+    def _publish(self, maker: str, order: str, reason: str, detail: str) -> None:
         provider = self._account.address
         rejection = Rejection(order=order, reason=reason, detail=detail, provider=provider)
-        key = str(RejectKey(self._channel.lighthouse, order, provider))
+        key = str(RejectKey(self._channel.lighthouse, maker))
         self._channel.put(key, rejection.signed_by(self._account.signer).encode())

@@ -11,10 +11,11 @@ import zenoh
 
 import mesh
 from mesh.chain.metrics import CachedMetrics, reading_families
-from mesh.network import call_in_loop, verified_key
+from mesh.network import call_in_loop, message_key
 from mesh.network.metrics import message_families
 from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge, labelled
 from schemas import encode, lighthouse_selector
+from schemas.selectors import ORDER
 from schemas.status import ALIVE, MarketStatus, Status
 
 if TYPE_CHECKING:
@@ -84,16 +85,22 @@ class OrderBookService:
     def answer(self, query: zenoh.Query) -> None:
         """Answer a query in a thread, or drop it. Call it in the event loop's thread, where the book changes."""
         if self._open and len(self._answers) < self._limit:
-            answer = self._threads.submit(self._reply, query, [*self._withdrawals, *self._book.orders()])
+            answer = self._threads.submit(self._reply, query, self._answer(query.parameters.get(ORDER)))
             self._answers.add(answer)
             answer.add_done_callback(self._answers.discard)
         else:
             query.drop()  # type: ignore[no-untyped-call]
 
+    def _answer(self, order: str | None) -> list[Verified[Any]]:
+        """The withdrawals of an order, if its hash is given; else all that is open."""
+        if order:
+            return [withdrawal for withdrawal in self._withdrawals if withdrawal.message.order == order]
+        return [*self._withdrawals, *self._book.orders()]
+
     def _reply(self, query: zenoh.Query, messages: list[Verified[Any]]) -> None:
         with query:  # leaving it ends the answer
             for message in messages:
-                key = verified_key(self._lighthouse, message)
+                key = message_key(self._lighthouse, message.message)
                 if not self._open:
                     return
                 if query.key_expr.intersects(zenoh.KeyExpr(key)):

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mesh.network.services import ServiceFailed, Services, call
     from mesh.network.session import Network, NetworkChange
     from mesh.network.tls import Tls
-    from mesh.network.validation import MessageValidator, ValidationStatistics, message_key, verified_key
+    from mesh.network.validation import MessageValidator, ValidationStatistics, message_key
 
 _HOMES: Final = {
     "Channel": "mesh.network.channel",
@@ -33,7 +33,6 @@ _HOMES: Final = {
     "call_in_loop": "mesh.network.pump",
     "free_endpoint": "mesh.network.endpoints",
     "message_key": "mesh.network.validation",
-    "verified_key": "mesh.network.validation",
 }
 
 # Names load on first use: an edge process opens a session without asyncio.
@@ -56,5 +55,4 @@ __all__ = [
     "call_in_loop",
     "free_endpoint",
     "message_key",
-    "verified_key",
 ]

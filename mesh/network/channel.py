@@ -24,7 +24,7 @@ from mesh.network.validation import (
     ValidatorCheck,
     message_key,
 )
-from schemas import Result, SignedMessage, Verified, encode
+from schemas import SignedMessage, Verified, encode
 from schemas.keys import PresenceKey, parse_key
 from schemas.selectors import lighthouse_selector, market_selector, presence_selector
 
@@ -110,16 +110,13 @@ class Channel:
             raise InvalidKey(key, "it contains a wildcard")
         self._session.put(key, payload, encoding="application/json", congestion_control=zenoh.CongestionControl.DROP)
 
-    def subscribe(self, kind: type[M], *, model: str = "*", liability: str = "*") -> Subscription[M]:
-        """Subscribe to the verified messages of `kind` (`Demand`, `Offer` or `Result`).
+    def subscribe(self, kind: type[M], *, model: str = "*") -> Subscription[M]:
+        """Subscribe to the verified messages of `kind` (`Demand`, `Offer`, `Withdrawal` or `Result`).
 
-        `model` (CIDv0) limits orders to that model, `liability` (an address) limits Results to that liability; the
-        network filters at the source.
+        `model` (CIDv0) limits orders to that model; the network filters at the source.
         """
         self._check_open()
-        if liability != "*" and kind is not Result:
-            raise InputError(f"a {kind.kind} has no liability to select by")
-        selector = market_selector(self.lighthouse, kind.kind, model if liability == "*" else liability)
+        selector = market_selector(self.lighthouse, kind.kind, model)
         validator: MessageValidator[M] = MessageValidator(
             kind,
             lighthouse=self.lighthouse,

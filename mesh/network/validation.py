@@ -1,7 +1,7 @@
 """Validation of the channel's messages: every sample is checked here before anything else sees it.
 
-Checks run from cheap to expensive, so that invalid input costs little: the JSON decodes, the message is new, its key
-is the one that its content requires (which rules out wildcards), its deadline lies ahead. The signature is verified
+Checks run from cheap to expensive, so that invalid input costs little: the JSON decodes, its key is the one that its
+content requires (which rules out wildcards), the message is new, its deadline lies ahead. The signature is verified
 last, and once; only an order whose validator the chain has to be asked about is verified again after that.
 """
 
@@ -11,7 +11,7 @@ import logging
 import threading
 from collections import Counter, OrderedDict
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeVar
 
 import msgspec
 
@@ -50,17 +50,8 @@ DEDUPLICATION_LIMIT: Final = 65_536
 
 def message_key(lighthouse: str, message: SignedMessage) -> str:
     """The key of `message` on the channel of `lighthouse` (ENS name, lower case)."""
-    return key_of(lighthouse, message, message_hash(message))
-
-
-def verified_key(lighthouse: str, verified: Verified[Any]) -> str:
-    """Like `message_key`, for a message whose hash is known."""
-    return key_of(lighthouse, verified.message, verified.hash)
-
-
-def key_of(lighthouse: str, message: SignedMessage, digest: bytes) -> str:
-    """Like `message_key`, given the message's hash. Constructing a message validates its fields, so this does not."""
-    return market_key(lighthouse, message.kind, message.key_chunk, digest.hex())
+    # Constructing a message validates its fields, so this does not.
+    return market_key(lighthouse, message.kind, message.key_model)
 
 
 class Unresolved(NamedTuple, Generic[M]):
@@ -103,7 +94,7 @@ class MessageValidator(Generic[M]):
     latest block number, or 0 when it isn't known (then no deadline is checked); `resolver` resolves ENS names;
     `validators` knows which validators orders may name (None: any). Thread-safe, except `complete`.
 
-    A message is a duplicate when key and signature equal those of one of the last `deduplication_limit` accepted
+    A message is a duplicate when hash and signature equal those of one of the last `deduplication_limit` accepted
     messages that were not forgotten since; equal generation-3 terms from two signers are two messages. The rule for
     consumers: hold a message until the chain has confirmed its effect, or `forget` it. Senders repeat a message until
     they see its effect, so the copy that arrives next takes the place of the one that had none.
@@ -128,7 +119,9 @@ class MessageValidator(Generic[M]):
         self._validators = validators
         self._deduplication_limit = deduplication_limit
         self._lock = threading.Lock()
-        self._seen: OrderedDict[tuple[str, str], None] = OrderedDict()
+        self._seen: OrderedDict[tuple[bytes, str], None] = OrderedDict()
+        self._named: OrderedDict[SignedMessage, tuple[bytes, str]] = OrderedDict()
+        """Accepted messages with ENS names, which can't be hashed before these are resolved."""
         self._invalid: Counter[str] = Counter()
         self._duplicate = 0
         self._accepted = 0
@@ -143,11 +136,11 @@ class MessageValidator(Generic[M]):
             message = decode(payload)
             if not isinstance(message, self.kind):
                 raise InvalidMessage("kind", f"a {type(message).__name__} on a key of {self.kind.__name__}")
-            if (key, message.signature) in self._seen:
-                self._count_duplicate()
-                return None
             if not (names := names_in(message)):
                 return self._verified(message, key)
+            if self._named.get(message) in self._seen:
+                self._count_duplicate()
+                return None
             if self._resolver is None:
                 raise InvalidMessage("name", f"no chain to resolve {', '.join(sorted(names))}")
             return Unresolved(message, key)
@@ -158,6 +151,7 @@ class MessageValidator(Generic[M]):
     async def complete(self, unresolved: Unresolved[M]) -> Verified[M] | None:
         """Ask the chain about a message; the verified message, or None, which is counted under its reason."""
         outcome: Verified[M] | Unresolved[M] | None = unresolved
+        asked = unresolved.message
         try:
             while isinstance(outcome, Unresolved):
                 unresolved = outcome
@@ -170,6 +164,10 @@ class MessageValidator(Generic[M]):
             log.debug("what a message names can't be looked up on the chain: %s", error)
             self.reject(unresolved.question)
             return None
+        if outcome is not None and names_in(asked):
+            self._named[asked] = outcome.hash, outcome.message.signature
+            if len(self._named) > self._deduplication_limit:
+                self._named.popitem(last=False)
         return outcome
 
     async def _answers(self, message: SignedMessage) -> dict[str, str]:
@@ -187,7 +185,7 @@ class MessageValidator(Generic[M]):
     def forget(self, verified: Verified[M]) -> None:
         """Accept an accepted message once more when it is sent again: its consumer no longer holds it."""
         with self._lock:
-            self._seen.pop((verified_key(self._lighthouse, verified), verified.message.signature), None)
+            self._seen.pop((verified.hash, verified.message.signature), None)
 
     def statistics(self, *, received: int, dropped: int) -> ValidationStatistics:
         """The counts so far, with what a subscription `received` and `dropped` before validation."""
@@ -201,14 +199,17 @@ class MessageValidator(Generic[M]):
             )
 
     def _verified(self, message: M, key: str) -> Verified[M] | Unresolved[M] | None:
-        digest = message_hash(message)
-        if key != key_of(self._lighthouse, message, digest):
+        if key != message_key(self._lighthouse, message):
             raise InvalidMessage("key", f"the message does not belong on {key}")
+        digest = message_hash(message)
+        if (digest, message.signature) in self._seen:
+            self._count_duplicate()
+            return None
         is_complete = self._check_order(message)
         verified = verify_hashed(message, digest)
         if not is_complete:
             return Unresolved(message, key)
-        return verified if self._accept_new(message, key) else None
+        return verified if self._accept_new(verified) else None
 
     def _check_order(self, order: SignedMessage) -> bool:
         """Raise `InvalidMessage` for an order that can't be used; False if the chain has to be asked, too."""
@@ -231,14 +232,15 @@ class MessageValidator(Generic[M]):
         with self._lock:
             self._duplicate += 1
 
-    def _accept_new(self, message: M, key: str) -> bool:
+    def _accept_new(self, verified: Verified[M]) -> bool:
         """Record an accepted message, forgetting the oldest; False if another thread accepted the same one first."""
+        identity = verified.hash, verified.message.signature
         with self._lock:
-            if (key, message.signature) in self._seen:
+            if identity in self._seen:
                 self._duplicate += 1
                 return False
             if len(self._seen) >= self._deduplication_limit:
                 self._seen.popitem(last=False)
-            self._seen[key, message.signature] = None
+            self._seen[identity] = None
             self._accepted += 1
         return True

@@ -22,19 +22,18 @@ from schemas import (
 )
 from tests.schemas.samples import LIGHTHOUSE, MODEL, SENDER
 from tests.schemas.samples import LIGHTHOUSE_NAME as NAME
-from tests.schemas.samples import NONCE as HASH
 
 A = SENDER.lower()
 L = LIGHTHOUSE.lower()
 
 KEYS: list[tuple[Key, str]] = [
-    (DemandKey(NAME, MODEL, HASH), f"aira/{NAME}/demand/{MODEL}/{HASH}"),
-    (OfferKey(NAME, MODEL, HASH), f"aira/{NAME}/offer/{MODEL}/{HASH}"),
-    (WithdrawalKey(NAME, HASH, HASH), f"aira/{NAME}/withdrawal/{HASH}/{HASH}"),
-    (ResultKey(NAME, LIGHTHOUSE, HASH), f"aira/{NAME}/result/{L}/{HASH}"),
-    (FeedbackKey(NAME, HASH, HASH), f"aira/{NAME}/feedback/{HASH}/{HASH}"),
-    (PendingKey(NAME, HASH), f"aira/{NAME}/pending/{HASH}"),
-    (RejectKey(NAME, HASH, SENDER), f"aira/{NAME}/reject/{HASH}/{A}"),
+    (DemandKey(NAME, MODEL), f"aira/{NAME}/demand/{MODEL}"),
+    (OfferKey(NAME, MODEL), f"aira/{NAME}/offer/{MODEL}"),
+    (WithdrawalKey(NAME), f"aira/{NAME}/withdrawal"),
+    (ResultKey(NAME), f"aira/{NAME}/result"),
+    (FeedbackKey(NAME), f"aira/{NAME}/feedback"),
+    (PendingKey(NAME), f"aira/{NAME}/pending"),
+    (RejectKey(NAME, SENDER), f"aira/{NAME}/reject/{A}"),
     (PresenceKey(NAME, "provider", SENDER), f"aira/{NAME}/@agent/provider/{A}"),
     (EventKey(SENDER, LIGHTHOUSE, "ready"), f"aira/agent/{A}/liability/{L}/ready"),
     (ObjectiveTopicKey(SENDER, LIGHTHOUSE, "/a/b"), f"aira/agent/{A}/liability/{L}/objective/a/b"),

@@ -20,20 +20,27 @@ from schemas import (
     presence_selector,
     topic_selector,
 )
+from schemas.selectors import withdrawal_selector
 from tests.schemas.sample_keys import KEYS, A, L
 from tests.schemas.samples import LIGHTHOUSE, MODEL, SENDER
 from tests.schemas.samples import LIGHTHOUSE_NAME as NAME
 
 
 def test_market_selectors() -> None:
-    assert market_selector(NAME, "demand") == f"aira/{NAME}/demand/*/*"
-    assert market_selector(NAME.upper(), "offer", MODEL) == f"aira/{NAME}/offer/{MODEL}/*"
-    assert market_selector(NAME, "result") == f"aira/{NAME}/result/*/*"
-    assert market_selector(NAME, "result", LIGHTHOUSE) == f"aira/{NAME}/result/{L}/*"
-    assert market_selector(NAME, "withdrawal", "ab" * 32) == f"aira/{NAME}/withdrawal/{'ab' * 32}/*"
-    assert market_selector(NAME, "reject", "ab" * 32) == f"aira/{NAME}/reject/{'ab' * 32}/*"
-    assert market_selector(NAME, "pending", "ab" * 32) == f"aira/{NAME}/pending/{'ab' * 32}"
-    assert market_selector(NAME, "pending") == f"aira/{NAME}/pending/*"
+    assert market_selector(NAME, "demand") == f"aira/{NAME}/demand/*"
+    assert market_selector(NAME.upper(), "offer", MODEL) == f"aira/{NAME}/offer/{MODEL}"
+    assert market_selector(NAME, "reject") == f"aira/{NAME}/reject/*"
+    assert market_selector(NAME, "reject", SENDER) == f"aira/{NAME}/reject/{A}"
+    one_key: tuple[Any, ...] = ("result", "withdrawal", "feedback", "pending")
+    for kind in one_key:
+        assert market_selector(NAME, kind) == f"aira/{NAME}/{kind}"
+
+
+def test_withdrawals_of_one_order_are_asked_for_by_its_hash() -> None:
+    assert withdrawal_selector(NAME, "ab" * 32) == f"aira/{NAME}/withdrawal?order={'ab' * 32}"
+    for text in ("", "AB" * 32, "ab" * 31, "0x" + "ab" * 32, "*"):
+        with pytest.raises(InvalidKey):
+            withdrawal_selector(NAME, text)
 
 
 @pytest.mark.parametrize(("key", "text"), KEYS[:7], ids=lambda value: value if isinstance(value, str) else "")
@@ -76,6 +83,8 @@ def test_selectors_are_checked() -> None:
         market_selector(NAME, "demand", "**")
     with pytest.raises(InvalidKey):
         market_selector(NAME, "result", MODEL)
+    with pytest.raises(InvalidKey):
+        market_selector(NAME, "reject", MODEL)
     with pytest.raises(InvalidKey):
         lighthouse_selector("*")
     with pytest.raises(InvalidKey):

@@ -65,7 +65,7 @@ def bridge(time: Time, journal: RelayJournal, own: Rank | None = None, *others: 
 
 
 def message() -> RelayMessage:
-    return RelayMessage(next(_numbers).to_bytes(16, "big"), "aira/market/demand/model/hash", b"payload", b"legacy")
+    return RelayMessage(next(_numbers).to_bytes(16, "big"), "aira/market/demand/model", b"payload", b"legacy", "")
 
 
 def send_all(relay: MessageRelay, side: Side, *, heard: bool = True) -> list[bytes]:

@@ -12,8 +12,8 @@ from msgspec.structs import replace
 from bridges.ipfs.validation import ChainAwaited, RelayValidator, legacy_json
 from mesh.errors import InputError
 from mesh.network import message_key
-from schemas import FeedbackKey, InvalidMessage, OrderFeedback, TransactionFeedback, decode, encode, resolve_names
-from tests.support.orders import LIGHTHOUSE, MARKET, PERSON, STRANGER, TOKEN, demand, offer, result
+from schemas import InvalidMessage, OrderFeedback, TransactionFeedback, decode, encode, message_hash, resolve_names
+from tests.support.orders import LIGHTHOUSE, MARKET, OTHER_MODEL, PERSON, STRANGER, TOKEN, demand, offer, result
 
 if TYPE_CHECKING:
     from schemas import Message
@@ -46,20 +46,25 @@ async def test_a_valid_message_is_the_same_in_both_encodings(message: Message) -
     assert from_ipfs.key == message_key(MARKET, message)  # type: ignore[arg-type]
 
 
-async def test_feedback_keeps_the_key_on_which_it_arrived() -> None:
+async def test_feedback_has_one_key_of_each_kind() -> None:
     validator = RelayValidator(MARKET)
-    own, other = (await validator.validate(encode(FEEDBACK))).key, str(FeedbackKey(MARKET, "ab" * 32, "12" * 32))
-    assert own.rpartition("/")[0] == other.rpartition("/")[0]
-    assert (await validator.validate(encode(FEEDBACK), key=other)).key == other
-    assert await reason(validator, encode(FEEDBACK), key=str(FeedbackKey(MARKET, "ef" * 32, "12" * 32))) == "key"
-    assert (
-        await validator.validate(encode(TransactionFeedback(tx="ab" * 32)))
-    ).key == f"aira/{MARKET}/pending/{'ab' * 32}"
+    key = f"aira/{MARKET}/feedback"
+    assert (await validator.validate(encode(FEEDBACK), key=key)).key == key
+    assert await reason(validator, encode(FEEDBACK), key=f"{key}/{'12' * 32}") == "key"
+    assert (await validator.validate(encode(TransactionFeedback(tx="ab" * 32)))).key == f"aira/{MARKET}/pending"
+
+
+async def test_a_signed_message_has_its_hash_and_feedback_has_none() -> None:
+    validator, order = RelayValidator(MARKET), demand()
+    assert (await validator.validate(encode(order))).hash == message_hash(order).hex()
+    assert (await validator.validate(encode(FEEDBACK))).hash == ""
 
 
 async def test_a_message_on_another_key_is_rejected() -> None:
     order = demand()
-    assert await reason(RelayValidator(MARKET), encode(order), key=message_key(MARKET, demand())) == "key"
+    assert (
+        await reason(RelayValidator(MARKET), encode(order), key=message_key(MARKET, demand(model=OTHER_MODEL))) == "key"
+    )
     assert (
         await reason(RelayValidator(MARKET), encode(order), key=message_key("other.lighthouse.3.robonomics.eth", order))
         == "key"

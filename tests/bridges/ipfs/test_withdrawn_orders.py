@@ -87,7 +87,7 @@ async def test_a_bridge_that_starts_later_learns_withdrawals_from_a_provider(
     known.add(verify_message(withdrawal_of(demand())))
     nowhere = f"http://127.0.0.1:{free_port()}"
     async with OrderBookService(mesh.network.session, topic, OrderBook(LIGHTHOUSE), known):
-        await until_answered(mesh.network.session, f"aira/{topic}/withdrawal/*/*")
+        await until_answered(mesh.network.session, f"aira/{topic}/withdrawal")
         async with bridging(router.endpoint, nowhere, topic, tmp_path / "journal") as bridge:
             await until(lambda: set(bridge.withdrawals) == set(known), seconds=SECONDS)
 

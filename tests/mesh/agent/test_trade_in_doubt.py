@@ -44,7 +44,7 @@ async def test_a_rejection_is_information_and_the_order_stays_valid(
         demand = asyncio.create_task(person.demand(cid_of_file(job(place)), on_rejection=heard.append))
         await posted(person)
         (order,) = person.orders()
-        key = str(RejectKey(person.channel.lighthouse, order.hash, place.address("provider")))
+        key = str(RejectKey(person.channel.lighthouse, place.address("person")))
         for _ in range(2):
             network.session.put(key, rejection(place, "provider", order.hash).encode())
         await until(lambda: heard)
@@ -101,7 +101,7 @@ async def test_a_rejection_is_believed_of_the_lighthouses_providers_only(
         demand = asyncio.create_task(person.demand(OBJECTIVE))
         await posted(person)
         (identity,) = (order.hash for order in person.orders())
-        key = str(RejectKey(person.channel.lighthouse, identity, place.address("provider")))
+        key = str(RejectKey(person.channel.lighthouse, place.address("person")))
         stranger.session.put(key, b"no rejection at all")
         for untrue in untrue_rejections(place, identity):
             stranger.session.put(key, untrue.encode())
@@ -139,7 +139,7 @@ async def test_a_rejection_of_an_order_that_became_a_contract_is_ignored(place: 
         (identity,) = (order.hash for order in person.orders())
         async with place.provider() as provider:
             await until(lambda: provider.earnings().created == 1)
-            key = str(RejectKey(person.channel.lighthouse, identity, place.address("provider")))
+            key = str(RejectKey(person.channel.lighthouse, place.address("person")))
             network.session.put(key, rejection(place, "provider", identity, reason="WrongSigner").encode())
             contract = await demand
         demand_hash, _ = await chain.liabilities.order_hashes(contract.address)
@@ -154,7 +154,7 @@ async def test_an_order_is_sent_again_to_a_provider_whose_book_was_full(
         demand = asyncio.create_task(person.demand(cid_of_file(job(place))))
         await posted(person)
         (identity,) = (order.hash for order in person.orders())
-        key = str(RejectKey(person.channel.lighthouse, identity, place.address("provider")))
+        key = str(RejectKey(person.channel.lighthouse, place.address("person")))
         network.session.put(key, rejection(place, "provider", identity, reason="full").encode())
         await until(lambda: logged_facts(caplog, "order-deferred"))
         assert await waiting(person) == ["demand"]

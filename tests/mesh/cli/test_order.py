@@ -13,7 +13,7 @@ from mesh.cli.demand import demand
 from mesh.cli.errors import InvalidOptions, UnknownOrder
 from mesh.cli.order import _list, _withdraw
 from mesh.network import Endpoints, Network
-from schemas import RejectKey
+from schemas import RejectKey, verify
 from schemas.signing import Rejection
 from tests.mesh.operations.site import MODEL, Site
 from tests.support.commands import invoke
@@ -21,6 +21,8 @@ from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    import zenoh
 
     from mesh.settings import Settings
     from tests.support.nodes import Anvil
@@ -114,16 +116,14 @@ async def test_a_rejection_is_told_with_what_it_means(site: Site, capsys: pytest
     async with Network(Endpoints(connect=(site.endpoint,))) as network:
         orders: list[str] = []
 
-        def hear(key: str) -> None:
-            if key.rpartition("/")[2] != another.hash:
-                orders.append(key.rpartition("/")[2])
+        def hear(sample: zenoh.Sample) -> None:
+            if (digest := verify(sample.payload.to_bytes()).hash.hex()) != another.hash:
+                orders.append(digest)
 
-        network.session.declare_subscriber(
-            f"aira/{site.lighthouse}/demand/*/*", lambda sample: hear(str(sample.key_expr))
-        )
+        network.session.declare_subscriber(f"aira/{site.lighthouse}/demand/*", hear)
         await until(lambda: orders, what="the demand", seconds=60)
         unsigned = Rejection(order=orders[0], reason="Unwanted", detail="not today", provider=provider.address)
-        key = str(RejectKey(site.lighthouse, orders[0], provider.address))
+        key = str(RejectKey(site.lighthouse, site.accounts["person"].address))
         network.session.put(key, unsigned.signed_by(provider.signer).encode())
         said: list[str] = []
 

@@ -24,7 +24,7 @@ from tests.support.commands import AIRA, environment, invoke, refused
 from tests.support.log_events import logged_events
 from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
-from tests.support.orders import CONTRACT, MARKET, ROBOT, demand, result
+from tests.support.orders import CONTRACT, MARKET, PERSON, ROBOT, demand, result
 from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
@@ -147,7 +147,7 @@ async def publish_to(router: EmbeddedRouter) -> None:
         rejected = Rejection(
             order=message_hash(order).hex(), reason="expired", detail="too late", provider=ROBOT.address
         )
-        channel.put(str(RejectKey(MARKET, rejected.order, ROBOT.address)), rejected.signed_by(ROBOT).encode())
+        channel.put(str(RejectKey(MARKET, PERSON.address)), rejected.signed_by(ROBOT).encode())
 
 
 def test_lines_are_printed_at_once_and_the_counters_at_the_end(

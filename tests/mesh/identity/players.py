@@ -48,7 +48,6 @@ WHO = ("arm", "ann", "miner", "boss", "board", "bridge", "screen", "stranger", "
 """The identities of the matrix. The stranger has a certificate of the site and is not in the roster."""
 
 MODEL = "QmWATWQ7fVPP2EFGu71UkfnqhYXDYH566qy47CnJDgvs8u"
-HASH = "ab" * 32
 LIABILITY = "0x" + "ee" * 20
 
 
@@ -69,16 +68,16 @@ def keys_of(who: str) -> dict[str, str]:
     own, other = ADDRESSES[who], ADDRESSES["crane"]
     roles = ("agent", "person", "provider", "operator", "edge", "bridge", "bridge-turn-0-00000000000000ff", "watcher")
     keys: dict[str, Any] = {
-        "demand": DemandKey(MARKET, MODEL, HASH),
-        "offer": OfferKey(MARKET, MODEL, HASH),
-        "withdrawal": WithdrawalKey(MARKET, HASH, HASH),
-        "result": ResultKey(MARKET, LIABILITY, HASH),
-        "feedback": FeedbackKey(MARKET, HASH, HASH),
-        "pending": PendingKey(MARKET, HASH),
-        "reject": RejectKey(MARKET, HASH, own),
-        "other reject": RejectKey(MARKET, HASH, other),
+        "demand": DemandKey(MARKET, MODEL),
+        "offer": OfferKey(MARKET, MODEL),
+        "withdrawal": WithdrawalKey(MARKET),
+        "result": ResultKey(MARKET),
+        "feedback": FeedbackKey(MARKET),
+        "pending": PendingKey(MARKET),
+        "reject": RejectKey(MARKET, own),
+        "other reject": RejectKey(MARKET, other),
         "cid": CidKey(MODEL),
-        "other market": DemandKey("elsewhere.lighthouse.3.robonomics.eth", MODEL, HASH),
+        "other market": DemandKey("elsewhere.lighthouse.3.robonomics.eth", MODEL),
         "other presence": PresenceKey(MARKET, "agent", other),
         "nowhere": "aira/nowhere",
     }
@@ -101,7 +100,7 @@ NOBODY: dict[str, set[str]] = {who: set() for who in WHO}
 PUT = NOBODY | {
     "arm": OWN | {"offer", "withdrawal", "result"},
     "ann": OWN | {"demand", "withdrawal"},
-    "miner": OWN | {"feedback", "pending", "reject"},
+    "miner": OWN | {"feedback", "pending", "reject", "other reject"},
     "boss": OWN,
     "board": {"robot topic", "robot device"},
     "bridge": OWN | {"demand", "offer", "withdrawal", "result", "feedback", "pending"},

@@ -235,7 +235,7 @@ async def test_each_member_sees_presence_where_it_may(stage: Stage) -> None:
     assert {who: named(who, seen[who]) for who in WHO} == PRESENCE
 
 
-WILD = ("aira/**", "aira/agent/**", "aira/agent/*/rpc/**", "aira/*/demand/*/*", "aira/*/@agent/*/*", "aira/*/**")
+WILD = ("aira/**", "aira/agent/**", "aira/agent/*/rpc/**", "aira/*/demand/*", "aira/*/@agent/*/*", "aira/*/**")
 OTHERS_KEY = KEYS["arm"]["other rpc"]
 
 

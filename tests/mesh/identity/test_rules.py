@@ -83,7 +83,7 @@ def test_only_the_markets_of_the_roster_are_open() -> None:
 
     puts = next(one.keys for one in access_of(two) if one.right is Right.PUT)
 
-    markets = [f"aira/{market}/{kind}/*/*" for kind in ("demand", "withdrawal") for market in (MARKET, "b.eth")]
+    markets = [f"aira/{market}/{keys}" for keys in ("demand/*", "withdrawal") for market in (MARKET, "b.eth")]
     assert set(puts) == {f"aira/agent/{ARM}/**", *markets}
 
 

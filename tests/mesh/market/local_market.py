@@ -12,7 +12,7 @@ from mesh.chain.events import NewLiability
 from mesh.market.provider import Provider
 from mesh.network import Channel, Endpoints, Network
 from mesh.retry import RetryPolicy
-from schemas import Demand, Offer, RejectKey, Result, market_selector, message_hash, parse_key
+from schemas import Demand, Offer, RejectKey, Result, market_selector, message_hash, parse_key, verify_message
 from schemas.signing import Rejection
 from tests.support.orders import RECORDING, terms
 from tests.support.waiting import until, until_found, until_heard
@@ -52,6 +52,8 @@ class LocalMarket:
         self.lighthouse = self.deployment.lighthouse
         self.market = self.deployment.lighthouse_name
         self.rejections: list[Rejection] = []
+        self.rejected_makers: dict[str, str] = {}
+        """The account to which the last rejection of each message was addressed."""
         self._stack = AsyncExitStack()
 
     async def __aenter__(self) -> Self:
@@ -134,8 +136,8 @@ class LocalMarket:
             Background() as tasks,
         ):
             tasks.start(provider.run(), f"{role} at work")
-            for kind in ("demand", "offer", "result"):
-                await until_heard(self.session, f"aira/{self.market}/{kind}/x/x")
+            for keys in ("demand/x", "offer/x", "result"):
+                await until_heard(self.session, f"aira/{self.market}/{keys}")
             yield provider
 
     def demand(self, role: str = "person", **changes: Any) -> Demand:
@@ -184,14 +186,17 @@ class LocalMarket:
     async def rejection_of(self, message: SignedMessage) -> Rejection:
         """Wait for the rejection of a message."""
         await until(lambda: self._rejections_of(message), what=f"a rejection of the {type(message).__name__}")
+        assert self.rejected_makers[message_hash(message).hex()] == verify_message(message).signer.lower()
         return self._rejections_of(message)[0]
 
     def _rejections_of(self, message: SignedMessage) -> list[Rejection]:
         return [one for one in self.rejections if one.order == message_hash(message).hex()]
 
     def _rejected(self, sample: zenoh.Sample) -> None:
-        rejection = Rejection.decode(sample.payload.to_bytes())
-        assert parse_key(str(sample.key_expr)) == RejectKey(self.market, rejection.order, rejection.provider)
+        rejection, key = Rejection.decode(sample.payload.to_bytes()), parse_key(str(sample.key_expr))
+        assert isinstance(key, RejectKey)
+        assert rejection.is_signed
+        self.rejected_makers[rejection.order] = key.maker
         self.rejections.append(rejection)
 
     def _terms(self, changes: dict[str, Any]) -> dict[str, Any]:

@@ -7,16 +7,18 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
+import zenoh
+
 from mesh.market import OrderBook
 from mesh.market.services import THREADS, OrderBookService
 from mesh.market.withdrawals import Withdrawals
-from mesh.network import Endpoints, Network, message_key
-from tests.support.orders import LIGHTHOUSE, MARKET, MODEL, OTHER_MODEL, verified_demand, verified_offer
+from mesh.network import Channel, Endpoints, Network, message_key
+from schemas import Demand, Withdrawal, decode, market_selector, verify_message
+from schemas.selectors import withdrawal_selector
+from tests.support.orders import LIGHTHOUSE, MARKET, MODEL, OTHER_MODEL, PERSON, verified_demand, verified_offer
 from tests.support.waiting import at_most, until, until_answered
 
 if TYPE_CHECKING:
-    import zenoh
-
     from schemas import Verified
     from tests.support.routers import EmbeddedRouter
 
@@ -49,13 +51,53 @@ async def test_it_answers_with_the_orders_that_match_the_query(router: EmbeddedR
 
         for selector, expected in (
             (f"aira/{MARKET}/**", {keys["d"], keys["e"], keys["o"]}),
-            (f"aira/{MARKET}/demand/*/*", {keys["d"], keys["e"]}),
-            (f"aira/{MARKET}/demand/{MODEL}/*", {keys["d"]}),
+            (f"aira/{MARKET}/demand/*", {keys["d"], keys["e"]}),
+            (f"aira/{MARKET}/demand/{MODEL}", {keys["d"]}),
             (keys["o"], {keys["o"]}),
-            (f"aira/{MARKET}/result/*/*", set()),
-            (f"aira/{MARKET}/demand/{MODEL}/{'0' * 64}", set()),
+            (f"aira/{MARKET}/result", set()),
+            (f"aira/{MARKET}/demand/{MODEL[:-1]}", set()),
         ):
             assert set(await asyncio.to_thread(ask, two.session, selector)) == expected
+
+
+async def test_it_answers_with_the_withdrawals_of_one_order(router: EmbeddedRouter) -> None:
+    withdrawals, digests = Withdrawals(), ("ab" * 32, "cd" * 32)
+    for digest in digests:
+        withdrawal = Withdrawal(order=digest, lighthouse=LIGHTHOUSE, deadline=10)
+        withdrawals.add(verify_message(PERSON.sign(withdrawal)))
+    async with (
+        network(router) as one,
+        network(router) as two,
+        OrderBookService(one.session, MARKET, holding(verified_demand()), withdrawals),
+    ):
+        await until_answered(two.session, f"aira/{MARKET}/**")
+
+        def orders(selector: str) -> list[str]:
+            replies = two.session.get(selector, timeout=5, consolidation=zenoh.ConsolidationMode.NONE)
+            withdrawn = [decode(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
+            return sorted(message.order for message in withdrawn if isinstance(message, Withdrawal))
+
+        assert await asyncio.to_thread(orders, market_selector(MARKET, "withdrawal")) == sorted(digests)
+        assert await asyncio.to_thread(orders, withdrawal_selector(MARKET, digests[1])) == [digests[1]]
+
+
+async def test_it_answers_with_all_orders_of_a_model(router: EmbeddedRouter) -> None:
+    """They have one key."""
+    book = holding(*(verified_demand(model=MODEL) for _ in range(20)))
+    async with (
+        network(router) as one,
+        network(router) as two,
+        OrderBookService(one.session, MARKET, book, Withdrawals()),
+        Channel(two.session, MARKET) as channel,
+        channel.subscribe(Demand, model=MODEL) as demands,
+    ):
+        await until_answered(two.session, f"aira/{MARKET}/**")
+
+        await demands.recall()
+
+        async with asyncio.timeout(10):
+            recalled = {(await anext(demands)).hash for _ in range(20)}
+        assert recalled == {order.hash for order in book.orders()}
 
 
 async def test_it_answers_with_the_book_at_the_time_of_the_query(router: EmbeddedRouter) -> None:

@@ -44,7 +44,7 @@ async def test_orders_whose_validator_is_a_lighthouse_are_not_matched(
     ):
         tasks.start(provider.run(), "provider at work")
         for kind in ("demand", "offer"):
-            await until_heard(local.session, f"aira/{local.market}/{kind}/x/x")
+            await until_heard(local.session, f"aira/{local.market}/{kind}/x")
         demand, offer = local.demand(validator=trap), local.offer(validator=trap)
         local.publish(demand, offer)
 

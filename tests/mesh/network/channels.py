@@ -30,7 +30,7 @@ async def listening(
     here: zenoh.Session, there: zenoh.Session, kind: type[Any] = Demand, **options: Any
 ) -> AsyncIterator[tuple[Subscription[Any], Channel]]:
     """A subscription `here`, and a channel `there` whose messages reach it."""
-    selection = {name: options.pop(name) for name in ("model", "liability") if name in options}
+    selection = {name: options.pop(name) for name in ("model",) if name in options}
     async with opened(here, **options) as ours, opened(there) as theirs, ours.subscribe(kind, **selection) as messages:
         await until_heard(there, messages.selector)
         yield messages, theirs

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from typing import Any
 
 import pytest
@@ -14,7 +13,6 @@ from mesh.network import Channel, Endpoints, Network, ValidationStatistics, mess
 from schemas import Demand, Offer, Result, SignedMessage, Verified, encode, message_hash
 from tests.mesh.network.channels import KEY, ORDER, contents, listening, opened, take
 from tests.support.orders import (
-    LIGHTHOUSE,
     MARKET,
     MODEL,
     OTHER_MODEL,
@@ -107,35 +105,12 @@ async def test_orders_of_other_models_are_filtered_at_the_source(
         assert orders.statistics() == ValidationStatistics(received=1, accepted=1, invalid={}, duplicate=0, dropped=0)
 
 
-async def test_results_of_other_liabilities_are_filtered_at_the_source(
-    here: zenoh.Session, there: zenoh.Session
-) -> None:
-    async with listening(here, there, Result, liability=ROBOT.address) as (results, theirs):
-        theirs.publish(result(liability=PERSON.address))
-        theirs.publish(message := result(liability=ROBOT.address))
-
-        assert contents(await take(results, 1)) == [message]
-        assert results.statistics().received == 1
-
-
 async def test_a_selection_that_keys_can_not_express_is_rejected(here: zenoh.Session) -> None:
     async with opened(here) as channel:
         with pytest.raises(InvalidKey):
             channel.subscribe(Result, model=MODEL)
         with pytest.raises(InputError):
-            channel.subscribe(Demand, liability=LIGHTHOUSE)
-        with pytest.raises(InputError):
-            channel.subscribe(Result, liability="**")
-        with pytest.raises(InputError):
             channel.subscribe(Demand, model="**")
-
-
-def misplaced(message: SignedMessage) -> str:
-    return message_key(MARKET, message).replace(message_hash(message).hex(), "00" * 32)
-
-
-def altered(message: SignedMessage) -> bytes:
-    return json.dumps(json.loads(encode(message)) | {"cost": 1}).encode()
 
 
 FORGED = Demand(**terms(), validator_fee=0, signature="ff" * 65)
@@ -143,8 +118,6 @@ ELSEWHERE = demand(lighthouse=STRANGER.address)
 LATE = demand(deadline=7)
 REJECTED = {
     "other model's key": ("key", KEY.replace(MODEL, OTHER_MODEL), encode(ORDER)),
-    "wrong hash in the key": ("key", misplaced(ORDER), encode(ORDER)),
-    "altered content": ("key", KEY, altered(ORDER)),
     "wildcard for the model": ("key", KEY.replace(MODEL, "*"), encode(ORDER)),
     "wildcard for everything": ("key", "aira/**", encode(ORDER)),
     "other lighthouse in the order": ("lighthouse", message_key(MARKET, ELSEWHERE), encode(ELSEWHERE)),
@@ -245,7 +218,7 @@ async def test_an_unsigned_message_is_not_published(here: zenoh.Session) -> None
 async def test_nothing_is_put_on_a_key_with_a_wildcard(here: zenoh.Session) -> None:
     async with opened(here) as channel:
         with pytest.raises(InvalidKey):
-            channel.put(f"aira/{MARKET}/demand/*/x", b"")
+            channel.put(f"aira/{MARKET}/demand/*", b"")
 
 
 @pytest.mark.parametrize("name", ["", "a b.eth", "a/b.eth", "*", "**", "a$*.eth", "@agent", "line\n.eth"])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
-import pytest
 from msgspec.structs import replace
 
 from mesh.chain import UnknownName
@@ -61,17 +60,38 @@ async def test_a_message_with_a_name_is_accepted_once_the_name_is_resolved() -> 
     assert checked.statistics(received=0, dropped=0).duplicate == 2
 
 
-@pytest.mark.parametrize(
-    ("addresses", "reason"), [({NAME: ROBOT.address}, "key"), ({}, "name")], ids=["wrong", "unknown"]
-)
-async def test_a_name_that_resolves_to_another_address_is_counted(addresses: dict[str, str], reason: str) -> None:
-    checked, message = validator(resolver=resolving(addresses)), demand(token=STRANGER.address)
+async def test_a_message_with_an_unknown_name_is_counted() -> None:
+    checked, message = validator(resolver=resolving({})), demand(token=STRANGER.address)
     named = json.loads(encode(message)) | {"token": NAME}
     waiting = checked.check(message_key(MARKET, message), json.dumps(named).encode())
     assert isinstance(waiting, Unresolved)
 
     assert await checked.complete(waiting) is None
-    assert counted(checked) == {reason: 1}
+    assert counted(checked) == {"name": 1}
+
+
+async def test_a_message_whose_name_resolves_to_another_address_is_not_its_signers() -> None:
+    checked, message = validator(resolver=resolving({NAME: ROBOT.address})), demand(token=STRANGER.address)
+    named = json.loads(encode(message)) | {"token": NAME}
+    waiting = checked.check(message_key(MARKET, message), json.dumps(named).encode())
+    assert isinstance(waiting, Unresolved)
+
+    verified = await checked.complete(waiting)
+
+    assert not isinstance(verified, Verified) or verified.signer != PERSON.address
+
+
+async def test_a_forgotten_message_with_a_name_is_accepted_once_more() -> None:
+    checked, message = validator(resolver=resolving({NAME: STRANGER.address})), demand(token=STRANGER.address)
+    named = json.dumps(json.loads(encode(message)) | {"token": NAME}).encode()
+    waiting = checked.check(message_key(MARKET, message), named)
+    assert isinstance(waiting, Unresolved)
+    verified = await checked.complete(waiting)
+    assert isinstance(verified, Verified)
+
+    checked.forget(verified)
+
+    assert checked.check(message_key(MARKET, message), named) == waiting
 
 
 async def test_an_order_is_accepted_once_its_validator_is_known_to_be_safe() -> None:

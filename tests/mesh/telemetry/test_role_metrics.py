@@ -178,7 +178,7 @@ async def test_refused_messages_are_counted_by_reason(place: Place) -> None:
         before, session = await scraped(url), person.parts.network.session
         name = place.market.deployment.lighthouse_name
         for payload in (b"rubbish", b"{}"):
-            session.put(f"aira/{name}/demand/{MODEL}/{'ab' * 32}", payload)
+            session.put(f"aira/{name}/demand/{MODEL}", payload)
         person.channel.publish(demand(model=MODEL, deadline=1, lighthouse=place.market.deployment.lighthouse))
         await until_found(lambda: _changed(url, before, 3), what="three refusals", seconds=LONG)
         changes = (await scraped(url)).changes(before)
