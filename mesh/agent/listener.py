@@ -2,13 +2,12 @@
 
 `ChainListener` reads the chain block by block and saves its position in the ledger, so nothing is missed while the
 agent is down. A block that was not handled to its end is handled again: handling is idempotent. What a reorganisation
-undoes is undone in the methods named `…_reverted`.
+undoes is undone in the methods named `…_reverted`. `LateResults` finalizes what no provider does in time.
 """
 
 from __future__ import annotations
 
 import logging
-from collections import deque
 from contextlib import aclosing
 from functools import partial
 from typing import TYPE_CHECKING, Final
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 from msgspec.structs import replace
 
 from mesh.agent.contract import Outcome
+from mesh.agent.token_events import TokenEvents
 from mesh.chain import (
     Approval,
     Finalized,
@@ -24,33 +24,34 @@ from mesh.chain import (
     NoContracts,
     NodeUnreachable,
     NotALiability,
+    NotOffered,
     Reorganisation,
     RequestRefused,
+    Reverted,
     Transfer,
 )
+from mesh.errors import ChainError
 from mesh.log_context import liability_context, log_event, with_liability_context
 from mesh.retry import Backoff
 from mesh.work.ledger import TO_BE_DONE, Phase, advance
 from mesh.work.outbox import result_identity
-from schemas.agent_keys import EthEventKey
-from schemas.rpc import ApprovalEvent, TransferEvent
+from schemas import Result, decode
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from mesh.agent.components import AgentComponents
     from mesh.agent.trade import Trader
     from mesh.chain import ChainEvent
     from mesh.work.executor import Executor, OnPhase
     from mesh.work.ledger import JobRecord
-    from schemas import Liability, Record
+    from schemas import Liability
 
 log = logging.getLogger(__name__)
 
-READ_ERRORS: Final = (NodeUnreachable, RequestRefused)
-"""Errors after which a liability is read again."""
-REVERTED_KEPT: Final = 1_000
-"""Most reverted token events that are remembered, because they may happen again."""
+SHARE: Final = 4
+"""A Result is late when a quarter of the time that was left for it is left."""
+LEAST_BLOCKS: Final = 20
+"""It is late at this many blocks before the refund in any case."""
+NEVER: Final = 2**63
 
 
 class ChainListener:
@@ -67,7 +68,7 @@ class ChainListener:
         self._trader = trader
         self._executor = executor
         self._on_phase = on_phase
-        self._token_events = TokenEvents(parts.channel.put, self._account)
+        self.token_events = TokenEvents(parts.channel.put, self._account)
 
     async def run(self) -> None:
         """Read until cancelled, through outages of the node. Raises `ChainWentBack` and `UnknownName`."""
@@ -112,7 +113,7 @@ class ChainListener:
         for job in await self._ledger.jobs(TO_BE_DONE):
             read = partial(self._chain.liabilities.get, job.liability.address)
             try:
-                now = await self._chain.retrying(read, outages=self._parts.outages, errors=READ_ERRORS)
+                now = await self._chain.retrying(read, outages=self._parts.outages)
             except (NotALiability, NoContracts):  # reverted, which the listener will find
                 continue
             if now.is_finalized:
@@ -140,7 +141,7 @@ class ChainListener:
             case Finalized():
                 await self.finalized(event.liability, success=event.success, result=event.result)
             case Transfer() | Approval():
-                self.token_event(event)
+                self.token_events.publish(event)
 
     async def revert(self, event: ChainEvent) -> None:
         """Undo an event that a reorganisation has reverted."""
@@ -150,7 +151,7 @@ class ChainListener:
             case Finalized():
                 await self.finalization_reverted(event.liability)
             case Transfer() | Approval():
-                self.token_event_reverted(event)
+                self.token_events.revert(event)
 
     async def _read_new(self, address: str) -> None:
         """Read a new liability and, if it names this account, its orders."""
@@ -161,7 +162,7 @@ class ChainListener:
             return liability, await self._chain.liabilities.order_hashes(address) if is_ours else None
 
         try:
-            liability, orders = await self._chain.retrying(read, outages=self._parts.outages, errors=READ_ERRORS)
+            liability, orders = await self._chain.retrying(read, outages=self._parts.outages)
         except NotALiability:
             facts = log_event("liability-gone", liability=address)
             log.warning("the liability was reverted before it was read", extra=facts)
@@ -230,14 +231,6 @@ class ChainListener:
                 log.warning("the finalization was reverted", extra=log_event("finalization-reverted"))
                 await self._owe_result(job)
 
-    def token_event(self, event: Transfer | Approval) -> None:
-        """Tokens were transferred, or approved, perhaps not ours."""
-        self._token_events.publish(event)
-
-    def token_event_reverted(self, event: Transfer | Approval) -> None:
-        """A reorganisation reverted that; the new blocks may have it again."""
-        self._token_events.revert(event)
-
     async def new_head(self, block: int) -> None:
         """All of `block` has been handled. After a reorganisation it may be lower than before."""
         self._parts.chain_head.advance_to(block)
@@ -247,46 +240,55 @@ class ChainListener:
     async def _owe_result(self, job: JobRecord) -> None:
         """Send the Result of a complete job again."""
         assert job.result is not None
-        await self._executor.owe_result(
-            job.liability.address, success=bool(job.success), result=job.result, note=job.note
-        )
+        address, success = job.liability.address, bool(job.success)
+        await self._executor.owe_result(address, success=success, result=job.result, note=job.note)
         await self._parts.outbox.send_new()
 
 
-class TokenEvents:
-    """Publishes token events of `account` on `aira/agent/{account}/eth/event/transfer` or `…/approval`, with `put`.
+class LateResults:
+    """Brings the account's own Results to the chain in time, if no provider does.
 
-    An event that is reverted and happens again is published once. One that does not happen again was published in vain,
-    and after a crash in the middle of a block its events are published again: read balances from the chain, don't add
-    up events.
+    A provider may fail, or keep others from their turns, until the liability can be refunded. On the original
+    contracts, which offer no finalization without a turn, nothing is done.
     """
 
-    def __init__(self, put: Callable[[str, bytes], None], account: str) -> None:
-        self._put = put
-        self._account = account
-        self._reverted: deque[Transfer | Approval] = deque(maxlen=REVERTED_KEPT)
+    def __init__(self, parts: AgentComponents) -> None:
+        self._parts = parts
+        self._liabilities = parts.chain.liabilities
+        self._late_from: dict[str, int] = {}  # block, by liability
 
-    def publish(self, event: Transfer | Approval) -> None:
-        """Publish an event if it concerns the account and was not published before it was reverted."""
-        parties, record = _record(event)
-        if self._account not in parties:
-            return
-        if event in self._reverted:
-            self._reverted.remove(event)
-            return
-        kind: Final = "transfer" if isinstance(event, Transfer) else "approval"
-        self._put(str(EthEventKey(self._account, kind)), record.encode())
+    async def run(self) -> None:
+        """Look at the unsettled Results after each block, until cancelled."""
+        head = self._parts.chain_head
+        while True:
+            unsettled = await self._parts.ledger.outbox(head=head.head)
+            results = [decode(one.payload) for one in unsettled if one.kind == Result.kind]
+            waiting = {result.liability: result for result in results if isinstance(result, Result)}
+            self._late_from = {address: block for address, block in self._late_from.items() if address in waiting}
+            for address, result in waiting.items():
+                with liability_context(address):
+                    await self._finalize_if_late(result)
+            await head.reached(head.head + 1)
 
-    def revert(self, event: Transfer | Approval) -> None:
-        """A reorganisation reverted the event; it may happen again in another block."""
-        if self._account in _record(event)[0]:
-            self._reverted.append(event)
-
-
-def _record(event: Transfer | Approval) -> tuple[tuple[str, str], Record]:
-    """The accounts that an event concerns, and its record."""
-    match event:
-        case Transfer(sender, recipient, value):
-            return (sender, recipient), TransferEvent(sender, recipient, value)
-        case Approval(owner, spender, value):
-            return (owner, spender), ApprovalEvent(owner, spender, value)
+    async def _finalize_if_late(self, result: Result) -> None:
+        address, head = result.liability, self._parts.chain_head.head
+        try:
+            if address not in self._late_from:
+                refundable = await self._liabilities.refundable_from(address)
+                self._late_from[address] = refundable - max(LEAST_BLOCKS, (refundable - head) // SHARE)
+            if head < self._late_from[address]:
+                return
+            settled = await self._liabilities.finalize_without_turn(result)
+        except (NodeUnreachable, RequestRefused, NotALiability) as error:
+            log.debug("looking at the result again after the next block: %s", error)
+        except (NotOffered, Reverted) as error:
+            # The originals, a liability that has ended, or one whose validator must speak first.
+            self._late_from[address] = NEVER
+            log.debug("the result can't be brought without a provider: %s", error)
+        except ChainError as error:
+            facts = log_event("late-result-waits", code=error.code)
+            log.warning("no provider has brought the result, and it can't be brought now: %s", error, extra=facts)
+        else:
+            self._late_from[address] = NEVER
+            facts = log_event("late-result-finalized", success=result.success, gas=settled.gas_used)
+            log.warning("finalized without a provider, as none did in time", extra=facts)

@@ -6,8 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.agent.handlers import call
-from mesh.agent.late_results import LateResults
-from mesh.agent.listener import ChainListener
+from mesh.agent.listener import ChainListener, LateResults
 from mesh.agent.services import offer_services
 from mesh.agent.status import AgentStatus
 from mesh.agent.trade import Trader

@@ -13,6 +13,7 @@ from mesh.agent.components import working
 from mesh.agent.handlers import Handlers
 from mesh.agent.listener import ChainListener
 from mesh.agent.runtime import AgentRuntime
+from mesh.agent.token_events import TokenEvents
 from mesh.background import Background
 from mesh.work import Ledger
 from schemas import Demand, Offer, Result
@@ -34,6 +35,21 @@ async def ignore(_phase: Phase, _liability: Liability) -> None:
     pass
 
 
+class RecordedTokenEvents(TokenEvents):
+    """Token events, those of all accounts, written down instead of published."""
+
+    def __init__(self) -> None:
+        super().__init__(lambda key, payload: None, "")
+        self.published: list[Transfer | Approval] = []
+        self.reverted: list[Transfer | Approval] = []
+
+    def publish(self, event: Transfer | Approval) -> None:
+        self.published.append(event)
+
+    def revert(self, event: Transfer | Approval) -> None:
+        self.reverted.append(event)
+
+
 class RecordingListener(ChainListener):
     """A listener that writes down what happens on the chain, and does nothing about it."""
 
@@ -44,8 +60,7 @@ class RecordingListener(ChainListener):
         self.ends: list[tuple[str, bool, str]] = []
         self.reverted_ends: list[str] = []
         self.reverted_contracts: list[str] = []
-        self.token_events: list[Transfer | Approval] = []
-        self.reverted_token_events: list[Transfer | Approval] = []
+        self.token_events: RecordedTokenEvents = RecordedTokenEvents()
         self.head = 0
 
     async def new_liability(self, liability: Liability, *, demand_hash: bytes, offer_hash: bytes) -> None:
@@ -59,12 +74,6 @@ class RecordingListener(ChainListener):
 
     async def liability_reverted(self, address: str) -> None:
         self.reverted_contracts.append(address)
-
-    def token_event(self, event: Transfer | Approval) -> None:
-        self.token_events.append(event)
-
-    def token_event_reverted(self, event: Transfer | Approval) -> None:
-        self.reverted_token_events.append(event)
 
     async def new_head(self, block: int) -> None:
         self.head = block

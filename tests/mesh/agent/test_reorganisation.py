@@ -78,10 +78,10 @@ async def test_token_events_and_their_reversions_are_reported(place: Place, ledg
         await started(ledger)
         await person.tokens.approve(place.address("robot"), 11)
         await person.tokens.transfer(place.address("robot"), 12)
-        await until(lambda: len(listener.token_events) == 2)
+        await until(lambda: len(listener.token_events.published) == 2)
         await place.forget_blocks(1)
-        await until(lambda: listener.reverted_token_events)
-    approval, transfer = listener.token_events
+        await until(lambda: listener.token_events.reverted)
+    approval, transfer = listener.token_events.published
     assert isinstance(approval, Approval)
     assert (approval.owner, approval.spender, approval.value) == (place.address("person"), place.address("robot"), 11)
     assert isinstance(transfer, Transfer)
@@ -90,7 +90,7 @@ async def test_token_events_and_their_reversions_are_reported(place: Place, ledg
         place.address("robot"),
         12,
     )
-    assert listener.reverted_token_events == [transfer]
+    assert listener.token_events.reverted == [transfer]
 
 
 async def test_the_history_has_the_depth_of_the_settings_after_they_change(place: Place, ledger: Ledger) -> None:

@@ -6,7 +6,7 @@ import asyncio
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
-from mesh.agent.listener import TokenEvents
+from mesh.agent.token_events import TokenEvents
 from mesh.chain import Account, Approval, Transfer, new_private_key
 from mesh.network import Endpoints, Network
 from schemas.agent_keys import EthEventKey
