@@ -11,6 +11,7 @@ from mesh.chain.artifacts import is_code_of
 from mesh.chain.contracts import Contracts, contract_version
 from mesh.chain.errors import NoContracts, UnknownName
 from mesh.chain.following import NODE_ERRORS, follow, retrying
+from mesh.chain.funds import Funds
 from mesh.chain.liabilities import Liabilities
 from mesh.chain.lighthouses import Lighthouses
 from mesh.chain.metrics import CachedMetrics
@@ -95,6 +96,7 @@ class Chain:
                 await stack.enter_async_context(self.node)
             self._contracts = await self._find_contracts()
             self._validators = Validators(self._contracts)
+            self._funds = Funds(self._contracts, self.tokens)
             self._stack = stack.pop_all()
         return self
 
@@ -131,6 +133,12 @@ class Chain:
     def tokens(self) -> Tokens:
         """Ether, XRT and other tokens."""
         return Tokens(self._opened())
+
+    @property
+    def funds(self) -> Funds:
+        """Whether makers of orders can pay, asked in batches."""
+        self._opened()
+        return self._funds
 
     @property
     def lighthouses(self) -> Lighthouses:
