@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from mesh.running import fail, run_to_end
     from mesh.settings import Settings
     from mesh.work.ledger import WrongPhase
-    from mesh.work.playbacks import ObjectiveUnfit
+    from mesh.work.objectives import ObjectiveUnfit
     from schemas import (
         STRING,
         ZERO_ADDRESS,
@@ -75,7 +75,7 @@ _HOMES = {
     "NodeUnreachable": "mesh.chain",
     "NotALiability": "mesh.chain",
     "Objective": "mesh.recording",
-    "ObjectiveUnfit": "mesh.work.playbacks",
+    "ObjectiveUnfit": "mesh.work.objectives",
     "Offer": "schemas",
     "Order": "mesh.agent.orders",
     "OrderClosed": "mesh.agent.errors",

@@ -91,28 +91,36 @@ class RateLimiter:
 class FairQueue(Generic[T]):
     """A bounded queue that serves senders in turn: one item of each before the second of any.
 
-    At most `per_sender` items of one sender and `total` items wait. Use it in one event loop.
+    Items of a higher `priority` go first. At most `per_sender` items of one sender and `total` items wait. Use it in
+    one event loop.
     """
 
     def __init__(self, *, per_sender: int, total: int) -> None:
         self._per_sender = per_sender
         self._total = total
-        self._waiting: OrderedDict[str, deque[T]] = OrderedDict()
+        self._levels: dict[int, OrderedDict[str, deque[T]]] = {}
+        self._counts: Counter[str] = Counter()
         self._size = 0
         self._arrived = asyncio.Event()
 
     def __len__(self) -> int:
         return self._size
 
-    def put(self, sender: str, item: T) -> list[T]:
+    @property
+    def top(self) -> int | None:
+        """The highest priority of the items that wait; None if none does."""
+        return max(self._levels, default=None)
+
+    def put(self, sender: str, item: T, *, priority: int = 0) -> list[T]:
         """Add an item; returns what was dropped for it: the item itself if the sender has too many, or, when the queue
-        is full, the newest one of the sender that has the most."""
-        if len(self._waiting.get(sender, ())) >= self._per_sender:
+        is full, one of the lowest priority: the newest of the sender that has the most."""
+        if self._counts[sender] >= self._per_sender:
             return [item]
-        self._waiting.setdefault(sender, deque()).append(item)
+        self._levels.setdefault(priority, OrderedDict()).setdefault(sender, deque()).append(item)
+        self._counts[sender] += 1
         self._size += 1
         self._arrived.set()
-        return [self._take_newest()] if self._size > self._total else []
+        return [self._drop_newest()] if self._size > self._total else []
 
     async def get(self) -> T:
         """Wait for the next item and take it."""
@@ -123,22 +131,31 @@ class FairQueue(Generic[T]):
 
     def get_nowait(self) -> T:
         """Take the next item. Raises `IndexError` when none waits."""
-        if not self._size:
+        if (priority := self.top) is None:
             raise IndexError("the queue is empty")
-        sender, items = self._waiting.popitem(last=False)
+        sender, items = self._levels[priority].popitem(last=False)
         item = items.popleft()
         if items:
-            self._waiting[sender] = items  # behind all others
-        self._size -= 1
+            self._levels[priority][sender] = items  # behind all others
+        self._taken(sender, priority)
         return item
 
-    def _take_newest(self) -> T:
-        sender, items = max(self._waiting.items(), key=lambda entry: len(entry[1]))
+    def _drop_newest(self) -> T:
+        priority = min(self._levels)
+        sender, items = max(self._levels[priority].items(), key=lambda entry: len(entry[1]))
         item = items.pop()
         if not items:
-            del self._waiting[sender]
-        self._size -= 1
+            del self._levels[priority][sender]
+        self._taken(sender, priority)
         return item
+
+    def _taken(self, sender: str, priority: int) -> None:
+        if not self._levels[priority]:
+            del self._levels[priority]
+        self._size -= 1
+        self._counts[sender] -= 1
+        if not self._counts[sender]:
+            del self._counts[sender]
 
 
 class Drops:

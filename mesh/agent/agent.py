@@ -5,15 +5,17 @@ from __future__ import annotations
 import asyncio
 import logging
 from functools import partial
-from typing import TYPE_CHECKING, Final, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, Final, TypedDict, Unpack, cast
 
 from mesh.agent.components import watching, working
+from mesh.agent.demands import HANDLED, current_buyer
 from mesh.agent.handlers import HandlerDecorators, dispatch, repeat
 from mesh.agent.orders import Order, OrderState
 from mesh.agent.status import WatcherStatus
 from mesh.background import Background
 from mesh.composition import load_account
 from mesh.errors import ClosedError, ConfigurationError
+from mesh.flood import Drops
 from mesh.log_context import LogSource, log_event, source_context
 from mesh.role import Lifecycle
 from mesh.settings import load
@@ -39,8 +41,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-DEMANDS: Final = 32
-"""Demands that are handled at once: to fetch the objective of one may take long."""
 FETCH_PATIENCE: Final = 10.0
 """Seconds without a new block of an objective after which no offer is made for it."""
 
@@ -84,6 +84,8 @@ class Agent(HandlerDecorators, Lifecycle):
         self._resend = resend
         self.telemetry = Telemetry(self.settings.metrics_listen)
         """Serves its metrics and its health if the settings say where."""
+        self.drops = Drops()
+        """Counts what was dropped, of what strangers sent."""
         self._channel: Channel | None = None
         self._runtime: AgentRuntime | None = None
 
@@ -159,9 +161,10 @@ class Agent(HandlerDecorators, Lifecycle):
     async def examine(self, cid: str) -> Objective:
         """The objective with that CID, fetched if needed, after it was checked as before a job.
 
-        Raises `ObjectiveUnfit`, whose `reason` is a word for programs, and branches of `ContentError`.
+        Raises `ObjectiveUnfit`, whose `reason` is a word for programs, and branches of `ContentError`; while a demand
+        is handled also `ObjectiveNotFetched`, as what strangers make an agent fetch is limited.
         """
-        return await self.runtime.objectives.examine(cid, patience=FETCH_PATIENCE)
+        return await self.runtime.objectives.examine(cid, patience=FETCH_PATIENCE, buyer=current_buyer())
 
     async def order(
         self,
@@ -269,16 +272,20 @@ class Agent(HandlerDecorators, Lifecycle):
         for kind, handlers in self._handlers.market.items():
             model = self.model if kind is not Result and self.model else "*"
             subscription = await stack.enter_async_context(channel.subscribe(kind, model=model))
-            subscriptions.append((subscription, handlers, DEMANDS if kind is Demand else 1))
-        measure = partial(status.measure, [subscription for subscription, _, _ in subscriptions])
+            subscriptions.append((kind, subscription, handlers))
+        measure = partial(status.measure, [subscription for _, subscription, _ in subscriptions])
         stack.enter_context(self.telemetry.showing(measure=measure, health=status.health))
         # The tasks are entered last, so they end first: what handlers and jobs use is open until then.
         tasks = await stack.enter_async_context(Background())
         if self._runtime is not None:
             tasks.start(self._runtime.run(), "runtime")
-        for subscription, handlers, concurrency in subscriptions:
+        tasks.start(self.drops.run(), "drops")
+        for kind, subscription, handlers in subscriptions:
             tasks.start(subscription.recall(), "recall")
-            tasks.start(dispatch(subscription, handlers, concurrency=concurrency), "handlers")
+            if kind is Demand and self._runtime is not None:
+                tasks.start(self._runtime.handle_demands(cast("Any", subscription), handlers, self.drops), "demands")
+            else:
+                tasks.start(dispatch(subscription, handlers, concurrency=HANDLED if kind is Demand else 1), "handlers")
         for seconds, handler in self._handlers.periodic:
             tasks.start(repeat(seconds, handler), f"every {seconds:g} s")
 

@@ -110,13 +110,20 @@ class HandlerDecorators:
         self._handlers.market.setdefault(kind, []).append(handler)
 
 
-async def call(handler: Handler, *arguments: Any) -> None:
-    """Call a handler that belongs to no job. If it fails, that is logged and the agent goes on."""
+async def call(
+    handler: Handler, *arguments: Any, logged: Callable[[AiraError], bool] = lambda _error: True
+) -> AiraError | None:
+    """Call a handler that belongs to no job. If it fails, that is logged (an `AiraError` if `logged` says so).
+
+    The agent goes on. Returns the `AiraError`.
+    """
     name = getattr(handler, "__name__", handler)
     try:
         await handler(*arguments)
     except AiraError as error:
-        log.warning("handler %s: %s", name, error, extra=log_event("handler-failed", handler=name, code=error.code))
+        if logged(error):
+            log.warning("handler %s: %s", name, error, extra=log_event("handler-failed", handler=name, code=error.code))
+        return error
     except asyncio.CancelledError:
         task = asyncio.current_task()
         if task is not None and task.cancelling():
@@ -126,6 +133,7 @@ async def call(handler: Handler, *arguments: Any) -> None:
     except Exception as error:
         facts = log_event("handler-crashed", handler=name, error=type(error).__name__)
         log.exception("handler %s failed; the agent goes on", name, extra=facts)
+    return None
 
 
 async def dispatch(subscription: Subscription[Any], handlers: list[Handler], *, concurrency: int) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
+from mesh.agent.demands import DemandDispatcher
 from mesh.agent.handlers import call
 from mesh.agent.listener import ChainListener, LateResults
 from mesh.agent.services import offer_services
@@ -14,7 +16,8 @@ from mesh.role import Role
 from mesh.telemetry.logs import LogService
 from mesh.work.executor import Executor
 from mesh.work.ledger import Phase
-from mesh.work.playbacks import Objectives, Playbacks
+from mesh.work.objectives import Objectives
+from mesh.work.playbacks import Playbacks
 from schemas.agent_keys import EventKey, LiabilityEvent
 
 if TYPE_CHECKING:
@@ -22,10 +25,11 @@ if TYPE_CHECKING:
     from contextlib import AsyncExitStack
 
     from mesh.agent.components import AgentComponents
-    from mesh.agent.handlers import Handlers
+    from mesh.agent.handlers import Handler, Handlers
+    from mesh.flood import Drops
     from mesh.network import Subscription
     from mesh.telemetry.metrics import MetricFamily
-    from schemas import Liability
+    from schemas import Demand, Liability
 
 PUBLISHED: Final[dict[Phase, LiabilityEvent]] = {
     Phase.INCOMING: "incoming",
@@ -81,6 +85,22 @@ class AgentRuntime(Role):
     async def _do_jobs(self) -> None:
         await self.listener.finalize_ended()
         await self.executor.run()
+
+    async def handle_demands(
+        self, subscription: Subscription[Demand], handlers: Sequence[Handler], drops: Drops
+    ) -> None:
+        """Call the handlers with the demands of a subscription whose makers can pay, until cancelled."""
+        parts, names = self.parts, self.parts.chain.names
+        token = await parts.chain.retrying(partial(names.address, parts.settings.erc20_token), outages=parts.outages)
+        await DemandDispatcher(
+            subscription,
+            handlers,
+            chain=parts.chain,
+            token=token,
+            customers=self.trader.customers,
+            outages=parts.outages,
+            drops=drops,
+        ).run()
 
     async def measure(self, subscriptions: Sequence[Subscription[Any]]) -> tuple[MetricFamily, ...]:
         """The metrics of its work, and of the `subscriptions` of its handlers."""

@@ -6,9 +6,10 @@ import asyncio
 import logging
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from mesh.agent.contract import Contract, WatchedContracts, fail_future
+from mesh.agent.demands import Customers
 from mesh.agent.errors import OrderClosed, OrderExpired
 from mesh.agent.orders import Order, OrderState, Rejections, TradedOrder
 from mesh.agent.terms import Allowances, TermsWriter
@@ -19,6 +20,7 @@ from mesh.log_context import log_event
 from mesh.market.book import Refusal
 from mesh.role import Lifecycle
 from mesh.work.database import LedgerUnusable
+from mesh.work.ledger import Phase
 from schemas import Demand, Offer, Withdrawal, decode
 
 if TYPE_CHECKING:
@@ -33,9 +35,6 @@ if TYPE_CHECKING:
 
 
 log = logging.getLogger(__name__)
-
-ENDED: Final = "the agent has ended"
-ENDED_HINT: Final = "run it again: its orders stay open until their deadline"
 
 
 class Trader(Lifecycle):
@@ -59,6 +58,8 @@ class Trader(Lifecycle):
         self._changing = asyncio.Lock()
         self.contracts = WatchedContracts(parts)
         """The contracts whose end is waited for."""
+        self.customers = Customers()
+        """Who demanded the contracts of this account."""
 
     def orders(self, *states: OrderState) -> list[Order]:
         """The orders that can still become contracts, oldest first: open or withdrawn."""
@@ -67,6 +68,8 @@ class Trader(Lifecycle):
 
     async def _open(self, stack: AsyncExitStack) -> None:
         stack.push_async_callback(self._close)
+        for job in await self._parts.ledger.jobs(Phase):
+            self.customers.add(job.liability.promisee)
         resumed = [order for order in await self.load() if order.is_open]
         for order in resumed:
             kind, identity, deadline = order.signed.kind, order.identity, order.signed.deadline
@@ -78,10 +81,9 @@ class Trader(Lifecycle):
         self._send_when_covered(resumed)
 
     async def _close(self) -> None:
-        ended = ClosedError(ENDED, hint=ENDED_HINT)
         for order in self._orders.values():
-            fail_future(order.created, ended)
-        self.contracts.fail(ended)
+            fail_future(order.created, _ended())
+        self.contracts.fail(_ended())
 
     async def post(self, kind: type[Demand | Offer], terms: Terms, **fee: Any) -> Order:
         """Sign an order, ensure its allowance, and post it. Cancelling withdraws it. Raises `InsufficientTokens`."""
@@ -113,7 +115,7 @@ class Trader(Lifecycle):
             case OrderState.EXPIRED:
                 raise OrderExpired(order.identity, order.signed.deadline)
         if not self.is_open:
-            raise ClosedError(ENDED, hint=ENDED_HINT)
+            raise _ended()
         if order.created is None:
             order.created = asyncio.get_running_loop().create_future()
         with order.reporting(on_rejection):
@@ -157,6 +159,8 @@ class Trader(Lifecycle):
         """
         demand = demand_hash.hex() if liability.promisee == self._address else ""
         offer = offer_hash.hex() if liability.promisor == self._address else ""
+        if offer:
+            self.customers.add(liability.promisee)
         known = self.contracts.created(liability, demand or offer)
         for identity in filter(None, (demand, offer)):
             if (order := self._orders.get(identity)) is not None:
@@ -297,3 +301,7 @@ class Trader(Lifecycle):
     def _forget(self, order: TradedOrder) -> None:
         self._orders.pop(order.identity, None)
         self._allowances.release(order)
+
+
+def _ended() -> ClosedError:
+    return ClosedError("the agent has ended", hint="run it again: its orders stay open until their deadline")

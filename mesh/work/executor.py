@@ -30,8 +30,9 @@ if TYPE_CHECKING:
     from mesh.recording import Objective
     from mesh.work.job import TopicHandlers
     from mesh.work.ledger import JobRecord, Ledger
+    from mesh.work.objectives import Objectives
     from mesh.work.outbox import Outbox
-    from mesh.work.playbacks import Objectives, Playbacks
+    from mesh.work.playbacks import Playbacks
     from mesh.work.run import JobRun
     from schemas import Liability, Signer
 

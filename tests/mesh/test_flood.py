@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -58,16 +59,29 @@ async def test_senders_are_served_in_turn_and_a_flood_displaces_itself() -> None
     assert await waiting == "b1"
 
 
-@given(st.lists(st.tuples(st.sampled_from("abcd"), st.booleans()), max_size=300))
-def test_the_queue_stays_within_its_limits(steps: list[tuple[str, bool]]) -> None:
+async def test_a_higher_priority_goes_first_and_the_lowest_is_dropped() -> None:
+    queue: FairQueue[str] = FairQueue(per_sender=3, total=3)
+    assert queue.top is None
+    for sender in ("f1", "f2", "f3"):
+        queue.put(sender, sender)
+    assert queue.put("alice", "a0", priority=7) == ["f1"]
+    assert queue.put("f4", "f4", priority=-1) == ["f4"]
+    assert queue.top == 7
+    assert [queue.get_nowait() for _ in range(3)] == ["a0", "f2", "f3"]
+    with pytest.raises(IndexError):
+        queue.get_nowait()
+
+
+@given(st.lists(st.tuples(st.sampled_from("abcd"), st.booleans(), st.integers(0, 2)), max_size=300))
+def test_the_queue_stays_within_its_limits(steps: list[tuple[str, bool, int]]) -> None:
     queue: FairQueue[int] = FairQueue(per_sender=3, total=6)
     inside: set[int] = set()
-    for number, (sender, takes) in enumerate(steps):
+    for number, (sender, takes, priority) in enumerate(steps):
         if takes and inside:
             inside.remove(queue.get_nowait())
         else:
             inside.add(number)
-            inside.difference_update(queue.put(sender, number))
+            inside.difference_update(queue.put(sender, number, priority=priority))
         assert len(queue) == len(inside) <= 6
 
 

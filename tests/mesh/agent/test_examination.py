@@ -10,7 +10,7 @@ import pytest
 from msgspec import Struct
 
 from mesh.content import ContentUnavailable
-from mesh.work.playbacks import ObjectiveUnfit
+from mesh.work.objectives import ObjectiveUnfit
 from schemas import Empty, cid_of_bytes, cid_of_file
 from tests.support.market import Place, offering
 from tests.support.objectives import objective

@@ -10,7 +10,7 @@ import pytest
 from mesh.content import ContentUnavailable
 from mesh.errors import InputError
 from mesh.work.job import TopicHandlers
-from mesh.work.playbacks import Objectives, ObjectiveUnfit
+from mesh.work.objectives import Objectives, ObjectiveUnfit
 from schemas import Empty, cid_of_bytes
 from tests.support.objectives import objective
 

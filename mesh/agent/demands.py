@@ -1,0 +1,177 @@
+"""Demands on their way to an agent's handlers: makers in turn, those who pay more first, nobody who can't pay.
+
+Anybody can sign demands, with any number of keys. What a handler does with one may be expensive (fetching the
+objective, offering), so few are handled at once, and those that pay nothing never take all places.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import OrderedDict
+from contextvars import ContextVar
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+from mesh.agent.handlers import call
+from mesh.content import ContentUnavailable
+from mesh.flood import FairQueue, Rate, RateLimiter
+from mesh.work.objectives import Buyer, ObjectiveNotFetched
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from mesh.agent.handlers import Handler
+    from mesh.chain import Chain
+    from mesh.errors import AiraError
+    from mesh.flood import Drops
+    from mesh.network import Subscription
+    from mesh.outage_log import OutageLog
+    from schemas import Demand, Verified
+
+HANDLED: Final = 32
+"""Demands that are handled at once: to fetch the objective of one may take long."""
+FREE_HANDLED: Final = 16
+"""Of these, demands that pay nothing."""
+CHECKED: Final = 128
+"""Demands whose makers' funds are asked for at once."""
+PER_MAKER: Final = 64
+"""Demands of one maker that wait."""
+WAITING: Final = 2048
+"""Demands that wait for the check of their funds, and as many for a handler."""
+CUSTOMERS: Final = 4096
+LOGGED: Final = Rate(per_second=0.2, burst=20)
+"""Failures of handlers with the same code that are logged."""
+
+_handled: ContextVar[Buyer | None] = ContextVar("handled", default=None)
+"""Whose demand the running code handles."""
+
+
+def current_buyer() -> Buyer | None:
+    """Whose demand the running handler handles; None outside of a demand's handler."""
+    return _handled.get()
+
+
+class Customers:
+    """Accounts that a contract was created with before; the latest `limit`."""
+
+    def __init__(self, limit: int = CUSTOMERS) -> None:
+        self._limit = limit
+        self._known: OrderedDict[str, None] = OrderedDict()
+
+    def add(self, account: str) -> None:
+        """Remember an account."""
+        self._known.pop(account, None)
+        self._known[account] = None
+        if len(self._known) > self._limit:
+            self._known.popitem(last=False)
+
+    def __contains__(self, account: str) -> bool:
+        return account in self._known
+
+
+class DemandDispatcher:
+    """Calls `handlers` with the demands of a subscription: `await dispatcher.run()`.
+
+    A demand whose maker can't pay now is not handled, but its next copy is looked at again. Pay counts in `token` (an
+    address) only. What is not handled is counted in `drops`.
+    """
+
+    def __init__(
+        self,
+        subscription: Subscription[Demand],
+        handlers: Sequence[Handler],
+        *,
+        chain: Chain,
+        token: str,
+        customers: Customers,
+        outages: OutageLog,
+        drops: Drops,
+    ) -> None:
+        self._subscription = subscription
+        self._handlers = handlers
+        self._chain = chain
+        self._token = token
+        self._customers = customers
+        self._outages = outages
+        self._drops = drops
+        self._arrived: FairQueue[Verified[Demand]] = FairQueue(per_sender=PER_MAKER, total=WAITING)
+        self._funded: FairQueue[Verified[Demand]] = FairQueue(per_sender=PER_MAKER, total=WAITING)
+        self._changed = asyncio.Event()
+        self._running = self._running_free = 0
+        self._logged = RateLimiter(per_sender=LOGGED)
+
+    async def run(self) -> None:
+        """Receive, check and handle demands, until cancelled."""
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._receive(), name="demands")
+            tasks.create_task(self._check(), name="funds of demands")
+            await self._handle(tasks)
+
+    async def _receive(self) -> None:
+        async for demand in self._subscription:
+            is_customer = demand.signer in self._customers
+            for dropped in self._arrived.put(demand.signer, demand, priority=int(is_customer)):
+                self._drop(dropped, "queue-full")
+
+    async def _check(self) -> None:
+        """Pass on the demands whose makers can pay."""
+        while True:
+            batch = [await self._arrived.get()]
+            while len(self._arrived) and len(batch) < CHECKED:
+                batch.append(self._arrived.get_nowait())
+            for demand, is_funded in zip(batch, await asyncio.gather(*map(self._is_funded, batch)), strict=True):
+                if not is_funded:
+                    self._drop(demand, "unfunded")
+                    continue
+                for dropped in self._funded.put(demand.signer, demand, priority=self._worth(demand)):
+                    self._drop(dropped, "queue-full")
+            self._changed.set()
+
+    async def _is_funded(self, demand: Verified[Demand]) -> bool:
+        return await self._chain.retrying(partial(self._chain.funds.can_pay, demand), outages=self._outages)
+
+    def _worth(self, demand: Verified[Demand]) -> int:
+        """The priority of a demand: by the magnitude of its pay, and of two alike the customer's."""
+        return 2 * self._pay(demand).bit_length() + (demand.signer in self._customers)
+
+    def _pay(self, demand: Verified[Demand]) -> int:
+        return demand.message.cost if demand.message.token == self._token else 0
+
+    async def _handle(self, tasks: asyncio.TaskGroup) -> None:
+        while True:
+            self._changed.clear()
+            while self._has_place():
+                demand = self._funded.get_nowait()
+                pays = self._pay(demand) > 0
+                self._running += 1
+                self._running_free += not pays
+                tasks.create_task(self._handle_one(demand, pays=pays), name="handler")
+            await self._changed.wait()
+
+    def _has_place(self) -> bool:
+        top = self._funded.top
+        if top is None or self._running >= HANDLED:
+            return False
+        return top > 1 or self._running_free < FREE_HANDLED
+
+    async def _handle_one(self, demand: Verified[Demand], *, pays: bool) -> None:
+        _handled.set(Buyer(demand.signer, pays))
+        try:
+            for handler in self._handlers:
+                error = await call(handler, demand, logged=self._is_logged)
+                if isinstance(error, ObjectiveNotFetched):
+                    self._drop(demand, f"objective-{error.reason}")
+                elif isinstance(error, ContentUnavailable):
+                    self._drop(demand, "objective-missing")
+        finally:
+            self._running -= 1
+            self._running_free -= not pays
+            self._changed.set()
+
+    def _is_logged(self, error: AiraError) -> bool:
+        return not isinstance(error, ObjectiveNotFetched) and self._logged.allow(error.code)
+
+    def _drop(self, demand: Verified[Demand], reason: str) -> None:
+        """Count a demand that is not handled now, and let its next copy through."""
+        self._drops.count(reason, demand.signer)
+        self._subscription.forget(demand)

@@ -1,0 +1,167 @@
+"""The objectives of jobs and of demands: fetched if they are not in the store, and checked.
+
+A job is paid for, so its objective is fetched in any case. A demand is only a stranger's word: fetching for demands is
+limited for each maker and in total, and a CID that nobody had is remembered for a while.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter, OrderedDict
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+from weakref import WeakValueDictionary
+
+from mesh.clock import SYSTEM_CLOCK
+from mesh.content import ContentUnavailable
+from mesh.errors import ContentError, InputError
+from mesh.flood import Rate, RateLimiter
+from mesh.recording import Limits, preflight
+from mesh.retry import RetryPolicy
+from mesh.settings import LONGEST
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from mesh.clock import Clock
+    from mesh.content import Exchange, Store
+    from mesh.recording import Objective
+    from mesh.settings import ContentSettings
+    from mesh.work.job import TopicHandlers
+
+FETCHES: Final = 32
+"""Objectives fetched at once for jobs: one that nobody has must not delay the others."""
+PREFLIGHTS: Final = 1
+"""Objectives checked at once: a check uses one core, and up to 256 MiB of memory for a malicious file."""
+FETCH_RATE: Final = Rate(per_second=1.0, burst=32)
+"""Fetches for the demands of one maker."""
+FREE_FETCH_RATE: Final = Rate(per_second=4.0, burst=64)
+"""Fetches for all demands that pay nothing."""
+SAME_FETCH: Final = 8
+"""Demands that may wait for the same objective at once."""
+MISSING: Final = RetryPolicy(initial=10.0, ceiling=300.0, jitter=0.0)
+"""How long an objective that nobody had is not looked for again, by how often it was missing."""
+MISSING_KEPT: Final = 4096
+"""Missing objectives that are remembered."""
+
+
+class ObjectiveUnfit(InputError, code="objective-unfit"):
+    """An objective can't be played here. `reason` is the word for programs that the check gave."""
+
+    def __init__(self, cid: str, reason: str, detail: str) -> None:
+        super().__init__(f"objective {cid} can't be played ({reason}): {detail}")
+        self.cid = cid
+        self.reason = reason
+
+
+class ObjectiveNotFetched(ContentError, code="objective-not-fetched"):
+    """An objective is not fetched for a demand now. `reason` is `missing` (nobody had it a moment ago), `shared`
+    (enough others wait for it) or `rate` (there were too many fetches)."""
+
+    def __init__(self, cid: str, reason: Literal["missing", "shared", "rate"]) -> None:
+        super().__init__(f"objective {cid} is not fetched now ({reason})", hint="the demand's next copy is looked at")
+        self.cid = cid
+        self.reason = reason
+
+
+class Buyer(NamedTuple):
+    """For whom an objective is fetched: the maker of a demand (address), and whether the demand pays."""
+
+    maker: str
+    pays: bool
+
+
+class Objectives:
+    """The objectives of jobs and of demands. With `handlers`, an objective must fit them."""
+
+    def __init__(
+        self,
+        store: Store,
+        exchange: Exchange,
+        settings: ContentSettings,
+        handlers: TopicHandlers | None = None,
+        *,
+        clock: Clock = SYSTEM_CLOCK,
+    ) -> None:
+        self._store = store
+        self._exchange = exchange
+        self._settings = settings
+        self._handlers = handlers
+        self._budget = FetchBudget(clock)
+        self._fetching = asyncio.Semaphore(FETCHES)
+        self._checking = asyncio.Semaphore(PREFLIGHTS)
+
+    async def examine(self, cid: str, *, patience: float = LONGEST, buyer: Buyer | None = None) -> Objective:
+        """The objective with that CID, from the store or fetched from the mesh, after it was checked.
+
+        Fetching fails after `patience`, or the setting `fetch_timeout`, seconds without a new block. For a `buyer` it
+        is limited: raises `ObjectiveNotFetched`. Raises `ObjectiveUnfit` and branches of `ContentError`.
+        """
+        path = await asyncio.to_thread(self._store.checked, cid)
+        if path is None:
+            async with self._fetching if buyer is None else self._budget.spend(cid, buyer):
+                path = await self._fetch(cid, patience)
+        return await self._check(cid, path)
+
+    async def _fetch(self, cid: str, patience: float) -> Path:
+        limit, timeout = self._settings.objective_size_limit, min(patience, self._settings.fetch_timeout)
+        return await self._exchange.fetch(cid, size_limit=limit, timeout=timeout)
+
+    async def _check(self, cid: str, path: Path) -> Objective:
+        settings, handlers = self._settings, self._handlers
+        limits = Limits(size=settings.objective_size_limit, expanded=settings.objective_expanded_limit)
+        topics, obstacle = (None, None) if handlers is None else (handlers.topics, handlers.obstacle)
+        async with self._checking:
+            outcome = await asyncio.to_thread(preflight, path, limits, topics=topics, obstacle=obstacle)
+        if outcome.objective is None or not outcome.ok:
+            raise ObjectiveUnfit(cid, outcome.reason, outcome.detail)
+        return outcome.objective
+
+
+class FetchBudget:
+    """What may be fetched for demands: `async with budget.spend(cid, buyer)` around a fetch."""
+
+    def __init__(self, clock: Clock = SYSTEM_CLOCK) -> None:
+        self._clock = clock
+        self._rate = RateLimiter(per_sender=FETCH_RATE, clock=clock)
+        self._free = RateLimiter(per_sender=FETCH_RATE, total=FREE_FETCH_RATE, clock=clock)
+        self._waiting: Counter[str] = Counter()
+        self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
+        self._missing: OrderedDict[str, tuple[int, float]] = OrderedDict()
+        """How often a CID was missing, and until when it is not looked for."""
+
+    @asynccontextmanager
+    async def spend(self, cid: str, buyer: Buyer) -> AsyncIterator[None]:
+        """Count a fetch, and remember the CID if it is not available; one fetch of a CID at a time.
+
+        Raises `ObjectiveNotFetched`.
+        """
+        if self._waiting[cid] >= SAME_FETCH:
+            raise ObjectiveNotFetched(cid, "shared")
+        self._waiting[cid] += 1
+        try:
+            async with self._locks.setdefault(cid, asyncio.Lock()):
+                self._check(cid, buyer)
+                yield
+                self._missing.pop(cid, None)
+        except ContentUnavailable:
+            self._remember(cid)
+            raise
+        finally:
+            self._waiting[cid] -= 1
+            if not self._waiting[cid]:
+                del self._waiting[cid]
+
+    def _check(self, cid: str, buyer: Buyer) -> None:
+        if self._clock.monotonic() < self._missing.get(cid, (0, 0.0))[1]:
+            raise ObjectiveNotFetched(cid, "missing")
+        limiter = self._rate if buyer.pays else self._free
+        if not limiter.allow(buyer.maker):
+            raise ObjectiveNotFetched(cid, "rate")
+
+    def _remember(self, cid: str) -> None:
+        times = self._missing.pop(cid, (0, 0.0))[0] + 1
+        self._missing[cid] = times, self._clock.monotonic() + MISSING.delay(times)
+        if len(self._missing) > MISSING_KEPT:
+            self._missing.popitem(last=False)
