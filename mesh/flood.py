@@ -99,6 +99,8 @@ class FairQueue(Generic[T]):
         self._per_sender = per_sender
         self._total = total
         self._levels: dict[int, OrderedDict[str, deque[T]]] = {}
+        self._heaviest: dict[int, str] = {}
+        """Of each level the sender that had the most at its last put."""
         self._counts: Counter[str] = Counter()
         self._size = 0
         self._arrived = asyncio.Event()
@@ -116,7 +118,11 @@ class FairQueue(Generic[T]):
         is full, one of the lowest priority: the newest of the sender that has the most."""
         if self._counts[sender] >= self._per_sender:
             return [item]
-        self._levels.setdefault(priority, OrderedDict()).setdefault(sender, deque()).append(item)
+        level = self._levels.setdefault(priority, OrderedDict())
+        items = level.setdefault(sender, deque())
+        items.append(item)
+        if len(items) >= len(level.get(self._heaviest.get(priority, ""), ())):
+            self._heaviest[priority] = sender
         self._counts[sender] += 1
         self._size += 1
         self._arrived.set()
@@ -142,16 +148,18 @@ class FairQueue(Generic[T]):
 
     def _drop_newest(self) -> T:
         priority = min(self._levels)
-        sender, items = max(self._levels[priority].items(), key=lambda entry: len(entry[1]))
-        item = items.pop()
-        if not items:
-            del self._levels[priority][sender]
+        level, sender = self._levels[priority], self._heaviest[priority]
+        if len(level.get(sender, ())) < 2:
+            sender = next(iter(level))  # nobody has more than one: the oldest
+        item = level[sender].pop()
+        if not level[sender]:
+            del level[sender]
         self._taken(sender, priority)
         return item
 
     def _taken(self, sender: str, priority: int) -> None:
         if not self._levels[priority]:
-            del self._levels[priority]
+            del self._levels[priority], self._heaviest[priority]
         self._size -= 1
         self._counts[sender] -= 1
         if not self._counts[sender]:

@@ -34,9 +34,7 @@ FREE_HANDLED: Final = 16
 """Of these, demands that pay nothing."""
 CHECKED: Final = 128
 """Demands whose makers' funds are asked for at once."""
-PER_MAKER: Final = 64
-"""Demands of one maker that wait."""
-WAITING: Final = 2048
+WAITING: Final = 16_384
 """Demands that wait for the check of their funds, and as many for a handler."""
 CUSTOMERS: Final = 4096
 LOGGED: Final = Rate(per_second=0.2, burst=20)
@@ -94,8 +92,8 @@ class DemandDispatcher:
         self._customers = customers
         self._outages = outages
         self._drops = drops
-        self._arrived: FairQueue[Verified[Demand]] = FairQueue(per_sender=PER_MAKER, total=WAITING)
-        self._funded: FairQueue[Verified[Demand]] = FairQueue(per_sender=PER_MAKER, total=WAITING)
+        self._arrived: FairQueue[Verified[Demand]] = FairQueue(per_sender=WAITING, total=WAITING)
+        self._funded: FairQueue[Verified[Demand]] = FairQueue(per_sender=WAITING, total=WAITING)
         self._changed = asyncio.Event()
         self._running = self._running_free = 0
         self._logged = RateLimiter(per_sender=LOGGED)
