@@ -19,7 +19,7 @@ from mesh.log_context import liability_context, log_event
 from mesh.market.book import ORDER_USED, Match, Refusal, at_fault, order_id, reason_word
 from mesh.market.liability_events import OPEN_LIABILITIES, LiabilityEvents, Unconfirmed
 from mesh.market.rejections import RejectionPublisher
-from mesh.market.unfunded import Funds, UnfundedOrders
+from mesh.market.unfunded import UnfundedOrders
 from mesh.market.withdrawals import withdrawn_id
 from schemas import ZERO_ADDRESS, Result
 
@@ -88,8 +88,7 @@ class Settlement:
             reverted=self._settle_again,
             open_limit=open_limit,
         )
-        self._funds = Funds(chain, self.events.lookups)
-        self._unfunded = UnfundedOrders(book, self._funds, funded=self.add, interval=chain.node.timing.poll_interval)
+        self._unfunded = UnfundedOrders(book, self._can_pay, funded=self.add, interval=chain.node.timing.poll_interval)
 
     def start(self, tasks: asyncio.TaskGroup) -> None:
         """Follow the chain, and from now on settle what is added, in tasks of this group."""
@@ -219,7 +218,7 @@ class Settlement:
 
     async def _set_aside_unfunded(self, match: Match, error: Reverted) -> bool:
         """Keep the orders whose makers can't pay in the book, unmatched, and tell them; False if both can."""
-        unfunded = [order for order in match if not await self._funds.can_pay(order)]
+        unfunded = [order for order in match if not await self._can_pay(order, fresh=True)]
         for order in match if unfunded else ():
             if self._unconfirmed.end(order):
                 continue
@@ -230,6 +229,10 @@ class Settlement:
             self.reject(order, _reason(error), str(error))
             self._forget(order)
         return bool(unfunded)
+
+    async def _can_pay(self, order: Verified[Order], *, fresh: bool = False) -> bool:
+        question = partial(self._chain.funds.can_pay, order, fresh=fresh)
+        return await self._chain.retrying(question, outages=self.events.lookups)
 
     async def _not_created(self, match: Match, rejected: tuple[Verified[Order], ...], error: AiraError) -> None:
         """Reject some orders of a match; put the other one back into the book, unless it was used meanwhile."""

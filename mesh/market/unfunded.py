@@ -4,60 +4,28 @@ from __future__ import annotations
 
 import asyncio
 import heapq
-from functools import partial
 from itertools import count
 from typing import TYPE_CHECKING, Final
 
-from mesh.chain import NoContracts, RequestRefused, Reverted
 from mesh.market.book import order_id
 from mesh.retry import Backoff, RetryPolicy
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Awaitable, Callable
 
-    from mesh.chain import Chain
     from mesh.market.book import Order, OrderBook
-    from mesh.outage_log import OutageLog
     from schemas import Verified
 
 RETRY: Final = RetryPolicy(initial=2.0, ceiling=60.0)
 """When an order's maker is asked after again."""
 LIMIT: Final = 4096
 """Orders that may wait for their makers' funds at the same time."""
-CHECKS: Final = 4
-"""Orders that are looked at in one round, at most: each takes up to four requests to the node."""
-
-
-class Funds:
-    """What the makers of orders can pay, asked of the chain. Outages of the node are logged to `outages`."""
-
-    def __init__(self, chain: Chain, outages: OutageLog) -> None:
-        self._chain = chain
-        self._outages = outages
-
-    async def can_pay(self, order: Verified[Order]) -> bool:
-        """Whether an order's maker has, and allows the factory to take, what the order costs it.
-
-        True if that can't be read: tokens are contracts of strangers. Asked again until the node answers.
-        """
-        return await self._chain.retrying(partial(self._can_pay, order), outages=self._outages)
-
-    async def _can_pay(self, order: Verified[Order]) -> bool:
-        tokens = self._chain.tokens
-        try:
-            for token, amount in tokens.costs_of(order.message).items():
-                if amount and (
-                    await tokens.balance(order.signer, token=token) < amount
-                    or await tokens.allowance(order.signer, self._chain.factory, token=token) < amount
-                ):
-                    return False
-        except (Reverted, RequestRefused, NoContracts):
-            return True
-        return True
+CHECKS: Final = 64
+"""Orders that are looked at in one round, at most."""
 
 
 class UnfundedOrders:
-    """The orders in `book` whose makers can't pay. Those that can again are taken out of it and passed to `funded`.
+    """The orders in `book` whose makers can't pay; if one can again, its order is taken out and passed to `funded`.
 
     `interval` is in seconds between two rounds, of at most `CHECKS` orders each.
     """
@@ -65,7 +33,7 @@ class UnfundedOrders:
     def __init__(
         self,
         book: OrderBook,
-        funds: Funds,
+        can_pay: Callable[[Verified[Order]], Awaitable[bool]],
         *,
         funded: Callable[[Verified[Order]], object],
         interval: float,
@@ -73,7 +41,7 @@ class UnfundedOrders:
         limit: int = LIMIT,
     ) -> None:
         self._book = book
-        self._funds = funds
+        self._can_pay = can_pay
         self._funded = funded
         self._interval = interval
         self._retry = retry
@@ -102,12 +70,11 @@ class UnfundedOrders:
         """Look at the orders when they are due, until cancelled."""
         while True:
             await asyncio.sleep(self._interval)
-            for _ in range(CHECKS):
-                if (order := self._next_due()) is not None:
-                    await self._check(order)
+            due = [order for order in (self._next_due() for _ in range(CHECKS)) if order is not None]
+            await asyncio.gather(*map(self._check, due))
 
     async def _check(self, order: Verified[Order]) -> None:
-        can_pay = await self._funds.can_pay(order)
+        can_pay = await self._can_pay(order)
         waiting = self._waiting.pop(order_id(order), None)
         if waiting is None or order_id(order) not in self._book:
             return

@@ -61,7 +61,7 @@ async def test_senders_are_served_in_turn_and_a_flood_displaces_itself() -> None
 
 async def test_a_higher_priority_goes_first_and_the_lowest_is_dropped() -> None:
     queue: FairQueue[str] = FairQueue(per_sender=3, total=3)
-    assert queue.top is None
+    assert (queue.top, len(queue)) == (None, 0)
     for sender in ("f1", "f2", "f3"):
         queue.put(sender, sender)
     assert queue.put("alice", "a0", priority=7) == ["f1"]

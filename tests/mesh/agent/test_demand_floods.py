@@ -34,7 +34,7 @@ async def stranger(place: Place) -> AsyncIterator[Channel]:
         Network(Endpoints(connect=(place.endpoint,))) as network,
         Channel(network.session, lighthouse) as channel,
     ):
-        await until_heard(network.session, f"aira/{lighthouse}/demand/{MODEL}/x")
+        await until_heard(network.session, f"aira/{lighthouse}/demand/{MODEL}")
         yield channel
 
 
