@@ -126,7 +126,7 @@ class DemandDispatcher:
             self._changed.set()
 
     async def _is_funded(self, demand: Verified[Demand]) -> bool:
-        return await self._chain.retrying(partial(self._chain.funds.can_pay, demand), outages=self._outages)
+        return await self._chain.retrying(partial(self._chain.costs.can_be_paid, demand), outages=self._outages)
 
     def _worth(self, demand: Verified[Demand]) -> int:
         """The priority of a demand: by the magnitude of its pay, and of two alike the customer's."""

@@ -201,7 +201,7 @@ class Trader(Lifecycle):
         await self.load()
 
     async def _ensure_allowance(self, order: TradedOrder) -> None:
-        await self._allowances.ensure(order, self._chain.tokens.costs_of(order.signed))
+        await self._allowances.ensure(order, self._chain.costs.of(order.signed))
 
     def _send_when_covered(self, orders: Collection[TradedOrder]) -> None:
         """Send these orders of the ledger when the factory has the allowance for them, in a task."""
@@ -231,7 +231,7 @@ class Trader(Lifecycle):
                     continue
                 if order is None:
                     order = self._orders[stored.identity] = TradedOrder(signed, stored.posted)
-                    self._allowances.count(order, self._chain.tokens.costs_of(signed))
+                    self._allowances.count(order, self._chain.costs.of(signed))
                     new.append(order)
                 if stored.is_withdrawn and order.is_open:
                     self._set_withdrawn(order)

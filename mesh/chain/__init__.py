@@ -18,6 +18,7 @@ from mesh.chain.accounts import (
     new_private_key,
     write_keyfile,
 )
+from mesh.chain.admission import UnsafeValidator, Validators
 from mesh.chain.answers import BlockHeader
 from mesh.chain.client import Chain
 from mesh.chain.deploy import XRT, Deployment, DeploymentPlan, deploy
@@ -60,7 +61,6 @@ from mesh.chain.node import Node
 from mesh.chain.policy import GWEI, FeePolicy, Timing
 from mesh.chain.tokens import Token
 from mesh.chain.transactions import Receipt, TransactionSender
-from mesh.chain.validators import UnsafeValidator, Validators
 
 RECURSION_LIMIT: Final = 3_000
 """Frames: safe on a stack of 2 MB (measured; 6,000 is not), and enough for contracts that call 200 deep."""

@@ -7,6 +7,7 @@ from contextlib import AsyncExitStack
 from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
+from mesh.chain.admission import OrderCosts, Validators
 from mesh.chain.artifacts import is_code_of
 from mesh.chain.contracts import Contracts, contract_version
 from mesh.chain.errors import NoContracts, UnknownName
@@ -20,7 +21,6 @@ from mesh.chain.node import Node
 from mesh.chain.reader import EventSources, read_events
 from mesh.chain.tokens import Tokens
 from mesh.chain.transactions import TransactionSender
-from mesh.chain.validators import Validators
 from mesh.errors import ClosedError
 from mesh.telemetry.metrics import gauge
 
@@ -57,7 +57,7 @@ class Chain:
     `NodeUnreachable` when the node is lost, except those that wait for something. Methods that send a transaction wait
     until it is mined, and raise `NoAccount`, `Reverted` (also without sending, when the simulation fails),
     `InsufficientFunds`, `TransactionTimeout`. Its methods are grouped in parts: `liabilities`,
-    `lighthouses`, `validators`, `tokens`, `names`; `follow` yields events.
+    `lighthouses`, `validators`, `costs`, `funds`, `tokens`, `names`; `follow` yields events.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Chain:
                 await stack.enter_async_context(self.node)
             self._contracts = await self._find_contracts()
             self._validators = Validators(self._contracts)
-            self._funds = Funds(self._contracts, self.tokens)
+            self._funds = Funds(self._contracts)
             self._stack = stack.pop_all()
         return self
 
@@ -136,9 +136,14 @@ class Chain:
 
     @property
     def funds(self) -> Funds:
-        """Whether makers of orders can pay, asked in batches."""
+        """What accounts have of tokens, and let the factory take, asked in batches."""
         self._opened()
         return self._funds
+
+    @property
+    def costs(self) -> OrderCosts:
+        """What orders cost, and whether their makers can pay it."""
+        return OrderCosts(self._opened(), self._funds)
 
     @property
     def lighthouses(self) -> Lighthouses:

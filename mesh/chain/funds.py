@@ -1,8 +1,8 @@
-"""Whether the makers of orders can pay what these cost: asked of the chain in batches, remembered for a short time.
+"""What accounts have of tokens and let the factory take: asked of the chain in batches, remembered for a short time.
 
-Anybody can sign orders with fresh keys. One request to the node answers for `BATCH` accounts: a call without a
-contract, whose code asks the tokens. A token is code of a stranger: each question has `TOKEN_GAS`, and one that fails
-says nothing about the others.
+Anybody can sign orders with fresh keys, so many accounts are asked for. One request to the node answers for `BATCH`
+accounts: a call without a contract, whose code asks the tokens. A token is code of a stranger: each question has
+`TOKEN_GAS`, and one that fails says nothing about the others.
 """
 
 from __future__ import annotations
@@ -20,10 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from mesh.chain.contracts import Contracts
-    from mesh.chain.tokens import Tokens
     from mesh.clock import Clock
-    from schemas import Verified
-    from schemas.messages import Order
 
 log = logging.getLogger(__name__)
 
@@ -56,11 +53,10 @@ class Funding(NamedTuple):
 
 
 class Funds:
-    """What the makers of orders can pay. `chain.funds`. Used in one event loop."""
+    """What accounts have of tokens, and let the factory take. `chain.funds`. Used in one event loop."""
 
-    def __init__(self, contracts: Contracts, tokens: Tokens, *, clock: Clock = SYSTEM_CLOCK, kept: int = KEPT) -> None:
+    def __init__(self, contracts: Contracts, *, clock: Clock = SYSTEM_CLOCK, kept: int = KEPT) -> None:
         self._contracts = contracts
-        self._tokens = tokens
         self._clock = clock
         self._kept = kept
         self._known: OrderedDict[Holding, tuple[float, Funding | None]] = OrderedDict()
@@ -68,19 +64,6 @@ class Funds:
         self._asking: asyncio.Task[None] | None = None
         self.requests = 0
         """Requests to the node so far."""
-
-    async def can_pay(self, order: Verified[Order], *, fresh: bool = False) -> bool:
-        """Whether an order's maker has, and allows the factory to take, what the order costs it.
-
-        The answer may be a few poll intervals old, unless it is to be `fresh`. True if a token can't be read: it is a
-        contract of strangers. Raises `NodeUnreachable`.
-        """
-        for token, amount in self._tokens.costs_of(order.message).items():
-            if amount:
-                funding = await self.of(Holding(token, order.signer), fresh=fresh)
-                if funding is not None and min(funding) < amount:
-                    return False
-        return True
 
     async def of(self, holding: Holding, *, fresh: bool = False) -> Funding | None:
         """What is known of a holding, or asked now; None if the token can't be read. Raises `NodeUnreachable`."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -10,16 +9,12 @@ from eth_abi.abi import decode
 from eth_abi.exceptions import DecodingError
 
 from mesh.chain.errors import NoContracts, Reverted
-from schemas.messages import Offer
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from web3.contract import AsyncContract
     from web3.contract.async_contract import AsyncContractFunction
 
     from mesh.chain.contracts import Contracts
-    from schemas.messages import Order
 
 LONGEST_LABEL: Final = 64
 """Characters of a token's name or symbol that are shown; anybody can deploy a token with any name."""
@@ -47,15 +42,6 @@ class Tokens:
 
     def __init__(self, contracts: Contracts) -> None:
         self._contracts = contracts
-
-    def costs_of(self, order: Order) -> Mapping[str, int]:
-        """What the factory may take from the maker of an order, by token, in the token's smallest unit."""
-        xrt = self._contracts.xrt
-        if isinstance(order, Offer):
-            return {xrt: order.lighthouse_fee}
-        costs = Counter({order.token: order.cost})
-        costs[xrt] += order.validator_fee
-        return costs
 
     async def eth_balance(self, address: str | None = None) -> int:
         """Wei of an account; of one's own by default."""

@@ -231,7 +231,7 @@ class Settlement:
         return bool(unfunded)
 
     async def _can_pay(self, order: Verified[Order], *, fresh: bool = False) -> bool:
-        question = partial(self._chain.funds.can_pay, order, fresh=fresh)
+        question = partial(self._chain.costs.can_be_paid, order, fresh=fresh)
         return await self._chain.retrying(question, outages=self.events.lookups)
 
     async def _not_created(self, match: Match, rejected: tuple[Verified[Order], ...], error: AiraError) -> None:

@@ -33,23 +33,23 @@ async def test_an_order_is_covered_by_balance_and_allowance(market: DeployedMark
         await chain.tokens.approve(chain.factory, 1000)
         balance = await chain.tokens.balance()
         assert await chain.funds.of(Holding(chain.xrt, person.address)) == Funding(balance, 1000)
-        assert await chain.funds.can_pay(demand_of(market, person.signer, cost=1000))
-        assert await chain.funds.can_pay(demand_of(market, person.signer, cost=0, validator_fee=1000))
-        assert not await chain.funds.can_pay(demand_of(market, person.signer, cost=1001))
-        assert not await chain.funds.can_pay(demand_of(market, person.signer, cost=600, validator_fee=600))
+        assert await chain.costs.can_be_paid(demand_of(market, person.signer, cost=1000))
+        assert await chain.costs.can_be_paid(demand_of(market, person.signer, cost=0, validator_fee=1000))
+        assert not await chain.costs.can_be_paid(demand_of(market, person.signer, cost=1001))
+        assert not await chain.costs.can_be_paid(demand_of(market, person.signer, cost=600, validator_fee=600))
         await chain.tokens.approve(chain.factory, balance + 5)
-        assert not await chain.funds.can_pay(demand_of(market, person.signer, cost=balance + 1), fresh=True)
-        assert await chain.funds.can_pay(demand_of(market, person.signer, cost=balance), fresh=True)
+        assert not await chain.costs.can_be_paid(demand_of(market, person.signer, cost=balance + 1), fresh=True)
+        assert await chain.costs.can_be_paid(demand_of(market, person.signer, cost=balance), fresh=True)
 
 
 async def test_fresh_keys_cost_few_requests_and_a_second_look_none(market: DeployedMarket) -> None:
     made = [demand_of(market, Signer(secrets.token_bytes(32)), cost=1) for _ in range(300)]
     async with market.chain(timing=SLOW) as chain:
-        assert not any(await asyncio.gather(*(chain.funds.can_pay(demand) for demand in made)))
+        assert not any(await asyncio.gather(*(chain.costs.can_be_paid(demand) for demand in made)))
         assert chain.funds.requests == -(-300 // BATCH)
-        assert not any(await asyncio.gather(*(chain.funds.can_pay(demand) for demand in made)))
+        assert not any(await asyncio.gather(*(chain.costs.can_be_paid(demand) for demand in made)))
         assert chain.funds.requests == -(-300 // BATCH)
-        assert await chain.funds.can_pay(demand_of(market, market.stranger.signer, cost=0))
+        assert await chain.costs.can_be_paid(demand_of(market, market.stranger.signer, cost=0))
         assert chain.funds.requests == -(-300 // BATCH), "what costs nothing needs no question"
 
 
@@ -62,4 +62,4 @@ async def test_a_strangers_token_spoils_no_other_answer(market: DeployedMarket, 
         assert unreadable is None
         assert read is not None
         assert read.balance == await chain.tokens.balance(person.address)
-        assert await chain.funds.can_pay(demand_of(market, person.signer, token=strange, cost=1))
+        assert await chain.costs.can_be_paid(demand_of(market, person.signer, token=strange, cost=1))

@@ -1,5 +1,6 @@
-"""Which validators orders may name: no lighthouse, and nothing that could become one. `chain.validators`.
+"""Which orders can be used: what they cost, whether their makers can pay, and which validators they may name.
 
+A validator is no lighthouse, and nothing that could become one.
 An offer on lighthouse L with validator V is, with the same signature, a demand on lighthouse V with validator L: the
 format has the two addresses in swapped places. So a stranger whose demand names a lighthouse as validator could use the
 offer of a robot that agrees to it as that robot's demand, and take the cost from the robot. Our contracts refuse such
@@ -10,24 +11,57 @@ from __future__ import annotations
 
 import math
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING, Final
 
 from mesh.chain.contracts import OriginalContracts
+from mesh.chain.funds import Holding
 from mesh.chain.lighthouses import Lighthouses
 from mesh.errors import InputError
 from schemas.address import ZERO_ADDRESS
+from schemas.messages import Offer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from mesh.chain.contracts import Contracts
+    from mesh.chain.funds import Funds
+    from schemas import Verified
     from schemas.messages import Order
 
 REMEMBERED: Final = 4096
 """Validators whose verdict is remembered, the latest ones."""
 RECHECK: Final = 60.0
 """Seconds after which a verdict is asked for again that a transaction can change."""
+
+
+class OrderCosts:
+    """What orders cost their makers, and whether these can pay it. `chain.costs`."""
+
+    def __init__(self, contracts: Contracts, funds: Funds) -> None:
+        self._xrt = contracts.xrt
+        self._funds = funds
+
+    def of(self, order: Order) -> Mapping[str, int]:
+        """What the factory may take from the maker of an order, by token, in the token's smallest unit."""
+        if isinstance(order, Offer):
+            return {self._xrt: order.lighthouse_fee}
+        costs = Counter({order.token: order.cost})
+        costs[self._xrt] += order.validator_fee
+        return costs
+
+    async def can_be_paid(self, order: Verified[Order], *, fresh: bool = False) -> bool:
+        """Whether an order's maker has, and allows the factory to take, what the order costs it.
+
+        Without `fresh`, the answer may be a few poll intervals old. True if a token can't be read: it is a stranger's
+        contract. Raises `NodeUnreachable`.
+        """
+        for token, amount in self.of(order.message).items():
+            if amount:
+                funding = await self._funds.of(Holding(token, order.signer), fresh=fresh)
+                if funding is not None and min(funding) < amount:
+                    return False
+        return True
 
 
 class UnsafeValidator(InputError, code="validator-unsafe"):
