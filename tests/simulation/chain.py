@@ -1,4 +1,4 @@
-"""The simulated chain: the real contracts on the embedded EVM, with a pool, blocks by time, and reorganisations.
+"""The simulated chain: the contracts on the embedded EVM or their model, with a pool, blocks and reorganisations.
 
 Each process reaches it through a node of its own, which may be slow, silent or wrong.
 """
@@ -9,19 +9,23 @@ import asyncio
 import json
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from web3.providers.async_base import AsyncBaseProvider
 
 from mesh.devchain.bounded_vm import GAS_LIMIT
-from mesh.devchain.calls import Call, parse_call
+from mesh.devchain.calls import Call, Calls, parse_call
 from mesh.devchain.evm import Evm
 from mesh.devchain.jsonrpc import SERVER_ERROR, RpcError, parse_data
 from mesh.devchain.methods import Methods
+from tests.simulation.model_transactions import read_transaction
 from tests.simulation.threads import scheduler
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from tests.simulation.model import ModelChain
+    from tests.simulation.model_transactions import ModelTransaction
 
 LATENCY: Final = (0.001, 0.03)
 BUMP_PERCENT: Final = 10
@@ -66,12 +70,35 @@ class PooledTransaction:
     price: int
 
 
+class EvmCalls(Calls):
+    """Calls on the EVM, with estimates from one run: the embedded node takes several to find the least."""
+
+    def estimate(self, fields: Call, height: int) -> int:
+        """Enough gas for a transaction; raises as `call` does."""
+        computation = self._run(fields, height, gas=GAS_LIMIT)
+        if computation.is_error:
+            self.call(fields, height)  # raises
+        return (GAS_LIMIT - int(computation.get_gas_remaining())) * 5 // 4
+
+
+class EvmChain(Evm):
+    """The real contracts on the embedded EVM."""
+
+    def __init__(self) -> None:
+        super().__init__(run_seconds=60.0, max_logs=100_000)
+        self.calls = EvmCalls(self._backend.chain, run_seconds=60.0)
+
+    def read(self, raw: bytes) -> ModelTransaction:
+        """A signed transaction. Raises `RpcError`."""
+        return read_transaction(raw)
+
+
 class SimulatedChain:
     """The chain that all nodes show. `began` is the height at which the history began."""
 
-    def __init__(self) -> None:
-        self.evm = Evm(run_seconds=60.0, max_logs=100_000)
-        self.methods = Methods(self.evm)
+    def __init__(self, evm: EvmChain | ModelChain) -> None:
+        self.evm = evm
+        self.methods = Methods(cast("Evm", evm))
         self.instant = True
         """Mine each transaction at once, as while the contracts are deployed."""
         self.pool: dict[tuple[bytes, int], PooledTransaction] = {}
@@ -105,7 +132,7 @@ class SimulatedChain:
 
     def _answer(self, method: str, params: Any) -> Any:
         if method == "eth_estimateGas":
-            return hex(self._estimate(parse_call(params[0])))
+            return hex(self.evm.calls.estimate(parse_call(params[0]), self.evm.head))
         if method == "eth_getTransactionCount" and params[1:] == ["pending"]:
             return hex(self._next_nonce(parse_data(params[0], length=20)))
         if method in ("eth_gasPrice", "eth_maxPriorityFeePerGas"):
@@ -117,22 +144,10 @@ class SimulatedChain:
                 return {"hash": params[0], "blockHash": None, "blockNumber": None, "from": sender, "nonce": nonce}
         return self.methods.answer(method, params)
 
-    def _estimate(self, fields: Call) -> int:
-        """Enough gas for a transaction, from one run: the embedded node takes several to find the least."""
-        computation = self.evm.calls._run(fields, self.evm.head, gas=GAS_LIMIT)
-        if computation.is_error:
-            self.evm.calls.call(fields, self.evm.head)  # raises
-        return (GAS_LIMIT - int(computation.get_gas_remaining())) * 5 // 4
-
     def submit(self, raw: bytes) -> bytes:
         """Take a signed transaction into the pool; its hash. Raises `RpcError`."""
-        try:
-            decoded = self.evm._backend.chain.get_vm().get_transaction_builder().decode(raw)
-            sender, hash_ = bytes(decoded.sender), bytes(decoded.hash)
-        except Exception as error:
-            raise RpcError(SERVER_ERROR, f"the transaction can't be decoded: {error}") from None
-        nonce = int(decoded.nonce)
-        price = int(getattr(decoded, "max_fee_per_gas", 0) or decoded.gas_price)
+        one = self.evm.read(raw)
+        sender, nonce, price, hash_ = one.sender, one.nonce, one.price, one.hash
         expected = self.evm.nonce(sender, self.evm.head)
         if nonce < expected:
             raise RpcError(SERVER_ERROR, f"nonce too low: next nonce {expected}, tx nonce {nonce}")
@@ -141,7 +156,7 @@ class SimulatedChain:
             raise RpcError(SERVER_ERROR, "already known")
         if before is not None and price * 100 < before.price * (100 + BUMP_PERCENT):
             raise RpcError(SERVER_ERROR, "replacement transaction underpriced")
-        funds, wanted = self.evm.balance(sender, self.evm.head), decoded.gas * price + decoded.value
+        funds, wanted = self.evm.balance(sender, self.evm.head), one.gas * price + one.value
         if wanted > funds:
             raise RpcError(SERVER_ERROR, f"insufficient funds for gas * price + value: have {funds} want {wanted}")
         self.pool[sender, nonce] = PooledTransaction(raw, hash_, sender, nonce, price)

@@ -25,15 +25,13 @@ from tests.simulation.scheduler import REAL_TIME, SECOND
 router.install(lambda: history.CURRENT[-1])  # type: ignore[arg-type,return-value]
 
 from mesh.chain.web3_provider import ReliableProvider  # noqa: E402, F401
-from tests.simulation.chain import SimulatedChain  # noqa: E402
-from tests.simulation.deployment import found  # noqa: E402
+from tests.simulation.deployment import ON_EVM, ON_MODEL, Deployments  # noqa: E402
 from tests.simulation.faults import FaultPlan  # noqa: E402
 from tests.simulation.mutations import CANDIDATES, MUTATIONS, SEEDS, Mutation  # noqa: E402
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from tests.simulation.deployment import Deployed
 
 JOBS: Final = 6
 """Jobs in one history, at most."""
@@ -48,8 +46,8 @@ def main(arguments: Sequence[str]) -> None:
     executors_module._global_shutdown_lock = _thread.RLock()  # shared by all processes: never let one wait for it
     threads.number_in_sets(Queue, concurrent.futures.Future)
     began = REAL_TIME()
-    deployed = found(SimulatedChain(), threads.begin(0))
     gc.collect()
+    deployed = Deployments(options.chain)
     if options.mutants:
         _find_mutants(deployed, options)
     total = Report(options.seed)
@@ -83,6 +81,9 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--switches", metavar="FILE", help="write each switch of threads to a file")
     parser.add_argument("--mutants", action="store_true", help="plant each bug in turn, and search until it is found")
     parser.add_argument("--mutant", default="", help="only planted bugs whose name contains this")
+    parser.add_argument(
+        "--chain", choices=(ON_MODEL, ON_EVM), default=None, help="what runs the contracts; by default the seed chooses"
+    )
     parser.add_argument("--keep-going", action="store_true", help="do not stop at the first failure")
     parser.add_argument("--only", default="", help="the kinds of faults, with commas; `none` for none")
     parser.add_argument("--without", default="", help="kinds of faults that do not happen, with commas")
@@ -114,7 +115,7 @@ def _print_logs() -> None:
     logging.getLogger("mesh").addHandler(SimulatedHandler(sys.stdout))
 
 
-def _histories(deployed: Deployed, options: argparse.Namespace) -> Iterator[tuple[int, Report]]:
+def _histories(deployed: Deployments, options: argparse.Namespace) -> Iterator[tuple[int, Report]]:
     left, seed = options.jobs, options.seed
     while left > 0:
         jobs = min(left, JOBS)
@@ -122,7 +123,7 @@ def _histories(deployed: Deployed, options: argparse.Namespace) -> Iterator[tupl
         left, seed = left - jobs, seed + 1
 
 
-def _find_mutants(deployed: Deployed, options: argparse.Namespace) -> NoReturn:
+def _find_mutants(deployed: Deployments, options: argparse.Namespace) -> NoReturn:
     """Plant each bug in turn, until a history violates an invariant that holds without it. Ends with 1 if one hides."""
     missed, chosen = (
         0,
@@ -147,9 +148,11 @@ def _find_mutants(deployed: Deployed, options: argparse.Namespace) -> NoReturn:
 
 
 def _in_child(
-    deployed: Deployed, seed: int, jobs: int, options: argparse.Namespace, mutation: Mutation | None = None
+    deployed: Deployments, seed: int, jobs: int, options: argparse.Namespace, mutation: Mutation | None = None
 ) -> Report:
     """Run a history in a process of its own: nothing is left of it for the next one."""
+    kind = ON_MODEL if mutation is not None and options.chain is None else deployed.kind(seed)
+    market = deployed.market(kind)
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
@@ -159,7 +162,7 @@ def _in_child(
             if mutation is not None:
                 mutation.apply()
             plan = history.plan_of(seed, only=options.only, without=options.without)
-            report, lines = history.run_history(deployed, seed, jobs, plan, switches=options.switches)
+            report, lines = history.run_history(market, seed, jobs, plan, switches=options.switches)
             if options.trace:
                 print(plan, *lines, sep="\n", flush=True)
             with os.fdopen(writing, "w") as pipe:
@@ -177,7 +180,9 @@ def _in_child(
     os.waitpid(child, 0)
     if not said:
         return Report(seed, violations=["history-failed: the process of the history ended"])
-    return Report(**json.loads(said))
+    report = Report(**json.loads(said))
+    report.chains = {kind: 1}
+    return report
 
 
 def _add(total: Report, report: Report) -> None:
@@ -186,6 +191,7 @@ def _add(total: Report, report: Report) -> None:
     total.simulated_s = round(total.simulated_s + report.simulated_s, 3)
     total.cpu_s = round(total.cpu_s + report.cpu_s, 3)
     total.violations += [f"seed {report.seed}: {violation}" for violation in report.violations]
+    total.chains = dict(sorted((Counter(total.chains) + Counter(report.chains)).items()))
     total.faults = dict(sorted((Counter(total.faults) + Counter(report.faults)).items()))
     total.trace = report.trace
 

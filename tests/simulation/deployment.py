@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import random
 from dataclasses import dataclass
 from typing import Final
 
 from mesh.chain import Account, Chain, Timing
 from mesh.devchain.development import ALLOWANCE, DevelopmentMarket, deploy_market
 from schemas import cid_of_bytes
-from tests.simulation import loop
-from tests.simulation.chain import NodeFaults, SimulatedChain, SimulatedNode
+from tests.simulation import loop, threads
+from tests.simulation.chain import EvmChain, NodeFaults, SimulatedChain, SimulatedNode
+from tests.simulation.model import ModelChain
 from tests.simulation.scheduler import SECOND, Process, Scheduler
 
 MODEL: Final = cid_of_bytes(b"aira-mesh simulation: a lamp\n")
 ENDPOINT: Final = "tcp/127.0.0.1:7447"
 BLOCK_SECONDS: Final = 6.0
 TIMING: Final = Timing(poll_interval=3.0, receipt_interval=1.0, replace_after=30.0)
+ON_EVM: Final = "evm"
+ON_MODEL: Final = "model"
+EVM_EVERY: Final = 20
+"""One of so many seeds runs on the EVM."""
 PEOPLE: Final = 2
 ROBOTS: Final = 2
 LIFETIMES: Final = (4, 8, 60, 60, 60)
@@ -54,3 +60,23 @@ def found(chain: SimulatedChain, scheduler: Scheduler) -> Deployed:
         raise errors[0]
     chain.begin()
     return deployed[0]
+
+
+class Deployments:
+    """The market on the model and on the EVM, each deployed once it is wanted; all of one kind if `only` names it."""
+
+    def __init__(self, only: str | None = None) -> None:
+        self._only = only
+        self._evm = EvmChain()
+        self._found: dict[str, Deployed] = {}
+
+    def kind(self, seed: int) -> str:
+        """What runs the contracts in the history of a seed."""
+        return self._only or (ON_EVM if random.Random(f"chain {seed}").randrange(EVM_EVERY) == 0 else ON_MODEL)
+
+    def market(self, kind: str) -> Deployed:
+        """The market on a chain of that kind."""
+        if kind not in self._found:
+            chain = self._evm if kind == ON_EVM else ModelChain(self._evm.funded_keys)
+            self._found[kind] = found(SimulatedChain(chain), threads.begin(0))
+        return self._found[kind]

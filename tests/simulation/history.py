@@ -43,6 +43,8 @@ class Report:
     paid_twice: int = 0
     violations: list[str] = field(default_factory=list)
     faults: dict[str, int] = field(default_factory=dict)
+    chains: dict[str, int] = field(default_factory=dict)
+    """Histories by what ran the contracts: the `model` or the `evm`."""
     simulated_s: float = 0.0
     real_s: float = 0.0
     cpu_s: float = 0.0

@@ -1,0 +1,288 @@
+"""A chain of blocks over the model of the contracts, with the methods that the embedded EVM has.
+
+It has no gas of its own: each transaction takes what `gas_of` says, whatever the contracts do.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+import rlp  # type: ignore[import-untyped]
+from coincurve import PrivateKey
+
+from mesh.chain.reverts import REVERTED
+from mesh.devchain.evm import FUNDS_WEI
+from mesh.devchain.jsonrpc import SERVER_ERROR, RpcError
+from schemas import keccak256
+from tests.simulation.model_abi import ModelRevert, artifact
+from tests.simulation.model_contracts import ModelJury, ModelNames, ModelResolver, ModelToken
+from tests.simulation.model_factory import ModelFactory
+from tests.simulation.model_state import ModelRun, ModelState
+from tests.simulation.model_transactions import ModelTransaction, read_transaction
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from mesh.devchain.calls import Call
+
+CHAIN_ID: Final = 131277322940537
+"""That of the embedded EVM."""
+GAS_LIMIT: Final = 30_000_000
+BASE_FEE: Final = 10**9
+"""wei a gas in the first block."""
+CREATED: Final = (ModelToken, ModelNames, ModelResolver, ModelFactory, ModelJury)
+
+
+class ModelChain:
+    """The chain. Heights are block numbers; amounts are wei."""
+
+    def __init__(self, funded_keys: tuple[bytes, ...], *, max_logs: int = 100_000) -> None:
+        self.funded_keys = funded_keys
+        self.chain_id = CHAIN_ID
+        self.max_logs = max_logs
+        self.head = -1
+        self.base_fee = BASE_FEE
+        self.calls = self
+        self._state = ModelState()
+        self._blocks: list[dict[str, Any]] = []
+        self._base_fees: list[int] = []
+        """Of the block after each one."""
+        self._by_hash: dict[str, int] = {}
+        self._receipts: dict[bytes, dict[str, Any]] = {}
+        self._transactions: dict[bytes, dict[str, Any]] = {}
+        self._logs: dict[int, list[dict[str, Any]]] = {}
+        accounts = [_address_of(key) for key in funded_keys]
+        self._state.apply(0, {(account, "wei"): FUNDS_WEI for account in accounts})
+        self._add_block(None, 0)
+
+    def height(self, tag: object) -> int:
+        """The block number behind a tag (`latest`, …) or a number. Raises `RpcError` for a missing block."""
+        match tag:
+            case "latest" | "pending" | "safe" | "finalized":
+                return self.head
+            case "earliest":
+                return 0
+            case int() if 0 <= tag <= self.head:
+                return tag
+        raise RpcError(SERVER_ERROR, f"block {tag!r} not found; the latest is {self.head}")
+
+    def balance(self, address: bytes, height: int) -> int:
+        """Wei of an account."""
+        return int(self._state.get((address, "wei"), 0, height))
+
+    def nonce(self, address: bytes, height: int) -> int:
+        """Number of transactions that an account has sent."""
+        return int(self._state.get((address, "sent"), 0, height))
+
+    def code(self, address: bytes, height: int) -> bytes:
+        """A contract's code, empty for an account."""
+        return self._run(height).code(address)
+
+    def storage(self, address: bytes, slot: int, height: int) -> bytes:
+        """A storage slot: the model has none."""
+        raise RpcError(SERVER_ERROR, "storage is not modelled")
+
+    def block(self, identifier: int | bytes, *, transactions: str) -> dict[str, Any] | None:
+        """A block by number or hash, None if there is none; its `transactions` as `"hashes"` or as `"objects"`."""
+        number = self._by_hash.get("0x" + identifier.hex()) if isinstance(identifier, bytes) else identifier
+        if number is None or number > self.head:
+            return None
+        block = self._blocks[number]
+        if transactions == "objects":
+            mined = [self._transactions[bytes.fromhex(hash_[2:])] for hash_ in block["transactions"]]
+            return block | {"transactions": mined}
+        return block
+
+    def transaction(self, hash_: bytes) -> dict[str, Any] | None:
+        """A mined transaction, None if there is none."""
+        return self._transactions.get(hash_)
+
+    def receipt(self, hash_: bytes) -> dict[str, Any] | None:
+        """The receipt of a mined transaction, None if there is none."""
+        return self._receipts.get(hash_)
+
+    def logs(self, first: int, last: int) -> Iterator[dict[str, Any]]:
+        """All logs of the blocks from `first` to `last`, both included, in order."""
+        for height in range(first, min(last, self.head) + 1):
+            yield from self._logs.get(height, ())
+
+    def call(self, fields: Call, height: int) -> bytes:
+        """What a call returns. Raises `RpcError` with the revert data when it fails."""
+        run = self._run(height)
+        sender, data, value = fields.get("from") or bytes(20), fields.get("data") or b"", fields.get("value") or 0
+        try:
+            if fields.get("to") is None:
+                return self._create(run, sender, data)
+            return run.call(sender, fields["to"], data, value=value)
+        except ModelRevert as error:
+            raise RpcError(REVERTED, "execution reverted", data="0x" + error.data.hex()) from None
+
+    def estimate(self, fields: Call, height: int) -> int:
+        """Gas limit with which a transaction goes through; raises as `call` does."""
+        self.call(fields, height)
+        return gas_of(fields.get("to") or b"", fields.get("data") or b"") * 5 // 4
+
+    def mine(self, blocks: int) -> None:
+        """Mine empty blocks."""
+        for _ in range(blocks):
+            self._add_block(None, 0)
+
+    def rewind(self, height: int) -> None:
+        """Remove all blocks after one."""
+        self._state.rewind(height)
+        for block in self._blocks[height + 1 :]:
+            del self._by_hash[block["hash"]]
+            self._logs.pop(int(block["number"], 16), None)
+            for hash_ in block["transactions"]:
+                raw = bytes.fromhex(hash_[2:])
+                del self._receipts[raw], self._transactions[raw]
+        del self._blocks[height + 1 :], self._base_fees[height + 1 :]
+        self.head, self.base_fee = height, self._base_fees[-1]
+
+    def send(self, raw: bytes) -> bytes:
+        """Apply a signed transaction and mine its block; its hash. Raises `RpcError` for one that no block can hold."""
+        one = read_transaction(raw)
+        self._check(one)
+        run = self._run(self.head)
+        status, created, gas = 1, b"", gas_of(one.to, one.data)
+        try:
+            if gas > one.gas:
+                raise ModelRevert  # out of gas
+            if one.to:
+                run.call(one.sender, one.to, one.data, value=one.value)
+            else:
+                created = self._create(run, one.sender, one.data)
+        except ModelRevert:
+            status, gas = 0, min(gas, one.gas)
+            run = self._run(self.head)
+        price = min(one.price, self.base_fee + one.priority)
+        run.set(one.sender, "sent", one.nonce + 1)
+        run.set(one.sender, "wei", run.get(one.sender, "wei") - gas * price - (one.value if status else 0))
+        if status and one.value:
+            run.set(one.to, "wei", run.get(one.to, "wei") + one.value)
+        self._state.apply(self.head + 1, run.writes)
+        self._add_block(one, gas)
+        self._remember(one, run, status=status, created=created, gas=gas, price=price)
+        return one.hash
+
+    def read(self, raw: bytes) -> ModelTransaction:
+        """A signed transaction. Raises `RpcError`."""
+        return read_transaction(raw)
+
+    def _run(self, height: int) -> ModelRun:
+        return ModelRun(self._state, height, self.chain_id)
+
+    def _check(self, one: ModelTransaction) -> None:
+        if one.hash in self._receipts:
+            raise RpcError(SERVER_ERROR, "already known")
+        if one.gas > GAS_LIMIT:
+            raise RpcError(SERVER_ERROR, "exceeds block gas limit")
+        expected = self.nonce(one.sender, self.head)
+        if one.nonce != expected:
+            which = "low" if one.nonce < expected else "high"
+            raise RpcError(SERVER_ERROR, f"nonce too {which}: next nonce {expected}, tx nonce {one.nonce}")
+        funds, wanted = self.balance(one.sender, self.head), one.gas * one.price + one.value
+        if wanted > funds:
+            raise RpcError(SERVER_ERROR, f"insufficient funds for gas * price + value: have {funds} want {wanted}")
+        if one.price < self.base_fee:
+            raise RpcError(SERVER_ERROR, "max fee per gas less than block base fee")
+
+    def _create(self, run: ModelRun, sender: bytes, data: bytes) -> bytes:
+        nonce = int(run.get(sender, "sent"))
+        address = keccak256(rlp.encode([sender, nonce]))[12:]
+        for kind in CREATED:
+            creation = bytes.fromhex(artifact(kind.NAME)["bytecode"][2:])
+            if data.startswith(creation):
+                kind(run, address, sender).construct(data[len(creation) :])
+                run.set(address, "contract", (kind, bytes.fromhex(artifact(kind.NAME)["deployedBytecode"][2:])))
+                return address
+        raise ModelRevert
+
+    def _add_block(self, one: ModelTransaction | None, gas: int) -> None:
+        self.head += 1
+        parent = self._blocks[-1] if self._blocks else None
+        when = int(time.time())
+        if parent is not None:
+            when = max(when, int(parent["timestamp"], 16))
+        parent_hash = "0x" + bytes(32).hex() if parent is None else str(parent["hash"])
+        seed = f"{parent_hash} {self.head} {when} {one.hash.hex() if one else ''}"
+        hash_ = "0x" + keccak256(seed.encode()).hex()
+        self._blocks.append(
+            {
+                "number": hex(self.head),
+                "hash": hash_,
+                "parentHash": parent_hash,
+                "timestamp": hex(when),
+                "baseFeePerGas": hex(self.base_fee),
+                "gasLimit": hex(GAS_LIMIT),
+                "gasUsed": hex(gas),
+                "miner": "0x" + bytes(20).hex(),
+                "logsBloom": "0x" + bytes(256).hex(),
+                "transactions": [] if one is None else ["0x" + one.hash.hex()],
+            }
+        )
+        self._by_hash[hash_] = self.head
+        target = GAS_LIMIT // 2
+        change = self.base_fee * abs(gas - target) // target // 8
+        self.base_fee += max(change, 1) if gas > target else -change
+        self._base_fees.append(self.base_fee)
+
+    def _remember(
+        self, one: ModelTransaction, run: ModelRun, *, status: int, created: bytes, gas: int, price: int
+    ) -> None:
+        hash_, block = "0x" + one.hash.hex(), self._blocks[-1]
+        where = {"blockNumber": block["number"], "blockHash": block["hash"], "transactionIndex": "0x0"}
+        to = "0x" + one.to.hex() if one.to else None
+        mined = {"transactionHash": hash_, "removed": False} | where
+        logs = [
+            {
+                "address": "0x" + address.hex(),
+                "topics": ["0x" + topic.hex() for topic in topics],
+                "data": "0x" + data.hex(),
+                "logIndex": hex(index),
+            }
+            | mined
+            for index, (address, topics, data) in enumerate(run.logs if status else ())
+        ]
+        sender = "0x" + one.sender.hex()
+        self._receipts[one.hash] = where | {
+            "transactionHash": hash_,
+            "from": sender,
+            "to": to,
+            "contractAddress": "0x" + created.hex() if created else None,
+            "status": hex(status),
+            "gasUsed": hex(gas),
+            "cumulativeGasUsed": hex(gas),
+            "effectiveGasPrice": hex(price),
+            "type": "0x2",
+            "logs": logs,
+            "logsBloom": "0x" + bytes(256).hex(),
+        }
+        self._transactions[one.hash] = where | {
+            "hash": hash_,
+            "from": sender,
+            "to": to,
+            "nonce": hex(one.nonce),
+            "input": "0x" + one.data.hex(),
+            "value": hex(one.value),
+            "gas": hex(one.gas),
+            "maxFeePerGas": hex(one.price),
+            "maxPriorityFeePerGas": hex(one.priority),
+            "gasPrice": hex(price),
+            "type": "0x2",
+            "chainId": hex(self.chain_id),
+        }
+        if logs:
+            self._logs[self.head] = logs
+
+
+def gas_of(to: bytes, data: bytes) -> int:
+    """What a transaction takes, about."""
+    if not data:
+        return 21_000
+    return 250_000 if to else 3_000_000
+
+
+def _address_of(key: bytes) -> bytes:
+    return keccak256(PrivateKey(key).public_key.format(compressed=False)[1:])[12:]

@@ -1,0 +1,49 @@
+"""Signed transactions of the modelled chain: those of type 2, which is what accounts of the mesh send."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Final, NamedTuple
+
+import rlp  # type: ignore[import-untyped]
+from coincurve import PublicKey
+
+from mesh.devchain.jsonrpc import SERVER_ERROR, RpcError
+from schemas import keccak256
+
+TYPE_2: Final = 2
+
+
+class ModelTransaction(NamedTuple):
+    """A signed transaction of type 2."""
+
+    raw: bytes
+    hash: bytes
+    sender: bytes
+    nonce: int
+    priority: int
+    price: int
+    """The most wei that a gas may cost."""
+    gas: int
+    to: bytes
+    value: int
+    data: bytes
+
+
+@lru_cache(maxsize=10_000)
+def read_transaction(raw: bytes) -> ModelTransaction:
+    """A signed transaction. Raises `RpcError`."""
+    try:
+        if raw[0] != TYPE_2:
+            raise ValueError(f"transactions of type {raw[0]} are not modelled")
+        fields = rlp.decode(raw[1:])
+        numbers = [int.from_bytes(field, "big") for field in fields[:5]]
+        value, parity = int.from_bytes(fields[6], "big"), int.from_bytes(fields[9], "big")
+        signature = fields[10].rjust(32, b"\0") + fields[11].rjust(32, b"\0") + bytes([parity])
+        unsigned = keccak256(bytes([TYPE_2]) + rlp.encode(fields[:9]))
+        key = PublicKey.from_signature_and_message(signature, unsigned, hasher=None)
+    except Exception as error:
+        raise RpcError(SERVER_ERROR, f"the transaction can't be decoded: {error}") from None
+    sender = keccak256(key.format(compressed=False)[1:])[12:]
+    _, nonce, priority, price, gas = numbers
+    return ModelTransaction(raw, keccak256(raw), sender, nonce, priority, price, gas, fields[5], value, fields[7])

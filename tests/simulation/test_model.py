@@ -1,0 +1,37 @@
+"""The model of the contracts does what the contracts do on the EVM: answers, reasons, events, all that can be read."""
+
+from __future__ import annotations
+
+import os
+from typing import Any, Final
+
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.simulation.model_history import ModelHistory, twins
+
+HISTORIES: Final = int(os.environ.get("AIRA_MODEL_HISTORIES", "30"))
+STEPS: Final = 60
+SHOWN: Final = ("status", "contractAddress", "from", "to", "blockNumber", "transactionIndex", "type")
+
+
+@settings(max_examples=HISTORIES, deadline=None, suppress_health_check=list(HealthCheck))
+@given(seed=st.integers(0, 2**64), steps=st.integers(1, STEPS))
+def test_the_model_does_what_the_contracts_do(seed: int, steps: int) -> None:
+    ModelHistory(seed, steps).play()
+
+
+def test_the_chain_of_the_model_shows_what_the_chain_of_the_evm_shows() -> None:
+    """The deployment: receipts, transactions and logs, but for gas, prices and hashes of blocks."""
+    both = twins()
+    for number in range(1, both.evm.head + 1):
+        expected, found = (_block(chain, number) for chain in (both.evm, both.model))
+        assert found == expected
+
+
+def _block(chain: Any, number: int) -> dict[str, Any]:
+    (hash_,) = chain.block(number, transactions="hashes")["transactions"]
+    receipt, transaction = chain.receipt(bytes.fromhex(hash_[2:])), chain.transaction(bytes.fromhex(hash_[2:]))
+    shown = {name: receipt[name] for name in SHOWN}
+    shown["logs"] = [(log["address"], log["topics"], log["data"], log["logIndex"]) for log in receipt["logs"]]
+    return shown | {name: transaction[name] for name in ("to", "nonce", "input", "value")}
