@@ -39,12 +39,14 @@ class ChainHead:
 
     def __init__(self, head: int) -> None:
         self._advanced = asyncio.Event()
+        self.head = head
         self.advance_to(head)
         self._handled = -1
 
     def begin_after(self, block: int) -> None:
         """All blocks up to `block` were handled in earlier runs."""
         self._handled = block
+        self.head = max(self.head, block)  # which was read a moment earlier, or from a node that is behind
         self._advance()
 
     def advance_to(self, block: int) -> None:

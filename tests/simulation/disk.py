@@ -1,8 +1,7 @@
 """What a crash of the machine leaves of a folder (what was synced, and chance decides about the rest), and full disks.
 
 Files are real. What `os.fsync` was called for is remembered here, and what SQLite has synced: each commit with
-`synchronous = FULL`; otherwise what it has moved from its log to the database. Commits count as steps at which a process
-may crash.
+`synchronous = FULL`; otherwise what it has moved from its log to the database. A process may crash at each commit.
 """
 
 from __future__ import annotations
@@ -130,7 +129,7 @@ class SimulatedDisk:
         module.fsync = self.fsync
         for name in ("write", "pwrite"):
             setattr(os, name, _checked(self, getattr(os, name)))
-        io.open = builtins.open = _opener(self)  # type: ignore[assignment]
+        io.open = builtins.open = _opener(self)
         connect = sqlite3.connect
 
         def connect_here(path: Any, *arguments: Any, **options: Any) -> sqlite3.Connection:
@@ -161,7 +160,9 @@ def _opener(disk: SimulatedDisk) -> Any:
     def open_here(file: Any, mode: str = "r", buffering: int = -1, *arguments: Any, **options: Any) -> Any:
         if "b" not in mode or not set("wax+") & set(mode) or arguments:
             return original(file, mode, buffering, *arguments, **options)
-        raw = File(file, mode.replace("b", ""), **{name: options[name] for name in ("opener", "closefd") if name in options})
+        raw = File(
+            file, mode.replace("b", ""), **{name: options[name] for name in ("opener", "closefd") if name in options}
+        )
         if buffering == 0:
             return raw
         size = buffering if buffering > 1 else io.DEFAULT_BUFFER_SIZE
@@ -179,15 +180,18 @@ class DatabaseConnection(sqlite3.Connection):
 
     def execute(self, statement: str, *arguments: Any) -> sqlite3.Cursor:
         """Execute a statement."""
-        return self._guarded(statement, super().execute, statement, *arguments)
+        done: sqlite3.Cursor = self._guarded(statement, super().execute, statement, *arguments)
+        return done
 
     def executemany(self, statement: str, *arguments: Any) -> sqlite3.Cursor:
         """Execute a statement for each row."""
-        return self._guarded(statement, super().executemany, statement, *arguments)
+        done: sqlite3.Cursor = self._guarded(statement, super().executemany, statement, *arguments)
+        return done
 
     def executescript(self, statements: str) -> sqlite3.Cursor:
         """Execute several statements."""
-        return self._guarded("CREATE", super().executescript, statements)
+        done: sqlite3.Cursor = self._guarded("CREATE", super().executescript, statements)
+        return done
 
     def commit(self) -> None:
         """Commit."""
@@ -223,4 +227,3 @@ class DatabaseConnection(sqlite3.Connection):
         process = scheduler().process
         if process is not None:
             process.commit()
-
