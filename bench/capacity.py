@@ -16,9 +16,10 @@ from typing import Any, Final
 ROOT: Final = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))  # `peers` finds anvil
 
+from one_router import devices, filtered, sessions  # noqa: E402
+
 from common import arguments  # noqa: E402
 from load import jobs_per_minute, orders_per_second  # noqa: E402
-from scale import devices, filtered, sessions  # noqa: E402
 
 STEPS: Final = (10, 50, 100, 200, 400, 800)
 """Numbers of sessions to measure, up to the one in the options."""

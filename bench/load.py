@@ -10,6 +10,8 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from one_router import TIMEOUT
+
 from common import SPAWN, router, signed_demands
 from mesh import Agent
 from mesh.background import Background
@@ -21,7 +23,6 @@ from mesh.market.provider import Provider
 from mesh.network import Channel, Endpoints, Network
 from mesh.settings import Settings
 from peers.catalog import PeerMissing, locate
-from scale import TIMEOUT
 from schemas import cid_of_bytes
 
 if TYPE_CHECKING:

@@ -1,111 +1,100 @@
-"""Many sessions on one router: memory per session, messages to subscribers, and the cost of edge processes.
+"""A market of many agents on three linked routers: what a message costs the routers, and whether any is lost.
 
-Memory is the proportional set size (PSS), which counts shared memory once.
+Each agent has its session, a subscription to the demands for its own model and a presence token, and answers each
+demand with an offer. People on all three routers send demands; a listener on one of them receives all offers, as a
+provider does. The bars: no order lost or misdirected, the routers' processor time per message at the highest number of
+agents at most twice that at the lowest, all agents declared within ten seconds.
+
+Besides the jobs, the routers' time is measured for messages on keys that nobody subscribes to: demands for models that
+no agent serves, and events of agents.
 """
 
 from __future__ import annotations
 
 import asyncio
-import os
-import pty
-import subprocess
 import sys
 import time
-from contextlib import AsyncExitStack
+from argparse import ArgumentParser
+from contextlib import AsyncExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from msgspec.structs import replace
 from zenoh import CongestionControl
 
-from common import ADDRESS, LIGHTHOUSE, SPAWN, router, signed_demands
-from mesh.network import Channel, Endpoints, Network, message_key
-from schemas import Demand, cid_of_bytes, encode
-from schemas.selectors import market_selector
+from common import ADDRESS, LIGHTHOUSE, SPAWN, TOKEN, show
+from mesh.network import Channel, Endpoints, Network, free_endpoint
+from mesh.network.endpoints import allow_sessions
+from schemas import ZERO_ADDRESS, Demand, EventKey, Offer, Signer, cid_of_bytes, encode, market_selector
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
-SESSIONS_PER_PROCESS: Final = 50
-SETTLE_TIME: Final = 1.0
-"""Seconds until declarations have spread, and memory is stable."""
-TIMEOUT: Final = 120.0
-WINDOW: Final = 2000
-"""Most messages in flight, so that none is lost."""
+ROUTERS: Final = 3
+AGENTS_PER_PROCESS: Final = 125
+MAX_SESSIONS: Final = 10_000
+IN_FLIGHT: Final = 32
+"""Jobs at a time."""
+JOB_TIMEOUT: Final = 30.0
+"""Seconds after which an order that has no answer counts as lost."""
+START_TIMEOUT: Final = 600.0
+DECLARED_WITHIN: Final = 10.0
+FLAT: Final = 2.0
+
+
+class Routers(NamedTuple):
+    """Three linked routers, each a process: endpoints and process ids."""
+
+    endpoints: tuple[str, ...]
+    pids: tuple[int, ...]
+
+    def seconds(self) -> float:
+        """Processor time of all, to the nanosecond."""
+        return sum(map(seconds_of, self.pids))
+
+
+@contextmanager
+def routers() -> Iterator[Routers]:
+    """Start and stop them. Each connects to those before it."""
+    endpoints = tuple(free_endpoint() for _ in range(ROUTERS))
+    started = [
+        SPAWN.Process(target=_route, args=(endpoint, endpoints[:number]), daemon=True)
+        for number, endpoint in enumerate(endpoints)
+    ]
+    for process in started:
+        process.start()
+    try:
+        yield Routers(endpoints, tuple(process.pid for process in started if process.pid is not None))
+    finally:
+        for process in started:
+            process.terminate()
+            process.join()
+
+
+def _route(endpoint: str, others: tuple[str, ...]) -> None:
+    async def run() -> None:
+        at = Endpoints(listen=(endpoint,), connect=others, mode="router", max_sessions=MAX_SESSIONS)
+        async with Network(at):
+            await asyncio.Event().wait()
+
+    allow_sessions(MAX_SESSIONS)
+    asyncio.run(run())
+
+
+def seconds_of(pid: int) -> float:
+    """Processor time of all threads of a process."""
+    spent = 0
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        try:
+            spent += int((task / "schedstat").read_text().split()[0])
+        except (OSError, IndexError):
+            continue
+    return spent / 1e9
 
 
 def memory(pid: int) -> float:
-    """MiB of a process."""
-    for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines():
-        if line.startswith("Pss:"):
-            return int(line.split()[1]) / 1024
-    raise ValueError(f"no memory of {pid}")
-
-
-def sessions(counts: Sequence[int]) -> list[dict[str, float]]:
-    """For each number of agents: memory of the router, and the time of a query for all agents that are present.
-
-    Each agent is a session with a presence token and a subscription to the demands for its model.
-    """
-    found = []
-    processes: list[Any] = []
-    with router() as (endpoint, pid):
-        empty = None
-        try:
-            for count in sorted(counts):
-                while (missing := count - sum(size for _, size, _ in processes)) > 0:
-                    processes.append(
-                        _agents(endpoint, min(SESSIONS_PER_PROCESS, missing), first=sum(one[1] for one in processes))
-                    )
-                time.sleep(SETTLE_TIME)
-                seconds = asyncio.run(_query_presence(endpoint, count))
-                now = memory(pid)
-                empty = now if empty is None else empty
-                found.append({"sessions": count, "router_mib": round(now, 1), "roll_call_ms": round(seconds * 1e3, 1)})
-        finally:
-            for process, _, leave in processes:
-                leave.set()
-                process.join()
-    return found
-
-
-def _agents(endpoint: str, size: int, *, first: int) -> tuple[Any, int, Any]:
-    ready, leave = SPAWN.Event(), SPAWN.Event()
-    process = SPAWN.Process(target=run_agents, args=(endpoint, first, size, ready, leave), daemon=True)
-    process.start()
-    assert ready.wait(TIMEOUT), "the sessions did not open"
-    return process, size, leave
-
-
-def run_agents(endpoint: str, first: int, size: int, ready: Any, leave: Any) -> None:
-    """A process with many sessions."""
-    asyncio.run(_run_agents(endpoint, first, size, ready, leave))
-
-
-async def _run_agents(endpoint: str, first: int, size: int, ready: Any, leave: Any) -> None:
-    async with AsyncExitStack() as stack:
-        for number in range(first, first + size):
-            network = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,))))
-            channel = await stack.enter_async_context(Channel(network.session, LIGHTHOUSE, address=ADDRESS))
-            await stack.enter_async_context(channel.subscribe(Demand, model=model(number)))
-            channel.announce("agent", f"0x{number:040x}")
-        ready.set()
-        await asyncio.to_thread(leave.wait)
-
-
-async def _query_presence(endpoint: str, count: int) -> float:
-    """Seconds of a query that is answered with all agents; connecting is not counted."""
-    async with (
-        Network(Endpoints(connect=(endpoint,))) as network,
-        Channel(network.session, LIGHTHOUSE, address=ADDRESS) as channel,
-    ):
-        deadline = time.monotonic() + TIMEOUT
-        while True:
-            started = time.perf_counter()
-            present = len(await channel.present())
-            if present == count:
-                return time.perf_counter() - started
-            assert time.monotonic() < deadline, f"{present} of {count} are present"
+    """Proportional set size of a process, MiB: it counts shared memory once."""
+    lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("Pss:")) / 1024
 
 
 def model(number: int) -> str:
@@ -113,97 +102,267 @@ def model(number: int) -> str:
     return cid_of_bytes(f"model {number}".encode())
 
 
-def filtered(counts: Sequence[int], messages: int) -> list[dict[str, float]]:
-    """For each number of subscribers, each to its own model: messages per second from one publisher to all of them."""
-    found = []
-    for count in counts:
-        with router() as (endpoint, pid):
-            seconds, used = asyncio.run(_through(endpoint, pid, count, messages))
-            found.append(
-                {
-                    "subscribers": count,
-                    "messages_per_second": round(messages / seconds),
-                    "router_us_a_message": round(used / messages * 1e6, 1),
-                }
-            )
-    return found
+class Agents:
+    """Processes with many agents each, which start at the same moment."""
+
+    def __init__(self, endpoints: Sequence[str], count: int) -> None:
+        self.go, self.leave, self.wrong = SPAWN.Event(), SPAWN.Event(), SPAWN.Value("l", 0)
+        self._ready = SPAWN.Semaphore(0)
+        shares = [range(first, min(first + AGENTS_PER_PROCESS, count)) for first in range(0, count, AGENTS_PER_PROCESS)]
+        self.processes = [
+            SPAWN.Process(target=run_agents, args=(endpoints, share, self), daemon=True) for share in shares
+        ]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "processes"}
+
+    def start(self) -> None:
+        """Start the processes; they wait for `go`."""
+        for process in self.processes:
+            process.start()
+        for _ in self.processes:
+            assert self._ready.acquire(timeout=START_TIMEOUT), "the processes did not start"
+
+    def is_ready(self) -> None:
+        """A process waits for `go`."""
+        self._ready.release()
+
+    def memory(self) -> float:
+        """MiB of all processes."""
+        return sum(memory(process.pid) for process in self.processes if process.pid is not None)
+
+    def stop(self) -> None:
+        """End all processes."""
+        self.go.set()
+        self.leave.set()
+        for process in self.processes:
+            process.join(60)
+            process.kill()
 
 
-async def _through(endpoint: str, pid: int, count: int, messages: int) -> tuple[float, float]:
-    """Seconds that the messages took, and the router's processor time in seconds."""
-    received, ready, leave = SPAWN.Value("l", 0), SPAWN.Event(), SPAWN.Event()
-    subscribers = SPAWN.Process(target=subscribe, args=(endpoint, count, received, ready, leave), daemon=True)
-    subscribers.start()
-    assert await asyncio.to_thread(ready.wait, TIMEOUT)
-    (demand,) = signed_demands(1)  # only its size matters
-    wire = [(message_key(LIGHTHOUSE, replace(demand, model=model(number))), encode(demand)) for number in range(count)]
-    async with Network(Endpoints(connect=(endpoint,))) as network:
-        await asyncio.sleep(SETTLE_TIME)
-        before, started = _seconds_of(pid), time.perf_counter()
-        for number in range(messages):
-            while number - received.value >= WINDOW:
-                await asyncio.sleep(0.0005)
-            key, payload = wire[number % count]
-            network.session.put(key, payload, congestion_control=CongestionControl.BLOCK)
-        deadline = time.monotonic() + TIMEOUT
-        while received.value < messages:
-            assert time.monotonic() < deadline, f"{received.value} of {messages} arrived"
-            await asyncio.sleep(0.001)
-        seconds, used = time.perf_counter() - started, _seconds_of(pid) - before
-    leave.set()
-    subscribers.join()
-    return seconds, used
+def run_agents(endpoints: Sequence[str], numbers: range, agents: Agents) -> None:
+    """A process with an agent for each number."""
+    allow_sessions(MAX_SESSIONS)
+    agents.is_ready()
+    agents.go.wait()
+    asyncio.run(_run_agents(endpoints, numbers, agents))
 
 
-def subscribe(endpoint: str, count: int, received: Any, ready: Any, leave: Any) -> None:
-    """A process with many subscribers, each with its own session, that only count."""
-    asyncio.run(_subscribe(endpoint, count, received, ready, leave))
+async def _run_agents(endpoints: Sequence[str], numbers: range, agents: Agents) -> None:
+    async with AsyncExitStack() as stack, asyncio.TaskGroup() as tasks:
+        opening = asyncio.Semaphore(8)
+
+        async def open_agent(number: int) -> None:
+            async with opening:
+                at = Endpoints(connect=(endpoints[number % ROUTERS],), timeout=START_TIMEOUT)
+                network = await stack.enter_async_context(Network(at))
+            channel = await stack.enter_async_context(Channel(network.session, LIGHTHOUSE, address=ADDRESS))
+            demands = await stack.enter_async_context(channel.subscribe(Demand, model=model(number)))
+            channel.announce("agent", f"0x{number:040x}")
+            working.append(tasks.create_task(_work(channel, demands, number, agents)))
+
+        working: list[asyncio.Task[None]] = []
+        await asyncio.gather(*(open_agent(number) for number in numbers))
+        await asyncio.to_thread(agents.leave.wait)
+        for task in working:
+            task.cancel()
 
 
-async def _subscribe(endpoint: str, count: int, received: Any, ready: Any, leave: Any) -> None:
-    def count_one(_: Any) -> None:
-        with received.get_lock():
-            received.value += 1
+async def _work(channel: Channel, demands: Any, number: int, agents: Agents) -> None:
+    """Answer each demand with a signed offer of the same terms."""
+    signer = Signer((number + 1).to_bytes(32, "big"))
+    fields = ("model", "objective", "token", "cost", "lighthouse", "validator", "deadline", "nonce")
+    async for demand in demands:
+        if demand.message.model != model(number):
+            with agents.wrong.get_lock():
+                agents.wrong.value += 1
+        terms = {field: getattr(demand.message, field) for field in fields}
+        channel.publish(signer.sign(Offer(**terms, lighthouse_fee=0)))
 
+
+async def jobs(at: Routers, count: int, number: int) -> dict[str, float]:
+    """Exchange `number` demands and offers with `count` agents; the routers' processor time of a message."""
+    lost = wrong = 0
+    taken: list[float] = []
+    person = Signer(b"\2" * 32)
+    waiting: dict[str, asyncio.Future[None]] = {}
     async with AsyncExitStack() as stack:
-        for number in range(count):
-            network = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,))))
-            network.session.declare_subscriber(market_selector(LIGHTHOUSE, "demand", model(number)), count_one)
-        ready.set()
-        await asyncio.to_thread(leave.wait)
+        channels = [await _channel(stack, endpoint) for endpoint in at.endpoints]
+        offers = await stack.enter_async_context(channels[1].subscribe(Offer))
+        await _spread(channels, count)
 
+        async def listen() -> None:
+            nonlocal wrong
+            async for offer in offers:
+                answered = waiting.get(f"{offer.message.model} {offer.message.objective}")
+                if answered is None or answered.done():
+                    wrong += 1
+                else:
+                    answered.set_result(None)
 
-def _seconds_of(pid: int) -> float:
-    """Processor time of a process."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        async def job(index: int) -> None:
+            nonlocal lost
+            objective = cid_of_bytes(f"{time.time_ns()} {index}".encode())
+            demand = person.sign(_demand(model(index * 7919 % count), objective, index))
+            answered = waiting[f"{demand.model} {objective}"] = asyncio.get_running_loop().create_future()
+            started = time.perf_counter()
+            channels[index % ROUTERS].publish(demand)
+            try:
+                async with asyncio.timeout(JOB_TIMEOUT):
+                    await answered
+                taken.append(time.perf_counter() - started)
+            except TimeoutError:
+                lost += 1
 
-
-def devices(count: int) -> dict[str, float]:
-    """Idle edge processes on lines without a board: memory of each, and the processor time of all."""
-    lines = [pty.openpty() for _ in range(count)]
-    with router() as (endpoint, _):
-        processes = [_edge(endpoint, number, line) for number, (_, line) in enumerate(lines)]
-        try:
-            time.sleep(3 + SETTLE_TIME * count / 4)
-            before, started = sum(_seconds_of(process.pid) for process in processes), time.perf_counter()
-            time.sleep(5)
-            core = (sum(_seconds_of(process.pid) for process in processes) - before) / (time.perf_counter() - started)
-            used = [memory(process.pid) for process in processes]
-        finally:
-            for process in processes:
-                process.terminate()
-                process.wait()
+        listening = asyncio.create_task(listen())
+        await _in_turn(job, min(number // 10, 200))
+        taken.clear()
+        before = at.seconds()
+        await _in_turn(job, number)
+        used = at.seconds() - before
+        listening.cancel()
+    taken.sort()
     return {
-        "devices": count,
-        "edge_mib": round(sum(used) / count, 1),
-        "of_a_core_each_percent": round(core / count * 100, 2),
-        "devices_a_gib": int(1024 / (sum(used) / count)),
+        "router_us": used / (2 * number) * 1e6,
+        "lost": lost,
+        "wrong": wrong,
+        "p50_ms": taken[len(taken) // 2] * 1e3 if taken else 0.0,
+        "p99_ms": taken[len(taken) * 99 // 100] * 1e3 if taken else 0.0,
     }
 
 
-def _edge(endpoint: str, number: int, line: int) -> subprocess.Popen[bytes]:
-    words = ["edge", os.ttyname(line), "--agent", ADDRESS, "--name", f"d{number}", "--connect", endpoint]
-    return subprocess.Popen(
-        [sys.executable, "-m", "mesh", *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+async def _in_turn(job: Any, number: int) -> None:
+    """Run that many jobs, `IN_FLIGHT` at a time."""
+    todo = iter(range(number))
+
+    async def worker() -> None:
+        for index in todo:
+            await job(index)
+
+    await asyncio.gather(*(worker() for _ in range(IN_FLIGHT)))
+
+
+def _demand(of: str, objective: str, index: int) -> Demand:
+    return Demand(
+        model=of,
+        objective=objective,
+        token=TOKEN,
+        cost=1000,
+        lighthouse=ADDRESS,
+        validator=ZERO_ADDRESS,
+        validator_fee=0,
+        deadline=2**40,
+        nonce=f"{index + 2**200:064x}",
     )
+
+
+async def _channel(stack: AsyncExitStack, endpoint: str) -> Channel:
+    network = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,), timeout=START_TIMEOUT)))
+    return await stack.enter_async_context(Channel(network.session, LIGHTHOUSE, address=ADDRESS))
+
+
+async def _spread(channels: Sequence[Channel], count: int) -> None:
+    """Wait until every router knows all agents."""
+    deadline = time.monotonic() + START_TIMEOUT
+    for channel in channels:
+        while (present := len(await channel.present())) != count:
+            assert time.monotonic() < deadline, f"{present} of {count} agents are present"
+            await asyncio.sleep(0.05)
+
+
+async def unheard(at: Routers, messages: int) -> dict[str, float]:
+    """Processor time of a router for a message whose key nobody has subscribed to as such."""
+    payload = encode(Signer(b"\2" * 32).sign(_demand(model(0), model(0), 0)))
+    keys = {
+        "unknown_model": [market_selector(LIGHTHOUSE, "demand", model(-1 - number)) for number in range(64)],
+        "event": [str(EventKey(f"0x{number:040x}", f"0x{number:040x}", "ready")) for number in range(1, 65)],
+    }
+    found = {}
+    async with AsyncExitStack() as stack:
+        sender = (await _channel(stack, at.endpoints[0]))._session
+        watcher = (await _channel(stack, at.endpoints[1]))._session
+        passed = asyncio.Event()
+        loop = asyncio.get_running_loop()
+        watcher.declare_subscriber("aira/bench/passed", lambda _: loop.call_soon_threadsafe(passed.set))
+        watcher.declare_subscriber(market_selector(LIGHTHOUSE, "demand"), lambda _: None)
+        await asyncio.sleep(1)
+        for name, texts in keys.items():
+            passed.clear()
+            before = at.seconds()
+            for number in range(messages):
+                sender.put(texts[number % len(texts)], payload, congestion_control=CongestionControl.BLOCK)
+            sender.put("aira/bench/passed", b"", congestion_control=CongestionControl.BLOCK)
+            await asyncio.wait_for(passed.wait(), START_TIMEOUT)
+            found[f"{name}_us"] = (at.seconds() - before) / messages * 1e6
+    return found
+
+
+def measure(count: int, options: Any) -> dict[str, Any]:
+    """All measurements with that many agents."""
+    with routers() as at:
+        asyncio.run(asyncio.sleep(1))
+        empty = sum(map(memory, at.pids))
+        agents = Agents(at.endpoints, count)
+        agents.start()
+        idle = agents.memory()
+        try:
+            started = time.perf_counter()
+            agents.go.set()
+            asyncio.run(_until_declared(at, count))
+            declared = time.perf_counter() - started
+            found: dict[str, Any] = asyncio.run(jobs(at, count, options.jobs))
+            found |= asyncio.run(unheard(at, options.jobs))
+            found["wrong"] += agents.wrong.value
+            found["declared_s"] = declared
+            found["router_kib_an_agent"] = (sum(map(memory, at.pids)) - empty) / count * 1024
+            found["agent_mib"] = (agents.memory() - idle) / count
+        finally:
+            agents.stop()
+    return found
+
+
+async def _until_declared(at: Routers, count: int) -> None:
+    async with AsyncExitStack() as stack:
+        await _spread([await _channel(stack, endpoint) for endpoint in at.endpoints], count)
+
+
+def judged(found: dict[int, dict[str, Any]]) -> dict[str, Any]:
+    """The results by number of agents, and which bars are missed."""
+    counts = sorted(found)
+    few, many = found[counts[0]], found[counts[-1]]
+    lost, wrong = (sum(one[name] for one in found.values()) for name in ("lost", "wrong"))
+    ratio = many["router_us"] / few["router_us"]
+    bars = {
+        "an order was lost": lost == 0,
+        "an order was misdirected": wrong == 0,
+        f"a message costs the routers {ratio:.1f} times as much": ratio <= FLAT,
+        f"declaring took {many['declared_s']:.0f} s": many["declared_s"] <= DECLARED_WITHIN or counts[-1] > 1000,
+    }
+    names = [name for name in few if name not in ("lost", "wrong")]
+    by_count = {name: {str(count): round(found[count][name], 2) for count in counts} for name in names}
+    return {
+        "agents": counts,
+        "sessions": counts[-1],
+        "lost": lost,
+        "wrong": wrong,
+        **by_count,
+        "ratio": round(ratio, 2),
+        "missed": [bar for bar, is_met in bars.items() if not is_met],
+    }
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = ArgumentParser(description="many agents on three linked routers")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--agents", default="10,1000", help="numbers of agents, separated by commas")
+    parser.add_argument("--jobs", type=int, default=3000, help="demands that are answered by an offer")
+    options = parser.parse_args()
+    allow_sessions(MAX_SESSIONS)
+    results = judged({count: measure(count, options) for count in sorted(map(int, options.agents.split(",")))})
+    show(results, as_json=options.json)
+    sys.exit(bool(results["missed"]))
+
+
+if __name__ == "__main__":
+    main()

@@ -8,13 +8,11 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
-import zenoh
-
 from bridges.ipfs.errors import DaemonRefused, DaemonUnreachable, NoPeers, PublishedOutOfOrder
 from bridges.ipfs.journal import Side
 from bridges.ipfs.status import RateMeter
 from mesh.log_context import log_event
-from mesh.network import NetworkChange
+from mesh.network import NetworkChange, sending
 from mesh.retry import Backoff, RetryPolicy
 
 if TYPE_CHECKING:
@@ -139,13 +137,7 @@ class MeshPublisher:
                 await asyncio.sleep(0)
 
     def _put(self, message: RelayMessage) -> None:
-        self._network.session.put(
-            message.key,
-            message.payload,
-            encoding="application/json",
-            congestion_control=zenoh.CongestionControl.DROP,
-            attachment=BRIDGE_MARK,
-        )
+        sending.put(self._network.session, message.key, message.payload, attachment=BRIDGE_MARK)
 
     async def _follow_network(self) -> None:
         """Pause while there is no router, then repeat puts that may have vanished; receivers drop duplicates."""

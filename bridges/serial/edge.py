@@ -26,6 +26,7 @@ from bridges.serial.line import SerialLine
 from bridges.serial.metrics import EdgeCounters
 from mesh.errors import InvalidKey
 from mesh.log_context import liability_context, log_event
+from mesh.network import sending
 from schemas.agent_keys import (
     DeviceTopicKey,
     EventKey,
@@ -290,6 +291,4 @@ class Edge:
         return str(LiabilityTopicKey(self._agent, liability, topic))
 
     def _put(self, key: str, payload: bytes, kind: PayloadType) -> None:
-        drop = zenoh.CongestionControl.DROP
-        encoding = kind.zenoh_encoding
-        self._session.put(key, payload, encoding=encoding, attachment=PUT_BY_EDGE, congestion_control=drop)
+        sending.put(self._session, key, payload, encoding=kind.zenoh_encoding, attachment=PUT_BY_EDGE)

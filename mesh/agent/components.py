@@ -39,14 +39,12 @@ class ChainHead:
 
     def __init__(self, head: int) -> None:
         self._advanced = asyncio.Event()
-        self.head = head
         self.advance_to(head)
         self._handled = -1
 
     def begin_after(self, block: int) -> None:
         """All blocks up to `block` were handled in earlier runs."""
         self._handled = block
-        self.head = max(self.head, block)  # which was read a moment earlier, or from a node that is behind
         self._advance()
 
     def advance_to(self, block: int) -> None:
@@ -133,7 +131,7 @@ async def working(
             ledger=ledger,
             outbox=Outbox(ledger, channel, network, head=lambda: chain_head.head, policy=resend),
             store=store,
-            exchange=await stack.enter_async_context(Exchange(network.session, store, address=account.address.lower())),
+            exchange=await stack.enter_async_context(Exchange(network.session, store)),
             services=await stack.enter_async_context(Services(network.session, account.address)),
             chain_head=chain_head,
             outages=OutageLog(log, "chain"),

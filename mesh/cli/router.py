@@ -30,7 +30,16 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-SITE_SETTINGS: Final = ("listen", "link", "tls_ca", "tls_certificate", "tls_key", "roster")
+SITE_SETTINGS: Final = (
+    "listen",
+    "link",
+    "tls_ca",
+    "tls_certificate",
+    "tls_key",
+    "roster",
+    "max_sessions",
+    "shared_memory",
+)
 ROSTER_INTERVAL: Final = 1.0
 """Seconds between two checks of the roster."""
 
@@ -105,8 +114,10 @@ def config(settings: Settings, out: Path) -> None:
 async def serve(settings: Settings) -> None:
     from mesh.identity.routers import router_endpoints
     from mesh.network import Network
+    from mesh.network.endpoints import allow_sessions
     from mesh.starting import wait_for_files
 
+    allow_sessions(settings.max_sessions)
     async with Telemetry(settings.metrics_listen) as telemetry:
         await wait_for_files(settings)
         endpoints = router_endpoints(settings)

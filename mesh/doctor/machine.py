@@ -16,6 +16,7 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from mesh.doctor.checks import CheckResult, failed, passed, warning
+from mesh.network.endpoints import SPARE_DESCRIPTORS, room_for_sessions
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -129,6 +130,19 @@ def check_disk_space(folder: Path, *, content_limit: int, least: int = LEAST) ->
     if free + kept < content_limit:
         return warning(shown, code="disk-space", hint="reduce --content-limit, or free some space")
     return passed(shown)
+
+
+def check_descriptors(max_sessions: int) -> CheckResult:
+    """Whether a router started like this process may open a file descriptor for each of `max_sessions`."""
+    room = room_for_sessions()
+    if room >= max_sessions:
+        return passed(f"there are file descriptors for {max_sessions:,} sessions")
+    return warning(
+        f"there are file descriptors for {room:,} sessions, not for {max_sessions:,}",
+        code="few-descriptors",
+        hint=f"raise the hard limit of open files to {max_sessions + SPARE_DESCRIPTORS} (LimitNOFILE in a systemd unit,"
+        f" or ulimit -Hn), or give the router --max-sessions {room}",
+    )
 
 
 def _write_failure(folder: Path, existing: Path, error: OSError) -> CheckResult:

@@ -41,6 +41,8 @@ async def checks_for(context: DoctorContext) -> AsyncIterator[list[Check]]:
         checks: list[Check] = []
         if "roster" in areas:
             checks.append(_roster_check(context))
+        if context.role == "router":
+            checks.append(_descriptors_check(context))
         checks += _network_checks(context, stack)
         if "chain" in areas:
             checks += _or_reason("node", partial(_chain_checks, context, stack))
@@ -82,6 +84,12 @@ def _roster_check(context: DoctorContext) -> Check:
     from mesh.doctor.router import check_roster
 
     return Check("roster", partial(in_thread, check_roster, context))
+
+
+def _descriptors_check(context: DoctorContext) -> Check:
+    from mesh.doctor.machine import check_descriptors
+
+    return Check("descriptors", partial(in_thread, check_descriptors, context.settings.max_sessions))
 
 
 def _network_checks(context: DoctorContext, stack: AsyncExitStack) -> list[Check]:

@@ -6,6 +6,7 @@ import asyncio
 import json
 import re
 from contextlib import ExitStack
+from dataclasses import replace
 from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -37,7 +38,7 @@ def router_endpoints(settings: Settings) -> Endpoints:
     """
     if not settings.roster:
         check_loopback((*settings.listen, *settings.link))
-        return Endpoints(mode="router", listen=settings.listen, connect=settings.link, tls=Tls.from_settings(settings))
+        return _endpoints(settings, Tls.from_settings(settings))
     roster = read_roster(Path(settings.roster).expanduser())
     for locator in (*settings.listen, *settings.link):
         if not locator.startswith("tls/"):
@@ -50,8 +51,18 @@ def router_endpoints(settings: Settings) -> Endpoints:
             "a router with a roster needs the site's certificate, its own certificate and its key",
             hint="give --tls-ca, --tls-certificate and --tls-key; `aira identity new --role router` creates them",
         )
-    access = access_control(roster)
-    return Endpoints(mode="router", listen=settings.listen, connect=settings.link, tls=tls, access=access)
+    return replace(_endpoints(settings, tls), access=access_control(roster))
+
+
+def _endpoints(settings: Settings, tls: Tls | None) -> Endpoints:
+    return Endpoints(
+        mode="router",
+        listen=settings.listen,
+        connect=settings.link,
+        tls=tls,
+        max_sessions=settings.max_sessions,
+        shared_memory=settings.shared_memory,
+    )
 
 
 def check_loopback(listen: tuple[str, ...]) -> None:

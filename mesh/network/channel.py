@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, Self
 import zenoh
 
 from mesh.errors import ClosedError, InputError, InvalidKey
+from mesh.network import sending
 from mesh.network.pump import Pump, call_in_loop
 from mesh.network.validation import (
     M,
@@ -108,7 +109,7 @@ class Channel:
         self._check_open()
         if "*" in key:
             raise InvalidKey(key, "it contains a wildcard")
-        self._session.put(key, payload, encoding="application/json", congestion_control=zenoh.CongestionControl.DROP)
+        sending.put(self._session, key, payload)
 
     def subscribe(self, kind: type[M], *, model: str = "*") -> Subscription[M]:
         """Subscribe to the verified messages of `kind` (`Demand`, `Offer`, `Withdrawal` or `Result`).

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import resource
 import socket
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -23,6 +24,11 @@ RECONNECT: Final = RetryPolicy(initial=0.1, factor=1.5, ceiling=0.5)
 """Delays between attempts to reach a router: short, so that an agent is back within a second."""
 ATTEMPT_TIMEOUT: Final = 3.0
 """Seconds an endpoint has to answer in one attempt."""
+MAX_SESSIONS: Final = 10_000
+"""Sessions that a router holds at a time, if the settings say nothing else. Zenoh's own default is 1,000."""
+SPARE_DESCRIPTORS: Final = 100
+"""Descriptors that a router needs besides those of its sessions."""
+MOST_SESSIONS: Final = 10**9
 SEND_QUEUE_BATCHES: Final = 16
 """Batches of 64 kB queued for a link before messages are dropped. Zenoh's default of two drops some of 100 puts."""
 LOCATOR: Final = re.compile(
@@ -35,6 +41,14 @@ TLS_PREFIXES: Final = ("tls/", "quic/")
 HIGHEST_PORT: Final = 65_535
 
 
+SEND_WAIT: Final = 0.02
+"""Seconds that a put waits for room in a client's queue before it drops the message, once until there is room again.
+
+A busy machine may give Zenoh's threads no time for so long. A router waits Zenoh's own 1 ms: while it waits for one
+slow client, it serves the others late.
+"""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Endpoints:
     """Where a session connects and listens, and with what identity.
@@ -42,7 +56,9 @@ class Endpoints:
     `connect` and `listen` are Zenoh locators (`tcp/HOST:PORT`). `mode` is `client` for agents and `router` for routers.
     A router connects to other routers and retries them as long as it is open. `timeout` is the time in seconds to
     reach a first router; -1 waits forever. `tls` is the identity on `tls/` locators. `access` is Zenoh's
-    `access_control`: the rights of each client of this router.
+    `access_control`: the rights of each client of this router; `max_sessions` is how many it holds at a time.
+    `shared_memory` exchanges large payloads with other processes of the machine in shared memory. Each session then
+    locks memory, and a router with 8 MiB of it (`ulimit -l`) admits some 350 sessions.
     """
 
     connect: tuple[str, ...] = ()
@@ -51,11 +67,18 @@ class Endpoints:
     timeout: float = 10.0
     tls: Tls | None = None
     access: Mapping[str, Any] | None = None
+    max_sessions: int = MAX_SESSIONS
+    shared_memory: bool = False
 
     @classmethod
     def from_settings(cls, settings: NetworkSettings) -> Endpoints:
         """The endpoints and identity of a client. Raises `ConfigurationError` for an incomplete identity."""
-        return cls(connect=settings.connect, timeout=settings.connect_timeout, tls=Tls.from_settings(settings))
+        return cls(
+            connect=settings.connect,
+            timeout=settings.connect_timeout,
+            tls=Tls.from_settings(settings),
+            shared_memory=settings.shared_memory,
+        )
 
     def config(self) -> zenoh.Config:
         """The Zenoh configuration for one attempt to open a session, which tries each endpoint once.
@@ -84,10 +107,14 @@ class Endpoints:
                 "period_increase_factor": RECONNECT.factor,
             },
             "transport/link/tx/queue/size/data": SEND_QUEUE_BATCHES,
+            "transport/shared_memory/enabled": self.shared_memory,
+            "transport/unicast/max_sessions": self.max_sessions,
             "scouting/multicast/enabled": False,
             # Otherwise a router waits half a second for others that scouting might find.
             "scouting/delay": 0,
         }
+        if self.mode == "client":
+            options["transport/link/tx/queue/congestion_control/drop/wait_before_drop"] = round(SEND_WAIT * 1e6)
         if self.tls is not None:
             options |= {f"transport/link/tls/{name}": value for name, value in self.tls.options(self.mode).items()}
         if self.access is not None:
@@ -110,6 +137,20 @@ class Endpoints:
                 "a tls/ endpoint needs the site's certificate",
                 hint="give --tls-ca, or tls_ca in the settings",
             )
+
+
+def room_for_sessions() -> int:
+    """The number of sessions for which a router may have file descriptors: by the hard limit."""
+    hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    return MOST_SESSIONS if hard == resource.RLIM_INFINITY else max(0, hard - SPARE_DESCRIPTORS)
+
+
+def allow_sessions(count: int) -> None:
+    """Raise this process's soft limit of file descriptors to what `count` sessions need, as far as it may."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = min(count, room_for_sessions()) + SPARE_DESCRIPTORS
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 def check_locators(*locators: str) -> None:

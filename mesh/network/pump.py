@@ -19,6 +19,7 @@ import zenoh
 
 from mesh.errors import ClosedError
 from mesh.log_context import log_event
+from mesh.network import sending
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -199,6 +200,7 @@ class Pump(Generic[T]):
             dropped += len(self._ring) == self._ring.maxlen
             self._ring.append(sample)
             sample = queue.try_recv() if received < ZENOH_QUEUE else None
+        sending.received(self._session)
         with self._lock:
             self.received += received
             self.dropped += dropped

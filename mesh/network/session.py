@@ -16,6 +16,7 @@ import zenoh
 
 from mesh.errors import ClosedError
 from mesh.log_context import log_event
+from mesh.network import sending
 from mesh.network.connecting import SessionOpening
 from mesh.network.pump import call_in_loop
 
@@ -92,6 +93,7 @@ class Network:
         session, self._session = self._session, None
         self._linked.clear()
         if session is not None:
+            sending.forget(session)
             await asyncio.to_thread(session.close)
 
     def _watch(self, session: zenoh.Session) -> None:

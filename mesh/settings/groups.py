@@ -59,6 +59,9 @@ class NetworkSettings:
         "", "this client's certificate for tls/ endpoints (PEM), created by `aira identity new`"
     )
     tls_key: str = option("", "the key of tls_certificate (PEM)")
+    shared_memory: bool = option(
+        False, "exchange large payloads with other processes of this machine in shared memory, which each session locks"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +74,9 @@ class RouterSettings(NetworkSettings):
     )
     link: tuple[str, ...] = option(
         (), "other routers of the site to stay connected to (each has the role router in the roster)"
+    )
+    max_sessions: PositiveInt = option(
+        10_000, "most sessions that `aira router` holds at a time; each needs a file descriptor"
     )
 
 

@@ -6,15 +6,17 @@ from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
-import zenoh
 
 from mesh.errors import AiraError, ClosedError, ConfigurationError
+from mesh.network import sending
 from mesh.recording import json_type
 from schemas.agent_keys import LiabilityTopicKey
 from schemas.errors import InvalidPayload
 from schemas.payloads import JSON, PayloadType, decode_value, encode_value
 
 if TYPE_CHECKING:
+    import zenoh
+
     from mesh.recording import Played
     from schemas import Liability
 
@@ -71,7 +73,7 @@ class Job:
         self._put(key, payload, kind)
 
     def _put(self, key: str, payload: bytes, kind: PayloadType) -> None:
-        self._session.put(key, payload, encoding=kind.zenoh_encoding, congestion_control=zenoh.CongestionControl.DROP)
+        sending.put(self._session, key, payload, encoding=kind.zenoh_encoding)
 
 
 TopicHandler = Callable[[Job, Any], Awaitable[object]]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, cast
 
@@ -17,12 +18,10 @@ from mesh.devchain.calls import Call, Calls, parse_call
 from mesh.devchain.evm import Evm
 from mesh.devchain.jsonrpc import SERVER_ERROR, RpcError, parse_data
 from mesh.devchain.methods import Methods
-from tests.simulation.chance import FaultDraw
 from tests.simulation.model_transactions import read_transaction
 from tests.simulation.threads import scheduler
 
 if TYPE_CHECKING:
-    import random
     from collections.abc import Callable
 
     from tests.simulation.model import ModelChain
@@ -43,7 +42,7 @@ class NodeFaults:
     late: float = 0.0
     spoilt: float = 0.0
     lost_after_sending: float = 0.0
-    draw: FaultDraw = field(default_factory=FaultDraw)
+    seen: Counter[str] = field(default_factory=Counter)
 
     def stop(self) -> None:
         """Answer properly from now on."""
@@ -57,7 +56,7 @@ class MiningFaults:
     leave_out: float = 0.0
     forget: float = 0.0
     price_factor: float = 1.0
-    draw: FaultDraw = field(default_factory=FaultDraw)
+    seen: Counter[str] = field(default_factory=Counter)
 
 
 @dataclass(frozen=True)
@@ -181,7 +180,9 @@ class SimulatedChain:
         self.evm.rewind(head - depth)
         for number in sorted(number for number in self.mined if number > head - depth):
             transaction = self.mined.pop(number)
-            if not self.faults.draw("transaction-forgotten", forget):
+            if scheduler().random.random() < forget:
+                self.faults.seen["transaction-forgotten"] += 1
+            else:
                 self.pool.setdefault((transaction.sender, transaction.nonce), transaction)
         self.reorganisations += 1
         self.deepest = max(self.deepest, depth)
@@ -196,10 +197,12 @@ class SimulatedChain:
         chance.shuffle(waiting)
         waiting.sort(key=lambda one: one.nonce)  # stable: of each sender in order
         for one in waiting:
-            if self.faults.draw("transaction-forgotten", self.faults.forget):
+            if self.faults.forget and chance.random() < self.faults.forget:
+                self.faults.seen["transaction-forgotten"] += 1
                 del self.pool[one.sender, one.nonce]
                 continue
-            if self.faults.draw("transaction-left-out", self.faults.leave_out):
+            if self.faults.leave_out and chance.random() < self.faults.leave_out:
+                self.faults.seen["transaction-left-out"] += 1
                 continue
             if one.price < self.evm.base_fee * self.faults.price_factor:
                 continue
@@ -234,23 +237,28 @@ class SimulatedNode(AsyncBaseProvider):
 
     async def make_request(self, method: Any, params: Any) -> Any:
         """A JSON-RPC response, or one of the faults."""
-        faults, draw = self._faults, self._faults.draw
-        await asyncio.sleep(scheduler().random.uniform(*LATENCY))
-        if draw("node-unreachable", faults.unreachable):
+        chance, faults, seen = scheduler().random, self._faults, self._faults.seen
+        await asyncio.sleep(chance.uniform(*LATENCY))
+        if faults.unreachable and chance.random() < faults.unreachable:
+            seen["node-unreachable"] += 1
             raise ConnectionRefusedError(111, "Connection refused")
-        if draw("node-silent", faults.silent):
+        if faults.silent and chance.random() < faults.silent:
+            seen["node-silent"] += 1
             await asyncio.sleep(3600)
-        if draw("node-late", faults.late):
-            await asyncio.sleep(draw.random.uniform(0.1, 10))
+        if faults.late and chance.random() < faults.late:
+            seen["node-late"] += 1
+            await asyncio.sleep(chance.uniform(0.1, 10))
         response: dict[str, Any] = {"jsonrpc": "2.0", "id": 0}
         try:
             response["result"] = self._chain.answer(method, list(params))
         except RpcError as error:
             response["error"] = error.as_object()
-        if method == SEND and draw("answer-lost", faults.lost_after_sending):
+        if method == SEND and faults.lost_after_sending and chance.random() < faults.lost_after_sending:
+            seen["answer-lost"] += 1
             raise ConnectionResetError(104, "Connection reset by peer")
-        if draw("answer-spoilt", faults.spoilt):
-            return spoil(response, draw.random)
+        if faults.spoilt and chance.random() < faults.spoilt:
+            seen["answer-spoilt"] += 1
+            return spoil(response)
         return response
 
     async def is_connected(self, show_traceback: bool = False) -> bool:
@@ -261,8 +269,9 @@ class SimulatedNode(AsyncBaseProvider):
         return "the simulated node"
 
 
-def spoil(response: dict[str, Any], chance: random.Random) -> Any:
+def spoil(response: dict[str, Any]) -> Any:
     """A response in which something is wrong, and can be seen to be: not an empty list in place of events."""
+    chance = scheduler().random
     result = response.get("result")
     others: list[Any] = [None, "", "0x", {}, "0xzz", 7]
     if not isinstance(result, list):

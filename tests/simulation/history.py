@@ -9,13 +9,13 @@ import random
 import shutil
 import tempfile
 import time
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from tests.simulation import loop, threads
 from tests.simulation.audit import Audit
-from tests.simulation.chance import FaultDraw
 from tests.simulation.faults import Faults, choose
 from tests.simulation.market import Market
 from tests.simulation.scheduler import REAL_TIME, SECOND, HistoryFailed, Process
@@ -48,8 +48,6 @@ class Report:
     simulated_s: float = 0.0
     real_s: float = 0.0
     cpu_s: float = 0.0
-    drawn: int = 0
-    """Faults that happened in the history of the report, and were left out."""
     trace: str = ""
     """The hash of the trace."""
 
@@ -60,15 +58,9 @@ def plan_of(seed: int, *, only: frozenset[str] | None = None, without: frozenset
 
 
 def run_history(
-    deployed: Deployed,
-    seed: int,
-    jobs: int,
-    plan: FaultPlan,
-    *,
-    left_out: frozenset[int] = frozenset(),
-    switches: str | None = None,
+    deployed: Deployed, seed: int, jobs: int, plan: FaultPlan, *, switches: str | None = None
 ) -> tuple[Report, list[str]]:
-    """Run the history of a seed with these faults, but those with the numbers `left_out`; its report and its trace.
+    """Run the history of a seed with these faults; what happened, and its trace.
 
     Each switch of threads is written to the file `switches`: where two runs of a seed differ, it shows where it begins.
     """
@@ -82,7 +74,7 @@ def run_history(
     folder.mkdir(parents=True)
     os.chdir(folder)
     try:
-        market = Market(scheduler, deployed, Path("market"), jobs, FaultDraw(seed, left_out))
+        market = Market(scheduler, deployed, Path("market"), jobs)
         market.folder.mkdir()
         CURRENT[:] = [market.router]
         gc.collect()
@@ -147,11 +139,11 @@ SETTLED_BLOCKS: Final = 5
 def _report(market: Market, seed: int) -> Report:
     orders = [order for person in market.people for order in person.orders]
     audit = market.audit
-    report = Report(seed, jobs=len(orders), violations=market.violations, drawn=market.draw.drawn)
+    report = Report(seed, jobs=len(orders), violations=market.violations)
     if audit is not None:
         report.paid, report.refunded, report.lost = len(audit.paid), len(audit.refunded), len(audit.open)
         report.paid_twice = audit.paid_twice
-    counts = market.draw.counts
+    counts = Counter(market.faults_seen)
     counts["reorganisation-blocks"] = market.deployed.chain.deepest
     report.faults = {kind: count for kind, count in sorted(counts.items()) if count}
     report.simulated_s = round(market.scheduler.now_ns / SECOND - 2_000, 3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import traceback
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,6 @@ from mesh.errors import AiraError
 from mesh.recording.mcap_writer import McapWriter
 from mesh.running import cause_of
 from schemas import EMPTY, cid_of_file
-from tests.simulation.chance import FaultDraw
 from tests.simulation.deployment import BLOCK_SECONDS, PEOPLE, ROBOTS, Deployed
 from tests.simulation.disk import SimulatedDisk
 from tests.simulation.roles import PersonRole, ProviderRole, RobotRole, Role
@@ -37,7 +37,7 @@ class Market:
     deployed: Deployed
     folder: Path
     jobs: int
-    draw: FaultDraw = field(default_factory=FaultDraw)
+    faults_seen: Counter[str] = field(default_factory=Counter)
     is_over: bool = False
     is_calm: bool = False
     """Whether all faults have stopped."""
@@ -49,9 +49,10 @@ class Market:
 
     def __post_init__(self) -> None:
         self.router = Router()
-        self.router.faults.draw = self.draw
-        self.deployed.chain.faults.draw = self.draw
-        self.disk = SimulatedDisk(self.folder, self.draw)
+        self.router.faults.seen = self.faults_seen
+        self.deployed.chain.faults.seen = self.faults_seen
+        self.disk = SimulatedDisk(self.folder)
+        self.disk.seen = self.faults_seen
         self.violations: list[str] = []
         self.objectives: dict[int, Path] = {}
         self.cids: dict[Path, str] = {}

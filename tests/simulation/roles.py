@@ -64,7 +64,7 @@ class Role:
         self.process: Process | None = None
         self.starts = 0
         self.errors: list[BaseException] = []
-        self.node_faults = NodeFaults(draw=market.draw)
+        self.node_faults = NodeFaults(seen=market.faults_seen)
         self.wall_offset_ns = 0
 
     async def main(self) -> None:
@@ -90,11 +90,11 @@ class Role:
 
     def _crashed(self, process: Process) -> None:
         """The process was killed, perhaps together with its machine. It is started again after a while."""
-        market, chance = self.market, self.market.draw.random
+        market, chance = self.market, self.market.scheduler.random
         market.router.lose(process)
         is_power_failure = chance.random() < 0.5
         kind = "power-failure" if is_power_failure else "kill"
-        market.draw.counts[kind] += 1
+        market.faults_seen[kind] += 1
         market.trace(self.name, kind, steps=process.steps, commits=process.commits)
         market.scheduler.call_later(chance.uniform(0.2, 20), self._restart_from_disk, is_power_failure)
 

@@ -60,7 +60,6 @@ def space(agent: str, device: str) -> dict[str, str]:
         "device": str(DeviceTopicKey(agent, device, "/a/b")),
         "rpc": str(RpcKey(agent, "eth/transfer")),
         "eth": str(EthEventKey(agent, "transfer")),
-        "cid": str(CidKey(agent, MODEL)),
     }
 
 
@@ -77,6 +76,7 @@ def keys_of(who: str) -> dict[str, str]:
         "pending": PendingKey(MARKET),
         "reject": RejectKey(MARKET, own),
         "other reject": RejectKey(MARKET, other),
+        "cid": CidKey(MODEL),
         "other market": DemandKey("elsewhere.lighthouse.3.robonomics.eth", MODEL),
         "other presence": PresenceKey(MARKET, "agent", other),
         "nowhere": "aira/nowhere",
@@ -91,8 +91,8 @@ def keys_of(who: str) -> dict[str, str]:
 
 
 KEYS = {who: keys_of(who) for who in WHO}
-OWN = {"own event", "own objective", "own topic", "own device", "own rpc", "own eth", "own cid"}
-OTHER = {"other event", "other objective", "other topic", "other device", "other rpc", "other eth", "other cid"}
+OWN = {"own event", "own objective", "own topic", "own device", "own rpc", "own eth"}
+OTHER = {"other event", "other objective", "other topic", "other device", "other rpc", "other eth"}
 MARKETS = {"demand", "offer", "withdrawal", "result", "feedback", "pending", "reject", "other reject"}
 PRESENCES = {name for name in KEYS["arm"] if name.startswith("as ")} | {"other presence"}
 NOBODY: dict[str, set[str]] = {who: set() for who in WHO}
@@ -107,12 +107,12 @@ PUT = NOBODY | {
 }
 DELETE = NOBODY | dict.fromkeys(("arm", "ann", "miner", "boss", "bridge"), OWN)
 SERVE = NOBODY | {
-    "arm": OWN,
-    "ann": OWN,
+    "arm": OWN | {"cid"},
+    "ann": OWN | {"cid"},
     "miner": OWN | MARKETS,
     "boss": OWN,
     "board": {"robot topic", "robot device"},
-    "bridge": OWN,
+    "bridge": OWN | {"cid"},
 }
 TOKEN = NOBODY | {
     "arm": OWN | {"as agent"},
@@ -123,13 +123,13 @@ TOKEN = NOBODY | {
     "bridge": OWN | {"as bridge", "as bridge-turn-0-00000000000000ff"},
 }
 GET = NOBODY | {
-    "arm": OWN | MARKETS | {"other cid"},
-    "ann": OWN | MARKETS | {"other cid"},
+    "arm": OWN | MARKETS | {"cid"},
+    "ann": OWN | MARKETS | {"cid"},
     "miner": OWN | MARKETS,
-    "boss": OWN | OTHER | MARKETS,
+    "boss": OWN | OTHER | MARKETS | {"cid"},
     "board": {"robot device"},
-    "bridge": OWN | MARKETS | {"other cid"},
-    "screen": MARKETS | {"own cid", "other cid"},
+    "bridge": OWN | MARKETS | {"cid"},
+    "screen": MARKETS | {"cid"},
 }
 SUBSCRIBE = NOBODY | {
     "arm": OWN | MARKETS,

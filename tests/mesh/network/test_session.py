@@ -279,3 +279,39 @@ async def test_a_process_that_is_stopped_while_it_waits_for_a_router_ends() -> N
             out, _ = await process.communicate()
 
     assert (out, process.returncode) == (b"cancelled\n", 0)
+
+
+async def test_a_router_admits_no_more_sessions_than_it_may() -> None:
+    endpoint = free_endpoint()
+    async with (
+        Network(Endpoints(mode="router", listen=(endpoint,), max_sessions=2)),
+        client(endpoint),
+        client(endpoint),
+    ):
+        with pytest.raises(NetworkUnavailable):
+            await client(endpoint, timeout=1).__aenter__()
+
+
+LOCKED = """
+import asyncio
+from pathlib import Path
+from mesh.network import Endpoints, Network, free_endpoint
+
+async def main() -> None:
+    at = free_endpoint()
+    async with (
+        Network(Endpoints(mode="router", listen=(at,), shared_memory=SHARED)),
+        Network(Endpoints(connect=(at,), shared_memory=SHARED)),
+    ):
+        (line,) = (line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmLck"))
+        print(line.split()[1])
+
+asyncio.run(main())
+"""
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_a_session_locks_memory_only_if_it_shares_memory(shared: bool) -> None:
+    script = LOCKED.replace("SHARED", str(shared))
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
+    assert (int(ran.stdout) > 0) == shared

@@ -1,0 +1,67 @@
+"""Putting a message on a session: at once where somebody may wait for it, in a batch with others in a stream.
+
+Zenoh holds a small message back for up to a millisecond, to send it with others in one batch. An `express` message is
+sent at once, but takes one of the sixteen batches of each link's queue for itself. A stream of them fills the queues as
+soon as a machine is busy for a few milliseconds, and messages are dropped. So a message is express only if nothing was
+put on the session just before it, and if the session has credit left: a little from time to time, and one message for
+each that it receives. A conversation is express throughout; of a stream, only the beginning is.
+"""
+
+from __future__ import annotations
+
+from time import monotonic
+from typing import TYPE_CHECKING, Any, Final
+
+import zenoh
+
+if TYPE_CHECKING:
+    from zenoh import Session
+
+QUIET: Final = 0.00025
+"""Seconds without a message after which the next one may be sent at once."""
+CREDIT: Final = 8.0
+"""Most messages in succession that are sent at once while nothing is received: half of a link's batches."""
+REFILL: Final = 200.0
+"""Credit that a session gains in a second."""
+JSON: Final = "application/json"
+
+
+class _Pace:
+    __slots__ = ("credit", "last")
+
+    def __init__(self) -> None:
+        self.last = 0.0
+        self.credit = CREDIT
+
+
+_paces: dict[int, _Pace] = {}
+"""The pace of each session, by the session's `id`: Zenoh's sessions hold no attributes."""
+
+
+def put(session: Session, key: str, payload: bytes, *, encoding: str = JSON, attachment: bytes | None = None) -> None:
+    """Put bytes on a key. A congested link drops them rather than block."""
+    pace, now = _pace_of(session), monotonic()
+    quiet = now - pace.last
+    pace.last = now
+    pace.credit = min(CREDIT, pace.credit + quiet * REFILL)
+    express = quiet >= QUIET and pace.credit >= 1
+    pace.credit -= express
+    options: dict[str, Any] = {} if attachment is None else {"attachment": attachment}
+    drop = zenoh.CongestionControl.DROP
+    session.put(key, payload, encoding=encoding, congestion_control=drop, express=express, **options)
+
+
+def received(session: Session) -> None:
+    """A message was received on the session, which may answer it at once. Call it on any thread."""
+    pace = _pace_of(session)
+    pace.credit = min(CREDIT, pace.credit + 1)
+
+
+def forget(session: Session) -> None:
+    """The session was closed."""
+    _paces.pop(id(session), None)
+
+
+def _pace_of(session: Session) -> _Pace:
+    pace = _paces.get(id(session))
+    return _paces.setdefault(id(session), _Pace()) if pace is None else pace

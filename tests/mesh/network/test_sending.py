@@ -1,0 +1,93 @@
+"""Putting messages: which are sent at once, and which wait for a batch."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from mesh.network import Endpoints, Network, sending
+from tests.mesh.network.channels import listening, take
+from tests.support.orders import demand
+from tests.support.waiting import until, until_heard
+
+if TYPE_CHECKING:
+    import zenoh
+
+    from tests.support.routers import EmbeddedRouter
+
+KEY = "aira/test"
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The time in seconds; tests change it."""
+    now = [1000.0]
+    monkeypatch.setattr(sending, "monotonic", lambda: now[0])
+    return now
+
+
+async def test_a_message_on_a_quiet_session_is_sent_at_once_and_those_right_after_it_in_batches(
+    here: zenoh.Session, clock: list[float]
+) -> None:
+    heard: list[bool] = []
+    subscriber: Any = here.declare_subscriber(KEY, lambda sample: heard.append(sample.express))
+    for pause in (0.0, 0.0, sending.QUIET / 2, sending.QUIET / 2, sending.QUIET * 1.01, 0.0):
+        clock[0] += pause
+        sending.put(here, KEY, b"")
+    await until(lambda: len(heard) == 6)
+    assert heard == [True, False, False, False, True, False]
+    subscriber.undeclare()
+
+
+async def test_of_a_stream_only_the_beginning_is_sent_at_once(here: zenoh.Session, clock: list[float]) -> None:
+    heard: list[bool] = []
+    subscriber: Any = here.declare_subscriber(KEY, lambda sample: heard.append(sample.express))
+    for _ in range(100):
+        clock[0] += sending.QUIET * 1.01
+        sending.put(here, KEY, b"")
+    await until(lambda: len(heard) == 100)
+    assert heard[:8] == [True] * 8
+    assert sum(heard[8:]) == 4, "as much as the credit of 23 ms"
+    subscriber.undeclare()
+
+
+async def test_a_conversation_is_sent_at_once_throughout(
+    here: zenoh.Session, there: zenoh.Session, clock: list[float]
+) -> None:
+    """Each order is answered before the next one is sent."""
+    async with listening(here, there) as (demands, theirs):
+        heard: list[bool] = []
+        subscriber: Any = there.declare_subscriber(KEY, lambda sample: heard.append(sample.express))
+        await until_heard(here, KEY)
+        for _ in range(30):
+            clock[0] += sending.QUIET * 1.01
+            theirs.publish(demand())
+            await take(demands, 1)
+            sending.put(here, KEY, b"")
+        await until(lambda: len(heard) == 30)
+        assert heard == [True] * 30
+        subscriber.undeclare()
+
+
+async def test_each_session_has_its_own_quiet(here: zenoh.Session, there: zenoh.Session, clock: list[float]) -> None:
+    heard: list[bool] = []
+    subscriber: Any = here.declare_subscriber(KEY, lambda sample: heard.append(sample.express))
+    sending.put(here, KEY, b"")
+    sending.put(here, KEY, b"")
+    await until(lambda: len(heard) == 2)
+    there_heard: list[bool] = []
+    other: Any = there.declare_subscriber(KEY, lambda sample: there_heard.append(sample.express))
+    sending.put(there, KEY, b"")
+    await until(lambda: there_heard)
+    assert (heard[:2], there_heard[0]) == ([True, False], True)
+    other.undeclare()
+    subscriber.undeclare()
+
+
+async def test_a_closed_session_is_forgotten(router: EmbeddedRouter) -> None:
+    async with Network(Endpoints(connect=(router.endpoint,))) as network:
+        identity = id(network.session)
+        sending.put(network.session, KEY, b"")
+        assert identity in sending._paces
+    assert identity not in sending._paces
