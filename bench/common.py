@@ -14,7 +14,7 @@ from mesh.network import Endpoints, Network, free_endpoint
 from schemas import ZERO_ADDRESS, Demand, Signer, cid_of_digest
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 SPAWN: Final = multiprocessing.get_context("spawn")
 LIGHTHOUSE: Final = "airalab.lighthouse.3.robonomics.eth"
@@ -59,6 +59,18 @@ def router() -> Iterator[tuple[str, int]]:
     finally:
         process.terminate()
         process.join()
+
+
+@contextmanager
+def process(target: Callable[..., None], *given: Any) -> Iterator[None]:
+    """Meanwhile run a function in a process of its own."""
+    running = SPAWN.Process(target=target, args=given, daemon=True)
+    running.start()
+    try:
+        yield
+    finally:
+        running.terminate()
+        running.join()
 
 
 def _route(endpoint: str) -> None:

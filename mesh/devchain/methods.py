@@ -41,20 +41,15 @@ class Methods:
 
     def __init__(self, evm: Evm) -> None:
         self._evm = evm
-        filters = NodeFilters(evm, self._logs, self._bound)
-        accounts = UnlockedAccounts(evm)
         self._table: dict[str, Callable[..., Any]] = {
+            **UnlockedAccounts(evm).methods(),
+            **NodeFilters(evm, self._logs, self._bound).methods(),
             "web3_clientVersion": lambda: "aira-embedded/py-evm",
             "web3_sha3": lambda data: keccak256(parse_data(data)),
             "net_version": lambda: str(evm.chain_id),
             "net_listening": lambda: True,
             "net_peerCount": lambda: 0,
             "eth_syncing": lambda: False,
-            "eth_accounts": lambda: accounts.addresses,
-            "eth_coinbase": lambda: accounts.addresses[0],
-            "eth_sign": accounts.sign,
-            "personal_sign": lambda text, address, _password=None: accounts.sign(address, text),
-            "eth_sendTransaction": accounts.send,
             "eth_chainId": lambda: evm.chain_id,
             "eth_blockNumber": lambda: evm.head,
             "eth_gasPrice": lambda: evm.base_fee + PRIORITY_FEE_WEI,
@@ -68,11 +63,6 @@ class Methods:
             "eth_getTransactionByHash": lambda hash_: evm.transaction(parse_data(hash_, length=32)),
             "eth_getTransactionReceipt": lambda hash_: evm.receipt(parse_data(hash_, length=32)),
             "eth_getLogs": self._logs,
-            "eth_newFilter": filters.of_logs,
-            "eth_newBlockFilter": filters.of_blocks,
-            "eth_getFilterChanges": filters.changes,
-            "eth_getFilterLogs": filters.everything,
-            "eth_uninstallFilter": filters.remove,
             "eth_call": lambda call, block="latest": evm.calls.call(parse_call(call), self._height(block)),
             "eth_estimateGas": lambda call, block="latest": evm.calls.estimate(parse_call(call), self._height(block)),
             "eth_sendRawTransaction": lambda raw: evm.send(parse_data(raw)),
@@ -171,6 +161,16 @@ class NodeFilters:
         self._bound = bound
         self._filters: OrderedDict[str, _Filter] = OrderedDict()
         self._made = 0
+
+    def methods(self) -> dict[str, Callable[..., Any]]:
+        """The JSON-RPC methods that use filters, by name."""
+        return {
+            "eth_newFilter": self.of_logs,
+            "eth_newBlockFilter": self.of_blocks,
+            "eth_getFilterChanges": self.changes,
+            "eth_getFilterLogs": self.everything,
+            "eth_uninstallFilter": self.remove,
+        }
 
     def of_logs(self, query: object) -> str:
         """Add a filter for the logs that a query accepts; its id."""

@@ -15,6 +15,8 @@ from mesh.devchain.calls import parse_call
 from mesh.devchain.jsonrpc import INVALID_PARAMS, RpcError, parse_data, parse_quantity
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from mesh.devchain.evm import Evm
 
 UNKNOWN_ACCOUNT: Final = "No Signer available"
@@ -27,6 +29,16 @@ class UnlockedAccounts:
     def __init__(self, evm: Evm) -> None:
         self._evm = evm
         self._keys = {_address_of(key): key for key in evm.funded_keys}
+
+    def methods(self) -> dict[str, Callable[..., Any]]:
+        """The JSON-RPC methods that use these accounts, by name."""
+        return {
+            "eth_accounts": lambda: self.addresses,
+            "eth_coinbase": lambda: self.addresses[0],
+            "eth_sign": self.sign,
+            "personal_sign": lambda text, address, _password=None: self.sign(address, text),
+            "eth_sendTransaction": self.send,
+        }
 
     @property
     def addresses(self) -> list[bytes]:
