@@ -43,8 +43,9 @@ class ChainHead:
         self._handled = -1
 
     def begin_after(self, block: int) -> None:
-        """All blocks up to `block` were handled in earlier runs."""
+        """All blocks up to `block` were handled in earlier runs, or are older than this agent."""
         self._handled = block
+        self.head = max(self.head, block)
         self._advance()
 
     def advance_to(self, block: int) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.agent import Phase
+from mesh.agent.components import ChainHead
 from mesh.chain import DeploymentPlan
 from mesh.devchain.development import deploy_market
 from mesh.devchain.embedded import EmbeddedChain
@@ -55,6 +56,18 @@ async def test_a_robot_brings_its_own_result_before_the_refund_if_no_provider_do
         assert await place.chains["person"].block_number() < refundable
     assert await place.balance("robot") == before + COST
     assert "late-result-finalized" in [getattr(record, "event", "") for record in caplog.records]
+
+
+async def test_a_robot_that_begins_after_a_newer_block_than_it_opened_at_waits_for_the_next_one() -> None:
+    """Else its loop over late results runs without a pause until that block comes."""
+    head = ChainHead(33)
+    head.begin_after(34)
+    with pytest.raises(TimeoutError):
+        async with asyncio.timeout(0.05):
+            await head.reached(head.head + 1)
+    head.advance_to(35)
+    async with asyncio.timeout(5):
+        await head.reached(head.head)
 
 
 async def _has_read(robot: Agent, place: Place) -> bool:
