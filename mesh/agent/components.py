@@ -39,6 +39,7 @@ class ChainHead:
 
     def __init__(self, head: int) -> None:
         self._advanced = asyncio.Event()
+        self.head = head
         self.advance_to(head)
         self._handled = -1
 

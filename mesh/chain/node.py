@@ -68,6 +68,7 @@ class Node:
         self._provider = open_provider(endpoint, self.timing, self.metrics)
         self._chain_id: int | None = None
         self._web3: AsyncWeb3[Any] = AsyncWeb3(AsyncBaseProvider(), middleware=[])
+        self._contract_kinds: dict[str, type[AsyncContract]] = {}
         self._pending: dict[str, PendingTransactions] = {}
         self.contract = lru_cache(maxsize=CONTRACTS_KEPT)(self._contract)
 
@@ -267,7 +268,13 @@ class Node:
 
     def _contract(self, name: str, address: str) -> AsyncContract:
         """The contract at an address with the ABI of one of ours (`artifacts.NAMES`); cached."""
-        return self.contract_with_abi(address, load_artifact(name).abi)
+        return self._contract_kind(name)(cast("ChecksumAddress", address))
+
+    def _contract_kind(self, name: str) -> type[AsyncContract]:
+        """The class of the contracts with that ABI, which takes longer to make than a contract."""
+        if name not in self._contract_kinds:
+            self._contract_kinds[name] = self._web3.eth.contract(abi=load_artifact(name).abi)
+        return self._contract_kinds[name]
 
 
 def _block(identifier: int | str) -> str:

@@ -6,11 +6,11 @@ Each process reaches it through a node of its own, which may be slow, silent or 
 from __future__ import annotations
 
 import asyncio
-import json
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, cast
 
+import msgspec
 from web3.providers.async_base import AsyncBaseProvider
 
 from mesh.devchain.bounded_vm import GAS_LIMIT
@@ -109,7 +109,7 @@ class SimulatedChain:
         self.reorganisations = 0
         self.deepest = 0
         self.on_block: Callable[[], None] = lambda: None
-        self._cache: dict[str, Any] = {}
+        self._cache: dict[bytes, bytes] = {}
 
     def begin(self) -> None:
         """From now on blocks are mined by time."""
@@ -124,11 +124,10 @@ class SimulatedChain:
         if method == SEND:
             self._cache.clear()
             return self.methods.answer(method, params)
-        key = json.dumps([method, params], default=str)
+        key = method.encode() + msgspec.json.encode(params)
         if key not in self._cache:
-            self._cache[key] = self._answer(method, params)
-        found = self._cache[key]
-        return json.loads(json.dumps(found)) if isinstance(found, dict | list) else found
+            self._cache[key] = msgspec.json.encode(self._answer(method, params))
+        return msgspec.json.decode(self._cache[key])
 
     def _answer(self, method: str, params: Any) -> Any:
         if method == "eth_estimateGas":

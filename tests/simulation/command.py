@@ -6,7 +6,6 @@ import _thread
 import argparse
 import concurrent.futures
 import concurrent.futures.thread as executors
-import gc
 import json
 import logging
 import os
@@ -46,7 +45,6 @@ def main(arguments: Sequence[str]) -> None:
     executors_module._global_shutdown_lock = _thread.RLock()  # shared by all processes: never let one wait for it
     threads.number_in_sets(Queue, concurrent.futures.Future)
     began = REAL_TIME()
-    gc.collect()
     deployed = Deployments(options.chain)
     if options.mutants:
         _find_mutants(deployed, options)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import random
 from dataclasses import dataclass
 from typing import Final
@@ -79,4 +80,8 @@ class Deployments:
         if kind not in self._found:
             chain = self._evm if kind == ON_EVM else ModelChain(self._evm.funded_keys)
             self._found[kind] = found(SimulatedChain(chain), threads.begin(0))
+            # Histories run in forks of this process, without collections: what one runs would be chance.
+            gc.collect()
+            gc.freeze()
+            gc.disable()
         return self._found[kind]

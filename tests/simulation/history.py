@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import hashlib
 import os
 import random
@@ -77,9 +76,6 @@ def run_history(
         market = Market(scheduler, deployed, Path("market"), jobs)
         market.folder.mkdir()
         CURRENT[:] = [market.router]
-        gc.collect()
-        gc.freeze()
-        gc.disable()
         try:
             _play(market, plan)
         except HistoryFailed as failure:
