@@ -30,7 +30,7 @@ CONNECTION_ERRORS: Final = (OSError, TimeoutError, ClientError, Web3Exception, V
 """What transports raise for a missing node, a lost connection and an answer that is not JSON; and `SpoiledAnswer`."""
 
 Transport: TypeAlias = HttpTransport | WebSocketTransport
-Endpoint: TypeAlias = "str | Sequence[str] | AsyncBaseProvider"
+Endpoint: TypeAlias = "str | AsyncBaseProvider | Sequence[str | AsyncBaseProvider]"
 
 SEND: Final = "eth_sendRawTransaction"
 CHAIN_ID: Final = "eth_chainId"
@@ -172,17 +172,20 @@ class ReliableProvider:
 
 
 def open_provider(endpoint: Endpoint, timing: Timing, metrics: NodeMetrics | None = None) -> ReliableProvider:
-    """The provider of an endpoint: `http(s)://…`, `ws(s)://…`, several of them, or a provider object.
+    """The provider of an endpoint: `http(s)://…`, `ws(s)://…`, a provider object, or several of them.
 
     Several are a sequence, or one text with commas. Nothing is connected yet. `metrics` counts whether they answer.
     Raises `InvalidEndpoint` for any other text.
     """
     metrics = metrics or NodeMetrics()
-    if isinstance(endpoint, AsyncBaseProvider):
-        return ReliableProvider([Upstream(endpoint, endpoint=str(endpoint))], timing=timing, metrics=metrics)
-    texts = [endpoint] if isinstance(endpoint, str) else endpoint
-    urls = [url.strip() for text in texts for url in text.split(",")] or [""]
-    return ReliableProvider([_upstream(url) for url in urls], timing=timing, metrics=metrics)
+    given = [endpoint] if isinstance(endpoint, str | AsyncBaseProvider) else endpoint
+    upstreams: list[Upstream] = []
+    for one in given or [""]:
+        if isinstance(one, AsyncBaseProvider):
+            upstreams.append(Upstream(one, endpoint=str(one)))
+        else:
+            upstreams += [_upstream(url.strip()) for url in one.split(",")]
+    return ReliableProvider(upstreams, timing=timing, metrics=metrics)
 
 
 def _upstream(url: str) -> Upstream:

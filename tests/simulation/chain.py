@@ -229,8 +229,9 @@ class SimulatedChain:
 class SimulatedNode(AsyncBaseProvider):
     """A node of that chain, as one process reaches it."""
 
-    def __init__(self, chain: SimulatedChain, faults: NodeFaults) -> None:
+    def __init__(self, chain: SimulatedChain, faults: NodeFaults, number: int = 0) -> None:
         super().__init__()
+        self._number = number
         self._chain = chain
         self._faults = faults
 
@@ -265,7 +266,7 @@ class SimulatedNode(AsyncBaseProvider):
         return True
 
     def __str__(self) -> str:
-        return "the simulated node"
+        return f"the simulated node {self._number}"
 
 
 def spoil(response: dict[str, Any]) -> Any:

@@ -189,6 +189,7 @@ def _add(total: Report, report: Report) -> None:
     total.simulated_s = round(total.simulated_s + report.simulated_s, 3)
     total.cpu_s = round(total.cpu_s + report.cpu_s, 3)
     total.violations += [f"seed {report.seed}: {violation}" for violation in report.violations]
+    total.markets = dict(sorted((Counter(total.markets) + Counter(report.markets)).items()))
     total.chains = dict(sorted((Counter(total.chains) + Counter(report.chains)).items()))
     total.faults = dict(sorted((Counter(total.faults) + Counter(report.faults)).items()))
     total.trace = report.trace

@@ -5,9 +5,9 @@ from __future__ import annotations
 import gc
 import random
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
-from mesh.chain import Account, Chain, Timing
+from mesh.chain import XRT, Account, Chain, Timing
 from mesh.devchain.development import ALLOWANCE, DevelopmentMarket, deploy_market
 from schemas import cid_of_bytes
 from tests.simulation import loop, threads
@@ -25,6 +25,10 @@ EVM_EVERY: Final = 20
 """One of so many seeds runs on the EVM."""
 PEOPLE: Final = 2
 ROBOTS: Final = 2
+STAKE: Final = 100 * XRT
+"""Of the second provider, in wn: as much as the first one has."""
+PLAIN: Final = 0.5
+"""How many markets are as small as possible."""
 LIFETIMES: Final = (4, 8, 60, 60, 60)
 """Blocks for which an order is valid: sometimes so few that it expires while it is matched."""
 
@@ -38,11 +42,36 @@ class Deployed:
     accounts: dict[str, Account]
 
 
+@dataclass(frozen=True)
+class MarketPlan:
+    """What kind of market a history has."""
+
+    generation: Literal[3, 5] = 3
+    providers: int = 1
+    nodes: int = 1
+    """How many each process knows."""
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """What is not as in a plain market."""
+        kinds = {"generation-5": self.generation == 5, "two-providers": self.providers > 1, "two-nodes": self.nodes > 1}
+        return tuple(kind for kind, is_so in kinds.items() if is_so)
+
+
+def market_plan(seed: int) -> MarketPlan:
+    """The market of a seed."""
+    chance = random.Random(f"market {seed}")
+    if chance.random() < PLAIN:
+        return MarketPlan()
+    return MarketPlan(5 if chance.random() < 0.5 else 3, chance.choice((1, 2)), chance.choice((1, 2)))
+
+
 def found(chain: SimulatedChain, scheduler: Scheduler) -> Deployed:
     """Deploy the contracts, and give people and robots their tokens."""
     deployed: list[Deployed] = []
     keys = chain.evm.funded_keys
     names = [f"person-{number}" for number in range(PEOPLE)] + [f"robot-{number}" for number in range(ROBOTS)]
+    names.append("provider-1")
     accounts = {name: Account.from_key(key) for name, key in zip(names, keys[3:], strict=False)}
 
     async def main() -> None:

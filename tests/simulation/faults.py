@@ -98,8 +98,7 @@ class Faults:
         transport.drop, transport.duplicate, transport.delay = plan.drop, plan.duplicate, plan.delay
         mining.forget, mining.leave_out = plan.forget, plan.leave_out
         self._scheduler.preempt = plan.preempt
-        for role in market.roles:
-            faults = role.node_faults
+        for faults in (faults for role in market.roles for faults in role.all_node_faults):
             faults.unreachable, faults.silent, faults.late = plan.unreachable, plan.silent, plan.late
             faults.spoilt, faults.lost_after_sending = plan.spoilt, plan.lost_after_sending
         every = {
@@ -128,7 +127,8 @@ class Faults:
         for session in market.router.sessions:
             session.set_linked(True)
         for role in market.roles:
-            role.node_faults.stop()
+            for node_faults in role.all_node_faults:
+                node_faults.stop()
             if role.process is not None:
                 role.process.crash_at_step = role.process.crash_at_commit = None
 

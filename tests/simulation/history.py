@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 from tests.simulation import loop, threads
 from tests.simulation.audit import Audit
+from tests.simulation.deployment import market_plan
 from tests.simulation.faults import Faults, choose
 from tests.simulation.market import Market
 from tests.simulation.scheduler import REAL_TIME, SECOND, HistoryFailed, Process
@@ -44,6 +45,8 @@ class Report:
     faults: dict[str, int] = field(default_factory=dict)
     chains: dict[str, int] = field(default_factory=dict)
     """Histories by what ran the contracts: the `model` or the `evm`."""
+    markets: dict[str, int] = field(default_factory=dict)
+    """Histories whose market had something more than a plain one."""
     simulated_s: float = 0.0
     real_s: float = 0.0
     cpu_s: float = 0.0
@@ -73,7 +76,7 @@ def run_history(
     folder.mkdir(parents=True)
     os.chdir(folder)
     try:
-        market = Market(scheduler, deployed, Path("market"), jobs)
+        market = Market(scheduler, deployed, Path("market"), jobs, plan=market_plan(seed))
         market.folder.mkdir()
         CURRENT[:] = [market.router]
         try:
@@ -142,6 +145,7 @@ def _report(market: Market, seed: int) -> Report:
     counts = Counter(market.faults_seen)
     counts["reorganisation-blocks"] = market.deployed.chain.deepest
     report.faults = {kind: count for kind, count in sorted(counts.items()) if count}
+    report.markets = dict.fromkeys(market.plan.kinds, 1)
     report.simulated_s = round(market.scheduler.now_ns / SECOND - 2_000, 3)
     report.trace = hashlib.sha256("\n".join(market.lines).encode()).hexdigest()
     return report

@@ -13,7 +13,7 @@ from mesh.errors import AiraError
 from mesh.recording.mcap_writer import McapWriter
 from mesh.running import cause_of
 from schemas import EMPTY, cid_of_file
-from tests.simulation.deployment import BLOCK_SECONDS, PEOPLE, ROBOTS, Deployed
+from tests.simulation.deployment import BLOCK_SECONDS, PEOPLE, ROBOTS, Deployed, MarketPlan
 from tests.simulation.disk import SimulatedDisk
 from tests.simulation.roles import PersonRole, ProviderRole, RobotRole, Role
 from tests.simulation.router import Router
@@ -46,6 +46,7 @@ class Market:
     audit: Audit | None = None
     settled_head: int = 0
     settled_blocks: int = 0
+    plan: MarketPlan = field(default_factory=MarketPlan)
 
     def __post_init__(self) -> None:
         self.router = Router()
@@ -57,11 +58,12 @@ class Market:
         self.objectives: dict[int, Path] = {}
         self.cids: dict[Path, str] = {}
         self.final_words = frozenset({"expired", "withdrawn"})
-        self.provider = ProviderRole(self, "provider")
+        names = ("provider", "provider-1")[: self.plan.providers]
+        self.providers = [ProviderRole(self, name) for name in names]
         self.robots = [RobotRole(self, f"robot-{number}") for number in range(ROBOTS)]
         share = [self.jobs // PEOPLE + (number < self.jobs % PEOPLE) for number in range(PEOPLE)]
         self.people = [PersonRole(self, f"person-{number}", jobs) for number, jobs in enumerate(share) if jobs]
-        self.roles: list[Role] = [self.provider, *self.robots, *self.people]
+        self.roles: list[Role] = [*self.providers, *self.robots, *self.people]
 
     def begin(self) -> None:
         """Start everything."""
@@ -94,9 +96,9 @@ class Market:
         if not isinstance(error, AiraError):
             self.violated("process-died", f"{role.name}: {_cause(error)}")
 
-    def matched(self, match: Match) -> None:
+    def matched(self, provider: str, match: Match) -> None:
         """A provider matched two orders."""
-        self.trace("provider", "matched", demand=match.demand.hash.hex()[:12], offer=match.offer.hash.hex()[:12])
+        self.trace(provider, "matched", demand=match.demand.hash.hex()[:12], offer=match.offer.hash.hex()[:12])
 
     def fails(self, liability: str) -> bool:
         """Whether the device of this job is broken: some jobs fail, which refunds the promisee."""

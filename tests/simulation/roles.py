@@ -16,7 +16,7 @@ from mesh.settings import Settings
 from schemas import String
 from tests.simulation import loop
 from tests.simulation.chain import NodeFaults, SimulatedNode
-from tests.simulation.deployment import ENDPOINT, LIFETIMES, MODEL, TIMING
+from tests.simulation.deployment import ENDPOINT, LIFETIMES, MODEL, STAKE, TIMING
 from tests.simulation.scheduler import Process
 
 if TYPE_CHECKING:
@@ -65,6 +65,11 @@ class Role:
         self.starts = 0
         self.errors: list[BaseException] = []
         self.node_faults = NodeFaults(seen=market.faults_seen)
+        """Of the first node that the process asks."""
+        self.all_node_faults = [
+            self.node_faults,
+            *(NodeFaults(seen=market.faults_seen) for _ in range(market.plan.nodes - 1)),
+        ]
         self.wall_offset_ns = 0
 
     async def main(self) -> None:
@@ -114,13 +119,24 @@ class Role:
 
     def chain(self) -> Chain:
         """The chain, as this process reaches it."""
+        nodes = [
+            SimulatedNode(self.market.deployed.chain, faults, number)
+            for number, faults in enumerate(self.all_node_faults)
+        ]
         return Chain(
-            SimulatedNode(self.market.deployed.chain, self.node_faults),
+            nodes,
             account=self.account,
+            generation=self.market.plan.generation,
             ens=self.market.deployed.market.deployment.ens,
             timing=TIMING,
             transactions=self.folder / "transactions",
         )
+
+    @property
+    def lighthouse(self) -> str:
+        """The name of the market's lighthouse in its generation."""
+        name = self.market.deployed.market.deployment.lighthouse_name
+        return name.replace(".3.", f".{self.market.plan.generation}.")
 
     def settings(self) -> Settings:
         """Its settings."""
@@ -129,7 +145,8 @@ class Role:
             connect=(ENDPOINT,),
             connect_timeout=-1,
             data_dir=str(self.folder),
-            lighthouse_contract=deployment.lighthouse_name,
+            generation=self.market.plan.generation,
+            lighthouse_contract=self.lighthouse,
             ens_contract=deployment.ens,
             poll_interval=TIMING.poll_interval,
             fetch_timeout=60.0,
@@ -143,18 +160,13 @@ class ProviderRole(Role):
 
     async def main(self) -> None:
         """Match and settle."""
-        market = self.market
-        async with (
-            Network(Endpoints(connect=(ENDPOINT,), timeout=-1)) as network,
-            self.chain() as chain,
-            Provider(
-                network.session, chain, market.deployed.market.deployment.lighthouse_name, matched=self._matched
-            ) as self.provider,
-        ):
-            await self.provider.run()
+        async with Network(Endpoints(connect=(ENDPOINT,), timeout=-1)) as network, self.chain() as chain:
+            await chain.lighthouses.become_provider(self.lighthouse, STAKE)
+            async with Provider(network.session, chain, self.lighthouse, matched=self._matched) as self.provider:
+                await self.provider.run()
 
     def _matched(self, match: Match) -> None:
-        self.market.matched(match)
+        self.market.matched(self.name, match)
 
 
 class RobotRole(Role):

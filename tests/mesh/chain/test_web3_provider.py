@@ -192,6 +192,13 @@ async def test_the_next_node_is_asked_when_one_fails(scheme: str) -> None:
     assert caught.value.endpoint == ", ".join(urls)
 
 
+async def test_several_nodes_may_be_addresses_and_provider_objects() -> None:
+    async with EmbeddedChain() as chain:
+        endpoint: list[Any] = [f"http://127.0.0.1:{free_port()}", chain.provider]
+        async with Node(endpoint, timing=QUICK) as node:
+            assert await node.block_number() == 0
+
+
 async def test_a_frozen_node_is_skipped_and_asked_last_afterwards() -> None:
     async with Anvil() as frozen, Anvil() as other:
         timing = replace(QUICK, request_timeout=2)
