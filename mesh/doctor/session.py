@@ -50,6 +50,10 @@ GRACE: Final = 0.2
 """Seconds in which everything written before a received message must have arrived, too."""
 
 
+class WritesUndelivered(RemoteError, code="writes-undelivered"):
+    """Writes that the router allows did not arrive in time, so denied ones can't be detected."""
+
+
 class ProbeKeys(NamedTuple):
     """The keys of test writes: those at `own` must pass, those at `foreign` must be denied."""
 
@@ -127,7 +131,7 @@ class SessionPair:
         """Those of the `foreign` keys that the reader may read, and those of them on which it received the writer.
 
         `own` is a key that the reader may read, `barrier` one that the writer may write: once that arrived, all that
-        was written before has arrived or never will. Raises `RemoteError` if it does not arrive.
+        was written before has arrived or never will. Raises `WritesUndelivered` if it does not arrive.
         """
         heard: set[str] = set()
         with ExitStack() as declared:
@@ -141,7 +145,7 @@ class SessionPair:
             if barrier is not None:
                 self._put(barrier)
                 if not await _within(FORWARD_TIMEOUT, lambda: barrier in heard):
-                    raise RemoteError(
+                    raise WritesUndelivered(
                         f"no allowed write arrived within {FORWARD_TIMEOUT:g} s, so denied writes can't be detected",
                         hint="try again; the router or the network may be overloaded",
                     )

@@ -17,7 +17,7 @@ import zstandard
 
 from mesh.content.files import raising_store_full, sync_directory
 from mesh.errors import ConfigurationError
-from mesh.state.layout import ArchiveUnusable, is_part, part_of
+from mesh.state.layout import ArchiveUnusable, TooManyFiles, is_part, part_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -111,10 +111,7 @@ class ArchiveWriter:
     def _finish(self) -> None:
         sums = msgspec.json.encode(self._sums)
         if len(sums) > LARGEST_TEXT:
-            raise ConfigurationError(
-                f"{len(self._sums):,} files are more than a backup can list",
-                hint="exclude content that agents can fetch again: --content needed, or none",
-            )
+            raise TooManyFiles(len(self._sums))
         self._add_text(CHECKSUMS, sums)
         self._stream.write(bytes(2 * tarfile.BLOCKSIZE))
         self._stream.close()  # type: ignore[no-untyped-call]

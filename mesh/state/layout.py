@@ -93,6 +93,27 @@ class StateChanging(ConfigurationError, code="state-changing"):
         self.path = path
 
 
+class TooManyFiles(ConfigurationError, code="too-many-files"):
+    """A data folder has more files than a backup can list."""
+
+    def __init__(self, count: int) -> None:
+        super().__init__(
+            f"{count:,} files are more than a backup can list",
+            hint="exclude content that agents can fetch again: --content needed, or none",
+        )
+        self.count = count
+
+
+class DataFolderUnwritable(ConfigurationError, code="data-folder-unwritable"):
+    """A backup can't be restored to a folder."""
+
+    def __init__(self, folder: Path, why: str | None) -> None:
+        super().__init__(
+            f"can't restore to {folder}: {why}", hint="give this user write access, or use another --data-dir"
+        )
+        self.folder = folder
+
+
 @dataclass(frozen=True)
 class AccountFolder:
     """The folder of an account in a data folder."""

@@ -25,6 +25,7 @@ from mesh.state.layout import (
     LEDGER,
     TRANSACTIONS,
     ArchiveUnusable,
+    DataFolderUnwritable,
     StateExists,
     StateInUse,
     path_of,
@@ -93,10 +94,7 @@ def _scratch(folder: Path) -> Iterator[Path]:
         make_missing_folders(folder)
         staging = Path(tempfile.mkdtemp(prefix=STAGING, dir=folder))
     except OSError as error:
-        raise ConfigurationError(
-            f"can't restore to {folder}: {error.strerror}",
-            hint="give this user write access, or use another --data-dir",
-        ) from None
+        raise DataFolderUnwritable(folder, error.strerror) from None
     try:
         yield staging
     finally:

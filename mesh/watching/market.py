@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections import Counter, OrderedDict
-from contextlib import AsyncExitStack
 from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, Self, TypeAlias, TypeVar
 
 import msgspec
@@ -17,6 +16,7 @@ import msgspec
 from mesh.background import Background
 from mesh.errors import AiraError, InputError
 from mesh.network import Pump, ValidationStatistics
+from mesh.role import Lifecycle
 from schemas import (
     Demand,
     EventKey,
@@ -35,7 +35,7 @@ from schemas.signing import Rejection
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterable
-    from types import TracebackType
+    from contextlib import AsyncExitStack
 
     import zenoh
 
@@ -124,13 +124,15 @@ class RecentSet:
         return True
 
 
-class MarketWatch:
+class MarketWatch(Lifecycle):
     """Events on an open channel from now on: `async with MarketWatch(session, channel) as watch`, then iterate.
 
     With `model` (CIDv0), only events about orders and liabilities of that model; a result counts once its agent has
     reported the liability. Job events are taken from agents that are, or have been meanwhile, present on the channel.
     For one consumer. Leaving `async with` ends it; the caller closes session and channel.
     """
+
+    title = "market watch"
 
     def __init__(self, session: zenoh.Session, channel: Channel, *, model: str = "*") -> None:
         self._session = session
@@ -141,38 +143,29 @@ class MarketWatch:
         self._orders = RecentSet()
         self._contracts = RecentSet()
         self._rejections = RecentSet()
-        self._stack = AsyncExitStack()
 
-    async def __aenter__(self) -> Self:
-        async with AsyncExitStack() as stack:
-            channel = self._channel
-            self._demands = await stack.enter_async_context(channel.subscribe(Demand, model=self._model))
-            self._offers = await stack.enter_async_context(channel.subscribe(Offer, model=self._model))
-            self._results = await stack.enter_async_context(channel.subscribe(Result))
-            channel.watch_presence(lambda key: self._agents.add(key.agent))
-            for key in await channel.present():
-                self._agents.add(key.agent)
-            self._rejection_reader = ClaimReader(read_rejection, reason="rejection")
-            self._event_reader = ClaimReader(read_event, reason="event")
-            selector = market_selector(channel.lighthouse, "reject")
-            self._rejected = await stack.enter_async_context(Pump(self._session, selector, self._rejection_reader))
-            self._events = await stack.enter_async_context(Pump(self._session, event_selector(), self._event_reader))
-            tasks = await stack.enter_async_context(Background())
-            for name, items in (
-                ("demands", self._seen_orders(self._demands)),
-                ("offers", self._seen_orders(self._offers)),
-                ("results", self._seen_results()),
-                ("rejections", self._seen_rejections()),
-                ("events", self._seen_events()),
-            ):
-                tasks.start(self._move(items), f"watched {name}")
-            self._stack = stack.pop_all()
-        return self
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> bool | None:
-        return await self._stack.__aexit__(kind, error, trace)
+    async def _open(self, stack: AsyncExitStack) -> None:
+        channel = self._channel
+        self._demands = await stack.enter_async_context(channel.subscribe(Demand, model=self._model))
+        self._offers = await stack.enter_async_context(channel.subscribe(Offer, model=self._model))
+        self._results = await stack.enter_async_context(channel.subscribe(Result))
+        channel.watch_presence(lambda key: self._agents.add(key.agent))
+        for key in await channel.present():
+            self._agents.add(key.agent)
+        self._rejection_reader = ClaimReader(read_rejection, reason="rejection")
+        self._event_reader = ClaimReader(read_event, reason="event")
+        selector = market_selector(channel.lighthouse, "reject")
+        self._rejected = await stack.enter_async_context(Pump(self._session, selector, self._rejection_reader))
+        self._events = await stack.enter_async_context(Pump(self._session, event_selector(), self._event_reader))
+        tasks = await stack.enter_async_context(Background())
+        for name, items in (
+            ("demands", self._seen_orders(self._demands)),
+            ("offers", self._seen_orders(self._offers)),
+            ("results", self._seen_results()),
+            ("rejections", self._seen_rejections()),
+            ("events", self._seen_events()),
+        ):
+            tasks.start(self._move(items), f"watched {name}")
 
     def __aiter__(self) -> Self:
         return self

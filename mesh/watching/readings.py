@@ -5,9 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import tempfile
-from contextlib import AsyncExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
@@ -16,13 +15,14 @@ from mesh.content import Exchange, Store
 from mesh.errors import AiraError
 from mesh.log_context import log_event
 from mesh.recording import Limits, open_objective
+from mesh.role import Lifecycle
 from mesh.watching.market import JobEvent, RecentSet
 from schemas import Result, Verified
 from schemas.payloads import decode_value
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from types import TracebackType
+    from contextlib import AsyncExitStack
 
     import zenoh
 
@@ -53,12 +53,14 @@ class SensorReading(msgspec.Struct, frozen=True):
     """`Empty`, `String`, JSON data or bytes."""
 
 
-class ReadingFetcher:
+class ReadingFetcher(Lifecycle):
     """Fetches the results without a liability among the events given to `handle`, and passes each reading to `deliver`.
 
     Use with `async with`; files are in a temporary folder meanwhile. Agents' job events show which results have a
     liability. Results that can't be fetched or read are logged.
     """
+
+    title = "fetcher of readings"
 
     def __init__(
         self, session: zenoh.Session, deliver: Callable[[SensorReading], None], *, timeout: float = TIMEOUT
@@ -69,22 +71,13 @@ class ReadingFetcher:
         self._contracts = RecentSet()
         self._turns = asyncio.Semaphore(MAX_FETCHES)
         self._pending = 0
-        self._stack = AsyncExitStack()
 
-    async def __aenter__(self) -> Self:
-        async with AsyncExitStack() as stack:
-            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="aira-readings-"))
-            store = await asyncio.to_thread(Store, Path(folder), limit=LARGEST, quota=KEPT)
-            stack.callback(store.close)
-            self._exchange = await stack.enter_async_context(Exchange(self._session, store))
-            self._tasks = await stack.enter_async_context(Background())
-            self._stack = stack.pop_all()
-        return self
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> bool | None:
-        return await self._stack.__aexit__(kind, error, trace)
+    async def _open(self, stack: AsyncExitStack) -> None:
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="aira-readings-"))
+        store = await asyncio.to_thread(Store, Path(folder), limit=LARGEST, quota=KEPT)
+        stack.callback(store.close)
+        self._exchange = await stack.enter_async_context(Exchange(self._session, store))
+        self._tasks = await stack.enter_async_context(Background())
 
     @property
     def pending(self) -> int:

@@ -1,8 +1,8 @@
 """Turns under random actions of the providers, against a model of the queue.
 
-The model is a list of accounts. Each step, the lighthouse must refuse and change what the model does; and whoever waits
-must not be set back, unless it had a whole timeout alone to take the turn. `AIRA_TURN_HISTORIES` says how many
-histories there are to be.
+The model is a list of accounts. At each step the lighthouse must refuse and change what the model does. A provider that
+waits must not be set back, unless it had a whole timeout alone to take the turn. `AIRA_TURN_HISTORIES` is the number of
+histories.
 """
 
 from __future__ import annotations

@@ -57,10 +57,10 @@ async def test_a_role_works_while_it_is_open_and_closes_in_reverse_order() -> No
 
 async def test_a_closed_role_can_not_run_and_an_open_one_can_not_be_opened_twice() -> None:
     role = ExampleRole()
-    with pytest.raises(ClosedError, match="this example is not open"):
+    with pytest.raises(ClosedError):
         await role.run()
     async with role:
-        with pytest.raises(ClosedError, match="this example is open already"):
+        with pytest.raises(ClosedError):
             await role.__aenter__()
         assert role.done == ["opens first", "opens second"]
     async with role:

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import gc
-import os
 import sys
 import time
 from typing import TYPE_CHECKING
@@ -9,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from tests.support.ports import answers, free_port
-from tests.support.processes import Server, ServerFailed
+from tests.support.processes import Server, ServerFailed, is_alive
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -36,14 +35,6 @@ class Scripted(Server):
 
     def is_ready(self) -> bool:
         return answers(self.port)
-
-
-def is_alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
 
 
 def test_a_server_runs_inside_with_and_its_folder_is_removed_afterwards() -> None:

@@ -170,7 +170,7 @@ async def test_a_closed_node_raises() -> None:
 async def test_a_closed_embedded_chain_raises() -> None:
     async with EmbeddedChain() as chain, Node(chain.provider, timing=QUICK) as node:
         await chain.__aexit__(None, None, None)
-        with pytest.raises(ClosedError, match="embedded"):
+        with pytest.raises(ClosedError):
             await node.block_number()
 
 

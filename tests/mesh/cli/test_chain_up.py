@@ -25,6 +25,7 @@ from tests.support.commands import AIRA, SOON, Serving, aira, invoke, refused
 from tests.support.development import variables_of
 from tests.support.peers import require
 from tests.support.ports import answers, free_port
+from tests.support.processes import is_alive
 from tests.support.waiting import wait_until
 
 if TYPE_CHECKING:
@@ -46,23 +47,6 @@ def child_of(pid: int) -> int:
     """The one process that a process has started."""
     (child,) = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
     return int(child)
-
-
-def is_alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
-
-
-@pytest.fixture
-def on_path(tmp_path: Path) -> dict[str, str]:
-    """Variables with which anvil is on the path."""
-    folder = tmp_path / "programs"
-    folder.mkdir()
-    (folder / "anvil").symlink_to(require("anvil"))
-    return {"PATH": f"{folder}:{os.environ['PATH']}"}
 
 
 def test_anvil_on_the_path_is_used_and_stopped_with_the_command(tmp_path: Path, on_path: dict[str, str]) -> None:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING
 
-import pytest
 from click.testing import CliRunner
 
 from mesh.chain import Node
@@ -24,15 +22,6 @@ def up(folder: Path, *options: str | Path, **variables: str) -> Serving:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     arguments = ("--port", "0", "--listen", endpoint, "--data-dir", folder, *options)
     return Serving(*AIRA, "up", *arguments, says="provider    0x", variables=variables)
-
-
-@pytest.fixture
-def on_path(tmp_path: Path) -> dict[str, str]:
-    """Variables with which anvil is on the path."""
-    folder = tmp_path / "programs"
-    folder.mkdir()
-    (folder / "anvil").symlink_to(require("anvil"))
-    return {"PATH": f"{folder}:{os.environ['PATH']}"}
 
 
 def test_anvil_on_the_path_is_used(tmp_path: Path, on_path: dict[str, str]) -> None:

@@ -20,6 +20,7 @@ from mesh.devchain.errors import InvalidChainState, MarketMissing, NotAProgram, 
 from mesh.settings import Settings
 from tests.support.peers import require
 from tests.support.ports import answers, free_port
+from tests.support.processes import is_alive
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,14 +32,6 @@ NEW_ACCOUNT = "0x00000000000000000000000000000000000000AA"
 def program() -> Path:
     """The real anvil."""
     return require("anvil")
-
-
-def is_alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
 
 
 async def test_anvil_runs_for_the_body_and_stops_after_it(program: Path) -> None:

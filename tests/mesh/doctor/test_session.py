@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 import zenoh
 
-from mesh.doctor.session import SessionPair
-from mesh.errors import RemoteError
+from mesh.doctor.session import SessionPair, WritesUndelivered
 from tests.support.routers import client_config
 
 if TYPE_CHECKING:
@@ -73,5 +72,5 @@ async def test_denied_writes_are_not_checked_if_allowed_ones_do_not_arrive(
     router: EmbeddedRouter,
 ) -> None:
     async with pair(router.endpoint, router.endpoint) as both:
-        with pytest.raises(RemoteError, match="no allowed write arrived"):
+        with pytest.raises(WritesUndelivered):
             await both.delivered(("aira/test/foreign",), own="aira/test/own", barrier="aira/test/unheard")

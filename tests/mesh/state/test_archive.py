@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import pytest
 import zstandard
 
-from mesh.errors import ConfigurationError
 from mesh.state import ArchiveUnusable, ContentScope, back_up, examine_archive, restore
 from mesh.state import archive as archives
+from mesh.state.layout import TooManyFiles
 from tests.mesh.state.conftest import ADDRESS, CHAIN, Folder, forge, members, names_in, unpacked
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ async def test_a_backup_with_too_many_files_to_restore_is_not_made(
     folder: Folder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(archives, "LARGEST_TEXT", 500)
-    with pytest.raises(ConfigurationError, match="files are more than a backup can list"):
+    with pytest.raises(TooManyFiles):
         await back_up(folder.path, tmp_path / "it", content=ContentScope.ALL)
     assert names_in(tmp_path) == ["data"]
 

@@ -29,6 +29,7 @@ from mesh.state import (
     back_up,
     restore,
 )
+from mesh.state.layout import DataFolderUnwritable
 from mesh.work import Ledger, Phase
 from mesh.work.database import VERSION, LedgerTooNew, LedgerUnusable
 from schemas import cid_of_bytes
@@ -265,8 +266,9 @@ async def test_a_full_disk_is_an_error_and_changes_nothing(archive: Path, tmp_pa
 
 async def test_an_unwritable_folder_is_an_error(archive: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(ConfigurationError, match="can't restore to"):
+    with pytest.raises(DataFolderUnwritable) as caught:
         await restore(archive, tmp_path / "file")
+    assert caught.value.folder == tmp_path / "file"
 
 
 async def test_a_mounted_folder_is_kept_and_filled(archive: Path, tmp_path: Path) -> None:
