@@ -204,6 +204,10 @@ class Drops:
         with self._lock:
             return self._by_sender.get(reason, Counter()).most_common(number)
 
+    def senders(self) -> dict[str, dict[str, int]]:
+        """The `heaviest` senders by reason."""
+        return {reason: dict(self.heaviest(reason)) for reason in self.totals() if self.heaviest(reason)}
+
     def report(self) -> bool:
         """Log what was dropped since the last report, and begin to count senders again; False if nothing was."""
         with self._lock:

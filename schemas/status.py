@@ -79,6 +79,10 @@ class Status(Record, frozen=True, kw_only=True, rename="camel", forbid_unknown_f
     """Seconds since it started."""
     work: Work | None = None
     market: MarketStatus | None = None
+    dropped: Mapping[str, int] = {}
+    """What it dropped since it started because there was too much of it, by reason."""
+    heaviest: Mapping[str, Mapping[str, int]] = {}
+    """The senders from whom it dropped most in the last minute, by reason, with estimated counts."""
 
 
 class DirectionStatus(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):

@@ -19,8 +19,8 @@ from schemas.messages import MESSAGE_TYPES, Demand, Message, Offer, Order, Resul
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-MAX_MESSAGE_SIZE: Final = 65_536
-"""The longest payload, in bytes, that is decoded. Real messages have about 600."""
+MAX_MESSAGE_SIZE: Final = 16_384
+"""The longest payload, in bytes, that is decoded. Real messages have about 700."""
 
 _TYPE_OF_MARK: Final[dict[str, type[Message]]] = {kind.mark: kind for kind in MESSAGE_TYPES}
 _MARKS: Final = tuple((f'"{mark}"'.encode(), kind) for mark, kind in _TYPE_OF_MARK.items())

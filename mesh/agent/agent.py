@@ -258,8 +258,8 @@ class Agent(HandlerDecorators, Lifecycle):
         """Open the components, then start the tasks."""
         status: WatcherStatus | AgentRuntime
         if account is None:
-            network, channel = await stack.enter_async_context(watching(self.settings))
-            status, self._channel = WatcherStatus(network, channel), channel
+            network, channel = await stack.enter_async_context(watching(self.settings, drops=self.drops))
+            status, self._channel = WatcherStatus(network, channel, self.drops), channel
         else:
             status = self._runtime = await self._open_runtime(stack, account)
             network, channel = status.parts.network, status.parts.channel
@@ -283,7 +283,7 @@ class Agent(HandlerDecorators, Lifecycle):
         for kind, subscription, handlers in subscriptions:
             tasks.start(subscription.recall(), "recall")
             if kind is Demand and self._runtime is not None:
-                tasks.start(self._runtime.handle_demands(cast("Any", subscription), handlers, self.drops), "demands")
+                tasks.start(self._runtime.handle_demands(cast("Any", subscription), handlers), "demands")
             else:
                 tasks.start(dispatch(subscription, handlers, concurrency=HANDLED if kind is Demand else 1), "handlers")
         for seconds, handler in self._handlers.periodic:
@@ -292,7 +292,7 @@ class Agent(HandlerDecorators, Lifecycle):
     async def _open_runtime(self, stack: AsyncExitStack, account: Account) -> AgentRuntime:
         from mesh.agent.runtime import AgentRuntime  # loads web3, which an agent that watches does without
 
-        make = partial(working, self.settings, account, self._given_chain, resend=self._resend)
+        make = partial(working, self.settings, account, self._given_chain, resend=self._resend, drops=self.drops)
         parts = await open_when_ready(stack, self.settings, make, role="agent", on_wait=self.telemetry.starting)
         return await stack.enter_async_context(AgentRuntime(parts, self._handlers))
 

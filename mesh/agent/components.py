@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 from mesh.composition import chain_of, endpoints_of
 from mesh.content import Exchange, Store
 from mesh.errors import ConfigurationError
+from mesh.flood import Drops
 from mesh.network import Channel, Network, Services
 from mesh.outage_log import OutageLog
 from mesh.private_files import make_private_folder
@@ -82,6 +83,8 @@ class AgentComponents:
     chain_head: ChainHead
     outages: OutageLog
     """Outages of the node, for everything that waits for it."""
+    drops: Drops
+    """What was dropped because of floods."""
     directory: Path
     """The folder of what belongs to this chain: the ledger and unfinished recordings."""
 
@@ -92,23 +95,29 @@ class AgentComponents:
 
 
 @asynccontextmanager
-async def watching(settings: Settings) -> AsyncIterator[tuple[Network, Channel]]:
+async def watching(settings: Settings, *, drops: Drops | None = None) -> AsyncIterator[tuple[Network, Channel]]:
     """The components of an agent that only watches the market: it needs a router, but no account and no chain."""
     async with (
         Network(endpoints_of(settings)) as network,
-        Channel(network.session, settings.lighthouse_contract) as channel,
+        Channel(network.session, settings.lighthouse_contract, drops=drops) as channel,
     ):
         yield network, channel
 
 
 @asynccontextmanager
 async def working(
-    settings: Settings, account: Account, chain: Chain | None, *, resend: RetryPolicy = RESEND
+    settings: Settings,
+    account: Account,
+    chain: Chain | None,
+    *,
+    resend: RetryPolicy = RESEND,
+    drops: Drops | None = None,
 ) -> AsyncIterator[AgentComponents]:
     """The components of an agent with an account, on `chain` (open), or on the chain that the settings name.
 
     Its state is in the settings' folder by address, and what belongs to a chain in a folder for that chain.
     """
+    drops = Drops() if drops is None else drops
     async with AsyncExitStack() as stack:
         if chain is None:
             chain = await stack.enter_async_context(chain_of(settings, account))
@@ -117,7 +126,7 @@ async def working(
         chain_head = ChainHead(await chain.block_number())
         network = await stack.enter_async_context(Network(endpoints_of(settings)))
         channel = await stack.enter_async_context(
-            await _channel_of(settings.lighthouse_contract, network, chain=chain, head=chain_head)
+            await _channel_of(settings.lighthouse_contract, network, chain=chain, head=chain_head, drops=drops)
         )
         ledger = await stack.enter_async_context(Ledger(directory / LEDGER))
         store = await asyncio.to_thread(
@@ -134,16 +143,17 @@ async def working(
             outbox=Outbox(ledger, channel, network, head=lambda: chain_head.head, policy=resend),
             store=store,
             exchange=await stack.enter_async_context(Exchange(network.session, store)),
-            services=await stack.enter_async_context(Services(network.session, account.address)),
+            services=await stack.enter_async_context(Services(network.session, account.address, drops=drops)),
             chain_head=chain_head,
             outages=OutageLog(log, "chain"),
+            drops=drops,
             directory=directory,
         )
         _make_folder(parts.recordings)
         yield parts
 
 
-async def _channel_of(lighthouse: str, network: Network, *, chain: Chain, head: ChainHead) -> Channel:
+async def _channel_of(lighthouse: str, network: Network, *, chain: Chain, head: ChainHead, drops: Drops) -> Channel:
     """The channel of a lighthouse, not yet open, which resolves names and knows the head by the chain."""
     address = await chain.names.address(lighthouse)
     return Channel(
@@ -153,6 +163,7 @@ async def _channel_of(lighthouse: str, network: Network, *, chain: Chain, head: 
         resolver=chain.names.address,
         validators=chain.validators,
         head=lambda: head.head,
+        drops=drops,
     )
 
 

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
     from mesh.agent.components import AgentComponents
     from mesh.agent.handlers import Handler, Handlers
-    from mesh.flood import Drops
     from mesh.network import Subscription
     from mesh.telemetry.metrics import MetricFamily
     from schemas import Demand, Liability
@@ -86,9 +85,7 @@ class AgentRuntime(Role):
         await self.listener.finalize_ended()
         await self.executor.run()
 
-    async def handle_demands(
-        self, subscription: Subscription[Demand], handlers: Sequence[Handler], drops: Drops
-    ) -> None:
+    async def handle_demands(self, subscription: Subscription[Demand], handlers: Sequence[Handler]) -> None:
         """Call the handlers with the demands of a subscription whose makers can pay, until cancelled."""
         parts, names = self.parts, self.parts.chain.names
         token = await parts.chain.retrying(partial(names.address, parts.settings.erc20_token), outages=parts.outages)
@@ -99,7 +96,7 @@ class AgentRuntime(Role):
             token=token,
             customers=self.trader.customers,
             outages=parts.outages,
-            drops=drops,
+            drops=parts.drops,
         ).run()
 
     async def measure(self, subscriptions: Sequence[Subscription[Any]]) -> tuple[MetricFamily, ...]:

@@ -7,7 +7,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import mesh
-from mesh.network.metrics import link_state, message_families, network_families
+from mesh.network.metrics import drop_family, link_state, message_families, network_families
 from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge, labelled
 from mesh.work.ledger import UNFINISHED, Phase
 from schemas.status import ALIVE, OFF, Status, StoreUse, Work
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from mesh.agent.components import AgentComponents
+    from mesh.flood import Drops
     from mesh.network import Channel, Network, Subscription
     from mesh.recording import Recorders
     from mesh.work.executor import Executor
@@ -25,13 +26,16 @@ if TYPE_CHECKING:
 class WatcherStatus:
     """The metrics and the health of an agent without an account, which only receives the market's messages."""
 
-    def __init__(self, network: Network, channel: Channel) -> None:
+    def __init__(self, network: Network, channel: Channel, drops: Drops) -> None:
+        self._drops = drops
         self._network = network
         self._channel = channel
 
     async def measure(self, subscriptions: Sequence[Subscription[Any]]) -> tuple[MetricFamily, ...]:
         """The metrics of its subscriptions and its session."""
-        received = labelled(message_families(subscriptions), lighthouse=self._channel.lighthouse)
+        received = labelled(
+            (*message_families(subscriptions), drop_family(self._drops)), lighthouse=self._channel.lighthouse
+        )
         return (*received, *network_families(self._network))
 
     def health(self) -> Mapping[str, str]:
@@ -63,6 +67,8 @@ class AgentStatus:
             chain_id=parts.chain.chain_id,
             xrt=parts.chain.xrt,
             uptime=round(time.monotonic() - self._started, 3),
+            dropped=parts.drops.totals(),
+            heaviest=parts.drops.senders(),
             work=Work(
                 jobs=await parts.ledger.jobs_by_phase(),
                 outbox=sum((await parts.ledger.waiting_by_kind()).values()),
@@ -89,6 +95,7 @@ class AgentStatus:
 
         families = (
             *message_families(subscriptions),
+            drop_family(self._parts.drops),
             *await self._jobs(),
             *await self._outbox(),
             *self._recording(),

@@ -183,6 +183,10 @@ def _describe_participant(how: Status) -> dict[str, str]:
     }
     facts |= {} if how.work is None else _describe_work(how.work)
     facts |= {} if how.market is None else _describe_market(how.market)
+    if how.dropped:
+        facts["dropped"] = _counts(how.dropped)
+    for reason, senders in how.heaviest.items():
+        facts[f"most {reason}"] = ", ".join(f"{sender} {count:,}" for sender, count in senders.items())
     return facts | {
         "uptime": format_duration(int(how.uptime) * 10**9),
         "version": how.version,

@@ -11,6 +11,7 @@ import asyncio
 from typing import TYPE_CHECKING, Any
 
 from mesh.chain import InsufficientFunds
+from mesh.flood import Drops
 from mesh.log_context import LogSource, source_context
 from mesh.market.book import LIMIT, Match, OrderBook
 from mesh.market.earnings import Earnings, EarningsLedger
@@ -65,6 +66,7 @@ class Provider(Role):
         retry: RetryPolicy = RETRY,
         open_liabilities: int = OPEN_LIABILITIES,
         withdrawals: Path | None = None,
+        drops: Drops | None = None,
     ) -> None:
         if chain.account is None:
             raise ValueError("a provider needs a chain with an account")
@@ -78,6 +80,8 @@ class Provider(Role):
         self._open_liabilities = open_liabilities
         self.withdrawals = Withdrawals(withdrawals)
         self.ledger = EarningsLedger()
+        self.drops = Drops() if drops is None else drops
+        """What it dropped because of floods."""
         self._source = LogSource("provider", self.address, self._lighthouse)
 
     async def _open(self, stack: AsyncExitStack) -> None:
@@ -98,6 +102,7 @@ class Provider(Role):
                 resolver=self._chain.names.address,
                 validators=self._chain.validators,
                 head=lambda: self.settlement.events.head,
+                drops=self.drops,
             )
         )
         self._demands = await stack.enter_async_context(self.channel.subscribe(Demand))
@@ -105,8 +110,10 @@ class Provider(Role):
         self._withdrawn = await stack.enter_async_context(self.channel.subscribe(Withdrawal))
         self.results = await stack.enter_async_context(self.channel.subscribe(Result))
         self._wire(head)
-        await stack.enter_async_context(OrderBookService(self._session, self._lighthouse, self.book, self.withdrawals))
-        services = await stack.enter_async_context(Services(self._session, self.address))
+        await stack.enter_async_context(
+            OrderBookService(self._session, self._lighthouse, self.book, self.withdrawals, drops=self.drops)
+        )
+        services = await stack.enter_async_context(Services(self._session, self.address, drops=self.drops))
         with source_context(self._source):
             services.offer("status", self._status.status)
             services.offer("logs", LogService("provider", self.address).logs)
@@ -135,12 +142,14 @@ class Provider(Role):
             queue=self.queue,
             settlement=self.settlement,
             earnings=self.ledger,
+            drops=self.drops,
         )
 
     async def _work(self) -> None:
         with source_context(self._source):
             async with asyncio.TaskGroup() as tasks:
                 self.settlement.start(tasks)
+                tasks.create_task(self.drops.run(), name="provider drops")
                 # Before the orders that they concern; one that comes later still stops what was not sent.
                 await self._withdrawn.recall()
                 tasks.create_task(self._take_withdrawals(), name="provider withdrawals")

@@ -11,8 +11,9 @@ import zenoh
 
 import mesh
 from mesh.chain.metrics import CachedMetrics, reading_families
+from mesh.flood import Rate, RateLimiter
 from mesh.network import call_in_loop, message_key
-from mesh.network.metrics import message_families
+from mesh.network.metrics import drop_family, message_families
 from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge, labelled
 from schemas import encode, lighthouse_selector
 from schemas.selectors import ORDER
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
 
     from mesh.chain import Chain
+    from mesh.flood import Drops
     from mesh.market.book import OrderBook
     from mesh.market.earnings import EarningsLedger
     from mesh.market.settlement import Settlement
@@ -34,6 +36,10 @@ if TYPE_CHECKING:
 
 THREADS: Final = 2
 """Threads that answer queries: a book can be large, and a client may take the answers slowly."""
+REPLIES: Final = Rate(10_000, 500_000)
+"""Orders that are sent in answers, a second and in a burst: a tenth of a core. A query counts as many as the book has,
+and is dropped when that is too many. Zenoh does not say who asks, so that strangers share this with all others, who get
+orders also when these are sent again."""
 PENDING: Final = 64
 """Queries that may be pending, each with a copy of the list of orders; further ones are dropped."""
 
@@ -42,7 +48,7 @@ class OrderBookService:
     """Answers queries for open orders and withdrawals, which a client sends after it has subscribed.
 
     Inside `async with` it answers on the keys of `lighthouse` (ENS name) from `book` and `withdrawals`. At most `limit`
-    queries are pending at a time. Leaving `async with` aborts the answers.
+    queries are pending at a time, and at most `replies` orders are sent. Leaving `async with` aborts the answers.
     """
 
     def __init__(
@@ -53,6 +59,8 @@ class OrderBookService:
         withdrawals: Withdrawals,
         *,
         limit: int = PENDING,
+        replies: Rate = REPLIES,
+        drops: Drops | None = None,
         threads: ThreadPoolExecutor | None = None,
     ) -> None:
         self._session = session
@@ -60,6 +68,9 @@ class OrderBookService:
         self._book = book
         self._withdrawals = withdrawals
         self._limit = limit
+        self._drops = drops
+        self._most = replies.burst
+        self._rate = RateLimiter(per_sender=replies)
         self._threads = threads or ThreadPoolExecutor(THREADS, thread_name_prefix="order book")
         self._answers: set[Future[None]] = set()
         self._open = True
@@ -72,9 +83,18 @@ class OrderBookService:
     async def __aenter__(self) -> Self:
         loop = asyncio.get_running_loop()
         self._queryable: Any = self._session.declare_queryable(
-            lighthouse_selector(self._lighthouse), lambda query: call_in_loop(loop, self.answer, query), complete=True
+            lighthouse_selector(self._lighthouse), lambda query: self._received(loop, query), complete=True
         )
         return self
+
+    def _received(self, loop: asyncio.AbstractEventLoop, query: zenoh.Query) -> None:
+        """Refuse what is too much on Zenoh's thread, so that the event loop is not kept busy."""
+        if len(self._answers) < self._limit and self._rate.allow("", min(len(self._book) + 1, self._most)):
+            call_in_loop(loop, self.answer, query)
+            return
+        query.drop()  # type: ignore[no-untyped-call]
+        if self._drops is not None:
+            self._drops.count("recall")
 
     async def __aexit__(self, *exc_info: object) -> None:
         self._open = False
@@ -121,6 +141,7 @@ class ProviderStatusService:
         queue: TransactionQueue,
         settlement: Settlement,
         earnings: EarningsLedger,
+        drops: Drops,
     ) -> None:
         assert chain.account is not None
         self._address = chain.account.address
@@ -132,6 +153,7 @@ class ProviderStatusService:
         self._queue = queue
         self._settlement = settlement
         self._earnings = earnings
+        self._drops = drops
         self._stake = CachedMetrics(self._ask_stake)
         self._began = time.monotonic()
 
@@ -159,6 +181,8 @@ class ProviderStatusService:
                 fees=earned.fees,
                 minted=earned.minted,
             ),
+            dropped=self._drops.totals(),
+            heaviest=self._drops.senders(),
         )
 
     def health(self) -> dict[str, str]:
@@ -177,6 +201,7 @@ class ProviderStatusService:
         """The metrics now, labelled with the lighthouse; without those of the account."""
         families = (
             *message_families(self._subscriptions),
+            drop_family(self._drops),
             *self._market_families(),
             *self._earnings_families(),
             *reading_families(head=self._settlement.events.head, read_at=self._settlement.events.read_at),

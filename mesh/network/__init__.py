@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Final
 from schemas.loading import on_demand
 
 if TYPE_CHECKING:
-    from mesh.network.channel import Channel, Subscription
+    from mesh.network.channel import Channel
     from mesh.network.connecting import NotAdmitted
     from mesh.network.endpoints import Endpoints, free_endpoint
     from mesh.network.pump import Pump, call_in_loop
     from mesh.network.services import ServiceFailed, Services, call
     from mesh.network.session import Network, NetworkChange
+    from mesh.network.subscription import Subscription
     from mesh.network.tls import Tls
     from mesh.network.validation import MessageValidator, ValidationStatistics, message_key
 
@@ -26,7 +27,7 @@ _HOMES: Final = {
     "Pump": "mesh.network.pump",
     "ServiceFailed": "mesh.network.services",
     "Services": "mesh.network.services",
-    "Subscription": "mesh.network.channel",
+    "Subscription": "mesh.network.subscription",
     "Tls": "mesh.network.tls",
     "ValidationStatistics": "mesh.network.validation",
     "call": "mesh.network.services",

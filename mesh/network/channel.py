@@ -8,42 +8,29 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import deque
 from contextvars import copy_context
-from typing import TYPE_CHECKING, Any, Final, Generic, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import zenoh
 
 from mesh.errors import ClosedError, InputError, InvalidKey
 from mesh.network import sending
-from mesh.network.pump import Pump, call_in_loop
-from mesh.network.validation import (
-    M,
-    MessageValidator,
-    Unresolved,
-    ValidationStatistics,
-    ValidatorCheck,
-    message_key,
-)
-from schemas import SignedMessage, Verified, encode
+from mesh.network.pump import call_in_loop
+from mesh.network.subscription import RECALL_LIMIT, RECALL_TIMEOUT, Subscription
+from mesh.network.validation import M, MessageValidator, message_key
+from schemas import SignedMessage, encode
 from schemas.keys import PresenceKey, parse_key
 from schemas.selectors import lighthouse_selector, market_selector, presence_selector
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
-    from types import TracebackType
+
+    from mesh.flood import Drops
+    from mesh.network.lookups import ValidatorCheck
 
     Resolver = Callable[[str], Awaitable[str]]
 
 log = logging.getLogger(__name__)
-
-
-RECALL_TIMEOUT: Final = 5.0
-"""Seconds that providers have to answer with their open orders."""
-RECALL_LIMIT: Final = 65_536
-"""Open orders accepted from one recall, at most."""
-LOOKUP_LIMIT: Final = 256
-"""Messages that may wait for the resolution of their ENS names. More are rejected: anybody may send unknown names."""
 
 
 class Channel:
@@ -51,8 +38,9 @@ class Channel:
 
     `lighthouse` is the ENS name of the market. `address`, if given, is the lighthouse that orders must name;
     `resolver` resolves ENS names in messages; `validators` knows which validators orders may name (None: any); `head`
-    returns the latest block number, for deadlines. Leaving `async with` withdraws the presence tokens and ends the
-    watches; the caller closes the session. Raises `InvalidKey` for a name that no key may contain.
+    returns the latest block number, for deadlines; what is dropped is counted in `drops`. Leaving `async with`
+    withdraws the presence tokens and ends the watches; the caller closes the session. Raises `InvalidKey` for a name
+    that no key may contain.
     """
 
     def __init__(
@@ -64,6 +52,7 @@ class Channel:
         resolver: Resolver | None = None,
         validators: ValidatorCheck | None = None,
         head: Callable[[], int] = lambda: 0,
+        drops: Drops | None = None,
     ) -> None:
         self._session = session
         self.lighthouse = lighthouse.lower()
@@ -72,6 +61,7 @@ class Channel:
         self._resolver = resolver
         self._validators = validators
         self._head = head
+        self._drops = drops
         self._declarations: list[Any] = []
         self._open = False
 
@@ -126,7 +116,7 @@ class Channel:
             resolver=self._resolver,
             validators=self._validators,
         )
-        return Subscription(self._session, selector, validator)
+        return Subscription(self._session, selector, validator, drops=self._drops)
 
     def announce(self, role: str, address: str) -> None:
         """Announce the agent at `address` as present in `role`, for as long as the channel is open."""
@@ -173,108 +163,6 @@ class Channel:
     def _check_open(self) -> None:
         if not self._open:
             raise ClosedError("the channel is not open", hint="use it inside `async with`")
-
-
-class Subscription(Generic[M]):
-    """The verified messages of one kind, as an async iterator: `async with channel.subscribe(Demand) as demands`.
-
-    The iteration ends when `async with` is left. Supports one consumer. Messages about which the chain has to be asked
-    (ENS names, unknown validators) are delivered after that, so later ones may overtake them; at most `lookup_limit`
-    wait. Raises `ClosedError` before it is entered.
-    """
-
-    def __init__(
-        self,
-        session: zenoh.Session,
-        selector: str,
-        validator: MessageValidator[M],
-        *,
-        lookup_limit: int = LOOKUP_LIMIT,
-    ) -> None:
-        self._session = session
-        self.selector: Final = selector
-        """The key expression that is subscribed to."""
-        self._validator: MessageValidator[M] = validator
-        self._pump: Pump[Verified[M] | Unresolved[M]] = Pump(session, selector, validator)
-        self._unresolved: asyncio.Queue[Unresolved[M]] = asyncio.Queue(lookup_limit)
-        self._queries: set[zenoh.CancellationToken] = set()
-
-    async def __aenter__(self) -> Self:
-        await self._pump.__aenter__()
-        self._lookups = asyncio.create_task(self._ask_chain(), name=f"ask the chain about {self.selector}")
-        return self
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._lookups.cancel()
-        for query in tuple(self._queries):
-            query.cancel()  # type: ignore[no-untyped-call]
-        await self._pump.__aexit__(kind, error, trace)
-
-    def __aiter__(self) -> Self:
-        return self
-
-    async def __anext__(self) -> Verified[M]:
-        while isinstance(item := await anext(self._pump), Unresolved):
-            if self._unresolved.full():
-                self._validator.reject(item.question)
-            else:
-                self._unresolved.put_nowait(item)
-        return item
-
-    async def recall(self) -> None:
-        """Ask the providers for the open orders; the iterator yields each new one once.
-
-        Returns when all providers have answered or after `RECALL_TIMEOUT`; having no provider is not an error.
-        Cancelling this call or leaving `async with` ends the query.
-        """
-        self._pump.check_entered()
-        query = zenoh.CancellationToken()
-        self._queries.add(query)
-        try:
-            await asyncio.to_thread(self._recall, query)
-        finally:
-            self._queries.discard(query)
-            query.cancel()  # type: ignore[no-untyped-call]
-
-    def _recall(self, query: zenoh.CancellationToken) -> None:
-        """Empty Zenoh's queue before verifying signatures: a full queue would stall the session."""
-        # Not a RingChannel, which loses what it still holds when the last reply arrives.
-        replies = self._session.get(
-            self.selector,
-            zenoh.handlers.FifoChannel(RECALL_LIMIT),
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=RECALL_TIMEOUT,
-            cancellation_token=query,
-        )
-        samples = deque((reply.ok for reply in replies if reply.ok is not None), maxlen=RECALL_LIMIT)
-        while samples and not query.is_cancelled:
-            self._pump.feed(samples.popleft())
-
-    @property
-    def kind(self) -> str:
-        """The kind of message: `demand`, `offer` or `result`."""
-        return self._validator.kind.__name__.lower()
-
-    def forget(self, verified: Verified[M]) -> None:
-        """Deliver a message once more when it is sent again; see `MessageValidator`."""
-        self._validator.forget(verified)
-
-    def statistics(self) -> ValidationStatistics:
-        """The messages received, rejected (by reason) and dropped so far."""
-        return self._validator.statistics(received=self._pump.received, dropped=self._pump.dropped)
-
-    async def _ask_chain(self) -> None:
-        """Ask the chain about one message after another. An unexpected error ends the iteration."""
-        try:
-            while True:
-                unresolved = await self._unresolved.get()
-                if (verified := await self._validator.complete(unresolved)) is not None:
-                    self._pump.insert(verified)
-        except Exception as error:
-            self._pump.fail(error)
 
 
 def _presence_keys(texts: list[str]) -> Iterator[PresenceKey]:

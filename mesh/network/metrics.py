@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from mesh.telemetry.metrics import MetricFamily, MetricSample, counter, gauge
+from mesh.telemetry.metrics import MetricFamily, MetricSample, by_label, counter, gauge
 from schemas.status import ALIVE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from mesh.network.channel import Subscription
+    from mesh.flood import Drops
     from mesh.network.session import Network
+    from mesh.network.subscription import Subscription
     from mesh.network.validation import ValidationStatistics
 
 
@@ -36,6 +37,12 @@ def message_families(subscriptions: Iterable[Subscription[Any]]) -> tuple[Metric
             tuple(MetricSample(statistics.dropped, {"kind": kind}) for kind, statistics in counts),
         ),
     )
+
+
+def drop_family(drops: Drops) -> MetricFamily:
+    """What a role dropped because of floods."""
+    meaning = "Messages, requests and the like that were dropped because there were too many, by reason"
+    return by_label("aira_dropped_total", "counter", meaning, "reason", drops.totals())
 
 
 def network_families(network: Network) -> tuple[MetricFamily, ...]:

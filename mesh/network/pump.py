@@ -1,9 +1,13 @@
 """The pump: samples from a Zenoh subscriber into asyncio, fast, with bounded memory.
 
-One thread moves samples from Zenoh's queue into a ring, converts them (decoding and signature checks run here, off the
-event loop) and passes them to the loop in batches. At most two batches are in flight; while the consumer is busy, the
-ring fills up and drops the *oldest* samples, which are counted. A slow consumer therefore loses old messages, but costs
-no memory and never stalls the session, because the thread keeps emptying Zenoh's queue.
+One thread moves samples from Zenoh's queue into a ring, as copies, because a sample keeps the buffer alive in which it
+was received. Then it converts them (signature checks run here, off the event loop) and passes them to the loop in
+batches. At most two batches are in flight; while the consumer is busy, or more arrives than can be converted, the ring
+fills up and drops the *oldest* samples, which are counted. That costs no memory and never stalls the session, because
+the thread keeps emptying Zenoh's queue.
+
+A sample that gets through a full ring waits no longer than a ring takes to fill. Each copy that a sender sends again
+has the same chance, whatever others send: the part of all samples that is converted.
 """
 
 from __future__ import annotations
@@ -25,20 +29,29 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from contextvars import Context
 
+    from mesh.flood import Drops
+
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
 RING_CAPACITY: Final = 8192
 """Samples that the ring holds before it drops the oldest."""
+RING_BYTES: Final = 8 * 1024 * 1024
+"""Bytes of payloads that the ring holds before it drops the oldest."""
 FED_CAPACITY: Final = 65_536
 """Fed samples that may wait beside the ring; more are dropped."""
 BATCH: Final = 256
 """Samples converted for one call into the loop, at most."""
+SLICE: Final = 64
+"""Samples converted before Zenoh's queue is emptied again: a few milliseconds of signature checks."""
 BATCHES_IN_FLIGHT: Final = 2
 """Batches between the pump's thread and the consumer, at most."""
-ZENOH_QUEUE: Final = 8192
-"""Capacity of Zenoh's own queue; the pump's thread empties it many times faster than samples arrive."""
+ZENOH_QUEUE: Final = 512
+"""Capacity of Zenoh's own queue. Each sample in it may keep 64 KiB alive. The thread empties it many times faster than
+samples arrive; when it is full nevertheless, Zenoh stops reading from the router for a moment."""
+TAKEN_AT_ONCE: Final = 8192
+"""Samples taken from Zenoh's queue before the next conversion, at most."""
 SLOT_WAIT: Final = 0.002
 """Seconds the thread waits for the consumer before it empties Zenoh's queue again."""
 
@@ -58,28 +71,42 @@ def call_in_loop(
 
 
 class Pump(Generic[T]):
-    """An async iterator over the converted samples on `selector`: `async with Pump(...) as pump`.
+    """An async iterator over the converted samples on `selector`: `async with Pump(session, selector, convert)`.
 
-    `convert` runs on the pump's own thread and returns None for a sample to skip; the iterator raises what `convert`
-    raises. Samples arrive in order. `capacity` bounds the ring, `fed_capacity` the samples given to `feed`. Leaving
-    `async with` undeclares the subscriber and ends the thread and the iteration; undelivered samples are lost.
-    Supports one consumer. Raises `ClosedError` before it is entered.
+    `convert` makes an item of a sample at once, or returns None to skip it. If that is expensive, give two functions
+    instead: `copy` takes what is needed out of a sample at once, and `convert_all` makes items of up to `SLICE` copies
+    while others wait in the ring. They run on the pump's own thread; the iterator raises what they raise. Items arrive
+    in order. `capacity` and `capacity_bytes` bound the ring, `fed_capacity` what is given to `feed`. Samples with more
+    than `payload_limit` bytes are refused. What is dropped is also counted in `drops`. Leaving `async with` undeclares
+    the subscriber and ends the thread and the iteration; undelivered samples are lost. Supports one consumer. Raises
+    `ClosedError` before it is entered.
     """
 
     def __init__(
         self,
         session: zenoh.Session,
         selector: str,
-        convert: Callable[[zenoh.Sample], T | None],
+        convert: Callable[[zenoh.Sample], T | None] | None = None,
         *,
+        copy: Callable[[zenoh.Sample], Any] | None = None,
+        convert_all: Callable[[list[Any]], list[T]] | None = None,
         capacity: int = RING_CAPACITY,
+        capacity_bytes: int = RING_BYTES,
         fed_capacity: int = FED_CAPACITY,
+        payload_limit: int | None = None,
+        drops: Drops | None = None,
     ) -> None:
         self._session = session
         self._selector = selector
-        self._convert = convert
+        self._copy: Any = copy if convert is None else convert
+        self._convert_all = convert_all
+        self._payload_limit = payload_limit
+        self._drops = drops
         self._lock = threading.Lock()
-        self._ring: deque[zenoh.Sample] = deque(maxlen=capacity)
+        self._ring: deque[tuple[Any, int]] = deque()
+        self._ring_bytes = 0
+        self._capacity = capacity
+        self._capacity_bytes = capacity_bytes
         self._fed = 0
         self._fed_capacity = fed_capacity
         self._slots = threading.Semaphore(BATCHES_IN_FLIGHT)
@@ -88,11 +115,14 @@ class Pump(Generic[T]):
         self._batches: deque[tuple[list[T], Callable[[], None]]] = deque()
         self._current: deque[T] = deque()
         self._ready = asyncio.Event()
+        self._copy_failure: Exception | None = None
         self._failure: Exception | None = None
         self.received = 0
         """Samples that Zenoh delivered or that were fed."""
         self.dropped = 0
-        """Samples that were dropped because the consumer was too slow."""
+        """Samples that were dropped because more arrived than could be converted or consumed."""
+        self.refused = 0
+        """Samples that were refused because of their size."""
 
     async def __aenter__(self) -> Self:
         if self._loop is not None:
@@ -143,8 +173,23 @@ class Pump(Generic[T]):
             raise ClosedError("the subscription is not open", hint="use it inside `async with`")
         return self._loop
 
-    def feed(self, sample: zenoh.Sample) -> None:
-        """Convert and deliver a sample from elsewhere (a query's reply), on any thread, without waiting.
+    def take_ready(self) -> T | None:
+        """The next item if it has arrived already: what `anext` returns then, at a fraction of its cost."""
+        return self._current.popleft() if self._current and not self._stopping else None
+
+    def copy(self, sample: zenoh.Sample) -> tuple[Any, int] | None:
+        """What `feed` takes of a sample from elsewhere (a query's reply), on any thread; None if it is refused."""
+        size = len(sample.payload)
+        if self._payload_limit is not None and size > self._payload_limit:
+            with self._lock:
+                self.received += 1
+            self._count_refused(1)
+            return None
+        copied = self._copy(sample)
+        return None if copied is None else (copied, size)
+
+    def feed(self, copied: tuple[Any, int]) -> None:
+        """Convert and deliver what `copy` returned, on any thread, without waiting.
 
         Fed samples bypass the ring, so that live ones do not displace them; beyond `fed_capacity` they are dropped.
         """
@@ -155,8 +200,7 @@ class Pump(Generic[T]):
                 self.dropped += 1
                 return
             self._fed += 1
-        item = self._convert(sample)
-        call_in_loop(loop, self._receive, [] if item is None else [item], self._fed_taken)
+        call_in_loop(loop, self._receive, self._items([copied[0]]), self._fed_taken)
 
     def _fed_taken(self) -> None:
         with self._lock:
@@ -177,9 +221,7 @@ class Pump(Generic[T]):
             while not self._stopping:
                 self._take(queue)
                 if self._ring and self._slots.acquire(timeout=SLOT_WAIT):
-                    batch = [self._ring.popleft() for _ in range(min(BATCH, len(self._ring)))]
-                    items = [item for sample in batch if (item := self._convert(sample)) is not None]
-                    call_in_loop(loop, self._receive, items, self._slots.release)
+                    self._deliver_batch(loop, queue)
         except zenoh.ZError:  # the queue was closed, which ends the thread
             if not self._stopping:
                 call_in_loop(loop, self.fail, ClosedError("the network session of a subscription was closed"))
@@ -193,17 +235,62 @@ class Pump(Generic[T]):
 
     def _take(self, queue: zenoh.handlers.Handler[zenoh.Sample]) -> None:
         """Move samples from Zenoh's queue into the ring; wait for one when both are empty."""
-        sample = queue.try_recv() if self._ring else queue.recv()
-        dropped = received = 0
+        if self._copy_failure is not None:
+            if not self._ring:
+                raise self._copy_failure
+            return
+        ring, limit = self._ring, self._payload_limit
+        sample = queue.try_recv() if ring else queue.recv()
+        dropped = received = refused = 0
         while sample is not None:
             received += 1
-            dropped += len(self._ring) == self._ring.maxlen
-            self._ring.append(sample)
-            sample = queue.try_recv() if received < ZENOH_QUEUE else None
+            size = len(sample.payload)
+            if limit is not None and size > limit:
+                refused += 1
+            else:
+                try:
+                    copied = self._copy(sample)
+                except Exception as error:  # raised once the samples before it are converted
+                    self._copy_failure = error
+                    break
+                if copied is not None:
+                    ring.append((copied, size))
+                    self._ring_bytes += size
+                while len(ring) > self._capacity or (self._ring_bytes > self._capacity_bytes and len(ring) > 1):
+                    self._ring_bytes -= ring.popleft()[1]
+                    dropped += 1
+            sample = queue.try_recv() if received < TAKEN_AT_ONCE else None
         sending.received(self._session)
         with self._lock:
             self.received += received
             self.dropped += dropped
+        if dropped and self._drops is not None:
+            self._drops.count("overflow", number=dropped)
+        if refused:
+            self._count_refused(refused)
+
+    def _count_refused(self, number: int) -> None:
+        with self._lock:
+            self.refused += number
+        if self._drops is not None:
+            self._drops.count("too-large", number=number)
+
+    def _deliver_batch(self, loop: asyncio.AbstractEventLoop, queue: zenoh.handlers.Handler[zenoh.Sample]) -> None:
+        """Convert up to a batch of samples, emptying Zenoh's queue in between, and pass them to the loop."""
+        items: list[T] = []
+        try:
+            for _ in range(BATCH // SLICE):
+                taken = [self._ring.popleft() for _ in range(min(SLICE, len(self._ring)))]
+                self._ring_bytes -= sum(size for _, size in taken)
+                items += self._items([copied for copied, _ in taken])
+                if not self._ring:
+                    break
+                self._take(queue)
+        finally:
+            call_in_loop(loop, self._receive, items, self._slots.release)
+
+    def _items(self, copies: list[Any]) -> list[T]:
+        return copies if self._convert_all is None else self._convert_all(copies)
 
     def _receive(self, batch: list[T], taken: Callable[[], None]) -> None:
         if batch:

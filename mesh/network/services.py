@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import difflib
 import logging
+import threading
 from contextvars import copy_context
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypeAlias
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypeAlias
 import zenoh
 
 from mesh.errors import AiraError, ClosedError, RemoteError
+from mesh.flood import Rate, RateLimiter
 from mesh.log_context import log_event
 from mesh.network.pump import call_in_loop
 from schemas import InvalidRecord, Record, RpcKey
@@ -24,6 +26,7 @@ from schemas.rpc import SERVICES, SPENDING
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
+    from mesh.flood import Drops
     from schemas.rpc import Service
 
 log = logging.getLogger(__name__)
@@ -36,6 +39,11 @@ SPENDING_TIMEOUT: Final = 240.0
 """Seconds to wait for a reply that needs a mined transaction. Calling again too early would pay twice."""
 CONCURRENT_REQUESTS: Final = 256
 """Requests that an agent handles at the same time; more get an error reply."""
+REQUESTS: Final = Rate(20, 300)
+"""Requests for one service that an agent handles, a second and at once; more get an error reply. Zenoh does not say who
+asks, and each may cost a call of the node."""
+REQUESTS_IN_TOTAL: Final = Rate(60, 1000)
+"""The same for all services together."""
 
 
 class Failure(Record, frozen=True):
@@ -60,10 +68,14 @@ class ServiceFailed(RemoteError, code="service-failed"):
 class Services:
     """The services of the agent at `address`: `async with Services(session, address)`, then `offer` each.
 
-    Leaving `async with` withdraws them and cancels requests in progress.
+    Requests that are too many get an error reply, and are counted in `drops`. Leaving `async with` withdraws the
+    services and cancels requests in progress.
     """
 
-    def __init__(self, session: zenoh.Session, address: str) -> None:
+    def __init__(self, session: zenoh.Session, address: str, *, drops: Drops | None = None) -> None:
+        self._drops = drops
+        self._rate = RateLimiter(per_sender=REQUESTS, total=REQUESTS_IN_TOTAL)
+        self._lock = threading.Lock()
         self._session = session
         self._address = address
         self._queryables: list[Any] = []
@@ -102,9 +114,20 @@ class Services:
         key, context = str(RpcKey(self._address, service)), copy_context()
 
         def received(query: zenoh.Query) -> None:
-            call_in_loop(loop, self._accept, query, key, request_type, handler, context=context)
+            # Zenoh's thread answers what is too much, so that the event loop is not kept busy.
+            if len(self._requests) < CONCURRENT_REQUESTS and self._allow(service):
+                call_in_loop(loop, self._accept, query, key, request_type, handler, context=context)
+                return
+            if self._drops is not None:
+                self._drops.count("request")
+            with query:
+                query.reply_err(BUSY)
 
         self._queryables.append(self._session.declare_queryable(key, received))
+
+    def _allow(self, service: str) -> bool:
+        with self._lock:
+            return self._rate.allow(service)
 
     def _accept(
         self, query: zenoh.Query, key: str, request_type: type[Record], handler: Callable[[Any], Awaitable[Record]]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import zenoh
 
+from mesh.flood import Drops, Rate
 from mesh.market import OrderBook
 from mesh.market.services import THREADS, OrderBookService
 from mesh.market.withdrawals import Withdrawals
@@ -172,3 +173,17 @@ async def test_leaving_after_the_session_was_closed_does_not_hang(router: Embedd
         with at_most(2):
             async with OrderBookService(one.session, MARKET, holding(), Withdrawals()):
                 one.session.close()  # type: ignore[no-untyped-call]
+
+
+async def test_queries_beyond_the_rate_are_dropped_and_counted(router: EmbeddedRouter) -> None:
+    book, drops = holding(verified_demand(), verified_offer(cost=1)), Drops()
+    async with (
+        network(router) as one,
+        network(router) as two,
+        OrderBookService(one.session, MARKET, book, Withdrawals(), replies=Rate(1e-9, 5), drops=drops),
+    ):
+        await until_answered(two.session, f"aira/{MARKET}/**")
+
+        answers = [len(await asyncio.to_thread(ask, two.session, f"aira/{MARKET}/**")) for _ in range(2)]
+        assert answers == [2, 0], "a query counts as three"
+        assert drops.totals() == {"recall": 1}

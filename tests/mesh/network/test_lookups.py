@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from typing import TYPE_CHECKING
 
+import pytest
+import zenoh
 from msgspec.structs import replace
 
 from mesh.chain import UnknownName
-from mesh.errors import RemoteError
-from mesh.network import message_key
+from mesh.errors import AiraError, RemoteError
+from mesh.flood import Drops
+from mesh.network import Channel, message_key
+from mesh.network.lookups import FAILURE_KEPT, KEPT, NameCache
 from mesh.network.validation import Unresolved
-from schemas import Offer, Verified, encode, message_hash
+from schemas import Demand, Offer, Verified, encode, message_hash
 from tests.mesh.network.validating import NAME, check, counted, validator
+from tests.support.clocks import SECOND, SetClock
 from tests.support.orders import MARKET, PERSON, ROBOT, STRANGER, demand, offer
+from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -91,7 +98,7 @@ async def test_a_forgotten_message_with_a_name_is_accepted_once_more() -> None:
 
     checked.forget(verified)
 
-    assert checked.check(message_key(MARKET, message), named) == waiting
+    assert checked.check(message_key(MARKET, message), named) == verified, "its name is known"
 
 
 async def test_an_order_is_accepted_once_its_validator_is_known_to_be_safe() -> None:
@@ -136,3 +143,58 @@ def test_the_chain_is_asked_about_no_order_without_a_validator_or_with_a_wrong_s
     assert check(checked, demand()) is not None
     assert check(checked, forged) is None
     assert counted(checked) == {"signature": 1}
+
+
+async def test_a_name_is_asked_about_once_a_minute_and_after_a_failure_once_in_ten_seconds() -> None:
+    clock, asked = SetClock(), list[str]()
+
+    async def resolve(name: str) -> str:
+        asked.append(name)
+        if name != NAME:
+            raise UnknownName(name)
+        return STRANGER.address
+
+    names = NameCache(resolve, clock=clock)
+    assert names.known([NAME]) is None
+    for _ in range(3):
+        assert await names.addresses([NAME]) == {NAME: STRANGER.address}
+        assert names.known([NAME]) == {NAME: STRANGER.address}
+        with pytest.raises(AiraError):
+            await names.addresses(["unknown.eth"])
+    assert asked == [NAME, "unknown.eth"]
+
+    clock.pass_by(round(FAILURE_KEPT * SECOND))
+    assert names.known(["unknown.eth"]) is None
+    assert names.known([NAME]) is not None
+    clock.pass_by(round(KEPT * SECOND))
+    assert names.known([NAME]) is None
+
+
+async def test_unknown_names_take_little_of_the_chain_and_no_lookups_of_known_signers(
+    here: zenoh.Session, there: zenoh.Session
+) -> None:
+    asked, drops, known = list[str](), Drops(), Known(**{STRANGER.address: True})
+
+    async def resolve(name: str) -> str:
+        asked.append(name)
+        raise UnknownName(name)
+
+    async with (
+        Channel(here, MARKET, resolver=resolve, validators=known, drops=drops) as ours,
+        ours.subscribe(Demand) as demands,
+    ):
+        await until_heard(there, message_key(MARKET, demand()))
+        for number in range(1000):
+            put(there, replace(demand(), validator=f"nobody-{number}.eth"))
+        put(there, order := demand(validator=STRANGER.address))
+
+        async with asyncio.timeout(20):
+            assert (await anext(demands)).message == order
+        await until(lambda: demands.statistics().received == 1001)
+        assert 1 <= len(asked) < 200
+        assert drops.totals()["lookup"] > 500
+
+
+def put(session: zenoh.Session, message: Demand) -> None:
+    block = zenoh.CongestionControl.BLOCK
+    session.put(message_key(MARKET, message), encode(message), congestion_control=block)

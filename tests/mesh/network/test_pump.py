@@ -10,6 +10,7 @@ import pytest
 import zenoh
 
 from mesh.errors import ClosedError
+from mesh.flood import Drops
 from mesh.network import Pump, pump
 from tests.support.waiting import at_most, until, until_heard
 
@@ -42,7 +43,13 @@ async def take_to_last(numbers: Pump[int]) -> list[int]:
 
 def feed_all(numbers: Pump[int], samples: list[zenoh.Sample]) -> None:
     for sample in samples:
-        numbers.feed(sample)
+        numbers.feed(copied(numbers, sample))
+
+
+def copied(numbers: Pump[int], sample: zenoh.Sample) -> tuple[int, int]:
+    taken = numbers.copy(sample)
+    assert taken is not None
+    return taken
 
 
 def pumps_running() -> list[str]:
@@ -93,6 +100,47 @@ async def test_a_slow_consumer_loses_the_oldest_samples_and_each_is_counted(
         assert numbers.received == len(taken) + 1 + numbers.dropped
 
 
+async def test_the_ring_is_bounded_in_bytes(here: zenoh.Session, there: zenoh.Session) -> None:
+    drops = Drops()
+    async with Pump(here, KEY, number, capacity_bytes=200, drops=drops) as numbers:
+        await until_heard(there, KEY)
+        await asyncio.to_thread(put, there, *range(10_000, 15_000))
+        put(there, LAST)
+        await until(lambda: numbers.received == 5001)
+        taken = await take_to_last(numbers)
+
+        assert taken[-39:] == list(range(15_000 - 39, 15_000)), "39 with five bytes each, and the last"
+        assert numbers.received == len(taken) + 1 + numbers.dropped
+        assert drops.totals() == {"overflow": numbers.dropped}
+
+
+async def test_too_large_payloads_are_refused_live_and_fed(here: zenoh.Session, there: zenoh.Session) -> None:
+    drops, fed = Drops(), await some_samples(here, there, 1)
+    async with Pump(here, KEY, number, payload_limit=2, drops=drops) as numbers:
+        await until_heard(there, KEY)
+        put(there, 1, 100, 99, 100, 2)
+
+        assert await take(numbers, 3) == [1, 99, 2]
+        assert numbers.copy(fed[0]) is not None
+        assert (numbers.received, numbers.dropped, numbers.refused) == (5, 0, 2)
+        assert drops.totals() == {"too-large": 2}
+
+
+async def test_expensive_conversions_get_copies_in_slices(here: zenoh.Session, there: zenoh.Session) -> None:
+    sizes: list[int] = []
+
+    def convert_all(copies: list[int]) -> list[int]:
+        sizes.append(len(copies))
+        return [value for value in copies if value % 2]
+
+    async with Pump(here, KEY, copy=number, convert_all=convert_all) as numbers:
+        await until_heard(there, KEY)
+        put(there, *range(2000))
+
+        assert await take(numbers, 1000) == list(range(1, 2000, 2))
+        assert max(sizes) <= pump.SLICE
+
+
 async def test_a_cancelled_consumer_loses_nothing(here: zenoh.Session, there: zenoh.Session) -> None:
     async with Pump(here, KEY, number) as numbers:
         await until_heard(there, KEY)
@@ -109,7 +157,7 @@ async def test_fed_samples_are_delivered_beside_live_ones(here: zenoh.Session, t
 
     async with Pump(here, "test/elsewhere", number) as numbers:
         for sample in samples:
-            numbers.feed(sample)
+            numbers.feed(copied(numbers, sample))
 
         assert await take(numbers, 3) == [0, 1, 2]
         assert numbers.received == 3
@@ -123,7 +171,7 @@ async def test_feeding_never_waits_for_the_consumer_and_counts_what_it_drops(
     async with Pump(here, "test/elsewhere", number, fed_capacity=1000) as numbers:
         with at_most(5):
             for _ in range(20_000):
-                numbers.feed(sample)
+                numbers.feed(copied(numbers, sample))
 
         assert numbers.received == 20_000
         assert numbers.dropped > 15_000

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from mesh.network import ValidationStatistics, message_key
-from schemas import Demand, Offer, Result, Verified, encode, message_hash
+from mesh.network import ValidationStatistics, message_key, validation
+from schemas import Demand, Offer, Result, Verified, encode, message_hash, verify_hashed
 from tests.mesh.network.validating import HEAD, check, counted, validator
 from tests.support.orders import (
     MARKET,
@@ -205,3 +205,30 @@ def test_many_threads_accept_each_message_once_and_count_exactly() -> None:
     statistics = checked.statistics(received=0, dropped=0)
     assert statistics.duplicate == 7 * 200
     assert statistics.invalid == {"kind": 8 * 200}
+
+
+def test_a_copy_of_an_accepted_message_is_not_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
+    checked, message = validator(), demand()
+    assert check(checked, message) is not None
+    monkeypatch.setattr(validation, "decode", None)
+
+    assert check(checked, message) is None
+    assert checked.statistics(received=0, dropped=0).duplicate == 1
+
+
+def test_the_signature_of_a_message_that_comes_twice_at_once_is_verified_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    checked, message, verifications = validator(), demand(), list[bytes]()
+
+    def verify(message: Demand, digest: bytes) -> Verified[Demand]:
+        verifications.append(digest)
+        return verify_hashed(message, digest)
+
+    monkeypatch.setattr(validation, "verify_hashed", verify)
+    copy = json.dumps(json.loads(encode(message))).encode()
+
+    (found,) = checked.check_all([(message_key(MARKET, message), payload) for payload in (encode(message), copy)])
+
+    assert isinstance(found, Verified)
+    assert found.message == message
+    assert len(verifications) == 1
+    assert checked.statistics(received=0, dropped=0).duplicate == 1

@@ -1,0 +1,74 @@
+"""What validation asks the chain: ENS names, whose addresses are kept for a while, and validators of orders."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import TYPE_CHECKING, Final, Protocol
+
+from mesh.clock import SYSTEM_CLOCK
+from mesh.errors import InvalidMessage
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterable
+
+    from mesh.clock import Clock
+
+    Resolver = Callable[[str], Awaitable[str]]
+
+KEPT: Final = 60.0
+"""Seconds for which the address of a name is used."""
+FAILURE_KEPT: Final = 10.0
+"""Seconds for which a name that could not be resolved is not asked about again."""
+NAMES: Final = 4096
+"""Names that are remembered; the oldest are forgotten first."""
+
+
+class ValidatorCheck(Protocol):
+    """Which validators (EIP-55 addresses) orders may name: `chain.validators`."""
+
+    def known(self, validator: str) -> bool | None:
+        """Whether orders may name it; None if that has to be asked."""
+
+    async def is_safe(self, validator: str) -> bool:
+        """The same, asked. Raises `ChainError`."""
+
+
+class NameCache:
+    """Addresses of ENS names by `resolver`, which is asked about a name once in a while. `known` is thread-safe."""
+
+    def __init__(self, resolver: Resolver, *, clock: Clock = SYSTEM_CLOCK) -> None:
+        self._resolver = resolver
+        self._clock = clock
+        self._answers: OrderedDict[str, tuple[float, str]] = OrderedDict()
+
+    def known(self, names: Iterable[str]) -> dict[str, str] | None:
+        """The addresses of these names, without asking; None if one has to be asked.
+
+        Raises `InvalidMessage` (`name`) if one could not be resolved a moment ago.
+        """
+        now, found = self._clock.monotonic(), {}
+        for name in names:
+            until, address = self._answers.get(name, (0.0, ""))
+            if until <= now:
+                return None
+            if not address:
+                raise InvalidMessage("name", f"{name} could not be resolved a moment ago")
+            found[name] = address
+        return found
+
+    async def addresses(self, names: Iterable[str]) -> dict[str, str]:
+        """The addresses of these names. Raises `AiraError`."""
+        return {name: await self._address(name) for name in names}
+
+    async def _address(self, name: str) -> str:
+        if (known := self.known((name,))) is not None:
+            return known[name]
+        address, kept = "", FAILURE_KEPT
+        try:
+            address, kept = await self._resolver(name), KEPT
+        finally:
+            self._answers.pop(name, None)
+            self._answers[name] = self._clock.monotonic() + kept, address
+            if len(self._answers) > NAMES:
+                self._answers.popitem(last=False)
+        return address
