@@ -1,0 +1,36 @@
+"""The markets and chains that seeds choose."""
+
+from __future__ import annotations
+
+from itertools import count
+
+from tests.simulation.deployment import EVM_EVERY, ON_EVM, ON_MODEL, Deployments, MarketPlan, market_plan
+from tests.simulation.test_simulation import simulate
+
+
+def test_jobs_end_in_a_market_of_generation_5_with_two_providers_and_two_nodes() -> None:
+    seed = next(seed for seed in count() if market_plan(seed) == MarketPlan(generation=5, providers=2, nodes=2))
+    found, said = simulate("--seed", str(seed), "--jobs", "2", "--only", "unreachable", "--chain", "model")
+    assert found["markets"] == {"generation-5": 1, "two-nodes": 1, "two-providers": 1}
+    assert (found["violations"], found["lost"], found["paid_twice"]) == ([], 0, 0), said
+    assert found["paid"] + found["refunded"] > 0
+
+
+def test_a_job_ends_on_the_evm_too() -> None:
+    found, said = simulate("--seed", "1", "--jobs", "1", "--only", "none", "--chain", "evm")
+    assert (found["paid"] + found["refunded"], found["violations"]) == (1, []), said
+    assert found["chains"] == {"evm": 1}
+
+
+def test_the_seed_chooses_the_chain() -> None:
+    deployments = Deployments()
+    kinds = [deployments.kind(seed) for seed in range(20 * EVM_EVERY)]
+    assert 5 < kinds.count(ON_EVM) < 60
+    assert Deployments(ON_MODEL).kind(kinds.index(ON_EVM)) == ON_MODEL
+
+
+def test_a_history_is_the_same_alone_and_after_another() -> None:
+    options = ("--only", "delay,duplicate,late", "--chain", "model")
+    after = simulate("--seed", "30", "--jobs", "7", *options)[0]
+    alone = simulate("--seed", "31", "--jobs", "1", *options)[0]
+    assert after["trace"] == alone["trace"]
