@@ -74,7 +74,8 @@ peers: ## the real programs that some tests run against
 	@$(PYTHON) -m peers.install
 
 bench: $(INSTALLED) ## what the mesh and the contracts can do on this machine; fails where a bar is missed
-	@for bench in $(BENCHES); do $(BIN)/python $$bench $(ARGS); done
+	@missed=; for bench in $(BENCHES); do $(BIN)/python $$bench $(ARGS) || missed="$$missed $$bench"; done; \
+		[ -z "$$missed" ] || { echo "bars missed in:$$missed" >&2; exit 1; }
 
 contracts/node_modules/.package-lock.json: contracts/package-lock.json
 	@npm --prefix contracts ci --no-audit --no-fund

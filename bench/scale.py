@@ -1,6 +1,6 @@
 """A market of many agents on three linked routers: what a message costs the routers, and whether any is lost.
 
-Each agent has its session, a subscription to the demands for its own model and a presence token, and answers each
+Each agent has a session, a subscription to demands for its own model, a service and a presence token, and answers each
 demand with an offer. People on all three routers send demands; a listener on one of them receives all offers, as a
 provider does. The bars: no order lost or misdirected, the routers' processor time per message at the highest number of
 agents at most twice that at the lowest, all agents declared within ten seconds.
@@ -22,18 +22,20 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from zenoh import CongestionControl
 
 from common import ADDRESS, LIGHTHOUSE, SPAWN, TOKEN, show
-from mesh.network import Channel, Endpoints, Network, free_endpoint
+from mesh.network import Channel, Endpoints, Network, Services, free_endpoint
 from mesh.network.endpoints import allow_sessions
 from schemas import ZERO_ADDRESS, Demand, EventKey, Offer, Signer, cid_of_bytes, encode, market_selector
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from schemas import Record
+
 ROUTERS: Final = 3
 AGENTS_PER_PROCESS: Final = 125
 MAX_SESSIONS: Final = 10_000
-IN_FLIGHT: Final = 32
-"""Jobs at a time."""
+IN_FLIGHT: Final = 8
+"""Jobs at a time: fewer than agents, or messages to one agent would travel together."""
 JOB_TIMEOUT: Final = 30.0
 """Seconds after which an order that has no answer counts as lost."""
 START_TIMEOUT: Final = 600.0
@@ -150,7 +152,7 @@ def run_agents(endpoints: Sequence[str], numbers: range, agents: Agents) -> None
 
 async def _run_agents(endpoints: Sequence[str], numbers: range, agents: Agents) -> None:
     async with AsyncExitStack() as stack, asyncio.TaskGroup() as tasks:
-        opening = asyncio.Semaphore(8)
+        opening = asyncio.Semaphore(2)  # more at a time would make each other time out
 
         async def open_agent(number: int) -> None:
             async with opening:
@@ -158,6 +160,8 @@ async def _run_agents(endpoints: Sequence[str], numbers: range, agents: Agents) 
                 network = await stack.enter_async_context(Network(at))
             channel = await stack.enter_async_context(Channel(network.session, LIGHTHOUSE, address=ADDRESS))
             demands = await stack.enter_async_context(channel.subscribe(Demand, model=model(number)))
+            services = await stack.enter_async_context(Services(network.session, f"0x{number:040x}"))
+            services.offer("status", _no_status)
             channel.announce("agent", f"0x{number:040x}")
             working.append(tasks.create_task(_work(channel, demands, number, agents)))
 
@@ -166,6 +170,10 @@ async def _run_agents(endpoints: Sequence[str], numbers: range, agents: Agents) 
         await asyncio.to_thread(agents.leave.wait)
         for task in working:
             task.cancel()
+
+
+async def _no_status(_request: Record) -> Record:
+    raise NotImplementedError
 
 
 async def _work(channel: Channel, demands: Any, number: int, agents: Agents) -> None:
