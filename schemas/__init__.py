@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     )
     from schemas.agent_keys import (
         AgentKey,
+        CidKey,
         DeviceTopicKey,
         EthEventKey,
         EventKey,
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
         InvalidRecord,
     )
     from schemas.keys import (
-        CidKey,
         DemandKey,
         FeedbackKey,
         Key,
@@ -67,12 +67,14 @@ if TYPE_CHECKING:
     from schemas.payloads import EMPTY, JSON, RAW, STRING, Empty, PayloadType, String, payload_type
     from schemas.records import Liability, Record, UInt256
     from schemas.selectors import (
+        cid_selector,
         device_selector,
         event_selector,
         lighthouse_selector,
         market_selector,
         objective_selector,
         presence_selector,
+        requested_cid,
         topic_selector,
     )
     from schemas.signing import Signer, Verified, recover, verify, verify_hashed, verify_message
@@ -94,11 +96,11 @@ _NAMES: Final = {
     "address": (
         "ZERO_ADDRESS address_bytes checksum_address is_ens_name keccak256 parse_address parse_address_or_name"
     ),
-    "agent_keys": ("AgentKey DeviceTopicKey EthEventKey EventKey LiabilityTopicKey ObjectiveTopicKey RpcKey"),
+    "agent_keys": ("AgentKey CidKey DeviceTopicKey EthEventKey EventKey LiabilityTopicKey ObjectiveTopicKey RpcKey"),
     "cid": ("cid_of_digest format_cid parse_cid"),
     "errors": ("AiraError InputError InvalidAddress InvalidCid InvalidKey InvalidMessage InvalidPayload InvalidRecord"),
     "keys": (
-        "CidKey DemandKey FeedbackKey Key MarketKey OfferKey PendingKey PresenceKey RejectKey ResultKey "
+        "DemandKey FeedbackKey Key MarketKey OfferKey PendingKey PresenceKey RejectKey ResultKey "
         "WithdrawalKey parse_key"
     ),
     "message_fields": ("MAX_UINT256"),
@@ -109,8 +111,8 @@ _NAMES: Final = {
     "payloads": ("EMPTY Empty JSON PayloadType RAW STRING String payload_type"),
     "records": ("Liability Record UInt256"),
     "selectors": (
-        "device_selector event_selector lighthouse_selector market_selector objective_selector presence_selector "
-        "topic_selector"
+        "cid_selector device_selector event_selector lighthouse_selector market_selector objective_selector "
+        "presence_selector requested_cid topic_selector"
     ),
     "signing": ("Signer Verified recover verify verify_hashed verify_message"),
     "unixfs": (
@@ -190,6 +192,7 @@ __all__ = [
     "cid_of_digest",
     "cid_of_file",
     "cid_of_stream",
+    "cid_selector",
     "decode",
     "device_selector",
     "encode",
@@ -211,6 +214,7 @@ __all__ = [
     "payload_type",
     "presence_selector",
     "recover",
+    "requested_cid",
     "resolve_names",
     "topic_selector",
     "verify",

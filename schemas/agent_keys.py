@@ -1,4 +1,4 @@
-"""The keys of an agent: its jobs, its devices and its services; and the checks of what keys consist of.
+"""The keys of an agent: its jobs, its devices, its services and its content; and the checks of what keys consist of.
 
 The functions `…_chunk` and `…_chunks` return the canonical form of a text, or raise `InvalidKey`. Accepted texts
 contain no wildcards, blanks, control characters or empty chunks, and do not begin with `@`. Keys of markets are in
@@ -16,7 +16,8 @@ from msgspec import Struct
 from msgspec.structs import force_setattr
 
 from schemas.address import parse_address
-from schemas.errors import InvalidAddress, InvalidKey
+from schemas.cid import parse_cid
+from schemas.errors import InvalidAddress, InvalidCid, InvalidKey
 
 LiabilityEvent: TypeAlias = Literal["incoming", "ready", "complete", "finalized"]
 EthEvent: TypeAlias = Literal["transfer", "approval"]
@@ -40,6 +41,15 @@ def address_chunk(text: str) -> str:
         return parse_address(text).lower()
     except InvalidAddress as error:
         raise InvalidKey(text, str(error)) from None
+
+
+def cid_chunk(text: str) -> str:
+    """A CIDv0."""
+    try:
+        parse_cid(text)
+    except InvalidCid as error:
+        raise InvalidKey(text, str(error)) from None
+    return text
 
 
 def name_chunk(text: str) -> str:
@@ -76,6 +86,7 @@ class BaseKey(Struct, frozen=True, gc=False):
     checks: ClassVar[Mapping[str, Callable[[str], str]]] = {
         "agent": address_chunk,
         "liability": address_chunk,
+        "cid": cid_chunk,
         "device": name_chunk,
         "event": name_chunk,
         "service": path_chunks,
@@ -163,7 +174,17 @@ class EthEventKey(BaseKey, frozen=True):
         return f"aira/agent/{self.agent}/eth/event/{self.event}"
 
 
-AgentKey: TypeAlias = EventKey | ObjectiveTopicKey | LiabilityTopicKey | DeviceTopicKey | RpcKey | EthEventKey
+class CidKey(BaseKey, frozen=True):
+    """A block or a file by its CID, which the agent's store answers. `*` in place of the agent asks all stores."""
+
+    agent: str
+    cid: str
+
+    def __str__(self) -> str:
+        return f"aira/agent/{self.agent}/cid/{self.cid}"
+
+
+AgentKey: TypeAlias = EventKey | ObjectiveTopicKey | LiabilityTopicKey | DeviceTopicKey | RpcKey | EthEventKey | CidKey
 
 
 def parse_agent_key(text: str) -> AgentKey:
@@ -202,4 +223,6 @@ def _parse_path(text: str, agent: str, path: list[str]) -> AgentKey:
             return RpcKey(agent, "/".join(service))
         case ["eth", "event", event]:
             return EthEventKey(agent, event)  # type: ignore[arg-type]
+        case ["cid", cid]:
+            return CidKey(agent, cid)
     raise InvalidKey(text, "there is no such family under an agent")

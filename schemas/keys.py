@@ -26,11 +26,11 @@ from schemas.agent_keys import (
     address_chunk,
     check_canonical,
     check_length,
+    cid_chunk,
     name_chunk,
     parse_agent_key,
 )
-from schemas.cid import parse_cid
-from schemas.errors import InvalidAddress, InvalidCid, InvalidKey
+from schemas.errors import InvalidAddress, InvalidKey
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -47,15 +47,6 @@ def lighthouse_chunk(text: str) -> str:
         raise InvalidKey(text, "a lighthouse is named by an ENS name or an address") from None
 
 
-def cid_chunk(text: str) -> str:
-    """A CIDv0."""
-    try:
-        parse_cid(text)
-    except InvalidCid as error:
-        raise InvalidKey(text, str(error)) from None
-    return text
-
-
 class _Key(BaseKey, frozen=True, gc=False):
     """The base of the keys that are not an agent's."""
 
@@ -64,7 +55,6 @@ class _Key(BaseKey, frozen=True, gc=False):
         "agent": address_chunk,
         "maker": address_chunk,
         "model": cid_chunk,
-        "cid": cid_chunk,
         "role": name_chunk,
     }
 
@@ -146,17 +136,8 @@ class PresenceKey(_Key, frozen=True):
         return f"aira/{self.lighthouse}/@agent/{self.role}/{self.agent}"
 
 
-class CidKey(_Key, frozen=True):
-    """A block or a file by its CID; answered by every store that has it."""
-
-    cid: str
-
-    def __str__(self) -> str:
-        return f"aira/cid/{self.cid}"
-
-
 MarketKey: TypeAlias = DemandKey | OfferKey | WithdrawalKey | ResultKey | FeedbackKey | PendingKey | RejectKey
-Key: TypeAlias = MarketKey | AgentKey | PresenceKey | CidKey
+Key: TypeAlias = MarketKey | AgentKey | PresenceKey
 
 
 def market_key(lighthouse: str, kind: MarketKind, model: str) -> str:
@@ -187,8 +168,6 @@ def _parse(text: str) -> Key:
             return ResultKey(lighthouse)
         case ["aira", "agent", *_]:
             return parse_agent_key(text)
-        case ["aira", "cid", cid]:
-            return CidKey(cid)
         case ["aira", lighthouse, "feedback"]:
             return FeedbackKey(lighthouse)
         case ["aira", lighthouse, "pending"]:

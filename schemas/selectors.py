@@ -8,18 +8,15 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
-from schemas.agent_keys import address_chunk, name_chunk, topic_chunks
+from schemas.agent_keys import address_chunk, cid_chunk, name_chunk, topic_chunks
 from schemas.errors import InvalidKey
-from schemas.keys import cid_chunk, lighthouse_chunk
+from schemas.keys import lighthouse_chunk
 from schemas.message_fields import hex_digits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from schemas.keys import MarketKind
-
-CID_SELECTOR: Final = "aira/cid/*"
-"""All blocks and files."""
 
 ORDER: Final = "order"
 """The parameter of a query for the withdrawals of one order."""
@@ -89,6 +86,22 @@ def topic_selector(agent: str, liability: str = "*", topic: str = "/**") -> str:
 def device_selector(agent: str, device: str = "*") -> str:
     """All topics outside any job of one device of an agent, or of all its devices."""
     return f"aira/agent/{address_chunk(agent)}/device/{_any_or(name_chunk, device)}/**"
+
+
+def cid_selector(agent: str = "*", cid: str = "*") -> str:
+    """A block or a file in the store of one agent or of any; or all that an agent's store has."""
+    return f"aira/agent/{_any_or(address_chunk, agent)}/cid/{_any_or(cid_chunk, cid)}"
+
+
+def requested_cid(selector: str) -> str | None:
+    """The CID of the one block that a query of `cid_selector` requests; None if it has a wildcard there."""
+    match selector.split("/"):
+        case ["aira", "agent", _, "cid", cid]:
+            try:
+                return cid_chunk(cid)
+            except InvalidKey:
+                return None
+    return None
 
 
 def _any_or(check: Callable[[str], str], text: str) -> str:

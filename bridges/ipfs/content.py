@@ -11,14 +11,12 @@ import zenoh
 
 from bridges.ipfs.errors import IpfsError
 from bridges.ipfs.transfers import add_file
-from mesh.content import ContentUnavailable
-from mesh.content.download import HOLDER
-from mesh.errors import AiraError, ClosedError, InvalidKey
+from mesh.content import ContentUnavailable, session_address
+from mesh.errors import AiraError, ClosedError
 from mesh.log_context import log_event
 from mesh.network import call_in_loop
 from mesh.retry import Backoff, RetryPolicy
-from schemas import CidKey, InputError, parse_block, parse_key
-from schemas.selectors import CID_SELECTOR
+from schemas import CidKey, InputError, cid_selector, parse_block, requested_cid
 from schemas.status import ContentMetrics
 
 if TYPE_CHECKING:
@@ -65,12 +63,13 @@ class ContentBridge:
         daemon: Daemon,
         *,
         providers: tuple[Daemon, ...] = (),
+        address: str = "",
         size_limit: int,
         timeout: float,
         add_retry: RetryPolicy = ADD_RETRY,
     ) -> None:
         self._session = session
-        self._id = str(session.zid())
+        self._address = address or session_address(session)
         self._store = store
         self._exchange = exchange
         self._sources = sources
@@ -95,7 +94,7 @@ class ContentBridge:
         self._open = True
         loop = asyncio.get_running_loop()
         self._queryable: Any = self._session.declare_queryable(
-            CID_SELECTOR, lambda query: call_in_loop(loop, self._accept, query)
+            cid_selector(self._address), lambda query: call_in_loop(loop, self._accept, query)
         )
         return self
 
@@ -214,10 +213,9 @@ class ContentBridge:
 
     def _accept(self, query: zenoh.Query) -> None:
         """Answer a query for a block, unless there are too many."""
-        cid = _requested_cid(query)
-        mine = str(query.parameters.get(HOLDER, self._id)) == self._id
+        cid = requested_cid(str(query.key_expr))
         busy = self._answering >= CONCURRENT_ANSWERS or len(self._tasks) >= TASK_LIMIT
-        if not self._open or cid is None or not mine or busy or cid in self._adding or self._is_unavailable(cid):
+        if not self._open or cid is None or busy or cid in self._adding or self._is_unavailable(cid):
             query.drop()  # type: ignore[no-untyped-call]
             return
         self._answering += 1
@@ -234,7 +232,7 @@ class ContentBridge:
                     log.debug("%s", error)
                     _remember(self._unavailable, cid, asyncio.get_running_loop().time())
                     return
-                query.reply(query.key_expr, block, encoding=zenoh.Encoding.APPLICATION_OCTET_STREAM)
+                query.reply(str(CidKey(self._address, cid)), block, encoding=zenoh.Encoding.APPLICATION_OCTET_STREAM)
                 self._counts["answered"] += 1
             self._fetch_file_of(cid, block)
         finally:
@@ -254,15 +252,6 @@ class ContentBridge:
     def _is_unavailable(self, cid: str) -> bool:
         asked = self._unavailable.get(cid)
         return asked is not None and asyncio.get_running_loop().time() - asked < UNAVAILABLE_FOR
-
-
-def _requested_cid(query: zenoh.Query) -> str | None:
-    """The CID of the block that a query requests; None for a wildcard, which is not answered."""
-    try:
-        key = parse_key(str(query.key_expr))
-    except InvalidKey:
-        return None
-    return key.cid if isinstance(key, CidKey) else None
 
 
 def _remember(known: OrderedDict[str, Any], cid: str, value: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import secrets
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -36,7 +37,7 @@ class IpfsBridge(Role):
 
     `chain` creates an unopened client of the chain. With it, and once its node is reachable, ENS names in messages are
     resolved, orders must name the lighthouse's address, and expired orders are rejected. `address` identifies the
-    bridge on the mesh, by default a random one per channel. The caller closes the network.
+    bridge on the mesh, by default a random one. The caller closes the network.
     """
 
     title = "IPFS bridge"
@@ -54,7 +55,7 @@ class IpfsBridge(Role):
         self._settings = settings
         self._lighthouses = tuple(name.lower() for name in lighthouses or (settings.lighthouse_contract,))
         self._chain = chain and ChainView(chain, self._lighthouses, interval=max(settings.poll_interval, 1.0))
-        self._address = address
+        self._address = (address or f"0x{secrets.token_hex(20)}").lower()
         self.channels: tuple[ChannelBridge, ...] = ()
         self.daemon: Final = Daemon(settings.ipfs_http_provider, authorization=authorization_of(settings))
 
@@ -92,7 +93,7 @@ class IpfsBridge(Role):
             Store, self._directory / "content", limit=settings.objective_size_limit, quota=settings.content_limit
         )
         stack.callback(store.close)
-        exchange = await stack.enter_async_context(Exchange(self._network.session, store))
+        exchange = await stack.enter_async_context(Exchange(self._network.session, store, address=self._address))
         gateways = [Gateway(settings.ipfs_gateway)] if settings.ipfs_gateway else []
         for gateway in gateways:
             await stack.enter_async_context(gateway)
@@ -107,6 +108,7 @@ class IpfsBridge(Role):
                 ContentSources(self.daemon, *gateways),
                 self.daemon,
                 providers=providers,
+                address=self._address,
                 size_limit=settings.objective_size_limit,
                 timeout=settings.fetch_timeout,
             )

@@ -142,7 +142,9 @@ async def working(
             ledger=ledger,
             outbox=Outbox(ledger, channel, network, head=lambda: chain_head.head, policy=resend),
             store=store,
-            exchange=await stack.enter_async_context(Exchange(network.session, store)),
+            exchange=await stack.enter_async_context(
+                Exchange(network.session, store, address=account.address.lower(), drops=drops)
+            ),
             services=await stack.enter_async_context(Services(network.session, account.address, drops=drops)),
             chain_head=chain_head,
             outages=OutageLog(log, "chain"),

@@ -13,7 +13,7 @@ from mesh.content.errors import (
     StoreDamaged,
     StoreFull,
 )
-from mesh.content.exchange import Exchange, ExchangeStatistics
+from mesh.content.exchange import Exchange, ExchangeStatistics, session_address
 from mesh.content.files import Progress
 from mesh.content.quota import EvictionReport
 from mesh.content.store import IntegrityReport, Store
@@ -38,4 +38,5 @@ __all__ = [
     "StoreFull",
     "Usage",
     "is_block",
+    "session_address",
 ]

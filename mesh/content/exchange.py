@@ -13,11 +13,13 @@ from weakref import WeakValueDictionary
 
 import zenoh
 
-from mesh.content.download import HOLDER, BlockRequester, Download, DownloadTiming
-from mesh.errors import AiraError, ClosedError, InvalidKey
+from mesh.content.download import Download, DownloadTiming
+from mesh.content.requester import BlockRequester, Liars
+from mesh.errors import AiraError, ClosedError
+from mesh.flood import Drops
 from mesh.log_context import log_event
-from schemas.keys import CidKey, parse_key
-from schemas.selectors import CID_SELECTOR
+from schemas.agent_keys import CidKey
+from schemas.selectors import cid_selector, requested_cid
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -45,27 +47,37 @@ class ExchangeStatistics:
     missed: int
     """Queries for blocks that are not held."""
     ignored: int
-    """Queries that were meant for another session, or had a wildcard."""
+    """Queries for no single block."""
     fetched_blocks: int
     fetched_bytes: int
     corrupt_blocks: Mapping[str, int]
-    """Replies that did not have the hash asked for, by the sender's Zenoh id (which the sender can forge)."""
+    """Replies that did not have the hash asked for, by their sender: `ADDRESS@SESSION`, see `Replier`."""
 
 
 class Exchange:
     """Connects a store to the network: `async with Exchange(session, store) as exchange`.
 
-    Inside, it serves blocks of the store on `aira/cid/{cid}`, and `fetch` gets files from others, `width` blocks at a
-    time. Session and store remain the caller's, who closes them after the exchange.
+    Inside, it serves blocks of the store on `aira/agent/{address}/cid/{cid}`, and `fetch` gets files from others,
+    `width` blocks at a time. `address` is that of the account, by default one made from the session's id. Replies that
+    are lies are counted in `drops`. Session and store remain the caller's, who closes them after the exchange.
     """
 
     def __init__(
-        self, session: zenoh.Session, store: Store, *, width: int = 8, timing: DownloadTiming = _TIMING
+        self,
+        session: zenoh.Session,
+        store: Store,
+        *,
+        address: str = "",
+        width: int = 8,
+        timing: DownloadTiming = _TIMING,
+        drops: Drops | None = None,
     ) -> None:
         self._session = session
         self._store = store
         self._width = width
         self._timing = timing
+        self._address = address or session_address(session)
+        self._liars = Liars(drops or Drops())
         self._server: BlockServer | None = None
         self._running: dict[Download, asyncio.Future[Path]] = {}
         self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
@@ -76,7 +88,7 @@ class Exchange:
     async def __aenter__(self) -> Self:
         if self._server is not None:
             raise ClosedError("this exchange was opened before")
-        self._server = BlockServer(self._session, self._store)
+        self._server = BlockServer(self._session, self._store, self._address)
         await asyncio.to_thread(self._server.start)
         return self
 
@@ -125,7 +137,7 @@ class Exchange:
         )
 
     async def _download(self, cid: str, size_limit: int | None, timeout: float, progress: Progress | None) -> Path:
-        loop, requester = asyncio.get_running_loop(), BlockRequester(self._session)
+        loop, requester = asyncio.get_running_loop(), BlockRequester(self._session, self._liars)
         download = Download(
             self._store,
             requester,
@@ -154,15 +166,15 @@ class Exchange:
 
 
 class BlockServer:
-    """Answers queries on `aira/cid/{cid}` with the bytes of the block, or with nothing if it is not held.
+    """Answers queries for blocks, on the keys of `address`, with the bytes, or with nothing if one is not held.
 
     `start` and `stop` may block for a moment; neither closes the session. A thread of its own reads the disk.
     """
 
-    def __init__(self, session: zenoh.Session, store: Store) -> None:
+    def __init__(self, session: zenoh.Session, store: Store, address: str) -> None:
         self._session = session
         self._store = store
-        self._id = str(session.zid())
+        self._address = address
         self._queryable: zenoh.Queryable[zenoh.Handler[zenoh.Query]] | None = None
         self._thread = threading.Thread(target=self._serve, name="aira-blocks", daemon=True)
         self.served = 0
@@ -171,7 +183,9 @@ class BlockServer:
 
     def start(self) -> None:
         """Declare the queryable and begin to answer."""
-        self._queryable = self._session.declare_queryable(CID_SELECTOR, zenoh.handlers.RingChannel(_QUEUED))
+        self._queryable = self._session.declare_queryable(
+            cid_selector(self._address), zenoh.handlers.RingChannel(_QUEUED)
+        )
         self._thread.start()
 
     def stop(self) -> None:
@@ -191,25 +205,21 @@ class BlockServer:
                     log.exception("a query for a block could not be answered", extra=event)
 
     def _answer(self, query: zenoh.Query) -> None:
-        key = _block_key(query)
-        if key is None or query.parameters.get(HOLDER, self._id) != self._id:
+        cid = requested_cid(str(query.key_expr))
+        if cid is None:
             self.ignored += 1
             return
-        block = self._store.get_block(key.cid)
+        block = self._store.get_block(cid)
         if block is None:
             self.missed += 1
             return
-        query.reply(query.key_expr, block, encoding=zenoh.Encoding.APPLICATION_OCTET_STREAM)
+        query.reply(str(CidKey(self._address, cid)), block, encoding=zenoh.Encoding.APPLICATION_OCTET_STREAM)
         self.served += 1
 
 
-def _block_key(query: zenoh.Query) -> CidKey | None:
-    """The key of the one block that a query names; None for a wildcard, which is never answered."""
-    try:
-        key = parse_key(str(query.key_expr))
-    except InvalidKey:
-        return None
-    return key if isinstance(key, CidKey) else None
+def session_address(session: zenoh.Session) -> str:
+    """An address for a session without an account: its Zenoh id, filled up with zeros."""
+    return f"0x{session.zid()!s:0>40}"
 
 
 def _in_loop(loop: asyncio.AbstractEventLoop, progress: Progress) -> Progress:

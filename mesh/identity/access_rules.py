@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from mesh.identity.roster import ROLES, Right
 from schemas.address import parse_address
+from schemas.selectors import cid_selector
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -47,6 +48,17 @@ DECLARED: Final = {
     "key_exprs": ["aira/**"],
 }
 
+ASKED: Final = {
+    "id": "queries to every store",
+    "permission": "allow",
+    "flows": ["egress"],
+    # These name no agent, so no member's own space includes them. They reach those that serve content there.
+    "messages": ["query"],
+    "key_exprs": [cid_selector()],
+}
+SHARED: Final = (DECLARED, ASKED)
+"""The rules that apply to every member."""
+
 
 class Permission(NamedTuple):
     """A right of a member on these key expressions and everything that they cover."""
@@ -78,7 +90,7 @@ def _filled(shape: str, roster: Roster, member: Member) -> Iterator[str]:
 
 def access_control(roster: Roster) -> dict[str, Any]:
     """Zenoh's `access_control` for a site's routers: it denies what the roster does not allow."""
-    rules: list[dict[str, Any]] = [DECLARED]
+    rules: list[dict[str, Any]] = [*SHARED]
     for member, right, keys in access_of(roster):
         for flow, messages in (("ingress", INGRESS.get(right, ())), ("egress", EGRESS.get(right, ()))):
             if messages:
@@ -110,4 +122,4 @@ def access_control(roster: Roster) -> dict[str, Any]:
 
 
 def _rules_of(address: str, rules: list[dict[str, Any]]) -> list[str]:
-    return [rule["id"] for rule in rules if rule is DECLARED or rule["id"].startswith(address)]
+    return [rule["id"] for rule in rules if rule in SHARED or rule["id"].startswith(address)]

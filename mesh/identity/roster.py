@@ -93,8 +93,8 @@ _READ_MARKET: Final = (
     _grant("get subscribe", "aira/{market}/**"),
     _grant("presence", "aira/{market}/@agent/*/*"),
 )
-_READ_CONTENT: Final = _grant("get", "aira/cid/*")
-_HOLD_CONTENT: Final = _grant("get serve", "aira/cid/*")
+_READ_CONTENT: Final = _grant("get", "aira/agent/*/cid/*")
+"""Who holds content serves it in its own space."""
 
 ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
     {
@@ -103,7 +103,7 @@ ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
             *_READ_MARKET,
             _orders("offer", "withdrawal", "result"),
             _presence("agent"),
-            _HOLD_CONTENT,
+            _READ_CONTENT,
         ),
         # A person who orders work also runs an agent.
         "person": (
@@ -111,7 +111,7 @@ ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
             *_READ_MARKET,
             _orders("demand", "withdrawal"),
             _presence("agent", "person"),
-            _HOLD_CONTENT,
+            _READ_CONTENT,
         ),
         "provider": (
             _OWN_SPACE,
@@ -140,7 +140,7 @@ ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
             *_READ_MARKET,
             _orders("demand", "offer", "withdrawal", "result", "feedback", "pending"),
             _presence("bridge", "bridge-turn-$*"),
-            _HOLD_CONTENT,
+            _READ_CONTENT,
         ),
         "watcher": (*_READ_MARKET, _READ_CONTENT, _grant("subscribe presence", "aira/agent/**")),
         # Another router of the site forwards what it has admitted itself.

@@ -42,5 +42,5 @@ KEYS: list[tuple[Key, str]] = [
     (RpcKey(SENDER, "start"), f"aira/agent/{A}/rpc/start"),
     (RpcKey(SENDER, "eth/accounts"), f"aira/agent/{A}/rpc/eth/accounts"),
     (EthEventKey(SENDER, "transfer"), f"aira/agent/{A}/eth/event/transfer"),
-    (CidKey(MODEL), f"aira/cid/{MODEL}"),
+    (CidKey(SENDER, MODEL), f"aira/agent/{A}/cid/{MODEL}"),
 ]

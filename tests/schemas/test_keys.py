@@ -113,7 +113,7 @@ def test_model_is_a_cid(text: str) -> None:
     with pytest.raises(InvalidKey):
         OfferKey(NAME, text)
     with pytest.raises(InvalidKey):
-        CidKey(text)
+        CidKey(A, text)
 
 
 @pytest.mark.parametrize("text", ["", "*", NAME, L[2:], "0x" + "g" * 40])
@@ -139,10 +139,10 @@ def test_unknown_events_are_refused() -> None:
         "/",
         "aira",
         "aira/",
-        "/aira/cid/" + MODEL,
-        "other/cid/" + MODEL,
-        f"aira/cid/{MODEL}/",
-        f"aira/cid/{MODEL}/{MODEL}",
+        f"/aira/agent/{A}/cid/{MODEL}",
+        f"aira/cid/{MODEL}",
+        f"aira/agent/{A}/cid/{MODEL}/",
+        f"aira/agent/{A}/cid/{MODEL}/{MODEL}",
         "aira/**",
         f"aira/{NAME}/demand/*",
         f"aira/{NAME}/demand/{MODEL}/{HASH}",

@@ -9,11 +9,13 @@ import random
 from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import zenoh
 
+from mesh.content import session_address
 from schemas.cid import cid_of_digest
+from schemas.selectors import cid_selector
 from schemas.unixfs import UnixfsBlock, blocks_of_stream, write_bytes, write_number
 from tests.support.waiting import until_found
 
@@ -110,25 +112,33 @@ def digest(block: UnixfsBlock) -> bytes:
     return sha256(block.data).digest()
 
 
+class BlockQuery(NamedTuple):
+    """A query for a block, and the key of the reply."""
+
+    query: zenoh.Query
+    key_expr: str
+
+    def reply(self, key: str, payload: bytes) -> None:
+        self.query.reply(key, payload)
+
+
+def holder_of(session: zenoh.Session) -> str:
+    """How a fetch names the holder behind a session without an account."""
+    return f"{session_address(session)}@{session.zid()}"
+
+
 @contextmanager
 def answer_queries(session: zenoh.Session, answer: Callable[[zenoh.Query], None]) -> Iterator[None]:
-    """Answer queries on `aira/cid/*` as a foreign holder would."""
+    """Answer queries for blocks as a foreign holder would; `answer` gets each with a key of that holder."""
+    address = session_address(session)
 
     def reply(query: zenoh.Query) -> None:
         with query:
-            answer(query)
+            answer(cast("zenoh.Query", BlockQuery(query, str(query.key_expr).replace("*", address))))
 
-    queryable = session.declare_queryable("aira/cid/*", reply)
+    queryable = session.declare_queryable(cid_selector(address), reply)
     yield
     queryable.undeclare()  # type: ignore[no-untyped-call]
-
-
-async def until_matched(session: zenoh.Session) -> None:
-    """Return once `session` knows a queryable for content."""
-    querier = session.declare_querier("aira/cid/*")
-    while not querier.matching_status:
-        await asyncio.sleep(0.01)
-    querier.undeclare()  # type: ignore[no-untyped-call]
 
 
 async def until_held(session: zenoh.Session, cid: str, *, holders: int) -> None:
@@ -136,7 +146,7 @@ async def until_held(session: zenoh.Session, cid: str, *, holders: int) -> None:
 
     def answers() -> int:
         replies = session.get(
-            f"aira/cid/{cid}",
+            cid_selector(cid=cid),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=10.0,

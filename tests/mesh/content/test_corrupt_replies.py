@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.content import ContentCorrupt, DownloadTiming, Exchange, Store
+from schemas.selectors import cid_selector
 from schemas.unixfs import CHUNK_SIZE, cid_of_bytes
-from tests.support.content import answer_queries, sample_bytes
+from tests.support.content import answer_queries, holder_of, sample_bytes
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
@@ -39,8 +40,8 @@ async def test_a_corrupt_reply_is_counted_by_sender_and_another_holder_used(
             async with Exchange(other_session, holder_store):
                 assert (await fetching).read_bytes() == data
             corrupt = exchange.statistics().corrupt_blocks
-    assert list(corrupt) == [str(third_session.zid())]
-    assert corrupt[str(third_session.zid())] >= 1
+    assert list(corrupt) == [holder_of(third_session)]
+    assert corrupt[holder_of(third_session)] >= 1
 
 
 async def test_a_holder_that_sends_corrupt_parts_is_replaced_by_another(
@@ -71,7 +72,7 @@ async def test_a_holder_that_sends_corrupt_parts_is_replaced_by_another(
             await sent.wait()
             async with Exchange(other_session, holder_store):
                 assert (await fetching).read_bytes() == data
-            assert str(third_session.zid()) in exchange.statistics().corrupt_blocks
+            assert holder_of(third_session) in exchange.statistics().corrupt_blocks
 
 
 async def test_if_all_replies_are_corrupt_the_error_names_their_senders(
@@ -83,7 +84,7 @@ async def test_if_all_replies_are_corrupt_the_error_names_their_senders(
             with pytest.raises(ContentCorrupt) as caught:
                 await exchange.fetch(cid, timeout=0.3)
     assert caught.value.cid == cid
-    assert caught.value.holders == (str(other_session.zid()),)
+    assert caught.value.holders == (holder_of(other_session),)
     assert store.list() == ()
 
 
@@ -97,7 +98,7 @@ async def test_a_silent_holder_does_not_delay_another(
     data = sample_bytes(10 * CHUNK_SIZE)
     cid = holder_store.put_bytes(data)
     kept: list[zenoh.Query] = []
-    silent = third_session.declare_queryable("aira/cid/*", kept.append)
+    silent = third_session.declare_queryable(cid_selector(), kept.append)
     async with Exchange(session, store, timing=DownloadTiming(query_timeout=0.2)) as exchange:
         # At first the silent one is the only holder, so that it is asked and waited for.
         fetching = asyncio.create_task(exchange.fetch(cid, timeout=600))

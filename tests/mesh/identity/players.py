@@ -60,6 +60,7 @@ def space(agent: str, device: str) -> dict[str, str]:
         "device": str(DeviceTopicKey(agent, device, "/a/b")),
         "rpc": str(RpcKey(agent, "eth/transfer")),
         "eth": str(EthEventKey(agent, "transfer")),
+        "cid": str(CidKey(agent, MODEL)),
     }
 
 
@@ -76,7 +77,6 @@ def keys_of(who: str) -> dict[str, str]:
         "pending": PendingKey(MARKET),
         "reject": RejectKey(MARKET, own),
         "other reject": RejectKey(MARKET, other),
-        "cid": CidKey(MODEL),
         "other market": DemandKey("elsewhere.lighthouse.3.robonomics.eth", MODEL),
         "other presence": PresenceKey(MARKET, "agent", other),
         "nowhere": "aira/nowhere",
@@ -91,8 +91,8 @@ def keys_of(who: str) -> dict[str, str]:
 
 
 KEYS = {who: keys_of(who) for who in WHO}
-OWN = {"own event", "own objective", "own topic", "own device", "own rpc", "own eth"}
-OTHER = {"other event", "other objective", "other topic", "other device", "other rpc", "other eth"}
+OWN = {"own event", "own objective", "own topic", "own device", "own rpc", "own eth", "own cid"}
+OTHER = {"other event", "other objective", "other topic", "other device", "other rpc", "other eth", "other cid"}
 MARKETS = {"demand", "offer", "withdrawal", "result", "feedback", "pending", "reject", "other reject"}
 PRESENCES = {name for name in KEYS["arm"] if name.startswith("as ")} | {"other presence"}
 NOBODY: dict[str, set[str]] = {who: set() for who in WHO}
@@ -107,12 +107,12 @@ PUT = NOBODY | {
 }
 DELETE = NOBODY | dict.fromkeys(("arm", "ann", "miner", "boss", "bridge"), OWN)
 SERVE = NOBODY | {
-    "arm": OWN | {"cid"},
-    "ann": OWN | {"cid"},
+    "arm": OWN,
+    "ann": OWN,
     "miner": OWN | MARKETS,
     "boss": OWN,
     "board": {"robot topic", "robot device"},
-    "bridge": OWN | {"cid"},
+    "bridge": OWN,
 }
 TOKEN = NOBODY | {
     "arm": OWN | {"as agent"},
@@ -123,13 +123,13 @@ TOKEN = NOBODY | {
     "bridge": OWN | {"as bridge", "as bridge-turn-0-00000000000000ff"},
 }
 GET = NOBODY | {
-    "arm": OWN | MARKETS | {"cid"},
-    "ann": OWN | MARKETS | {"cid"},
+    "arm": OWN | MARKETS | {"other cid"},
+    "ann": OWN | MARKETS | {"other cid"},
     "miner": OWN | MARKETS,
-    "boss": OWN | OTHER | MARKETS | {"cid"},
+    "boss": OWN | OTHER | MARKETS,
     "board": {"robot device"},
-    "bridge": OWN | MARKETS | {"cid"},
-    "screen": MARKETS | {"cid"},
+    "bridge": OWN | MARKETS | {"other cid"},
+    "screen": MARKETS | {"own cid", "other cid"},
 }
 SUBSCRIBE = NOBODY | {
     "arm": OWN | MARKETS,

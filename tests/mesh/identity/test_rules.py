@@ -45,7 +45,6 @@ def test_every_family_of_keys_may_be_written_by_somebody() -> None:
         "pending",
         "reject",
         "@agent",
-        "aira/cid",
         "aira/agent/{own}",
     ):
         assert any(chunk in key for key in grants), chunk
