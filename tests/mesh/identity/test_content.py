@@ -44,7 +44,7 @@ async def test_a_lying_member_can_not_answer_for_the_holder_of_a_file(tmp_path: 
             stack.enter_context(zenoh.open(site.client(folders[name]).config())) for name in NAMES
         )
         for selector in ("aira/**", "aira/agent/*/cid/*", f"aira/agent/{ADDRESSES['liar']}/cid/*"):
-            stack.enter_context(liar.declare_queryable(selector, lie))  # type: ignore[arg-type]
+            stack.enter_context(liar.declare_queryable(selector, lie))
         held = stack.enter_context(Store(tmp_path / "held"))
         store = stack.enter_context(Store(tmp_path / "fetched"))
         cid = held.put_bytes(data)
