@@ -129,7 +129,13 @@ class ContentMetrics(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
     pinned: int
     """Files pinned by further nodes, counted once for each node."""
     failed: int
-    """Files that neither side could provide, or that could not be added."""
+    """Files that neither side could provide, that could not be added, or for which the queue had no room."""
+    joined: int = 0
+    """Files not transferred once more, because another transfer of the same served."""
+    adds_queued: int = 0
+    """Files that wait to be added to IPFS."""
+    fetches_queued: int = 0
+    """Files that wait to be fetched from IPFS."""
 
 
 class BridgeStatus(Record, frozen=True, kw_only=True, rename="camel", forbid_unknown_fields=False):

@@ -5,22 +5,25 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import Counter, OrderedDict
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final, Self
 
 import zenoh
 
 from bridges.ipfs.errors import IpfsError
+from bridges.ipfs.transfer_queue import USUAL, TransferQueue
 from bridges.ipfs.transfers import add_file
 from mesh.content import ContentUnavailable, session_address
-from mesh.errors import AiraError, ClosedError
+from mesh.errors import ClosedError
+from mesh.flood import Drops
 from mesh.log_context import log_event
 from mesh.network import call_in_loop
-from mesh.retry import Backoff, RetryPolicy
+from mesh.retry import RetryPolicy
 from schemas import CidKey, InputError, cid_selector, parse_block, requested_cid
 from schemas.status import ContentMetrics
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine
+    from collections.abc import Iterable, Iterator
     from pathlib import Path
 
     from bridges.ipfs.daemon import Daemon
@@ -33,12 +36,12 @@ BLOCK_TIMEOUT: Final = 10.0
 """Seconds that a source has for a block."""
 CONCURRENT_ANSWERS: Final = 32
 """Block queries of the mesh that are answered from IPFS at once; others get no reply and are sent again."""
-CONCURRENT_TRANSFERS: Final = 8
-"""Files named in messages that are transferred at once; the others wait."""
-TASK_LIMIT: Final = 4096
-"""Files that may wait; more are skipped and count as failed."""
+PROBE_TIMEOUT: Final = 2.0
+"""Seconds in which the first block of a file named in a message must be found, before the file is transferred."""
 ADD_RETRY: Final = RetryPolicy(initial=10.0, factor=1.0, ceiling=10.0, attempts=4)
 """For files that a message names before the mesh has them."""
+FETCH_RETRY: Final = RetryPolicy(initial=10.0, factor=1.0, ceiling=10.0, attempts=2)
+"""For files that IPFS does not find at once."""
 UNAVAILABLE_FOR: Final = 10.0
 """Seconds for which a block that IPFS did not have is not requested again."""
 REMEMBERED_BLOCKS: Final = 65_536
@@ -50,8 +53,9 @@ class ContentBridge:
 
     Inside, queries of the mesh for blocks that `store` lacks are answered from `sources`, and the file that such a
     block begins is fetched and stored. Files are added to `daemon`; `providers` are further nodes that pin them.
-    `size_limit` is in bytes of a file, `timeout` in seconds for a file; `add_retry` applies to `schedule_add`. The
-    caller closes what is passed in.
+    `size_limit` is in bytes of a file, `timeout` in seconds for a file; `add_retry` applies to `schedule_add`,
+    `fetch_retry` to `schedule_fetch`. What is not transferred because a signer names too many files is counted in
+    `drops`. The caller closes what is passed in.
     """
 
     def __init__(
@@ -67,6 +71,8 @@ class ContentBridge:
         size_limit: int,
         timeout: float,
         add_retry: RetryPolicy = ADD_RETRY,
+        fetch_retry: RetryPolicy = FETCH_RETRY,
+        drops: Drops | None = None,
     ) -> None:
         self._session = session
         self._address = address or session_address(session)
@@ -77,14 +83,15 @@ class ContentBridge:
         self._providers = providers
         self._size_limit = size_limit
         self._timeout = timeout
-        self._add_retry = add_retry
+        drops = drops or Drops()
+        self._adds = TransferQueue(self._add_if_held, kind="add", retry=add_retry, drops=drops)
+        self._prefetches = TransferQueue(self._fetch_if_found, kind="fetch", retry=fetch_retry, drops=drops)
         self._parts: OrderedDict[str, None] = OrderedDict()
         self._unavailable: OrderedDict[str, float] = OrderedDict()
         self._tasks: set[asyncio.Task[None]] = set()
         self._fetches: dict[str, asyncio.Task[Path]] = {}
         self._answering = 0
-        self._transfers = asyncio.Semaphore(CONCURRENT_TRANSFERS)
-        self._adding: set[str] = set()
+        self._adding: Counter[str] = Counter()
         self._open = False
         self._counts = Counter[str]()
 
@@ -92,6 +99,8 @@ class ContentBridge:
         if self._open:
             raise ClosedError("this content bridge is already open")
         self._open = True
+        await self._adds.__aenter__()
+        await self._prefetches.__aenter__()
         loop = asyncio.get_running_loop()
         self._queryable: Any = self._session.declare_queryable(
             cid_selector(self._address), lambda query: call_in_loop(loop, self._accept, query)
@@ -102,6 +111,8 @@ class ContentBridge:
         self._open = False
         if not self._session.is_closed():
             self._queryable.undeclare()
+        await self._adds.__aexit__()
+        await self._prefetches.__aexit__()
         tasks = [*self._tasks, *self._fetches.values()]
         for task in tasks:
             task.cancel()
@@ -125,11 +136,8 @@ class ContentBridge:
 
         Raises a `ContentError` when the mesh does not have it, `IpfsError` when the daemon does not accept it.
         """
-        self._adding.add(cid)  # this bridge must not answer its own query
-        try:
+        with self._not_answering(cid):
             path = await self._exchange.fetch(cid, size_limit=self._size_limit, timeout=self._timeout)
-        finally:
-            self._adding.discard(cid)
         try:
             size = (await asyncio.to_thread(path.stat)).st_size
             as_file = await add_file(self._daemon, self._store, path, cid, timeout=self._timeout)
@@ -144,13 +152,13 @@ class ContentBridge:
                 failed = log_event("pin-failed", cid=cid, provider=provider.api, code=error.code)
                 log.warning("%s is not pinned: %s", cid, error, extra=failed)
 
-    def schedule_fetch(self, cid: str) -> None:
-        """Like `fetch`, in the background; a failure is logged and counted."""
-        self._start(self._try_to_fetch(cid), f"fetch {cid}")
+    def schedule_fetch(self, cid: str, signer: str = "", *, priority: int = USUAL) -> None:
+        """Like `fetch`, in the background, for a message of `signer`; a failure is logged and counted."""
+        self._prefetches.add(cid, signer, priority=priority)
 
-    def schedule_add(self, cid: str) -> None:
-        """Like `add`, in the background and with retries; a failure is logged and counted."""
-        self._start(self._try_to_add(cid), f"add {cid}")
+    def schedule_add(self, cid: str, signer: str = "", *, priority: int = USUAL) -> None:
+        """Like `add`, in the background, for a message of `signer`; a failure is logged and counted."""
+        self._adds.add(cid, signer, priority=priority)
 
     def metrics(self) -> ContentMetrics:
         """The counts so far."""
@@ -164,62 +172,59 @@ class ContentBridge:
             added_bytes=counts["added_bytes"],
             by_blocks=counts["by_blocks"],
             pinned=counts["pinned"],
-            failed=counts["failed"],
+            failed=self._adds.failed + self._prefetches.failed,
+            joined=self._adds.joined + self._prefetches.joined,
+            adds_queued=self._adds.queued,
+            fetches_queued=self._prefetches.queued,
         )
 
     async def _fetch(self, cid: str) -> Path:
         path = await self._sources.fetch(
-            self._store, cid, size_limit=self._size_limit, timeout=self._timeout, block_timeout=BLOCK_TIMEOUT
+            self._store,
+            cid,
+            size_limit=self._size_limit,
+            timeout=self._timeout,
+            block_timeout=BLOCK_TIMEOUT,
+            found=self._remember_parts,
         )
         self._counts["fetched"] += 1
         return path
 
-    async def _try_to_fetch(self, cid: str) -> None:
+    async def _fetch_if_found(self, cid: str) -> None:
+        if not await asyncio.to_thread(self._store.has, cid):
+            await self._sources.block(cid, timeout=min(PROBE_TIMEOUT, self._timeout))
+        await self.fetch(cid)
+
+    async def _add_if_held(self, cid: str) -> None:
+        if not await asyncio.to_thread(self._store.has, cid):
+            with self._not_answering(cid):
+                is_held = await self._exchange.is_held(cid, timeout=min(PROBE_TIMEOUT, self._timeout))
+            if not is_held:
+                raise ContentUnavailable(cid, "nobody on the mesh has it")
+        await self.add(cid)
+
+    @contextmanager
+    def _not_answering(self, cid: str) -> Iterator[None]:
+        """Don't answer this bridge's own queries for a file that is to be added."""
+        self._adding[cid] += 1
         try:
-            async with self._transfers:
-                await self.fetch(cid)
-        except AiraError as error:
-            self._counts["failed"] += 1
-            failed = log_event("fetch-failed", cid=cid, code=error.code)
-            log.info("not fetched from IPFS: %s", error, extra=failed)
-
-    async def _try_to_add(self, cid: str) -> None:
-        backoff = Backoff(self._add_retry)
-        while True:
-            try:
-                async with self._transfers:
-                    await self.add(cid)
-                return
-            except AiraError as error:
-                delay = backoff.next_delay() if isinstance(error, ContentUnavailable | IpfsError) else None
-                if delay is None:
-                    self._counts["failed"] += 1
-                    failed = log_event("add-failed", cid=cid, code=error.code)
-                    log.warning("not added to IPFS: %s", error, extra=failed)
-                    return
-                retried = log_event("add-retried", cid=cid, code=error.code)
-                log.debug("not added to IPFS yet: %s", error, extra=retried)
-            await asyncio.sleep(delay)
-
-    def _start(self, work: Coroutine[Any, Any, None], name: str) -> None:
-        if not self._open or len(self._tasks) >= TASK_LIMIT:
-            self._counts["failed"] += 1
-            log.debug("too many tasks, skipped: %s", name)
-            work.close()
-            return
-        task = asyncio.create_task(work, name=name)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+            yield
+        finally:
+            self._adding[cid] -= 1
+            if not self._adding[cid]:
+                del self._adding[cid]
 
     def _accept(self, query: zenoh.Query) -> None:
         """Answer a query for a block, unless there are too many."""
         cid = requested_cid(str(query.key_expr))
-        busy = self._answering >= CONCURRENT_ANSWERS or len(self._tasks) >= TASK_LIMIT
+        busy = self._answering >= CONCURRENT_ANSWERS
         if not self._open or cid is None or busy or cid in self._adding or self._is_unavailable(cid):
             query.drop()  # type: ignore[no-untyped-call]
             return
         self._answering += 1
-        self._start(self._answer(query, cid), f"answer {cid}")
+        task = asyncio.create_task(self._answer(query, cid), name=f"answer {cid}")
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
 
     async def _answer(self, query: zenoh.Query, cid: str) -> None:
         try:
@@ -244,10 +249,14 @@ class ContentBridge:
             links = parse_block(block).links
         except InputError:
             return
-        for link in links:
-            _remember(self._parts, link.cid, None)
+        self._remember_parts(link.cid for link in links)
         if cid not in self._parts:
             self.schedule_fetch(cid)
+
+    def _remember_parts(self, cids: Iterable[str]) -> None:
+        """These are blocks of files that are fetched as a whole: no files to fetch of their own."""
+        for cid in cids:
+            _remember(self._parts, cid, None)
 
     def _is_unavailable(self, cid: str) -> bool:
         asked = self._unavailable.get(cid)

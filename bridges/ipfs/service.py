@@ -12,14 +12,16 @@ from bridges.ipfs.content import ContentBridge
 from bridges.ipfs.daemon import Daemon
 from bridges.ipfs.journal import RelayJournal, Side
 from bridges.ipfs.status import bridge_families, content_families, health_parts
+from bridges.ipfs.transfer_queue import URGENT, USUAL
 from bridges.ipfs.transfers import ContentSources, Gateway
 from bridges.ipfs.validation import ChainView, RelayValidator
 from mesh.content import Exchange, Store
 from mesh.errors import ConfigurationError
+from mesh.flood import Drops
 from mesh.market.withdrawals import Withdrawals
 from mesh.network.metrics import network_families
 from mesh.role import Role
-from schemas import Demand, Result, decode
+from schemas import Demand, Result, decode, recover
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -57,6 +59,8 @@ class IpfsBridge(Role):
         self._chain = chain and ChainView(chain, self._lighthouses, interval=max(settings.poll_interval, 1.0))
         self._address = (address or f"0x{secrets.token_hex(20)}").lower()
         self.channels: tuple[ChannelBridge, ...] = ()
+        self.drops: Final = Drops()
+        """What strangers sent that was dropped."""
         self.daemon: Final = Daemon(settings.ipfs_http_provider, authorization=authorization_of(settings))
 
     async def _open(self, stack: AsyncExitStack) -> None:
@@ -68,6 +72,7 @@ class IpfsBridge(Role):
         async with asyncio.TaskGroup() as tasks:
             for channel in self.channels:
                 tasks.create_task(channel.run(), name=f"bridge of {channel.lighthouse}")
+            tasks.create_task(self.drops.run(), name="bridge: drops")
             if self._chain is not None:
                 tasks.create_task(self._chain.run(), name="bridge: the chain")
 
@@ -93,7 +98,8 @@ class IpfsBridge(Role):
             Store, self._directory / "content", limit=settings.objective_size_limit, quota=settings.content_limit
         )
         stack.callback(store.close)
-        exchange = await stack.enter_async_context(Exchange(self._network.session, store, address=self._address))
+        exchange = Exchange(self._network.session, store, address=self._address, drops=self.drops)
+        await stack.enter_async_context(exchange)
         gateways = [Gateway(settings.ipfs_gateway)] if settings.ipfs_gateway else []
         for gateway in gateways:
             await stack.enter_async_context(gateway)
@@ -109,6 +115,7 @@ class IpfsBridge(Role):
                 self.daemon,
                 providers=providers,
                 address=self._address,
+                drops=self.drops,
                 size_limit=settings.objective_size_limit,
                 timeout=settings.fetch_timeout,
             )
@@ -146,12 +153,14 @@ class IpfsBridge(Role):
 
     def _published(self, side: Side, message: RelayMessage) -> None:
         """Transfer the file that a message names to the side to which the message was sent."""
-        match decode(message.payload):
+        match named := decode(message.payload):
             case Demand(objective=cid) | Result(result=cid):
+                signer = recover(bytes.fromhex(message.hash), named.signature)
+                priority = URGENT if isinstance(named, Result) else USUAL
                 if side is Side.IPFS:
-                    self.content.schedule_add(cid)
+                    self.content.schedule_add(cid, signer, priority=priority)
                 else:
-                    self.content.schedule_fetch(cid)
+                    self.content.schedule_fetch(cid, signer, priority=priority)
 
 
 def authorization_of(settings: IpfsSettings) -> str:

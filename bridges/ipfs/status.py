@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 RATE_WINDOW: Final = 10.0
 """Seconds over which a rate is measured."""
-GAUGES: Final = ("waiting", "left_waiting", "unheard")
+GAUGES: Final = ("waiting", "left_waiting", "unheard", "adds_queued", "fetches_queued")
 """Fields of a direction that are current values rather than counts."""
 
 
@@ -87,6 +87,9 @@ def content_families(content: ContentMetrics) -> tuple[MetricFamily, ...]:
         counter("aira_bridge_content_by_blocks_total", "Of these, files added block by block", content.by_blocks),
         counter("aira_bridge_content_pinned_total", "Pins of files on further nodes", content.pinned),
         counter("aira_bridge_content_failed_total", "Files that could not be fetched or added", content.failed),
+        counter("aira_bridge_content_joined_total", "Files not transferred once more for a repetition", content.joined),
+        gauge("aira_bridge_content_adds_queued", "Files that wait to be added to IPFS", content.adds_queued),
+        gauge("aira_bridge_content_fetches_queued", "Files that wait to be fetched from IPFS", content.fetches_queued),
     )
 
 

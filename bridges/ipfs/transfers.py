@@ -21,10 +21,13 @@ from schemas import InputError, parse_block
 from schemas.unixfs import MAX_BLOCK_SIZE
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
     from pathlib import Path
 
     from bridges.ipfs.daemon import Daemon
     from mesh.content import Assembly, BlockRef, Store
+
+    Found = Callable[[Iterable[str]], None]
 
 log = logging.getLogger(__name__)
 
@@ -121,12 +124,22 @@ class ContentSources:
             log.warning("%s returned %d bytes that do not match %s", source.api, len(block), cid, extra=corrupt)
         raise ContentUnavailable(cid, "; ".join(reasons) or "no IPFS node is configured")
 
-    async def fetch(self, store: Store, cid: str, *, size_limit: int, timeout: float, block_timeout: float) -> Path:
+    async def fetch(
+        self,
+        store: Store,
+        cid: str,
+        *,
+        size_limit: int,
+        timeout: float,
+        block_timeout: float,
+        found: Found = lambda cids: None,
+    ) -> Path:
         """Fetch a file into `store`, verifying each block; returns its path there.
 
-        `size_limit` is in bytes; `timeout` in seconds for the file, `block_timeout` for a block. Blocks received are
-        kept for the next attempt. Raises `ContentUnavailable`, `ContentTooLarge`, `ContentCorrupt`, `StoreFull`,
-        `InvalidCid`.
+        `size_limit` is in bytes; `timeout` in seconds for the file, `block_timeout` for a block. `found` is called with
+        the CIDs of its blocks as they are found. Blocks received are kept for the next attempt.
+
+        Raises `ContentUnavailable`, `ContentTooLarge`, `ContentCorrupt`, `StoreFull`, `InvalidCid`.
         """
         held = await asyncio.to_thread(store.checked, cid)
         if held is not None:
@@ -134,7 +147,7 @@ class ContentSources:
         with store.assemble(cid, size_limit=size_limit) as assembly:
             try:
                 async with asyncio.timeout(timeout):
-                    await self._assemble(assembly, block_timeout)
+                    await self._assemble(assembly, block_timeout, found)
             except TimeoutError:
                 done, size = assembly.progress()
                 raise ContentUnavailable(
@@ -142,7 +155,7 @@ class ContentSources:
                 ) from None
             return await asyncio.to_thread(assembly.finish)
 
-    async def _assemble(self, assembly: Assembly, block_timeout: float) -> None:
+    async def _assemble(self, assembly: Assembly, block_timeout: float, found: Found) -> None:
         waiting = [assembly.root]
         running: set[asyncio.Task[list[BlockRef]]] = set()
         try:
@@ -152,7 +165,9 @@ class ContentSources:
                     running.add(asyncio.create_task(self._take(assembly, ref, block_timeout), name=f"block {ref.cid}"))
                 done, running = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
                 for task in done:
-                    waiting.extend(reversed(task.result()))
+                    refs = task.result()
+                    found(ref.cid for ref in refs)
+                    waiting.extend(reversed(refs))
         finally:
             for task in running:
                 task.cancel()

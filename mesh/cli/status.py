@@ -237,7 +237,9 @@ def _describe_bridge(how: BridgeStatus) -> dict[str, str]:
 def _describe_content(content: ContentMetrics) -> str:
     fetched = f"{plural(content.fetched, 'file')} fetched ({format_size(content.fetched_bytes)})"
     added = f"{content.added:,} added ({format_size(content.added_bytes)})"
-    return f"{fetched}, {added}, {plural(content.answered, 'block')} served, {content.lies:,} invalid ones rejected"
+    served = f"{plural(content.answered, 'block')} served, {content.lies:,} invalid ones rejected"
+    queued = f"{content.adds_queued + content.fetches_queued:,} queued, {content.failed:,} failed"
+    return f"{fetched}, {added}, {served}, {queued}"
 
 
 def _describe_direction(direction: DirectionStatus) -> str:

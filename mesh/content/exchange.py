@@ -124,6 +124,15 @@ class Exchange:
             held = await asyncio.to_thread(self._store.checked, cid)
             return held or await self._download(cid, size_limit, timeout, progress)
 
+    async def is_held(self, cid: str, *, timeout: float) -> bool:
+        """Whether somebody on the mesh replies with the first block of a file within `timeout` seconds."""
+        requester = BlockRequester(self._session, self._liars)
+        asking = asyncio.to_thread(requester.request_from_all, cid, timeout=timeout, hear_liars=True)
+        try:
+            return await asking is not None
+        finally:
+            requester.cancel()
+
     def statistics(self) -> ExchangeStatistics:
         """A snapshot of the counters. The blocks of a fetch are counted when it ends."""
         server = self._server

@@ -153,7 +153,7 @@ async def test_a_file_of_the_mesh_is_added_under_its_cid_and_pinned_on_providers
 async def test_a_file_named_before_it_exists_is_added_later(
     swarm: Swarm, bob: LegacyClient, router: EmbeddedRouter, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level(logging.DEBUG, "bridges.ipfs.content")
+    caplog.set_level(logging.DEBUG, "bridges.ipfs.transfer_queue")
     content = content_of(1000, str(tmp_path))
     async with (
         agent(router.endpoint, tmp_path / "agent") as person,
@@ -166,7 +166,7 @@ async def test_a_file_named_before_it_exists_is_added_later(
         ) as bridge,
     ):
         bridge.content.schedule_add(cid_of_bytes(content))
-        await until(lambda: "add-retried" in events(caplog), seconds=SECONDS)
+        await until(lambda: "transfer-retried" in events(caplog), seconds=SECONDS)
         cid = await asyncio.to_thread(person.store.put_bytes, content)
         await until(lambda: bridge.content.metrics().added == 1, seconds=SECONDS)
         assert bridge.content.metrics().failed == 0

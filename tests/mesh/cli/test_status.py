@@ -180,7 +180,10 @@ def test_a_bridge_is_described() -> None:
     assert "content" not in shown
     counters = dict.fromkeys(ContentMetrics.__struct_fields__, 0) | {"fetched": 2, "fetched_bytes": 2048, "lies": 1}
     content = describe_status(msgspec.structs.replace(bridge_status(), content=ContentMetrics(**counters)))["content"]
-    assert content == "2 files fetched (2.0 KiB), 0 added (0 bytes), 0 blocks served, 1 invalid ones rejected"
+    assert (
+        content
+        == "2 files fetched (2.0 KiB), 0 added (0 bytes), 0 blocks served, 1 invalid ones rejected, 0 queued, 0 failed"
+    )
 
 
 def test_a_summary_begins_with_the_part_that_is_not_alive() -> None:
