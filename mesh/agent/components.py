@@ -16,7 +16,7 @@ from mesh.flood import Drops
 from mesh.network import Channel, Network, Services
 from mesh.outage_log import OutageLog
 from mesh.private_files import make_private_folder
-from mesh.work.ledger import Ledger
+from mesh.work.ledger import LISTENER, Ledger
 from mesh.work.outbox import RESEND, Outbox
 
 if TYPE_CHECKING:
@@ -123,12 +123,14 @@ async def working(
             chain = await stack.enter_async_context(chain_of(settings, account))
         home = settings.state_directory / account.address
         directory = await state_folder(settings, chain, account.address)
-        chain_head = ChainHead(await chain.block_number())
+        ledger = await stack.enter_async_context(Ledger(directory / LEDGER))
+        # What an earlier run has not read may have made contracts of orders that have expired meanwhile.
+        handled = await ledger.cursor(LISTENER)
+        chain_head = ChainHead(await chain.block_number() if handled is None else handled)
         network = await stack.enter_async_context(Network(endpoints_of(settings)))
         channel = await stack.enter_async_context(
             await _channel_of(settings.lighthouse_contract, network, chain=chain, head=chain_head, drops=drops)
         )
-        ledger = await stack.enter_async_context(Ledger(directory / LEDGER))
         store = await asyncio.to_thread(
             Store, home / "content", limit=settings.objective_expanded_limit, quota=settings.content_limit
         )

@@ -33,7 +33,7 @@ from mesh.chain import (
 from mesh.errors import ChainError
 from mesh.log_context import liability_context, log_event, with_liability_context
 from mesh.retry import Backoff
-from mesh.work.ledger import TO_BE_DONE, Phase, advance
+from mesh.work.ledger import LISTENER, TO_BE_DONE, Phase, advance
 from mesh.work.outbox import result_identity
 from schemas import Result, decode
 
@@ -57,7 +57,7 @@ NEVER: Final = 2**63
 class ChainListener:
     """Reads the chain for one agent. An agent that never ran begins at the head."""
 
-    CURSOR: Final = "listener"
+    CURSOR: Final = LISTENER
     """The name of its position in the ledger."""
 
     def __init__(self, parts: AgentComponents, trader: Trader, executor: Executor, *, on_phase: OnPhase) -> None:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
+LISTENER: Final = "listener"
+"""The reader of the chain whose position is how far the agent has handled it."""
 POST: Final = "INSERT OR IGNORE INTO outbox (identity, kind, payload, deadline, posted) VALUES (?, ?, ?, ?, ?)"
 SPENT_KEPT: Final = 4096
 """Most orders that are kept after they became contracts. A reorganisation replaces only the last blocks."""

@@ -23,11 +23,16 @@ if TYPE_CHECKING:
     from mesh.work.ledger import JobRecord
     from schemas import Liability
     from tests.simulation.market import Market
+    from tests.simulation.roles import Role
 
 INVALID: Final = frozenset(
     {"played", "sequence", "statistics", "readable", "result-file", "objective-file", "signature", "times"}
 )
 """The findings of `aira verify` that no job of an honest robot may have."""
+MATCHED_WITHIN: Final = 40
+"""Blocks without faults within which an open order becomes a contract, if there are robots."""
+DONE_WITHIN: Final = 70
+"""Blocks without faults within which a robot's result is on the chain. The refund delay is longer."""
 
 
 class Audit:
@@ -40,10 +45,12 @@ class Audit:
         self.refunded: set[str] = set()
         self.open: set[str] = set()
         self.paid_twice = 0
+        self._promisors: dict[str, str] = {}
 
-    def _events(self) -> list[ChainEvent | None]:
-        """All events on the chain."""
-        response = {"result": list(self._chain.evm.logs(self._chain.began + 1, self._chain.evm.head))}
+    def _events(self, first: int | None = None, last: int | None = None) -> list[ChainEvent | None]:
+        """All events on the chain, or those of some blocks."""
+        chain = self._chain
+        response = {"result": list(chain.evm.logs(first or chain.began + 1, last or chain.evm.head))}
         return [decode_log(log) for log in decode_answer("eth_getLogs", response, ANSWERS["eth_getLogs"])]
 
     def liabilities(self) -> dict[str, Finalized | None]:
@@ -93,7 +100,7 @@ class Audit:
             order.order: order
             for person in self._market.people
             for order in person.orders
-            if order.order and order.told in self._market.final_words
+            if order.order and order.is_dead
         }
         async with Chain(node, ens=self._market.deployed.market.deployment.ens) as chain:
             for address in self.liabilities():
@@ -101,6 +108,7 @@ class Audit:
                 if (believed := dead.get(demand.hex())) is not None and not self._chain.reorganisations:
                     self._market.violated("promise-broken", f"{believed.person} was told {believed.told!r}; {address}")
                 record = await chain.liabilities.get(address)
+                self._promisors[address] = record.promisor
                 self._told(address, told.get(address), record)
                 if record.is_finalized and record.is_success:
                     if self._market.fails(address):
@@ -110,6 +118,10 @@ class Audit:
             is_gone = order.told in ("paid", "refunded") and address not in self.liabilities()
             if is_gone and not self._chain.reorganisations:
                 self._market.violated("promise-broken", f"{order.person} was told {order.told!r}; {address} is gone")
+
+    def jobs_of(self, robot: Role) -> set[str]:
+        """The liabilities of a robot."""
+        return {address for address, promisor in self._promisors.items() if promisor == robot.account.address}
 
     def _told(self, address: str, order: object, record: Liability) -> None:
         told = getattr(order, "told", None)
@@ -139,10 +151,37 @@ class Audit:
             if is_open or (finding.holds is False and finding.name in INVALID):
                 self._market.violated("recording-incomplete", f"{record.address} {finding.name}: {finding.detail}")
 
+    def liveness(self) -> None:
+        """Without faults, orders that stay open are matched, and robots bring their results before the refund."""
+        calm, blocks = self._market.calm_since, self._blocks()
+        for person in self._market.people:
+            for order in person.orders:
+                open_for = order.deadline - max(order.posted, calm)
+                if order.told == "expired" and open_for >= MATCHED_WITHIN:
+                    detail = f"{person.name} waited {open_for} blocks without faults for {order.order[:12]}"
+                    self._market.violated("order-starved", detail)
+        gone = {address for robot in self._market.robots if robot.has_left for address in self.jobs_of(robot)}
+        for address, (created, ended, result) in blocks.items():
+            if address not in gone and ended and not result and ended - max(created, calm) >= DONE_WITHIN:
+                self._market.violated("job-abandoned", f"{address}: {ended - max(created, calm)} blocks without faults")
+
+    def _blocks(self) -> dict[str, tuple[int, int, str]]:
+        """Of each liability: in which block it was created, in which it ended (0: in none), and with what result."""
+        found: dict[str, tuple[int, int, str]] = {}
+        for number in range(self._chain.began + 1, self._chain.evm.head + 1):
+            for event in self._events(number, number):
+                if isinstance(event, NewLiability):
+                    found[event.liability] = (number, 0, "")
+                elif isinstance(event, Finalized) and event.liability in found:
+                    found[event.liability] = (found[event.liability][0], number, event.result)
+        return found
+
     def ledgers(self) -> None:
         """Each robot's ledger says of its jobs what the chain says."""
         ended = self.liabilities()
         for robot in self._market.robots:
+            if robot.has_left:
+                continue
             jobs = {job.liability.address: job for job in _jobs(robot.folder)}
             for address, job in jobs.items():
                 finalized = ended.get(address)

@@ -6,22 +6,24 @@ Each process reaches it through a node of its own, which may be slow, silent or 
 from __future__ import annotations
 
 import asyncio
-from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import msgspec
 from web3.providers.async_base import AsyncBaseProvider
 
+from mesh.chain.answers import ANSWERS, Count
 from mesh.devchain.bounded_vm import GAS_LIMIT
 from mesh.devchain.calls import Call, Calls, parse_call
 from mesh.devchain.evm import Evm
 from mesh.devchain.jsonrpc import SERVER_ERROR, RpcError, parse_data
 from mesh.devchain.methods import Methods
+from tests.simulation.chance import FaultDraw
 from tests.simulation.model_transactions import read_transaction
 from tests.simulation.threads import scheduler
 
 if TYPE_CHECKING:
+    import random
     from collections.abc import Callable
 
     from tests.simulation.model import ModelChain
@@ -42,7 +44,7 @@ class NodeFaults:
     late: float = 0.0
     spoilt: float = 0.0
     lost_after_sending: float = 0.0
-    seen: Counter[str] = field(default_factory=Counter)
+    draw: FaultDraw = field(default_factory=FaultDraw)
 
     def stop(self) -> None:
         """Answer properly from now on."""
@@ -56,7 +58,7 @@ class MiningFaults:
     leave_out: float = 0.0
     forget: float = 0.0
     price_factor: float = 1.0
-    seen: Counter[str] = field(default_factory=Counter)
+    draw: FaultDraw = field(default_factory=FaultDraw)
 
 
 @dataclass(frozen=True)
@@ -179,9 +181,7 @@ class SimulatedChain:
         self.evm.rewind(head - depth)
         for number in sorted(number for number in self.mined if number > head - depth):
             transaction = self.mined.pop(number)
-            if scheduler().random.random() < forget:
-                self.faults.seen["transaction-forgotten"] += 1
-            else:
+            if not self.faults.draw("transaction-forgotten", forget):
                 self.pool.setdefault((transaction.sender, transaction.nonce), transaction)
         self.reorganisations += 1
         self.deepest = max(self.deepest, depth)
@@ -196,12 +196,10 @@ class SimulatedChain:
         chance.shuffle(waiting)
         waiting.sort(key=lambda one: one.nonce)  # stable: of each sender in order
         for one in waiting:
-            if self.faults.forget and chance.random() < self.faults.forget:
-                self.faults.seen["transaction-forgotten"] += 1
+            if self.faults.draw("transaction-forgotten", self.faults.forget):
                 del self.pool[one.sender, one.nonce]
                 continue
-            if self.faults.leave_out and chance.random() < self.faults.leave_out:
-                self.faults.seen["transaction-left-out"] += 1
+            if self.faults.draw("transaction-left-out", self.faults.leave_out):
                 continue
             if one.price < self.evm.base_fee * self.faults.price_factor:
                 continue
@@ -237,28 +235,23 @@ class SimulatedNode(AsyncBaseProvider):
 
     async def make_request(self, method: Any, params: Any) -> Any:
         """A JSON-RPC response, or one of the faults."""
-        chance, faults, seen = scheduler().random, self._faults, self._faults.seen
-        await asyncio.sleep(chance.uniform(*LATENCY))
-        if faults.unreachable and chance.random() < faults.unreachable:
-            seen["node-unreachable"] += 1
+        faults, draw = self._faults, self._faults.draw
+        await asyncio.sleep(scheduler().random.uniform(*LATENCY))
+        if draw("node-unreachable", faults.unreachable):
             raise ConnectionRefusedError(111, "Connection refused")
-        if faults.silent and chance.random() < faults.silent:
-            seen["node-silent"] += 1
+        if draw("node-silent", faults.silent):
             await asyncio.sleep(3600)
-        if faults.late and chance.random() < faults.late:
-            seen["node-late"] += 1
-            await asyncio.sleep(chance.uniform(0.1, 10))
+        if draw("node-late", faults.late):
+            await asyncio.sleep(draw.random.uniform(0.1, 10))
         response: dict[str, Any] = {"jsonrpc": "2.0", "id": 0}
         try:
             response["result"] = self._chain.answer(method, list(params))
         except RpcError as error:
             response["error"] = error.as_object()
-        if method == SEND and faults.lost_after_sending and chance.random() < faults.lost_after_sending:
-            seen["answer-lost"] += 1
+        if method == SEND and draw("answer-lost", faults.lost_after_sending):
             raise ConnectionResetError(104, "Connection reset by peer")
-        if faults.spoilt and chance.random() < faults.spoilt:
-            seen["answer-spoilt"] += 1
-            return spoil(response)
+        if draw("answer-spoilt", faults.spoilt):
+            return spoil(method, response, draw.random)
         return response
 
     async def is_connected(self, show_traceback: bool = False) -> bool:
@@ -269,11 +262,12 @@ class SimulatedNode(AsyncBaseProvider):
         return f"the simulated node {self._number}"
 
 
-def spoil(response: dict[str, Any]) -> Any:
+def spoil(method: str, response: dict[str, Any], chance: random.Random) -> Any:
     """A response in which something is wrong, and can be seen to be: not an empty list in place of events."""
-    chance = scheduler().random
     result = response.get("result")
     others: list[Any] = [None, "", "0x", {}, "0xzz", 7]
+    if ANSWERS.get(method) is Count:
+        others.append("0x" + "ff" * 32)
     if not isinstance(result, list):
         others.append([])
     if isinstance(result, list) and result and isinstance(result[0], dict):

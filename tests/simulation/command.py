@@ -11,11 +11,10 @@ import logging
 import os
 import subprocess
 import sys
-import traceback
 from asyncio import Queue
 from collections import Counter
-from dataclasses import asdict, fields
-from typing import TYPE_CHECKING, Any, Final, NoReturn
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any, Final
 
 from tests.simulation import history, router, threads
 from tests.simulation.history import Report
@@ -25,8 +24,10 @@ router.install(lambda: history.CURRENT[-1])  # type: ignore[arg-type,return-valu
 
 from mesh.chain.web3_provider import ReliableProvider  # noqa: E402, F401
 from tests.simulation.deployment import ON_EVM, ON_MODEL, Deployments  # noqa: E402
-from tests.simulation.faults import FaultPlan  # noqa: E402
-from tests.simulation.mutations import CANDIDATES, MUTATIONS, SEEDS, Mutation  # noqa: E402
+from tests.simulation.faults import KINDS  # noqa: E402
+from tests.simulation.mutants import find_mutants  # noqa: E402
+from tests.simulation.runs import Run, numbers_in, run_in_child  # noqa: E402
+from tests.simulation.shrinking import Shrinking  # noqa: E402
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -34,8 +35,6 @@ if TYPE_CHECKING:
 
 JOBS: Final = 6
 """Jobs in one history, at most."""
-MUTANT_JOBS: Final = 2
-"""Jobs in a history with a planted bug."""
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -47,12 +46,16 @@ def main(arguments: Sequence[str]) -> None:
     began = REAL_TIME()
     deployed = Deployments(options.chain)
     if options.mutants:
-        _find_mutants(deployed, options)
+        found_all = find_mutants(deployed, options.seed, options.mutant)
+        sys.stdout.flush()
+        os._exit(0 if found_all else 1)
     total = Report(options.seed)
-    for jobs, report in _histories(deployed, options):
+    for run, report in _histories(deployed, options):
         _add(total, report)
         if report.violations:
-            _print_failure(report, jobs, options)
+            _print_failure(report, run)
+            if options.shrink:
+                _shrink(deployed, run, options.shrink)
         elif not options.json:
             print(f"seed {report.seed}: {report.jobs} jobs, {report.paid} paid", flush=True)
         if options.seconds and REAL_TIME() - began > options.seconds:
@@ -79,6 +82,10 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--switches", metavar="FILE", help="write each switch of threads to a file")
     parser.add_argument("--mutants", action="store_true", help="plant each bug in turn, and search until it is found")
     parser.add_argument("--mutant", default="", help="only planted bugs whose name contains this")
+    parser.add_argument("--plant", default="", help="plant this bug of mutations.py in all histories")
+    parser.add_argument("--shrink", type=int, nargs="?", const=100, default=0, metavar="RUNS", help="reduce failures")
+    parser.add_argument("--leave-out", type=numbers_in, default=frozenset(), help="faults by number, such as 0-4,7")
+    parser.add_argument("--lasts", type=float, default=None, help="seconds after which all faults stop")
     parser.add_argument(
         "--chain", choices=(ON_MODEL, ON_EVM), default=None, help="what runs the contracts; by default the seed chooses"
     )
@@ -89,7 +96,7 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
     if options.seed is None:
         options.seed = int.from_bytes(os.urandom(4), "big")
         print(f"seed {options.seed}", file=sys.stderr)
-    names = {field.name for field in fields(FaultPlan)}
+    names = set(KINDS)
     only, without = (frozenset(filter(None, text.split(","))) for text in (options.only, options.without))
     if (only | without) - names - {"none"}:
         parser.error(f"faults are {', '.join(sorted(names))}")
@@ -113,74 +120,21 @@ def _print_logs() -> None:
     logging.getLogger("mesh").addHandler(SimulatedHandler(sys.stdout))
 
 
-def _histories(deployed: Deployments, options: argparse.Namespace) -> Iterator[tuple[int, Report]]:
+def _histories(deployments: Deployments, options: argparse.Namespace) -> Iterator[tuple[Run, Report]]:
     left, seed = options.jobs, options.seed
     while left > 0:
-        jobs = min(left, JOBS)
-        yield jobs, _in_child(deployed, seed, jobs, options)
-        left, seed = left - jobs, seed + 1
-
-
-def _find_mutants(deployed: Deployments, options: argparse.Namespace) -> NoReturn:
-    """Plant each bug in turn, until a history violates an invariant that holds without it. Ends with 1 if one hides."""
-    missed, chosen = (
-        0,
-        [one for one in (*MUTATIONS, *(CANDIDATES if options.mutant else ())) if options.mutant in one.name],
-    )
-    options.without = frozenset()
-    for mutation in chosen:
-        mutation.source()
-    for mutation in chosen:
-        options.only = frozenset(mutation.faults.split(","))
-        for attempt in range(1, SEEDS + 1):
-            seed = options.seed + attempt - 1
-            report = _in_child(deployed, seed, MUTANT_JOBS, options, mutation)
-            if report.violations and not _in_child(deployed, seed, MUTANT_JOBS, options).violations:
-                print(f"found with seed {report.seed} ({attempt}): {mutation.name}: {report.violations[0]}", flush=True)
-                break
-        else:
-            missed += 1
-            print(f"NOT FOUND within {SEEDS} seeds: {mutation.name}", flush=True)
-    print(f"{len(chosen) - missed} of {len(chosen)} planted bugs found", flush=True)
-    os._exit(1 if missed else 0)
-
-
-def _in_child(
-    deployed: Deployments, seed: int, jobs: int, options: argparse.Namespace, mutation: Mutation | None = None
-) -> Report:
-    """Run a history in a process of its own: nothing is left of it for the next one."""
-    kind = ON_MODEL if mutation is not None and options.chain is None else deployed.kind(seed)
-    market = deployed.market(kind)
-    reading, writing = os.pipe()
-    child = os.fork()
-    if child == 0:
-        os.close(reading)
-        code = 1
-        try:
-            if mutation is not None:
-                mutation.apply()
-            plan = history.plan_of(seed, only=options.only, without=options.without)
-            report, lines = history.run_history(market, seed, jobs, plan, switches=options.switches)
-            if options.trace:
-                print(plan, *lines, sep="\n", flush=True)
-            with os.fdopen(writing, "w") as pipe:
-                json.dump(asdict(report), pipe)
-            code = 0
-        except BaseException:
-            traceback.print_exc()
-        finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(code)
-    os.close(writing)
-    with os.fdopen(reading) as pipe:
-        said = pipe.read()
-    os.waitpid(child, 0)
-    if not said:
-        return Report(seed, violations=["history-failed: the process of the history ended"])
-    report = Report(**json.loads(said))
-    report.chains = {kind: 1}
-    return report
+        run = Run(
+            seed,
+            min(left, JOBS),
+            options.only,
+            options.without,
+            options.leave_out,
+            options.lasts,
+            options.chain or "",
+            options.plant,
+        )
+        yield run, run_in_child(deployments, run, trace=options.trace, switches=options.switches)
+        left, seed = left - run.jobs, seed + 1
 
 
 def _add(total: Report, report: Report) -> None:
@@ -195,15 +149,22 @@ def _add(total: Report, report: Report) -> None:
     total.trace = report.trace
 
 
-def _print_failure(report: Report, jobs: int, options: argparse.Namespace) -> None:
+def _print_failure(report: Report, run: Run) -> None:
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
-    only = f" --only {','.join(sorted(options.only))}" if options.only else ""
-    only += f" --without {','.join(sorted(options.without))}" if options.without else ""
     print(f"FAILED at commit {commit.stdout.strip()}; replay with", file=sys.stderr)
-    print(f'    make simulate ARGS="--seed {report.seed} --jobs {jobs}{only} --trace"', file=sys.stderr)
+    print(f'    make simulate ARGS="{run.arguments()} --trace"', file=sys.stderr)
     for violation in report.violations:
         print(f"  {violation}", file=sys.stderr)
     sys.stderr.flush()
+
+
+def _shrink(deployments: Deployments, run: Run, most: int) -> None:
+    """Reduce a failing history, and print what is left of it."""
+    shrinking = Shrinking(deployments, run, most=most)
+    before, small = shrinking.report.drawn, shrinking.shrink()
+    report = shrinking.report
+    print(f"after {shrinking.runs} runs: {small.jobs} jobs, {report.drawn} faults of {before}", file=sys.stderr)
+    _print_failure(report, small)
 
 
 def _print_total(total: Report) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from mesh.chain import XRT, Account, Chain, Timing
+from mesh.chain.deploy import DeploymentPlan
 from mesh.devchain.development import ALLOWANCE, DevelopmentMarket, deploy_market
 from schemas import cid_of_bytes
 from tests.simulation import loop, threads
@@ -31,6 +32,9 @@ PLAIN: Final = 0.5
 """How many markets are as small as possible."""
 LIFETIMES: Final = (4, 8, 60, 60, 60)
 """Blocks for which an order is valid: sometimes so few that it expires while it is matched."""
+
+
+PLAN: Final = DeploymentPlan(timeout_blocks=100, refund_delay=100)
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,7 @@ def found(chain: SimulatedChain, scheduler: Scheduler) -> Deployed:
 
     async def main() -> None:
         node = SimulatedNode(chain, NodeFaults())
-        market = await deploy_market(node, keys)
+        market = await deploy_market(node, keys, plan=PLAN)
         async with Chain(node, account=market.accounts["provider"], ens=market.deployment.ens, timing=TIMING) as client:
             for account in accounts.values():
                 await client.tokens.transfer(account.address, ALLOWANCE)

@@ -28,6 +28,8 @@ class FaultPlan:
     drop: float = 0.0
     duplicate: float = 0.0
     delay: float = 0.0
+    replay: float = 0.0
+    """That a message arrives again, up to minutes later: anybody may repeat what is signed."""
     partition_every: float = 0.0
     router_every: float = 0.0
     crash: float = 0.0
@@ -44,13 +46,20 @@ class FaultPlan:
     lost_after_sending: float = 0.0
     outage_every: float = 0.0
     clock_every: float = 0.0
+    full_every: float = 0.0
+    """Disks that are full for a while."""
+    leave: float = 0.0
+    """That a robot leaves for good; another one stays."""
     preempt: float = 0.0
+    lasts: float = 0.0
+    """Seconds after which all faults stop, though people go on; zero: not before people are done, or time is up."""
 
 
 RANGES: Final[dict[str, tuple[float, float]]] = {
     "drop": (0.02, 0.4),
     "duplicate": (0.05, 0.5),
     "delay": (0.05, 0.5),
+    "replay": (0.05, 0.5),
     "partition_every": (30, 300),
     "router_every": (100, 600),
     "crash": (0.1, 0.7),
@@ -66,8 +75,14 @@ RANGES: Final[dict[str, tuple[float, float]]] = {
     "lost_after_sending": (0.05, 0.3),
     "outage_every": (60, 400),
     "clock_every": (2, 200),
+    "full_every": (30, 300),
+    "leave": (0.3, 1.0),
     "preempt": (0.01, 0.1),
 }
+
+
+KINDS: Final = tuple(field.name for field in fields(FaultPlan) if field.name in RANGES)
+LASTS: Final = (10, 150)
 
 
 def choose(
@@ -75,10 +90,11 @@ def choose(
 ) -> FaultPlan:
     """The faults of a history: all of the kinds in `only`, or of all kinds but `without` some."""
     plan, level = FaultPlan(), chance.choice(SHARES) if only is None else 1.0
-    for field in fields(plan):
-        is_chosen, value = chance.random() < level, chance.uniform(*RANGES[field.name])
-        if is_chosen and (only is None or field.name in only) and field.name not in without:
-            setattr(plan, field.name, value)
+    for name in KINDS:
+        is_chosen, value = chance.random() < level, chance.uniform(*RANGES[name])
+        if is_chosen and (only is None or name in only) and name not in without:
+            setattr(plan, name, value)
+    plan.lasts = chance.choice([0.0, chance.uniform(*LASTS)])
     return plan
 
 
@@ -89,6 +105,7 @@ class Faults:
         self._market = market
         self._scheduler = market.scheduler
         self._plan = plan
+        self._draw = market.draw
         market.plan_crash = self._plan_crash
 
     def start(self) -> None:
@@ -96,11 +113,14 @@ class Faults:
         market, plan = self._market, self._plan
         transport, mining = market.router.faults, market.deployed.chain.faults
         transport.drop, transport.duplicate, transport.delay = plan.drop, plan.duplicate, plan.delay
+        transport.replay = plan.replay
         mining.forget, mining.leave_out = plan.forget, plan.leave_out
         self._scheduler.preempt = plan.preempt
         for faults in (faults for role in market.roles for faults in role.all_node_faults):
             faults.unreachable, faults.silent, faults.late = plan.unreachable, plan.silent, plan.late
             faults.spoilt, faults.lost_after_sending = plan.spoilt, plan.lost_after_sending
+        if self._draw("robot-left", plan.leave):
+            self._scheduler.call_later(self._draw.random.uniform(5, 300), self._leave)
         every = {
             self._partition: plan.partition_every,
             self._router: plan.router_every,
@@ -109,6 +129,7 @@ class Faults:
             self._price: plan.price_every,
             self._outage: plan.outage_every,
             self._clock: plan.clock_every,
+            self._fill: plan.full_every,
         }
         for fault, mean in every.items():
             if mean:
@@ -119,10 +140,11 @@ class Faults:
         market = self._market
         market.is_calm = True
         faults, mining = market.router.faults, market.deployed.chain.faults
-        faults.drop = faults.duplicate = faults.delay = 0.0
+        faults.drop = faults.duplicate = faults.delay = faults.replay = 0.0
         mining.forget = mining.leave_out = 0.0
         mining.price_factor = 1.0
         self._scheduler.preempt = 0.0
+        market.disk.full.clear()
         market.router.set_up(True)
         for session in market.router.sessions:
             session.set_linked(True)
@@ -134,43 +156,49 @@ class Faults:
 
     def _later(self, mean: float, fault: object, *arguments: object) -> None:
         assert callable(fault)
-        self._scheduler.call_later(self._scheduler.random.expovariate(1 / mean), fault, *arguments)
+        self._scheduler.call_later(self._draw.random.expovariate(1 / mean), fault, *arguments)
 
     def _again(self, fault: object, mean: float, kind: str) -> bool:
-        """Whether the faults go on; then the next one is planned."""
+        """Whether the fault happens now; the next one is planned, while there are faults."""
         if self._market.is_calm:
             return False
         self._later(mean, fault, mean)
-        self._market.faults_seen[kind] += 1
-        return True
+        return self._draw(kind)
 
     def _plan_crash(self, role: Role, process: Process) -> None:
-        chance = self._scheduler.random
-        if chance.random() < self._plan.crash:
+        chance = self._draw.random
+        if self._draw("crash-planned", self._plan.crash):
             if chance.random() < 0.6:
                 process.crash_at_step = int(chance.lognormvariate(5.5, 1.5)) + 1
             else:
-                process.crash_at_commit = chance.randint(1, 25)
+                process.crash_at_commit = chance.randint(1, 60)
+
+    def _leave(self) -> None:
+        robot = self._market.robots[-1]
+        if not self._market.is_calm:
+            robot.has_left = True
+            self._market.trace(robot.name, "leaves")
+            robot.crash()
 
     def _crash(self, mean: float) -> None:
         if self._again(self._crash, mean, "crash"):
-            self._scheduler.random.choice(self._market.roles).crash()
+            self._draw.random.choice(self._market.roles).crash()
 
     def _partition(self, mean: float) -> None:
         sessions = self._market.router.sessions
         if self._again(self._partition, mean, "partition") and sessions:
-            session = self._scheduler.random.choice(sessions)
+            session = self._draw.random.choice(sessions)
             session.set_linked(False)
-            self._scheduler.call_later(self._scheduler.random.uniform(1, 60), session.set_linked, True)
+            self._scheduler.call_later(self._draw.random.uniform(1, 60), session.set_linked, True)
 
     def _router(self, mean: float) -> None:
         if self._again(self._router, mean, "router-restart"):
             self._market.router.set_up(False)
-            self._scheduler.call_later(self._scheduler.random.uniform(1, 60), self._market.router.set_up, True)
+            self._scheduler.call_later(self._draw.random.uniform(1, 60), self._market.router.set_up, True)
 
     def _reorganise(self, mean: float) -> None:
         if self._again(self._reorganise, mean, "reorganisation"):
-            chance = self._scheduler.random
+            chance = self._draw.random
             depth = chance.choice([1, 1, 1, 2, 2, 3, chance.randint(1, MOST_BLOCKS)])
             chain = self._market.deployed.chain
             before = chain.evm.head
@@ -179,13 +207,14 @@ class Faults:
 
     def _price(self, mean: float) -> None:
         if self._again(self._price, mean, "gas-price"):
-            faults, chance = self._market.deployed.chain.faults, self._scheduler.random
+            faults, chance = self._market.deployed.chain.faults, self._draw.random
             faults.price_factor = chance.choice([1.5, 3, 20, 2000])
             self._scheduler.call_later(chance.uniform(10, 200), setattr, faults, "price_factor", 1.0)
 
     def _outage(self, mean: float) -> None:
         if self._again(self._outage, mean, "node-outage"):
-            faults, chance = self._scheduler.random.choice(self._market.roles).node_faults, self._scheduler.random
+            chance = self._draw.random
+            faults = chance.choice(self._market.roles).node_faults
             before, faults.unreachable = faults.unreachable, 1.0
             ends = min(before, 0.9)
             self._scheduler.call_later(chance.uniform(5, 120), self._outage_over, faults, ends)
@@ -195,8 +224,16 @@ class Faults:
 
     def _clock(self, mean: float) -> None:
         if self._again(self._clock, mean, "clock-jump"):
-            chance = self._scheduler.random
+            chance = self._draw.random
             role = chance.choice(self._market.roles)
             role.wall_offset_ns += chance.choice([-HOUR_NS, HOUR_NS, -SECOND, 24 * HOUR_NS])
             if role.process is not None:
                 role.process.wall_offset_ns = role.wall_offset_ns
+
+    def _fill(self, mean: float) -> None:
+        if self._again(self._fill, mean, "disk-full"):
+            chance, disk = self._draw.random, self._market.disk
+            name = chance.choice(self._market.roles).name
+            disk.full.add(name)
+            self._market.trace(name, "disk-full")
+            self._scheduler.call_later(chance.uniform(1, 60), disk.full.discard, name)

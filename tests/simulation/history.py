@@ -8,13 +8,13 @@ import random
 import shutil
 import tempfile
 import time
-from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from tests.simulation import loop, threads
 from tests.simulation.audit import Audit
+from tests.simulation.chance import FaultDraw
 from tests.simulation.deployment import market_plan
 from tests.simulation.faults import Faults, choose
 from tests.simulation.market import Market
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 CHAOS_SECONDS: Final = 400
 """How long faults happen, for each job of a person."""
 CALM_SECONDS: Final = 900
-"""How long everything has after that to end: the bound within which each accepted job is paid or refunded."""
+"""How long everything has after that to end, for each job of a person: within it accepted jobs are paid or refunded."""
 FOLDER: Final = Path("/dev/shm" if Path("/dev/shm").is_dir() else tempfile.gettempdir()) / "aira-simulation"
 
 
@@ -40,6 +40,7 @@ class Report:
     paid: int = 0
     refunded: int = 0
     lost: int = 0
+    """Jobs whose contract has not ended."""
     paid_twice: int = 0
     violations: list[str] = field(default_factory=list)
     faults: dict[str, int] = field(default_factory=dict)
@@ -50,6 +51,8 @@ class Report:
     simulated_s: float = 0.0
     real_s: float = 0.0
     cpu_s: float = 0.0
+    drawn: int = 0
+    """Faults that happened in the history of the report, and were left out."""
     trace: str = ""
     """The hash of the trace."""
 
@@ -60,9 +63,15 @@ def plan_of(seed: int, *, only: frozenset[str] | None = None, without: frozenset
 
 
 def run_history(
-    deployed: Deployed, seed: int, jobs: int, plan: FaultPlan, *, switches: str | None = None
+    deployed: Deployed,
+    seed: int,
+    jobs: int,
+    plan: FaultPlan,
+    *,
+    left_out: frozenset[int] = frozenset(),
+    switches: str | None = None,
 ) -> tuple[Report, list[str]]:
-    """Run the history of a seed with these faults; what happened, and its trace.
+    """Run the history of a seed with these faults, but those with the numbers `left_out`; its report and its trace.
 
     Each switch of threads is written to the file `switches`: where two runs of a seed differ, it shows where it begins.
     """
@@ -76,7 +85,8 @@ def run_history(
     folder.mkdir(parents=True)
     os.chdir(folder)
     try:
-        market = Market(scheduler, deployed, Path("market"), jobs, plan=market_plan(seed))
+        draw = FaultDraw(seed, left_out)
+        market = Market(scheduler, deployed, Path("market"), jobs, draw, plan=market_plan(seed))
         market.folder.mkdir()
         CURRENT[:] = [market.router]
         try:
@@ -99,12 +109,16 @@ def _play(market: Market, plan: FaultPlan) -> None:
     faults = Faults(market, plan)
     market.begin()
     faults.start()
-    chaos = CHAOS_SECONDS * max(person.wanted for person in market.people)
-    scheduler.run(lambda: all(person.is_done for person in market.people), until_ns=scheduler.now_ns + chaos * SECOND)
+    most = max(person.wanted for person in market.people)
+    chaos = plan.lasts or CHAOS_SECONDS * most
+    scheduler.run(
+        lambda: all(person.is_done for person in market.people), until_ns=scheduler.now_ns + round(chaos * SECOND)
+    )
     faults.stop()
-    market.trace("faults", "stopped")
+    market.calm_since = market.deployed.chain.evm.head
+    market.trace("faults", "stopped", block=market.calm_since)
     audit = market.audit = Audit(market)
-    scheduler.run(lambda: _is_settled(market, audit), until_ns=scheduler.now_ns + CALM_SECONDS * SECOND)
+    scheduler.run(lambda: _is_settled(market, audit), until_ns=scheduler.now_ns + CALM_SECONDS * most * SECOND)
     for person in market.people:
         for order in person.orders:
             if not order.is_over:
@@ -116,6 +130,7 @@ def _play(market: Market, plan: FaultPlan) -> None:
         raise errors[0]
     audit.money()
     audit.ledgers()
+    audit.liveness()
     for address in sorted(audit.open):
         market.violated("not-finalized", address)
     market.is_over = True
@@ -138,11 +153,11 @@ SETTLED_BLOCKS: Final = 5
 def _report(market: Market, seed: int) -> Report:
     orders = [order for person in market.people for order in person.orders]
     audit = market.audit
-    report = Report(seed, jobs=len(orders), violations=market.violations)
+    report = Report(seed, jobs=len(orders), violations=market.violations, drawn=market.draw.drawn)
     if audit is not None:
         report.paid, report.refunded, report.lost = len(audit.paid), len(audit.refunded), len(audit.open)
         report.paid_twice = audit.paid_twice
-    counts = Counter(market.faults_seen)
+    counts = market.draw.counts
     counts["reorganisation-blocks"] = market.deployed.chain.deepest
     report.faults = {kind: count for kind, count in sorted(counts.items()) if count}
     report.markets = dict.fromkeys(market.plan.kinds, 1)

@@ -5,19 +5,20 @@ from __future__ import annotations
 import logging
 import os
 import traceback
-from collections import Counter
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from mesh.errors import AiraError
 from mesh.recording.mcap_writer import McapWriter
 from mesh.running import cause_of
 from schemas import EMPTY, cid_of_file
+from tests.simulation.chance import FaultDraw
 from tests.simulation.deployment import BLOCK_SECONDS, PEOPLE, ROBOTS, Deployed, MarketPlan
 from tests.simulation.disk import SimulatedDisk
 from tests.simulation.roles import PersonRole, ProviderRole, RobotRole, Role
 from tests.simulation.router import Router
 from tests.simulation.scheduler import SECOND, Process, Scheduler
+from tests.simulation.steps import StepAudit
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
 
     from mesh.market.book import Match
     from tests.simulation.audit import Audit
+
+WITHDRAWN: Final = (0.1, 0.2, 0.7)
+
 
 logging.getLogger().setLevel(logging.CRITICAL)
 
@@ -37,10 +41,12 @@ class Market:
     deployed: Deployed
     folder: Path
     jobs: int
-    faults_seen: Counter[str] = field(default_factory=Counter)
+    draw: FaultDraw = field(default_factory=FaultDraw)
     is_over: bool = False
     is_calm: bool = False
     """Whether all faults have stopped."""
+    calm_since: int = 0
+    """The block at which they stopped."""
     plan_crash: Callable[[Role, Process], None] = lambda role, process: None
     lines: list[str] = field(default_factory=list)
     audit: Audit | None = None
@@ -50,20 +56,23 @@ class Market:
 
     def __post_init__(self) -> None:
         self.router = Router()
-        self.router.faults.seen = self.faults_seen
-        self.deployed.chain.faults.seen = self.faults_seen
-        self.disk = SimulatedDisk(self.folder)
-        self.disk.seen = self.faults_seen
+        self.router.faults.draw = self.draw
+        self.deployed.chain.faults.draw = self.draw
+        self.disk = SimulatedDisk(self.folder, self.draw)
         self.violations: list[str] = []
         self.objectives: dict[int, Path] = {}
         self.cids: dict[Path, str] = {}
-        self.final_words = frozenset({"expired", "withdrawn"})
+        self.withdrawn = self.scheduler.random.choice(WITHDRAWN)
+        """How many orders people withdraw."""
         names = ("provider", "provider-1")[: self.plan.providers]
         self.providers = [ProviderRole(self, name) for name in names]
         self.robots = [RobotRole(self, f"robot-{number}") for number in range(ROBOTS)]
         share = [self.jobs // PEOPLE + (number < self.jobs % PEOPLE) for number in range(PEOPLE)]
         self.people = [PersonRole(self, f"person-{number}", jobs) for number, jobs in enumerate(share) if jobs]
         self.roles: list[Role] = [*self.providers, *self.robots, *self.people]
+        self.steps = StepAudit(self)
+        self.router.tap = self.steps.sent
+        self.deployed.chain.on_block = self.steps.block
 
     def begin(self) -> None:
         """Start everything."""
@@ -99,6 +108,7 @@ class Market:
     def matched(self, provider: str, match: Match) -> None:
         """A provider matched two orders."""
         self.trace(provider, "matched", demand=match.demand.hash.hex()[:12], offer=match.offer.hash.hex()[:12])
+        self.steps.matched(provider, match)
 
     def fails(self, liability: str) -> bool:
         """Whether the device of this job is broken: some jobs fail, which refunds the promisee."""

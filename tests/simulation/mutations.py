@@ -12,15 +12,13 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from types import ModuleType
 
-SEEDS: Final = 20
-"""Within so many seeds each is found."""
-
 
 @dataclass(frozen=True)
 class Mutation:
     """A bug: in the function `target` (module:Class.method), the text `old` becomes `new`.
 
-    `faults` are the kinds that bring it to light; the histories of its search have these only.
+    `faults` are the kinds that bring it to light; the histories of its search have these only, and `jobs`. It is found
+    within `seeds` of them.
     """
 
     name: str
@@ -28,6 +26,8 @@ class Mutation:
     old: str
     new: str
     faults: str
+    seeds: int = 20
+    jobs: int = 4
 
     def apply(self) -> None:
         """Plant the bug in this process."""
@@ -40,7 +40,9 @@ class Mutation:
     def source(self) -> str:
         """The changed function. Raises `LookupError` if production code has changed and the mutation must follow."""
         _, owner, name = self._find()
-        source = textwrap.dedent(inspect.getsource(getattr(owner, name)))
+        found: Any = getattr(owner, name)
+        function: Any = found.fget if isinstance(found, property) else found
+        source = textwrap.dedent(inspect.getsource(function))
         if self.old not in source:
             raise LookupError(f"{self.name}: {self.target} has no {self.old!r}")
         return source.replace(self.old, self.new, 1)
@@ -55,6 +57,14 @@ class Mutation:
         if not hasattr(owner, name):
             raise LookupError(f"{self.name}: there is no {self.target}")
         return module, owner, name
+
+
+def planted(name: str) -> Mutation:
+    """The bug with this name. Raises `LookupError`."""
+    found = next((one for one in MUTATIONS if one.name == name), None)
+    if found is None:
+        raise LookupError(f"there is no planted bug {name!r}")
+    return found
 
 
 CRASHES: Final = "crash,crash_every"
@@ -110,28 +120,18 @@ MUTATIONS: Final = (
         "self.CURSOR, block.block_number, history",
         CRASHES,
     ),
-)
-
-CANDIDATES: Final = (
     Mutation(
-        "the outbox sends nothing again after a restart",
-        "mesh.work.outbox:Outbox.send_all",
-        "self._attempts.clear()",
-        "return\n    self._attempts.clear()",
+        "open orders of an earlier run are sent again without being taken up",
+        "mesh.agent.trade:Trader.load",
+        "for stored in await self._parts.ledger.orders():",
+        "for stored in ():",
         CRASHES,
     ),
     Mutation(
-        "the outbox sends everything once",
-        "mesh.work.outbox:Outbox.send_due",
-        "await self._send(",
-        "0 and (",
-        "drop,partition_every",
-    ),
-    Mutation(
-        "the provider trusts a receipt",
+        "a result or match whose event a reorganisation took is waited for",
         "mesh.market.liability_events:LiabilityEvents.is_confirmed",
-        "timing, missing =",
-        "return True\n    timing, missing =",
+        "missing < MISSING_CHECKS",
+        "True",
         REORGANISATIONS + ",forget",
     ),
     Mutation(
@@ -139,21 +139,98 @@ CANDIDATES: Final = (
         "mesh.market.liability_events:LiabilityEvents._revert",
         "created = [",
         "return\n    created = [",
-        REORGANISATIONS,
+        REORGANISATIONS + ",forget",
     ),
     Mutation(
-        "an interrupted job is played again from its beginning, into the same recording",
-        "mesh.work.playbacks:Playbacks.begin",
-        "await self.create(job, objective)",
-        "await self.create(job, objective)\n    run.position = 0",
+        "the outbox sends everything once",
+        "mesh.work.outbox:Outbox.send_due",
+        "await self._send(",
+        "0 and (",
+        "drop",
+    ),
+    Mutation(
+        "an allowance that a reorganisation took is not approved again",
+        "mesh.agent.trade:Trader.liability_reverted",
+        "self._send_when_covered(again)",
+        "again = []",
+        REORGANISATIONS + ",forget",
+    ),
+    Mutation(
+        "a rejection is taken for the end of the order",
+        "mesh.agent.trade:Trader._rejected",
+        "elif order.reject(rejection):",
+        "elif fail_future(order.created, OrderExpired(identity, 0)) or order.reject(rejection):",
+        "outage_every,unreachable,late",
+    ),
+    Mutation(
+        "the ledger's position runs ahead of the recording",
+        "mesh.work.playbacks:Playbacks._save",
+        "synced.position, recorded=synced.messages",
+        "run.position + 1, recorded=0",
         CRASHES,
     ),
     Mutation(
-        "orders of a reverted contract are forgotten",
-        "mesh.agent.trade:Trader.liability_reverted",
-        "await self._parts.outbox.unspend(address)",
-        "None",
-        REORGANISATIONS,
+        "a spoiled answer of a node escapes",
+        "mesh.chain.web3_provider:ReliableProvider.request",
+        "except CONNECTION_ERRORS as error:",
+        "except OSError as error:",
+        "spoilt",
+    ),
+    Mutation(
+        "a count that a node states is believed, whatever it is",
+        "mesh.chain.answers:_decode_value",
+        "if kind is Count and number >> 63:",
+        "if False:",
+        "spoilt",
+    ),
+    Mutation(
+        "messages are recorded with the time of day",
+        "mesh.recording.recorder:Recorder.record",
+        "self._epoch + self._clock.monotonic_ns()",
+        "self._clock.time_ns()",
+        "clock_every",
+    ),
+    Mutation(
+        "the provider ignores withdrawals",
+        "mesh.market.settlement:Settlement._refusal",
+        "return Refusal.WITHDRAWN if order_id(order) in self._withdrawals else None",
+        "return None",
+        "replay,delay,duplicate",
+    ),
+    Mutation(
+        "the provider forgets withdrawals when it is restarted",
+        "mesh.market.withdrawals:Withdrawals._load",
+        "if self._database is None:",
+        "if True:",
+        CRASHES + ",replay,partition_every",
+    ),
+    Mutation(
+        "a withdrawal is not sent to the chain",
+        "mesh.agent.trade:Trader.withdraw_on_chain",
+        "tx = (await self._chain.liabilities.withdraw(order.signed)).tx",
+        'tx = ""',
+        "drop,delay,leave_out,partition_every",
+    ),
+    Mutation(
+        "the ledger is not synced",
+        "mesh.work.database:Database._prepare",
+        "PRAGMA synchronous = FULL",
+        "PRAGMA synchronous = OFF",
+        CRASHES,
+    ),
+    Mutation(
+        "a success is signed although the recording lacks messages",
+        "mesh.work.executor:Executor.finish",
+        "if success and (missing :=",
+        "if False and (missing :=",
+        "full_every",
+    ),
+    Mutation(
+        "nobody may take the cost back",
+        "mesh.chain.liabilities:RefundState.is_refundable",
+        "return not self.is_finalized",
+        "return self.is_finalized",
+        "leave",
     ),
     Mutation(
         "a job that was set aside is never taken up again",
@@ -163,53 +240,31 @@ CANDIDATES: Final = (
         REORGANISATIONS,
     ),
     Mutation(
+        "orders of a reverted contract are forgotten",
+        "mesh.agent.trade:Trader.liability_reverted",
+        "await self._parts.outbox.unspend(address)",
+        "None",
+        REORGANISATIONS + ",forget," + CRASHES,
+    ),
+    Mutation(
         "a reorganisation is not looked for",
         "mesh.chain.following:_Follower._find_replaced",
         "known = [",
         "return None\n    known = [",
-        REORGANISATIONS,
+        REORGANISATIONS + ",forget",
     ),
     Mutation(
         "a reverted payment is not asked for again",
         "mesh.agent.listener:ChainListener.finalization_reverted",
         "await self._owe_result(job)",
         "pass",
-        REORGANISATIONS + ",forget",
+        REORGANISATIONS + ",forget," + CRASHES,
     ),
     Mutation(
-        "a withdrawal is not sent to the chain",
-        "mesh.agent.trade:Trader.withdraw_on_chain",
-        "tx = (await self._chain.liabilities.withdraw(order.signed)).tx",
-        'tx = ""',
-        "drop,leave_out,partition_every",
-    ),
-    Mutation(
-        "the recording is stamped with the time of day",
-        "mesh.recording.recorder:Recorder.record",
-        "self._epoch + self._clock.monotonic_ns()",
-        "self._clock.time_ns()",
-        "clock_every",
-    ),
-    Mutation(
-        "a provider forgets what it could not settle",
-        "mesh.market.settlement:Settlement._finalize",
-        "if not self._unconfirmed.end(result):\n                self._forget(result)",
+        "the provider keeps out what it could not settle",
+        "mesh.market.settlement:Settlement._not_created",
+        "self._forget(order)",
         "pass",
-        "unreachable,outage_every,price_every",
-    ),
-    Mutation(
-        "a transaction whose answer is lost is sent with the next number",
-        "mesh.chain.transactions:TransactionSender._sent_before",
-        "if not pending.abandoned:",
-        "if True:",
-        "lost_after_sending,outage_every",
-    ),
-    Mutation(
-        "the ledger's position runs ahead of the recording",
-        "mesh.work.playbacks:Playbacks._save",
-        "synced.position, recorded=synced.messages",
-        "run.position + 1, recorded=0",
-        CRASHES,
+        "outage_every,unreachable",
     ),
 )
-"""Bugs that `--mutant NAME` plants as well, but that were not found within so few seeds yet."""

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.agent import Agent, JobFailed
 from mesh.agent.errors import LiabilityReverted, OrderClosed, OrderExpired
 from mesh.chain import XRT, Chain
-from mesh.errors import AiraError
+from mesh.errors import AiraError, ChainError
 from mesh.market.provider import Provider
 from mesh.network import Endpoints, Network
 from mesh.settings import Settings
-from schemas import String
+from schemas import String, decode, message_hash
 from tests.simulation import loop
 from tests.simulation.chain import NodeFaults, SimulatedNode
 from tests.simulation.deployment import ENDPOINT, LIFETIMES, MODEL, STAKE, TIMING
@@ -22,13 +23,13 @@ from tests.simulation.scheduler import Process
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
-    from mesh.agent import Contract
+    from mesh.agent import Contract, Outcome
     from mesh.market.book import Match
     from tests.simulation.market import Market
 
 
-WITHDRAWN: Final = 0.2
-"""How many orders people withdraw."""
+REFUND_CHECK: Final = 20.0
+"""Seconds after which people look again whether they can take a cost back."""
 
 
 @dataclass
@@ -40,6 +41,11 @@ class Ordered:
     cost: int
     order: str = ""
     contract: str = ""
+    posted: int = 0
+    """The block at which the order was posted."""
+    deadline: int = 0
+    used_up: bool = False
+    """Whether the withdrawal of the order is on the chain."""
     told: str = ""
     """The last thing: ordered, accepted, withdrawn, expired, paid, refunded, reverted, or an error's code."""
 
@@ -47,6 +53,11 @@ class Ordered:
     def is_over(self) -> bool:
         """Whether nothing more is expected."""
         return self.told not in ("", "ordered", "accepted")
+
+    @property
+    def is_dead(self) -> bool:
+        """Whether the person believes that it can't become a contract any more."""
+        return self.told in ("expired", "nothing-found") or (self.told == "withdrawn" and self.used_up)
 
 
 class NothingFound(AiraError, code="nothing-found"):
@@ -64,13 +75,15 @@ class Role:
         self.process: Process | None = None
         self.starts = 0
         self.errors: list[BaseException] = []
-        self.node_faults = NodeFaults(seen=market.faults_seen)
+        self.node_faults = NodeFaults(draw=market.draw)
         """Of the first node that the process asks."""
         self.all_node_faults = [
             self.node_faults,
-            *(NodeFaults(seen=market.faults_seen) for _ in range(market.plan.nodes - 1)),
+            *(NodeFaults(draw=market.draw) for _ in range(market.plan.nodes - 1)),
         ]
         self.wall_offset_ns = 0
+        self.has_left = False
+        """Whether it never comes back."""
 
     async def main(self) -> None:
         """What the process does."""
@@ -95,11 +108,13 @@ class Role:
 
     def _crashed(self, process: Process) -> None:
         """The process was killed, perhaps together with its machine. It is started again after a while."""
-        market, chance = self.market, self.market.scheduler.random
+        market, chance = self.market, self.market.draw.random
         market.router.lose(process)
         is_power_failure = chance.random() < 0.5
         kind = "power-failure" if is_power_failure else "kill"
-        market.faults_seen[kind] += 1
+        market.draw.counts[kind] += 1
+        if is_power_failure:
+            market.steps.power_failed(self.name)
         market.trace(self.name, kind, steps=process.steps, commits=process.commits)
         market.scheduler.call_later(chance.uniform(0.2, 20), self._restart_from_disk, is_power_failure)
 
@@ -113,7 +128,7 @@ class Role:
         market.scheduler.call_later(market.scheduler.random.uniform(0.2, 20), self._restart_from_disk, False)
 
     def _restart_from_disk(self, is_power_failure: bool) -> None:
-        if not self.market.is_over:
+        if not self.market.is_over and not self.has_left:
             self.market.disk.crash(self.folder, power=is_power_failure)
             self.start()
 
@@ -207,6 +222,19 @@ class PersonRole(Role):
         super().__init__(market, name)
         self.wanted = jobs
         self.orders: list[Ordered] = []
+        self.listed: set[str] = set()
+        """The orders (hashes) that the agent of this start has listed."""
+        self.has_begun = False
+
+    def start(self) -> None:
+        """Start the process."""
+        self.listed, self.has_begun = set(), False
+        super().start()
+
+    @property
+    def agent_is_open(self) -> bool:
+        """Whether the person can ask the agent for its orders."""
+        return self.has_begun and self.process is not None and not self.process.is_dead
 
     @property
     def is_done(self) -> bool:
@@ -215,18 +243,25 @@ class PersonRole(Role):
 
     async def main(self) -> None:
         """Take up what was ordered before a crash, then order the jobs that are left."""
-        chance = self.market.scheduler.random
         async with self.chain() as chain:
             self.agent = agent = Agent(MODEL, settings=self.settings(), account=self.account, chain=chain)
             async with agent:
-                if self.orders and not self.orders[-1].is_over:
-                    await self._finish(agent, self.orders[-1], self._take_up(agent, self.orders[-1]))
-                while len(self.orders) < self.wanted:
-                    await asyncio.sleep(chance.uniform(0.1, 30))
-                    wanted = Ordered(self.name, len(self.orders), cost=chance.randint(1, 50) * XRT)
-                    self.orders.append(wanted)
-                    await self._finish(agent, wanted, self._order(agent, wanted))
-                await asyncio.Event().wait()
+                self.has_begun = True
+                try:
+                    await self._live(agent)
+                finally:
+                    self.has_begun = False
+
+    async def _live(self, agent: Agent) -> None:
+        chance = self.market.scheduler.random
+        if self.orders and not self.orders[-1].is_over:
+            await self._finish(agent, self.orders[-1], self._take_up(agent, self.orders[-1]))
+        while len(self.orders) < self.wanted:
+            await asyncio.sleep(chance.uniform(0.1, 30))
+            wanted = Ordered(self.name, len(self.orders), cost=chance.randint(1, 50) * XRT)
+            self.orders.append(wanted)
+            await self._finish(agent, wanted, self._order(agent, wanted))
+        await asyncio.Event().wait()
 
     async def _order(self, agent: Agent, wanted: Ordered) -> Contract:
         """Post an order, and wait for its contract; some are withdrawn."""
@@ -235,10 +270,13 @@ class PersonRole(Role):
         self.market.trace(self.name, "demands", number=wanted.number, cost=wanted.cost)
         order = await agent.order(objective, cost=wanted.cost, lifetime=lifetime)
         wanted.order, wanted.told = order.hash, "ordered"
-        if chance.random() < WITHDRAWN:
+        wanted.posted, wanted.deadline = self.market.deployed.chain.evm.head, order.message.deadline
+        if chance.random() < self.market.withdrawn:
             await asyncio.sleep(chance.uniform(0.1, 20))
-            await order.withdraw_on_chain()
-            self.market.trace(self.name, "withdrew", order=order.hash[:12])
+            on_chain = chance.random() < 0.5
+            await (order.withdraw_on_chain() if on_chain else order.withdraw())
+            wanted.used_up = on_chain
+            self.market.trace(self.name, "withdrew", order=order.hash[:12], on_chain=on_chain)
         return await order.contract()
 
     async def _take_up(self, agent: Agent, wanted: Ordered) -> Contract:
@@ -250,6 +288,10 @@ class PersonRole(Role):
             if order.kind == "demand" and order.hash not in known:
                 wanted.order = order.hash
                 return await order.contract()
+        mine = {demand for demand, maker in self.market.steps.demands.items() if maker == (self, wanted.number)}
+        for payload, address in await agent.parts.ledger.contracts("demand"):
+            if message_hash(decode(payload)).hex() in mine:
+                return await agent.contract(address)
         raise NothingFound("no order of before the crash is open")
 
     async def _finish(self, agent: Agent, wanted: Ordered, contract_of: Coroutine[Any, Any, Contract]) -> None:
@@ -258,7 +300,7 @@ class PersonRole(Role):
             contract = await contract_of
             wanted.contract, wanted.told = contract.address, "accepted"
             self.market.trace(self.name, "accepted", liability=contract.address)
-            outcome = await contract.outcome()
+            outcome = await self._outcome(agent, contract)
             wanted.contract, wanted.told = contract.address, "paid" if outcome.success else "refunded"
         except OrderExpired:
             wanted.told = "expired"
@@ -269,3 +311,16 @@ class PersonRole(Role):
         except AiraError as error:
             wanted.told = error.code
         self.market.trace(self.name, wanted.told, number=wanted.number)
+        self.market.steps.told(self, wanted.number)
+
+    async def _outcome(self, agent: Agent, contract: Contract) -> Outcome:
+        """Wait for the end of a contract; take the cost back once that is possible."""
+        ended = asyncio.ensure_future(contract.outcome())
+        liabilities = agent.parts.chain.liabilities
+        while not ended.done():
+            await asyncio.wait([ended], timeout=REFUND_CHECK)
+            with suppress(ChainError):
+                if not ended.done() and (await liabilities.refund_state(contract.address)).is_refundable:
+                    await liabilities.refund(contract.address)
+                    self.market.trace(self.name, "took-back", liability=contract.address)
+        return await ended

@@ -6,12 +6,12 @@ thread of the receiving session.
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 import zenoh
 
+from tests.simulation.chance import FaultDraw
 from tests.simulation.messages import Callback, CancellationToken, FifoChannel, RingChannel, Sample, matches
 from tests.simulation.queries import Query
 from tests.simulation.scheduler import SECOND
@@ -31,13 +31,18 @@ LOST_LINK_SECONDS: Final = 2.0
 
 @dataclass
 class TransportFaults:
-    """How probable each fault of a message is; `extra` is the most seconds that a delayed one takes longer."""
+    """How probable each fault of a message is.
+
+    `extra` is the most seconds that a delayed one takes longer, `old` the oldest that somebody repeats.
+    """
 
     drop: float = 0.0
     duplicate: float = 0.0
     delay: float = 0.0
+    replay: float = 0.0
     extra: float = 5.0
-    seen: Counter[str] = field(default_factory=Counter)
+    old: float = 300.0
+    draw: FaultDraw = field(default_factory=FaultDraw)
 
 
 class Router:
@@ -115,28 +120,34 @@ class Router:
                 if self.linked(sender, session):
                     self._transfer(sample, sender, session)
                 else:
-                    self.faults.seen["partition"] += 1
+                    self.faults.draw.counts["message-cut-off"] += 1
 
     def _transfer(self, sample: Sample, sender: Session, session: Session) -> None:
-        current, faults = scheduler(), self.faults
+        faults, draw = self.faults, self.faults.draw
         if session is sender:
             self.later(session, sender, self.deliver, sample, sender, session)
             return
-        if faults.drop and current.random.random() < faults.drop:
-            faults.seen["message-dropped"] += 1
+        if draw("message-dropped", faults.drop):
             return
-        if faults.duplicate and current.random.random() < faults.duplicate:
-            faults.seen["message-duplicated"] += 1
+        if draw("message-duplicated", faults.duplicate):
             self._delayed(sample, sender, session)
-        if faults.delay and current.random.random() < faults.delay:
-            faults.seen["message-delayed"] += 1
+        if draw("message-replayed", faults.replay):
+            self._delayed(sample, sender, session, most=faults.old)
+        if draw("message-delayed", faults.delay):
             self._delayed(sample, sender, session)
             return
         self.later(session, sender, self.deliver, sample, sender, session)
 
-    def _delayed(self, sample: Sample, sender: Session, session: Session) -> None:
-        seconds = scheduler().random.uniform(0, self.faults.extra)
-        scheduler().call_later(seconds, session.arrive, self.deliver, sample, sender, session)
+    def _delayed(self, sample: Sample, sender: Session, session: Session, *, most: float = 0.0) -> None:
+        """Deliver a sample late: to the session that then has the place of `session`, if its process was restarted."""
+        seconds = self.faults.draw.random.uniform(0, most or self.faults.extra)
+        scheduler().call_later(seconds, self._deliver_late, sample, sender, session)
+
+    def _deliver_late(self, sample: Sample, sender: Session, session: Session) -> None:
+        place = session.name.partition("#")[0]
+        for current in self.sessions:
+            if current.name.partition("#")[0] == place and current.is_linked:
+                current.arrive(self.deliver, sample, sender, current)
 
     def deliver(self, sample: Sample, sender: Session, session: Session) -> None:
         """Give a sample to the matching subscribers of a session."""

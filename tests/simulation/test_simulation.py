@@ -7,7 +7,7 @@ import subprocess
 import sys
 from typing import Any
 
-from tests.simulation.mutations import CANDIDATES, MUTATIONS
+from tests.simulation.mutations import MUTATIONS
 
 FAULTS = "crash,crash_every,delay,drop,duplicate,late,leave_out,lost_after_sending,partition_every,preempt"
 
@@ -43,7 +43,7 @@ def test_no_invariant_is_violated() -> None:
 
 
 def test_planted_bugs_fit_the_sources() -> None:
-    for mutation in (*MUTATIONS, *CANDIDATES):
+    for mutation in MUTATIONS:
         compile(mutation.source(), mutation.name, "exec")
 
 
@@ -51,4 +51,4 @@ def test_a_planted_bug_is_found() -> None:
     command = [sys.executable, "-m", "tests.simulation", "--mutants", "--seed", "1", "--mutant", "before the objective"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
     assert ended.returncode == 0, ended.stdout + ended.stderr
-    assert "found with seed" in ended.stdout
+    assert "1 of 1 planted bugs found" in ended.stdout

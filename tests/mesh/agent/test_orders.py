@@ -231,3 +231,15 @@ class Clock:
 async def test_orders_are_valid_for_minutes(times: Any, blocks: float) -> None:
     chain: Any = Clock(times)
     assert await default_lifetime(chain) == pytest.approx(blocks, rel=0.02)
+
+
+async def test_an_order_that_became_a_contract_and_expired_while_its_program_was_away_is_not_forgotten(
+    place: Place,
+) -> None:
+    async with place.agent("person") as person:
+        order = await person.order(OBJECTIVE, cost=5, lifetime=4)
+    made = await created(place, order.message)
+    await place.node.mine(5)
+    async with place.agent("person") as person:
+        (resumed,) = person.orders()
+        assert (await resumed.contract()).address == made

@@ -1,0 +1,112 @@
+"""What is run: a history, from a few numbers and names, in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import traceback
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
+
+from tests.simulation import history
+from tests.simulation.history import Report
+from tests.simulation.mutations import planted
+
+if TYPE_CHECKING:
+    from tests.simulation.deployment import Deployments
+
+
+@dataclass(frozen=True)
+class Run:
+    """A history; the same run is the same to the byte.
+
+    `only` and `without` are kinds of faults, `left_out` numbers of faults, `lasts` the seconds after which faults stop
+    (None: as the seed says), `chain` what runs the contracts (empty: as the seed says), `plant` a bug of `mutations`.
+    """
+
+    seed: int
+    jobs: int
+    only: frozenset[str] | None = None
+    without: frozenset[str] = frozenset()
+    left_out: frozenset[int] = frozenset()
+    lasts: float | None = None
+    chain: str = ""
+    plant: str = ""
+
+    def arguments(self) -> str:
+        """The command line's arguments that run it again."""
+        words = [f"--seed {self.seed} --jobs {self.jobs}"]
+        if self.only is not None:
+            words.append(f"--only {','.join(sorted(self.only)) or 'none'}")
+        if self.without:
+            words.append(f"--without {','.join(sorted(self.without))}")
+        if self.left_out:
+            words.append(f"--leave-out {ranges(self.left_out)}")
+        if self.lasts is not None:
+            words.append(f"--lasts {self.lasts:g}")
+        if self.chain:
+            words.append(f"--chain {self.chain}")
+        if self.plant:
+            words.append(f"--plant '{self.plant}'")
+        return " ".join(words)
+
+
+def ranges(numbers: frozenset[int]) -> str:
+    """Numbers as text, such as 0-4,7; `numbers_in` reads it."""
+    words: list[str] = []
+    first = last = -2
+    for number in [*sorted(numbers), -2]:
+        if number == last + 1:
+            last = number
+            continue
+        if first >= 0:
+            words.append(f"{first}-{last}" if last > first else str(first))
+        first = last = number
+    return ",".join(words)
+
+
+def numbers_in(text: str) -> frozenset[int]:
+    """The numbers that `ranges` wrote. Raises `ValueError`."""
+    found: set[int] = set()
+    for word in filter(None, text.split(",")):
+        first, _, last = word.partition("-")
+        found.update(range(int(first), int(last or first) + 1))
+    return frozenset(found)
+
+
+def run_in_child(deployments: Deployments, run: Run, *, trace: bool = False, switches: str | None = None) -> Report:
+    """Run a history in a process of its own: nothing is left of it for the next one."""
+    kind = run.chain or deployments.kind(run.seed)
+    market = deployments.market(kind)
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(reading)
+        try:
+            if run.plant:
+                planted(run.plant).apply()
+            plan = history.plan_of(run.seed, only=run.only, without=run.without)
+            plan.lasts = plan.lasts if run.lasts is None else run.lasts
+            report, lines = history.run_history(
+                market, run.seed, run.jobs, plan, left_out=run.left_out, switches=switches
+            )
+            if trace:
+                print(plan, *lines, sep="\n", flush=True)
+            with os.fdopen(writing, "w") as pipe:
+                json.dump(asdict(report), pipe)
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(0)
+    os.close(writing)
+    with os.fdopen(reading) as pipe:
+        said = pipe.read()
+    os.waitpid(child, 0)
+    if not said:
+        return Report(run.seed, violations=["history-failed: the process of the history ended"])
+    report = Report(**json.loads(said))
+    report.chains = {kind: 1}
+    return report

@@ -1,0 +1,158 @@
+"""The invariants that must hold after each block, each match and each word to a person."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from typing import TYPE_CHECKING, Any, Final
+
+from eth_utils.crypto import keccak
+
+from mesh.agent.orders import OrderState
+from mesh.chain import Finalized, NewLiability, Transfer
+from mesh.chain.answers import ANSWERS, decode_answer
+from mesh.chain.events import decode_log
+from mesh.market.book import Refusal
+from schemas import ZERO_ADDRESS, Demand, InvalidMessage, InvalidRecord, decode
+from schemas.signing import Rejection
+from schemas.wire import message_hash
+
+if TYPE_CHECKING:
+    from mesh.chain import ChainEvent
+    from mesh.market.book import Match
+    from tests.simulation.market import Market
+    from tests.simulation.messages import Sample
+    from tests.simulation.roles import PersonRole
+    from tests.simulation.sessions import Session
+
+BALANCE_OF: Final = keccak(text="balanceOf(address)")[:4].hex()
+DEMAND_HASH: Final = keccak(text="demandHash()")[:4].hex()
+
+
+class StepAudit:
+    """Watches a market from its beginning."""
+
+    def __init__(self, market: Market) -> None:
+        self._market = market
+        self._chain = market.deployed.chain
+        deployment = market.deployed.market.deployment
+        self._token = deployment.xrt
+        holders = [account.address for account in market.deployed.accounts.values()]
+        self._begin = {one: self._balance(one) for one in (*holders, deployment.factory, deployment.lighthouse)}
+        self._reorganisations = 0
+        self._forget()
+        self.honoured: set[tuple[str, str]] = set()
+        """Providers and the orders (hashes) of which they have said that they honour their withdrawal."""
+        self.demands: dict[str, tuple[PersonRole, int]] = {}
+        """All demands that were sent: by whom, as which of their orders."""
+
+    def _forget(self) -> None:
+        self._read = self._chain.began
+        self._expected: Counter[str] = Counter(self._begin)
+        self._ended: set[str] = set()
+        self._payouts: dict[str, int] = defaultdict(int)
+        self._liabilities: dict[str, str] = {}
+        """Of each liability the demand's hash."""
+
+    def block(self) -> None:
+        """A block was mined, or some were replaced."""
+        if self._chain.reorganisations != self._reorganisations:
+            self._reorganisations = self._chain.reorganisations
+            self._forget()
+        head = self._chain.evm.head
+        self._listed()
+        changed: set[str] = set()
+        for event in self._events(self._read + 1, head):
+            if isinstance(event, NewLiability):
+                self._created(event.liability)
+            elif isinstance(event, Finalized):
+                if event.liability in self._ended:
+                    self._market.violated("finalized-twice", event.liability)
+                self._ended.add(event.liability)
+            elif isinstance(event, Transfer):
+                self._moved(event)
+                changed |= {event.sender, event.recipient}
+        self._read = head
+        for holder in sorted(changed - {ZERO_ADDRESS}):
+            if self._balance(holder) != self._expected[holder]:
+                detail = f"{holder} has {self._balance(holder)} and should have {self._expected[holder]} wn"
+                self._market.violated("tokens-not-conserved", detail)
+
+    def _events(self, first: int, last: int) -> list[ChainEvent | None]:
+        response = {"result": list(self._chain.evm.logs(first, last))}
+        return [decode_log(log) for log in decode_answer("eth_getLogs", response, ANSWERS["eth_getLogs"])]
+
+    def _moved(self, event: Transfer) -> None:
+        self._expected[event.sender] -= event.value
+        self._expected[event.recipient] += event.value
+        if event.sender in self._liabilities and event.value:
+            self._payouts[event.sender] += 1
+            if self._payouts[event.sender] > 1:
+                self._market.violated("paid-twice", event.sender)
+
+    def _created(self, liability: str) -> None:
+        demand = self._call(liability, DEMAND_HASH).hex()
+        self._liabilities[liability] = demand
+        if demand not in self.demands:
+            self._market.violated("unannounced-payment", f"{liability} is of a demand that was never sent")
+            return
+        person, number = self.demands[demand]
+        order = person.orders[number]
+        if order.is_dead and (not self._reorganisations or order.told == "nothing-found"):
+            self._market.violated("promise-broken", f"{person.name} was told {order.told!r}; {liability}")
+        if person.agent_is_open and not order.is_over and demand not in person.listed:
+            self._market.violated("unannounced-payment", f"{person.name}'s agent does not list {demand[:12]}")
+
+    def told(self, person: PersonRole, number: int) -> None:
+        """A person was told something of an order."""
+        order = person.orders[number]
+        if not order.is_dead or self._reorganisations:
+            return
+        mine = {demand for demand, maker in self.demands.items() if maker == (person, number)}
+        found = [liability for liability, demand in self._liabilities.items() if demand in mine]
+        if found:
+            self._market.violated("promise-broken", f"{person.name} is told {order.told!r}; {found[0]}")
+
+    def _listed(self) -> None:
+        """Note what agents list: what they name once, their people know."""
+        for person in self._market.people:
+            if person.agent_is_open and person.agent is not None:
+                person.listed |= {order.hash for order in person.agent.orders(OrderState.OPEN, OrderState.WITHDRAWN)}
+
+    def sent(self, sample: Sample, sender: Session) -> None:
+        """A message was published."""
+        role = next((one for one in self._market.roles if sender.process is one.process), None)
+        if role is None:
+            return
+        payload = sample.payload.to_bytes()
+        if role in self._market.providers:
+            try:
+                rejection = Rejection.decode(payload)
+            except InvalidRecord:
+                return
+            if rejection.reason == Refusal.WITHDRAWN:
+                self.honoured.add((role.name, rejection.order))
+        elif role in self._market.people:
+            try:
+                message = decode(payload)
+            except InvalidMessage:
+                return
+            if isinstance(message, Demand):
+                person: Any = role
+                self.demands.setdefault(message_hash(message).hex(), (person, len(person.orders) - 1))
+
+    def matched(self, provider: str, match: Match) -> None:
+        """A provider matched two orders."""
+        for order in match:
+            if (provider, order.hash.hex()) in self.honoured:
+                self._market.violated("matched-after-withdrawal", order.hash.hex())
+
+    def power_failed(self, role: str) -> None:
+        """A process lost power: a provider perhaps with it the withdrawals that it knew."""
+        self.honoured = {one for one in self.honoured if one[0] != role}
+
+    def _balance(self, holder: str) -> int:
+        return int.from_bytes(self._call(self._token, BALANCE_OF + holder[2:].lower().rjust(64, "0")))
+
+    def _call(self, contract: str, data: str) -> bytes:
+        answer: str = self._chain.answer("eth_call", [{"to": contract, "data": "0x" + data}, "latest"])
+        return bytes.fromhex(answer[2:])
