@@ -166,6 +166,24 @@ class FairQueue(Generic[T]):
             del self._counts[sender]
 
 
+class KnownSenders:
+    """The latest `limit` senders that were added: those with whom something went well before."""
+
+    def __init__(self, limit: int = SENDERS) -> None:
+        self._limit = limit
+        self._known: OrderedDict[str, None] = OrderedDict()
+
+    def add(self, sender: str) -> None:
+        """Remember a sender."""
+        self._known.pop(sender, None)
+        self._known[sender] = None
+        if len(self._known) > self._limit:
+            self._known.popitem(last=False)
+
+    def __contains__(self, sender: str) -> bool:
+        return sender in self._known
+
+
 class Drops:
     """Counts what was dropped, by reason and by sender. Thread-safe.
 

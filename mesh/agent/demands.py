@@ -7,7 +7,6 @@ objective, offering), so few are handled at once, and those that pay nothing nev
 from __future__ import annotations
 
 import asyncio
-from collections import OrderedDict
 from contextvars import ContextVar
 from functools import partial
 from typing import TYPE_CHECKING, Final
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
     from mesh.agent.handlers import Handler
     from mesh.chain import Chain
     from mesh.errors import AiraError
-    from mesh.flood import Drops
+    from mesh.flood import Drops, KnownSenders
     from mesh.network import Subscription
     from mesh.outage_log import OutageLog
     from schemas import Demand, Verified
@@ -36,7 +35,6 @@ CHECKED: Final = 128
 """Demands whose makers' funds are asked for at once."""
 WAITING: Final = 16_384
 """Demands that wait for the check of their funds, and as many for a handler."""
-CUSTOMERS: Final = 4096
 LOGGED: Final = Rate(per_second=0.2, burst=20)
 """Failures of handlers with the same code that are logged."""
 
@@ -47,24 +45,6 @@ _handled: ContextVar[Buyer | None] = ContextVar("handled", default=None)
 def current_buyer() -> Buyer | None:
     """Whose demand the running handler handles; None outside of a demand's handler."""
     return _handled.get()
-
-
-class Customers:
-    """Accounts that a contract was created with before; the latest `limit`."""
-
-    def __init__(self, limit: int = CUSTOMERS) -> None:
-        self._limit = limit
-        self._known: OrderedDict[str, None] = OrderedDict()
-
-    def add(self, account: str) -> None:
-        """Remember an account."""
-        self._known.pop(account, None)
-        self._known[account] = None
-        if len(self._known) > self._limit:
-            self._known.popitem(last=False)
-
-    def __contains__(self, account: str) -> bool:
-        return account in self._known
 
 
 class DemandDispatcher:
@@ -81,7 +61,7 @@ class DemandDispatcher:
         *,
         chain: Chain,
         token: str,
-        customers: Customers,
+        customers: KnownSenders,
         outages: OutageLog,
         drops: Drops,
     ) -> None:

@@ -9,13 +9,13 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from mesh.agent.contract import Contract, WatchedContracts, fail_future
-from mesh.agent.demands import Customers
 from mesh.agent.errors import OrderClosed, OrderExpired
 from mesh.agent.orders import Order, OrderState, Rejections, TradedOrder
 from mesh.agent.terms import Allowances, TermsWriter
 from mesh.background import Background
 from mesh.chain import OrderAlreadyUsed
 from mesh.errors import AiraError, ClosedError
+from mesh.flood import KnownSenders
 from mesh.log_context import log_event
 from mesh.market.book import Refusal
 from mesh.role import Lifecycle
@@ -58,7 +58,7 @@ class Trader(Lifecycle):
         self._changing = asyncio.Lock()
         self.contracts = WatchedContracts(parts)
         """The contracts whose end is waited for."""
-        self.customers = Customers()
+        self.customers = KnownSenders()
         """Who demanded the contracts of this account."""
 
     def orders(self, *states: OrderState) -> list[Order]:

@@ -15,7 +15,7 @@ from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING, Final
 
 from mesh.chain.contracts import OriginalContracts
-from mesh.chain.funds import Holding
+from mesh.chain.funds import SHORT_POLLS, Holding
 from mesh.chain.lighthouses import Lighthouses
 from mesh.errors import InputError
 from schemas.address import ZERO_ADDRESS
@@ -50,18 +50,26 @@ class OrderCosts:
         costs[self._xrt] += order.validator_fee
         return costs
 
-    async def can_be_paid(self, order: Verified[Order], *, fresh: bool = False) -> bool:
-        """Whether an order's maker has, and allows the factory to take, what the order costs it.
+    async def shortage(self, order: Verified[Order], *, fresh: bool = False) -> str:
+        """What an order's maker lacks to pay what the order costs it, as the contracts call it; empty if nothing.
 
-        Without `fresh`, the answer may be a few poll intervals old. True if a token can't be read: it is a stranger's
+        Without `fresh`, the answer may be a few poll intervals old. Empty if a token can't be read: it is a stranger's
         contract. Raises `NodeUnreachable`.
         """
         for token, amount in self.of(order.message).items():
-            if amount:
-                funding = await self._funds.of(Holding(token, order.signer), fresh=fresh)
-                if funding is not None and min(funding) < amount:
-                    return False
-        return True
+            if not amount:
+                continue
+            holding = Holding(token, order.signer)
+            funding = await self._funds.of(holding, fresh=fresh)
+            if funding is not None and min(funding) < amount and not fresh:
+                funding = await self._funds.of(holding, within=SHORT_POLLS)  # it may have paid in since
+            if funding is not None and min(funding) < amount:
+                return "ERC20InsufficientBalance" if funding.balance < amount else "ERC20InsufficientAllowance"
+        return ""
+
+    async def can_be_paid(self, order: Verified[Order], *, fresh: bool = False) -> bool:
+        """Whether an order's maker lacks nothing; see `shortage`."""
+        return not await self.shortage(order, fresh=fresh)
 
 
 class UnsafeValidator(InputError, code="validator-unsafe"):

@@ -30,6 +30,8 @@ TOKEN_GAS: Final = 100_000
 """Gas for each question to a token."""
 KEPT_POLLS: Final = 3
 """Intervals between polls of the chain for which an answer is used."""
+SHORT_POLLS: Final = 0.25
+"""The same for an answer that there is too little: the maker may have paid in and sent its order at once."""
 KEPT: Final = 8192
 """Answers that are remembered."""
 
@@ -65,10 +67,13 @@ class Funds:
         self.requests = 0
         """Requests to the node so far."""
 
-    async def of(self, holding: Holding, *, fresh: bool = False) -> Funding | None:
-        """What is known of a holding, or asked now; None if the token can't be read. Raises `NodeUnreachable`."""
-        known = self._known.get(holding)
-        if known is not None and not fresh and self._clock.monotonic() < known[0]:
+    async def of(self, holding: Holding, *, within: float = KEPT_POLLS, fresh: bool = False) -> Funding | None:
+        """What is known of a holding, read `within` that many poll intervals or now; None if the token can't be read.
+
+        Raises `NodeUnreachable`.
+        """
+        known, interval = self._known.get(holding), self._contracts.node.timing.poll_interval
+        if known is not None and not fresh and self._clock.monotonic() < known[0] + within * interval:
             return known[1]
         if holding not in self._asked:
             self._asked[holding] = asyncio.get_running_loop().create_future()
@@ -91,7 +96,7 @@ class Funds:
             self._asked.clear()
 
     async def _answer(self, batch: list[Holding]) -> None:
-        until = self._clock.monotonic() + KEPT_POLLS * self._contracts.node.timing.poll_interval
+        asked_at = self._clock.monotonic()
         futures = [self._asked.pop(holding) for holding in batch]
         try:
             answers = await self._read(batch)
@@ -107,7 +112,7 @@ class Funds:
             raise
         for holding, future, answer in zip(batch, futures, answers, strict=True):
             self._known.pop(holding, None)
-            self._known[holding] = until, answer
+            self._known[holding] = asked_at, answer
             if not future.cancelled():
                 future.set_result(answer)
         while len(self._known) > self._kept:

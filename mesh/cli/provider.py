@@ -42,6 +42,7 @@ REPORT_INTERVAL: Final = 600.0
     "keyfile_password_file",
     *options_of(ChainSettings),
     "open_orders_limit",
+    "deadline_limit",
     *options_of(TelemetrySettings),
 )
 def command(settings: Settings) -> None:
@@ -69,6 +70,7 @@ async def serve(settings: Settings) -> None:
         announce(log, "provider-started", words, provider=provider.address, zenoh=network.id)
         tasks = await stack.enter_async_context(Background())
         tasks.start(report_earnings(provider.earnings), "earnings")
+        tasks.start(provider.drops.run(), "drops")
         await provider.run()
 
 
@@ -91,6 +93,7 @@ async def _open_provider(
                 chain,
                 lighthouse,
                 limit=settings.open_orders_limit,
+                deadline_limit=settings.deadline_limit,
                 withdrawals=withdrawals_of(settings, account, lighthouse),
             ) as provider,
         ):

@@ -10,28 +10,28 @@ until the deadline, or until the lists are rebuilt because most of their orders 
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+from mesh.market.queues import QueueNode, Queues
 from schemas import Demand, address_bytes
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from schemas import Offer, Verified
 
     Order = Demand | Offer
     Terms = tuple[str, str, str, int, str, int]
 
-K = TypeVar("K", bound="Hashable")
-T = TypeVar("T")
-
 HASH_SIZE: Final = 32
 STALE: Final = 4096
 """Keys of orders that left the book which may stay in the lists, in addition to as many as are open."""
 LIMIT: Final = 1_000_000
 """Open orders that a book holds by default."""
+UNLIMITED: Final = 2**256
 ORDER_USED: Final = "OrderUsed"
 """The contracts' error for an order that became a liability, or was withdrawn there."""
 UNNAMED_ERROR: Final = "Reverted"
@@ -62,9 +62,10 @@ class Match(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Added:
-    """The order is in the book and waits for its counterpart."""
+    """The order is in the book and waits for its counterpart. Others may have been evicted for it."""
 
     order: Verified[Order]
+    evicted: tuple[Verified[Order], ...] = ()
 
 
 def order_id(order: Verified[Order]) -> bytes:
@@ -75,14 +76,27 @@ def order_id(order: Verified[Order]) -> bytes:
 class OrderBook:
     """The open orders of the lighthouse at `lighthouse` (EIP-55 address), `limit` of them at most.
 
+    An order stays for `deadline_limit` blocks at most, even if its deadline is later. A full book makes room: the
+    signer with the most orders loses its newest; if none has more than one, the oldest order that is not matched, or
+    that pays nothing, leaves.
+
     Not thread-safe. Methods are O(1) in the number of open orders, unless they say otherwise.
     """
 
-    def __init__(self, lighthouse: str, *, limit: int = LIMIT) -> None:
+    def __init__(self, lighthouse: str, *, limit: int = LIMIT, deadline_limit: int = UNLIMITED) -> None:
         self._lighthouse = lighthouse
         self._limit = limit
+        self._deadline_limit = deadline_limit
         self._head = 0
-        self._nodes: dict[bytes, QueueNode[Verified[Order]]] = {}
+        self._nodes: dict[bytes, _BookNode] = {}
+        self._signers: Queues[str, bytes] = Queues()
+        """The keys of each signer's orders, oldest first."""
+        self._numbers: Counter[str] = Counter()
+        """How many orders each signer has."""
+        self._heaviest = ""
+        """The signer that had the most orders when it added one."""
+        self._unpaid: dict[bytes, None] = {}
+        """The keys of orders that are not matched or pay nothing, oldest first."""
         self._demands: Queues[Terms, Verified[Order]] = Queues()
         self._offers: Queues[Terms, Verified[Order]] = Queues()
         self._aside: set[bytes] = set()
@@ -111,10 +125,11 @@ class OrderBook:
         if counterpart is not None:
             self.remove(order_id(counterpart.item))
             return _match(order, counterpart.item)
-        if len(self._nodes) >= self._limit:
+        evicted = self._make_room(order)
+        if evicted is None:
             return Refusal.FULL
         self._enter(order)
-        return Added(order)
+        return Added(order, evicted)
 
     def set_aside(self, order: Verified[Order]) -> bool:
         """Add an order that is not matched until it is removed and added; False if the book refuses it."""
@@ -126,10 +141,16 @@ class OrderBook:
 
     def remove(self, identity: bytes) -> Verified[Order] | None:
         """Remove and return the order with this identity; None if it is not in the book."""
-        node = self._nodes.pop(self._key(identity), None)
+        key = self._key(identity)
+        node = self._nodes.pop(key, None)
         if node is None:
             return None
-        message = node.item.message
+        message, signer = node.item.message, node.item.signer
+        self._signers.remove(signer, node.of_signer)
+        self._numbers[signer] -= 1
+        if not self._numbers[signer]:
+            del self._numbers[signer]
+        self._unpaid.pop(key, None)
         if identity in self._aside:
             self._aside.remove(identity)
         else:
@@ -137,7 +158,9 @@ class OrderBook:
         return node.item
 
     def expire(self, head: int) -> list[Verified[Order]]:
-        """Remove and return every order whose deadline is not after block `head`. O(blocks passed + orders expired).
+        """Remove and return every order whose deadline, or time in the book, is not after block `head`.
+
+        O(blocks passed + orders expired).
 
         A lower `head` than before (after a reorganisation) changes nothing.
         """
@@ -151,7 +174,7 @@ class OrderBook:
             self._listed -= len(keys)
             for key in keys:
                 node = self._nodes.get(key)  # None, or another order, if the one listed has left the book
-                if node is not None and node.item.message.deadline == block:
+                if node is not None and node.due == block:
                     self.remove(order_id(node.item))
                     expired.append(node.item)
         return expired
@@ -170,12 +193,37 @@ class OrderBook:
     def _enter(self, order: Verified[Order]) -> None:
         message = order.message
         key = order.hash if order.hash not in self._nodes else order_id(order)
-        node = self._nodes[key] = QueueNode(order)
+        node = self._nodes[key] = _BookNode(order, min(message.deadline, self._head + self._deadline_limit), key)
         if order_id(order) not in self._aside:
             self._side(message).append(_terms(message), node)
-        self._list(key, message.deadline)
+        if order_id(order) in self._aside or not _pays(message):
+            self._unpaid[key] = None
+        self._signers.append(order.signer, node.of_signer)
+        self._numbers[order.signer] += 1
+        if self._numbers[order.signer] >= self._numbers.get(self._heaviest, 0):
+            self._heaviest = order.signer
+        self._list(key, node.due)
         if self._listed > STALE + 2 * len(self._nodes):
             self.compact()
+
+    def _make_room(self, order: Verified[Order]) -> tuple[Verified[Order], ...] | None:
+        """Evict an order if the book is full, and return it; None if the new one has no better right to a place."""
+        if len(self._nodes) < self._limit:
+            return ()
+        most = self._numbers.get(self._heaviest, 0)
+        if self._numbers.get(order.signer, 0) >= max(most, 1):
+            return None
+        if most > 1:
+            last = self._signers.first(self._heaviest)
+            assert last is not None
+            key = last.before.item
+        elif self._unpaid:
+            key = next(iter(self._unpaid))
+        else:
+            return None
+        evicted = self.remove(order_id(self._nodes[key].item))
+        assert evicted is not None
+        return (evicted,)
 
     def _list(self, key: bytes, deadline: int) -> None:
         self._due.setdefault(deadline, []).append(key)
@@ -186,7 +234,7 @@ class OrderBook:
         self._due.clear()
         self._listed = 0
         for key, node in self._nodes.items():
-            self._list(key, node.item.message.deadline)
+            self._list(key, node.due)
 
     def _key(self, identity: bytes) -> bytes:
         """The key of the order with this identity, whether it is in the book or not.
@@ -201,60 +249,15 @@ class OrderBook:
         return self._demands if isinstance(message, Demand) else self._offers
 
 
-class QueueNode(Generic[T]):
-    """An item in a queue. A queue is a ring: the last node's `after` is the first.
+class _BookNode(QueueNode["Verified[Order]"]):
+    """An order in a book, the block in which it leaves, and the node of its key among its signer's."""
 
-    Outside a queue a node has no neighbours, not even itself: a cycle would keep the item until the next garbage
-    collection.
-    """
+    __slots__ = ("due", "of_signer")
 
-    __slots__ = ("after", "before", "item")
-
-    def __init__(self, item: T) -> None:
-        self.item = item
-        self.before: QueueNode[T]
-        self.after: QueueNode[T]
-
-
-class Queues(Generic[K, T]):
-    """A first-in-first-out queue for each key, with removal from the middle in constant time.
-
-    An empty queue takes no memory.
-    """
-
-    def __init__(self) -> None:
-        self._first: dict[K, QueueNode[T]] = {}
-
-    def __len__(self) -> int:
-        """The number of keys with a queue."""
-        return len(self._first)
-
-    def __iter__(self) -> Iterator[K]:
-        return iter(self._first)
-
-    def first(self, key: K) -> QueueNode[T] | None:
-        """The node that has waited longest at `key`."""
-        return self._first.get(key)
-
-    def append(self, key: K, node: QueueNode[T]) -> None:
-        """Append a node, which is in no queue, to the queue at `key`."""
-        first = self._first.get(key)
-        if first is None:
-            self._first[key] = node.before = node.after = node
-        else:
-            last = first.before
-            last.after = first.before = node
-            node.before, node.after = last, first
-
-    def remove(self, key: K, node: QueueNode[T]) -> None:
-        """Remove a node from the queue at `key`, which it must be in."""
-        if node.after is node:
-            del self._first[key]
-        else:
-            node.before.after, node.after.before = node.after, node.before
-            if self._first[key] is node:
-                self._first[key] = node.after
-        del node.before, node.after
+    def __init__(self, order: Verified[Order], due: int, key: bytes) -> None:
+        super().__init__(order)
+        self.due = due
+        self.of_signer = QueueNode(key)
 
 
 def at_fault(match: Match, error: str, arguments: Sequence[Any]) -> tuple[Verified[Order], ...]:
@@ -286,6 +289,11 @@ def reason_word(error: str) -> str:
 
 def _bytes(value: bytes | str) -> bytes:
     return bytes.fromhex(value.removeprefix("0x")) if isinstance(value, str) else bytes(value)
+
+
+def _pays(order: Order) -> bool:
+    """Whether an order costs its maker something, which makes a flood of such orders expensive."""
+    return (order.cost + order.validator_fee if isinstance(order, Demand) else order.lighthouse_fee) > 0
 
 
 def _terms(order: Order) -> Terms:

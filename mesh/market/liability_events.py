@@ -25,6 +25,7 @@ from mesh.chain import (
     Reorganisation,
     RequestRefused,
 )
+from mesh.flood import KnownSenders
 from mesh.log_context import liability_context, log_event
 from mesh.market.book import order_id
 from mesh.outage_log import OutageLog
@@ -67,6 +68,7 @@ class LiabilityEvents:
         earnings: EarningsLedger,
         head: int,
         reverted: Callable[[Verified[Any]], None],
+        forget: Callable[[Verified[Any]], None],
         open_limit: int = OPEN_LIABILITIES,
     ) -> None:
         self.head, self.read_at = head, time.monotonic()
@@ -84,6 +86,9 @@ class LiabilityEvents:
         self._withdrawals = withdrawals
         self._earnings = earnings
         self._reverted = reverted
+        self._forget = forget
+        self.parties: Final = KnownSenders()
+        """Accounts that a liability was created for."""
         self._open_limit = open_limit
         self._history = History(chain.node.timing.reorg_depth)
 
@@ -143,6 +148,7 @@ class LiabilityEvents:
         self._unconfirmed.confirm(self.head)
         self._withdrawals.expire(self.head)
         for order in self._book.expire(self.head):
+            self._forget(order)  # its deadline may be later than the book's limit
             expired = log_event("order-expired", order=order.hash.hex(), signer=order.signer)
             log.info("expired order %s of %s", order.hash.hex(), order.signer, extra=expired)
 
@@ -151,6 +157,8 @@ class LiabilityEvents:
         liability = await self._chain.liabilities.get(address)
         if liability.lighthouse != self._lighthouse:
             return
+        self.parties.add(liability.promisee)
+        self.parties.add(liability.promisor)
         demand_hash, offer_hash = await self._chain.liabilities.order_hashes(address)
         for digest, signer in ((demand_hash, liability.promisee), (offer_hash, liability.promisor)):
             identity = digest + address_bytes(signer)

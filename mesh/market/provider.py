@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from mesh.chain import InsufficientFunds
 from mesh.flood import Drops
 from mesh.log_context import LogSource, source_context
+from mesh.market.arrivals import Arrivals
 from mesh.market.book import LIMIT, Match, OrderBook
 from mesh.market.earnings import Earnings, EarningsLedger
 from mesh.market.liability_events import OPEN_LIABILITIES
@@ -24,6 +25,7 @@ from mesh.network.channel import Channel
 from mesh.network.metrics import link_state, network_families
 from mesh.network.services import Services
 from mesh.role import Role
+from mesh.settings.groups import DEADLINE_LIMIT
 from mesh.telemetry.logs import LogService
 from schemas import Demand, Offer, Result, Withdrawal
 
@@ -35,7 +37,7 @@ if TYPE_CHECKING:
     import zenoh
 
     from mesh.chain import Chain
-    from mesh.network import Network, Subscription
+    from mesh.network import Network
     from mesh.retry import RetryPolicy
     from mesh.telemetry.metrics import MetricFamily
     from schemas import Verified
@@ -49,8 +51,9 @@ class Provider(Role):
     `lighthouse` is the ENS name; its chain account must have a stake there. `limit` is the most open orders, `matched`
     is called with each match before its liability is created, `retry` is the policy for transactions that fail, and
     `open_liabilities` the most records of open liabilities in memory. Withdrawals are kept in the file
-    `withdrawals`, if given. The caller closes session and chain. When `run`
-    is cancelled, a transaction that was sent may still be mined.
+    `withdrawals`, if given. Orders leave the book after `deadline_limit` blocks. What is dropped is counted in `drops`,
+    which the caller reports. The caller closes session and chain. When `run` is cancelled, a transaction that was sent
+    may still be mined.
     """
 
     title = "provider"
@@ -66,6 +69,7 @@ class Provider(Role):
         retry: RetryPolicy = RETRY,
         open_liabilities: int = OPEN_LIABILITIES,
         withdrawals: Path | None = None,
+        deadline_limit: int = DEADLINE_LIMIT,
         drops: Drops | None = None,
     ) -> None:
         if chain.account is None:
@@ -78,6 +82,7 @@ class Provider(Role):
         self._matched = matched
         self._retry = retry
         self._open_liabilities = open_liabilities
+        self._deadline_limit = deadline_limit
         self.withdrawals = Withdrawals(withdrawals)
         self.ledger = EarningsLedger()
         self.drops = Drops() if drops is None else drops
@@ -87,7 +92,7 @@ class Provider(Role):
     async def _open(self, stack: AsyncExitStack) -> None:
         address, head = await self._chain.names.address(self._lighthouse), await self._chain.block_number()
         head = max(head - self._chain.node.timing.reorg_depth, 0)  # blocks that may be replaced are read again
-        self.book = OrderBook(address, limit=self._limit)
+        self.book = OrderBook(address, limit=self._limit, deadline_limit=self._deadline_limit)
         self.book.expire(head)
         stack.enter_context(self.withdrawals)
         self.withdrawals.expire(head)
@@ -131,6 +136,7 @@ class Provider(Role):
             matched=self._matched,
             forget=self._forget,
             withdrawals=self.withdrawals,
+            drops=self.drops,
             open_limit=self._open_liabilities,
         )
         self._status = ProviderStatusService(
@@ -153,8 +159,15 @@ class Provider(Role):
                 # Before the orders that they concern; one that comes later still stops what was not sent.
                 await self._withdrawn.recall()
                 tasks.create_task(self._take_withdrawals(), name="provider withdrawals")
-                tasks.create_task(self._take_orders(self._demands), name="provider demands")
-                tasks.create_task(self._take_orders(self._offers), name="provider offers")
+                arrivals = Arrivals(
+                    self.settlement,
+                    known=self.settlement.events.parties,
+                    has_room=self.queue.has_room,
+                    drops=self.drops,
+                )
+                tasks.create_task(arrivals.take(self._demands), name="provider demands")
+                tasks.create_task(arrivals.take(self._offers), name="provider offers")
+                tasks.create_task(arrivals.run(), name="provider arrivals")
                 tasks.create_task(self._take_results(), name="provider results")
 
     def earnings(self) -> Earnings:
@@ -168,12 +181,6 @@ class Provider(Role):
     def health(self) -> Mapping[str, str]:
         """The state of each part, as `aira status` shows it."""
         return self._status.health()
-
-    async def _take_orders(self, orders: Subscription[Any]) -> None:
-        await orders.recall()
-        async for order in orders:
-            await self.queue.has_room()
-            self.settlement.add(order)
 
     def _forget(self, verified: Verified[Any]) -> None:
         """Let the next copy of a message through: it is not handled, or its effect was not confirmed."""

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from mesh.chain import NodeUnreachable, NotALiability, RequestRefused, Reverted, TransactionTimeout
 from mesh.errors import AiraError, ChainError, InputError
 from mesh.log_context import liability_context, log_event
-from mesh.market.book import ORDER_USED, Match, Refusal, at_fault, order_id, reason_word
+from mesh.market.book import ORDER_USED, Added, Match, Refusal, at_fault, order_id, reason_word
 from mesh.market.liability_events import OPEN_LIABILITIES, LiabilityEvents, Unconfirmed
 from mesh.market.rejections import RejectionPublisher
 from mesh.market.unfunded import UnfundedOrders
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from mesh.chain import Chain, Created
+    from mesh.flood import Drops
     from mesh.market.book import Order, OrderBook
     from mesh.market.earnings import EarningsLedger
     from mesh.market.transaction_queue import TransactionQueue
@@ -62,6 +63,7 @@ class Settlement:
         matched: Callable[[Match], None],
         forget: Callable[[Verified[Any]], None],
         withdrawals: Withdrawals,
+        drops: Drops,
         open_limit: int = OPEN_LIABILITIES,
     ) -> None:
         assert chain.account is not None
@@ -74,7 +76,8 @@ class Settlement:
         self._matched = matched
         self._forget = forget
         self._withdrawals = withdrawals
-        self._publisher = RejectionPublisher(channel, chain.account, earnings)
+        self._drops = drops
+        self._publisher = RejectionPublisher(channel, chain.account, earnings, drops)
         self.reject: Final = self._publisher.reject
         self._unconfirmed = Unconfirmed(chain.node.timing.reorg_depth)
         self.events: Final = LiabilityEvents(
@@ -86,9 +89,12 @@ class Settlement:
             earnings=earnings,
             head=head,
             reverted=self._settle_again,
+            forget=forget,
             open_limit=open_limit,
         )
-        self._unfunded = UnfundedOrders(book, self._can_pay, funded=self.add, interval=chain.node.timing.poll_interval)
+        self._unfunded = UnfundedOrders(
+            book, self._is_funded, funded=self.add, interval=chain.node.timing.poll_interval
+        )
 
     def start(self, tasks: asyncio.TaskGroup) -> None:
         """Follow the chain, and from now on settle what is added, in tasks of this group."""
@@ -102,6 +108,9 @@ class Settlement:
         If the book refuses the order, returns why, and publishes a rejection unless the order is known already.
         """
         outcome = self._refusal(order) or self._book.add(order)
+        for evicted in outcome.evicted if isinstance(outcome, Added) else ():
+            self._drops.count("book-full", evicted.signer)
+            self._forget(evicted)
         if isinstance(outcome, Match):
             demand, offer = outcome.demand.hash.hex(), outcome.offer.hash.hex()
             event = log_event("orders-matched", demand=demand, offer=offer)
@@ -117,6 +126,12 @@ class Settlement:
                 self._forget(order)
             return outcome
         return None
+
+    def set_aside(self, order: Verified[Order], reason: str) -> None:
+        """Keep an order whose maker can't pay, unmatched, until it can; `reason` is the contracts' error for that."""
+        if self._refusal(order) is None and order_id(order) not in self._book and self._unfunded.add(order):
+            self.reject(order, reason, "its maker does not have, or does not allow the factory to take, what it costs")
+        self._forget(order)
 
     def _settle_again(self, message: Verified[Any]) -> None:
         if isinstance(message.message, Result):
@@ -172,12 +187,16 @@ class Settlement:
 
     async def _create(self, match: Match) -> None:
         demand, offer = match
+        for order in match:
+            if shortage := await self.shortage(order):
+                await self._set_aside_unfunded(match, shortage, "its maker can't pay any more")
+                return
         try:
             created = await self._queue.send(self._creation(match))
         except MatchWithdrawn:
             self._put_back(match)
         except Reverted as error:
-            if error.reason == ORDER_USED or not await self._set_aside_unfunded(match, error):
+            if error.reason == ORDER_USED or not await self._set_aside_unfunded(match, _reason(error), str(error)):
                 await self._not_created(match, at_fault(match, error.reason, error.arguments), error)
         except (NodeUnreachable, RequestRefused, InputError) as error:
             await self._not_created(match, match, error)
@@ -216,9 +235,9 @@ class Settlement:
             if not self._unconfirmed.end(order):
                 self.add(order)
 
-    async def _set_aside_unfunded(self, match: Match, error: Reverted) -> bool:
+    async def _set_aside_unfunded(self, match: Match, reason: str, detail: str) -> bool:
         """Keep the orders whose makers can't pay in the book, unmatched, and tell them; False if both can."""
-        unfunded = [order for order in match if not await self._can_pay(order, fresh=True)]
+        unfunded = [order for order in match if await self.shortage(order, fresh=True)]
         for order in match if unfunded else ():
             if self._unconfirmed.end(order):
                 continue
@@ -226,13 +245,17 @@ class Settlement:
                 self.add(order)
                 continue
             self._unfunded.add(order)
-            self.reject(order, _reason(error), str(error))
+            self.reject(order, reason, detail)
             self._forget(order)
         return bool(unfunded)
 
-    async def _can_pay(self, order: Verified[Order], *, fresh: bool = False) -> bool:
-        question = partial(self._chain.costs.can_be_paid, order, fresh=fresh)
+    async def shortage(self, order: Verified[Order], *, fresh: bool = False) -> str:
+        """What an order's maker lacks to pay what it costs: see `OrderCosts.shortage`. Asked until the node answers."""
+        question = partial(self._chain.costs.shortage, order, fresh=fresh)
         return await self._chain.retrying(question, outages=self.events.lookups)
+
+    async def _is_funded(self, order: Verified[Order]) -> bool:
+        return not await self.shortage(order)
 
     async def _not_created(self, match: Match, rejected: tuple[Verified[Order], ...], error: AiraError) -> None:
         """Reject some orders of a match; put the other one back into the book, unless it was used meanwhile."""

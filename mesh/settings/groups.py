@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 LONGEST: Final = 1e9
 """The most seconds that an option can hold, about thirty years: not every file format can express infinity."""
 
+DEADLINE_LIMIT: Final = 7200
+"""Blocks, about a day where one takes 12 seconds."""
+
 PositiveInt = Annotated[int, Meta(ge=1)]
 Seconds = Annotated[float, Meta(ge=0, le=LONGEST)]
 Interval = Annotated[float, Meta(gt=0, le=LONGEST)]
@@ -159,6 +162,10 @@ class MarketSettings:
     lighthouse_contract: str = option("", "ENS name of the lighthouse, the market to trade on")
     erc20_token: str = option("", "ENS name or address of the token that pays for work")
     open_orders_limit: PositiveInt = option(1_000_000, "most open orders that a provider keeps")
+    deadline_limit: PositiveInt = option(
+        DEADLINE_LIMIT,
+        "blocks after which a provider drops an order, and an agent's offer for a demand ends, before its deadline",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 from hypothesis import settings
@@ -88,7 +89,21 @@ class BookAgainstNaiveBook(RuleBasedStateMachine):
 
     @rule(order=st.sampled_from(POOL))
     def add(self, order: Verified[Any]) -> None:
-        assert self.book.add(order) == self.naive.add(order)
+        outcome, naive = self.book.add(order), self.naive.add(order)
+        if isinstance(outcome, Added) and outcome.evicted:
+            self.has_evicted(order, outcome)
+        else:
+            assert outcome == naive
+
+    def has_evicted(self, order: Verified[Any], outcome: Added) -> None:
+        """A full book has made room: for a signer with fewer orders than the one that lost its newest, or with none."""
+        (evicted,) = outcome.evicted
+        signers = Counter(one.signer for one in self.naive.open)
+        assert len(self.naive.open) == self.naive.limit
+        assert signers[order.signer] < signers[evicted.signer]
+        assert evicted == [one for one in self.naive.open if one.signer == evicted.signer][-1]
+        self.naive.open.remove(evicted)
+        self.naive.open.append(order)
 
     @rule(order=st.sampled_from(POOL))
     def remove(self, order: Verified[Any]) -> None:

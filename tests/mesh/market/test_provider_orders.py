@@ -111,7 +111,7 @@ async def test_a_contract_from_before_the_start_is_finalized(local: LocalMarket)
 
 async def test_a_full_book_rejects_an_order_and_accepts_it_when_there_is_room(local: LocalMarket) -> None:
     async with local.provider(limit=1) as provider:
-        first, second = local.demand(cost=0), local.demand(cost=1)
+        first, second = local.demand(), local.demand()
         local.publish(first, second)
         assert (await local.rejection_of(second)).reason == "full"
 

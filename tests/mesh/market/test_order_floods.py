@@ -1,0 +1,117 @@
+"""Floods of orders: makers without money, a full book, deadlines far away."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from typing import TYPE_CHECKING, Any
+
+from mesh.market import Added, OrderBook, Refusal
+from schemas import Demand, Signer, verify_message
+from tests.mesh.market.test_provider_withdrawals import withdrawal_of
+from tests.support.orders import LIGHTHOUSE, PERSON, STRANGER, verified_demand, verified_offer
+from tests.support.waiting import until
+
+if TYPE_CHECKING:
+    from mesh.market.book import Order
+    from schemas import Verified
+    from tests.mesh.market.local_market import LocalMarket
+
+
+def stranger() -> Signer:
+    return Signer(secrets.token_bytes(32))
+
+
+def filled(limit: int, *orders: Verified[Order], **options: Any) -> OrderBook:
+    book = OrderBook(LIGHTHOUSE, limit=limit, **options)
+    for order in orders:
+        assert isinstance(book.add(order), Added)
+    return book
+
+
+def test_in_a_full_book_the_signer_with_the_most_orders_loses_its_newest() -> None:
+    flood: list[Verified[Order]] = [verified_demand(signer=STRANGER) for _ in range(4)]
+    book = filled(4, *flood)
+    honest = verified_demand(signer=PERSON)
+    assert book.add(honest) == Added(honest, evicted=(flood[-1],))
+    assert book.add(verified_demand(signer=STRANGER)) is Refusal.FULL
+    assert list(book.orders()) == [*flood[:3], honest]
+    for order in flood[:2]:
+        other = verified_demand(signer=stranger())
+        outcome = book.add(other)
+        assert isinstance(outcome, Added)
+        assert outcome.evicted[0].signer == order.signer
+    assert len(book) == 4
+
+
+def test_in_a_full_book_of_fresh_keys_the_oldest_that_pays_nothing_leaves() -> None:
+    paid = verified_demand(signer=stranger(), cost=5)
+    free: list[Verified[Order]] = [
+        verified_demand(signer=stranger(), cost=0),
+        verified_offer(signer=stranger(), cost=7),
+    ]
+    book = filled(3, paid, *free)
+    newest = [verified_demand(signer=stranger(), cost=9) for _ in range(3)]
+    assert book.add(newest[0]) == Added(newest[0], evicted=(free[0],))
+    assert book.add(newest[1]) == Added(newest[1], evicted=(free[1],))
+    assert book.add(newest[2]) is Refusal.FULL
+    assert set(book.orders()) == {paid, *newest[:2]}
+
+
+def test_an_order_leaves_the_book_at_its_limit_of_blocks() -> None:
+    far, near = verified_demand(deadline=10**9), verified_demand(deadline=103)
+    book = OrderBook(LIGHTHOUSE, deadline_limit=10)
+    book.expire(100)
+    for order in (far, near):
+        assert isinstance(book.add(order), Added)
+    assert book.expire(103) == [near]
+    assert book.expire(109) == []
+    assert book.expire(110) == [far]
+    assert isinstance(book.add(far), Added), "its maker may send it again"
+    book.compact()
+    assert book.expire(120) == [far]
+
+
+def copies(local: LocalMarket, count: int, **terms: Any) -> list[Demand]:
+    """Demands with these terms of accounts that have nothing."""
+    demand = local.demand(**terms)
+    fields = {field: getattr(demand, field) for field in demand.__struct_fields__}
+    return [stranger().sign(Demand(**(fields | {"nonce": secrets.token_hex(32)}))) for _ in range(count)]
+
+
+async def test_unfunded_demands_with_the_same_terms_take_no_offer(local: LocalMarket) -> None:
+    await local.chain.tokens.approve(local.chain.factory, 5)
+    async with local.provider() as provider:
+        for number in range(6):
+            local.publish(*copies(local, 50, cost=5))
+            await until(lambda: provider.drops.totals().get("unfunded") == 50 * (number + 1))  # noqa: B023
+        honest = local.demand(cost=5)
+        async with asyncio.timeout(5):
+            local.publish(local.offer(cost=5), honest)
+            await local.liability_of(honest)
+        assert provider.ledger.turnover().matches == 1
+
+
+async def test_a_far_deadline_holds_a_place_for_some_blocks_only(local: LocalMarket) -> None:
+    async with local.provider(deadline_limit=5) as provider:
+        demand = local.demand(deadline=10**9)
+        local.publish(demand)
+        await until(lambda: len(provider.book) == 1)
+        await local.mine(6)
+        await until(lambda: len(provider.book) == 0)
+        local.publish(demand)
+        await until(lambda: list(provider.book.orders()) == [verify_message(demand)])
+
+
+async def test_an_evicted_order_is_accepted_again_when_there_is_room(local: LocalMarket) -> None:
+    async with local.provider(limit=2) as provider:
+        first, evicted, other = local.demand(), local.demand(), local.demand("robot", cost=0)
+        local.publish(first, evicted)
+        await until(lambda: len(provider.book) == 2)
+        local.publish(other)
+        await until(lambda: set(provider.book.orders()) == {verify_message(first), verify_message(other)})
+        assert provider.drops.totals() == {"book-full": 1}
+        local.publish(withdrawal_of(local, first))
+        await until(lambda: len(provider.book) == 1)
+        local.publish(evicted)
+        await until(lambda: len(provider.book) == 2)
