@@ -39,6 +39,7 @@ class TermsWriter:
         self._settings = parts.settings
         self._chain = parts.chain
         self._signer = parts.signer
+        self._chain_head = parts.chain_head
 
     async def terms(
         self, *, model: str, objective: str, cost: int, token: str, validator: str, lifetime: int | None
@@ -61,7 +62,14 @@ class TermsWriter:
         }
 
     def terms_of(self, order: Demand | Offer) -> Terms:
-        """The terms of `order`, for an order of this account in the same generation."""
+        """The terms of `order`, for an order of this account in the same generation that answers it.
+
+        The deadline is a stranger's: it counts up to the setting `deadline_limit`.
+        """
+        latest = self._chain_head.head + self._settings.deadline_limit
+        return {**self._repeated(order), "deadline": min(order.deadline, latest)}
+
+    def _repeated(self, order: Demand | Offer) -> Terms:
         terms = {field: getattr(order, field) for field in (*REPEATED, "deadline")}
         return {**terms, "sender": None if order.generation == 3 else self._signer.address}
 
@@ -76,8 +84,8 @@ class TermsWriter:
     async def sign_again(self, order: Demand | Offer) -> Demand | Offer:
         """An order like this one, with a fresh nonce."""
         if isinstance(order, Demand):
-            return await self.sign(Demand, self.terms_of(order), validator_fee=order.validator_fee)
-        return await self.sign(Offer, self.terms_of(order), lighthouse_fee=order.lighthouse_fee)
+            return await self.sign(Demand, self._repeated(order), validator_fee=order.validator_fee)
+        return await self.sign(Offer, self._repeated(order), lighthouse_fee=order.lighthouse_fee)
 
 
 def is_repeated(demand: Demand, terms: Terms, *, validator_fee: int) -> bool:

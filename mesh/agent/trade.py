@@ -9,7 +9,9 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from mesh.agent.contract import Contract, WatchedContracts, fail_future
+from mesh.agent.demands import current_buyer
 from mesh.agent.errors import OrderClosed, OrderExpired
+from mesh.agent.offers import OpenOffers
 from mesh.agent.orders import Order, OrderState, Rejections, TradedOrder
 from mesh.agent.terms import Allowances, TermsWriter
 from mesh.background import Background
@@ -55,6 +57,7 @@ class Trader(Lifecycle):
         self.writer = TermsWriter(parts)
         """Fills in and signs orders."""
         self._orders: dict[str, TradedOrder] = {}
+        self._answers = OpenOffers()
         self._changing = asyncio.Lock()
         self.contracts = WatchedContracts(parts)
         """The contracts whose end is waited for."""
@@ -72,6 +75,10 @@ class Trader(Lifecycle):
             self.customers.add(job.liability.promisee)
         resumed = [order for order in await self.load() if order.is_open]
         for order in resumed:
+            if isinstance(order.signed, Offer):
+                await self._give_up(self._answers.add(order.identity, "", pays=False))
+        resumed = [order for order in resumed if order.is_open]
+        for order in resumed:
             kind, identity, deadline = order.signed.kind, order.identity, order.signed.deadline
             facts = log_event("order-resumed", order=identity, kind=kind, deadline=deadline)
             log.info("the %s %s of an earlier run is open until block %d", kind, identity, deadline, extra=facts)
@@ -86,8 +93,13 @@ class Trader(Lifecycle):
         self.contracts.fail(_ended())
 
     async def post(self, kind: type[Demand | Offer], terms: Terms, **fee: Any) -> Order:
-        """Sign an order, ensure its allowance, and post it. Cancelling withdraws it. Raises `InsufficientTokens`."""
+        """Sign an order, ensure its allowance, and post it. Cancelling withdraws it.
+
+        Raises `InsufficientTokens`, and `TooManyOffers` for an offer that answers a demand.
+        """
         order = TradedOrder(await self.writer.sign(kind, terms, **fee), time.time())
+        if kind is Offer and (buyer := current_buyer()) is not None:
+            await self._give_up(self._answers.add(order.identity, buyer.maker, pays=buyer.pays))
         self._orders[order.identity] = order
         try:
             await self._ensure_allowance(order)
@@ -206,7 +218,10 @@ class Trader(Lifecycle):
     def _send_when_covered(self, orders: Collection[TradedOrder]) -> None:
         """Send these orders of the ledger when the factory has the allowance for them, in a task."""
         self._parts.outbox.hold(order.identity for order in orders)
-        for order in orders:
+        costly = [order for order in orders if any(self._chain.costs.of(order.signed).values())]
+        free = {order.identity for order in orders} - {order.identity for order in costly}
+        self._tasks.start(self._parts.outbox.release(free), "resume free orders")
+        for order in costly:
             self._tasks.start(self._cover_and_send(order), f"resume {order.identity}")
 
     async def _cover_and_send(self, order: TradedOrder) -> None:
@@ -293,6 +308,14 @@ class Trader(Lifecycle):
         facts = log_event("order-renewed", order=identity, renewed=order.identity)
         log.info("the %s %s is signed again as %s", signed.kind, identity, order.identity, extra=facts)
 
+    async def _give_up(self, identity: str) -> None:
+        """Don't send an offer any more. What providers have of it may still become a contract."""
+        if (order := self._orders.get(identity)) is not None:
+            self._forget(order)
+            order.state = OrderState.WITHDRAWN
+            fail_future(order.created, OrderClosed(identity, order.state))
+            await self._parts.outbox.settle(identity)
+
     def _set_withdrawn(self, order: TradedOrder) -> None:
         order.state = OrderState.WITHDRAWN
         self._allowances.withdraw(order)
@@ -300,6 +323,7 @@ class Trader(Lifecycle):
 
     def _forget(self, order: TradedOrder) -> None:
         self._orders.pop(order.identity, None)
+        self._answers.discard(order.identity)
         self._allowances.release(order)
 
 

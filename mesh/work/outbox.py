@@ -10,6 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from mesh.flood import Rate, RateLimiter
 from mesh.log_context import log_event
 from mesh.retry import Backoff, RetryPolicy
 from mesh.work.ledger import Outgoing
@@ -23,8 +24,12 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-RESEND: Final = RetryPolicy(initial=3.0, ceiling=60.0)
+RESEND: Final = RetryPolicy(initial=3.0, ceiling=300.0)
 """How long to wait for the effect of a message before it is sent again."""
+RESEND_RATE: Final = Rate(per_second=50.0, burst=250)
+"""Messages that are sent again, in all: strangers can make a robot offer, and tell it that a provider appeared."""
+LATER: Final = 0.5
+"""Seconds after which a message is due again that exceeded the rate."""
 
 
 def outgoing_identity(message: SignedMessage) -> str:
@@ -71,7 +76,8 @@ class Outbox:
 
     A message is sent when it is posted, and then again after growing delays (`policy`). All are sent at once, and their
     delays start over, when `run` starts, when the network returns and when a provider appears on the market: a provider
-    starts with an empty order book. `clock` (seconds) and `chance` (0 to 1, for jitter) are injected by tests.
+    starts with an empty order book. Beyond `rate` messages wait: the oldest longest, and offers behind all others.
+    `clock` (seconds) and `chance` (0 to 1, for jitter) are injected by tests.
     """
 
     def __init__(
@@ -82,6 +88,7 @@ class Outbox:
         *,
         head: Callable[[], int],
         policy: RetryPolicy = RESEND,
+        rate: Rate = RESEND_RATE,
         clock: Callable[[], float] = time.monotonic,
         chance: Callable[[], float] = random.random,
     ) -> None:
@@ -94,10 +101,14 @@ class Outbox:
         self._chance = chance
         self._attempts: dict[str, _Attempts] = {}
         self._held: set[str] = set()
+        self._fresh: set[str] = set()
+        """Messages that were never sent, in this run or an earlier one."""
+        self._limiter = RateLimiter(per_sender=rate)
         self._changed = asyncio.Event()
 
     async def post(self, message: SignedMessage) -> None:
         """Keep a signed message until `settle`, and send it now."""
+        self._fresh.add(outgoing_identity(message))
         await self._ledger.post(outgoing(message))
         await self.send_new()
 
@@ -175,12 +186,18 @@ class Outbox:
 
     async def _send(self, is_due: Callable[[str], bool]) -> None:
         unsent = await self._ledger.outbox(head=self._head())
-        for one in unsent:
-            if one.identity not in self._held and is_due(one.identity):
+        offers = [one for one in unsent if one.kind == "offer"]
+        for one in (*(one for one in unsent if one.kind != "offer"), *reversed(offers)):
+            if one.identity in self._held or not is_due(one.identity):
+                continue
+            if one.identity in self._fresh or self._limiter.allow(""):
+                self._fresh.discard(one.identity)
                 message = decode(one.payload)
                 assert isinstance(message, Demand | Offer | Withdrawal | Result)
                 self._channel.publish(message)
                 self._schedule(one)
+            else:
+                self._postpone(one)
         self._attempts = {
             one.identity: self._attempts[one.identity] for one in unsent if one.identity in self._attempts
         }
@@ -188,10 +205,17 @@ class Outbox:
 
     def _schedule(self, one: Outgoing) -> None:
         """Set the time of the next attempt at a message that has just been sent."""
+        attempts = self._attempts_at(one)
+        attempts.next_at = self._clock() + (attempts.backoff.next_delay() or 0.0)
+
+    def _postpone(self, one: Outgoing) -> None:
+        """A message is due, but too many are."""
+        self._attempts_at(one).next_at = self._clock() + LATER
+
+    def _attempts_at(self, one: Outgoing) -> _Attempts:
         if one.identity not in self._attempts:
             self._attempts[one.identity] = _Attempts(Backoff(self._policy, chance=self._chance), 0.0, one.deadline)
-        attempts = self._attempts[one.identity]
-        attempts.next_at = self._clock() + (attempts.backoff.next_delay() or 0.0)
+        return self._attempts[one.identity]
 
     async def _wait(self) -> None:
         """Wait until the next attempt is due."""
