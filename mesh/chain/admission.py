@@ -64,7 +64,7 @@ class OrderCosts:
             if funding is not None and min(funding) < amount and not fresh:
                 funding = await self._funds.of(holding, within=SHORT_POLLS)  # it may have paid in since
             if funding is not None and min(funding) < amount:
-                return "ERC20InsufficientBalance" if funding.balance < amount else "ERC20InsufficientAllowance"
+                return "ERC20InsufficientAllowance" if funding.allowance < amount else "ERC20InsufficientBalance"
         return ""
 
     async def can_be_paid(self, order: Verified[Order], *, fresh: bool = False) -> bool:
