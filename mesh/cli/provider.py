@@ -70,7 +70,6 @@ async def serve(settings: Settings) -> None:
         announce(log, "provider-started", words, provider=provider.address, zenoh=network.id)
         tasks = await stack.enter_async_context(Background())
         tasks.start(report_earnings(provider.earnings), "earnings")
-        tasks.start(provider.drops.run(), "drops")
         await provider.run()
 
 

@@ -51,8 +51,8 @@ class Provider(Role):
     `lighthouse` is the ENS name; its chain account must have a stake there. `limit` is the most open orders, `matched`
     is called with each match before its liability is created, `retry` is the policy for transactions that fail, and
     `open_liabilities` the most records of open liabilities in memory. Withdrawals are kept in the file
-    `withdrawals`, if given. Orders leave the book after `deadline_limit` blocks. What is dropped is counted in `drops`,
-    which the caller reports. The caller closes session and chain. When `run` is cancelled, a transaction that was sent
+    `withdrawals`, if given. Orders leave the book after `deadline_limit` blocks. What is dropped is counted in `drops`.
+    The caller closes session and chain. When `run` is cancelled, a transaction that was sent
     may still be mined.
     """
 

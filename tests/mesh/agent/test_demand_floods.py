@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from mesh.agent import Agent
     from schemas import Verified
 
-BEFORE_ITS_TURN = 2.0
-"""Seconds in which an honest demand is offered, though a flood came first; each dead objective takes 10 s."""
+BEFORE_ITS_TURN = 30.0
+"""Seconds in which an honest demand is a contract, though a flood came first, which would take three times as long."""
 
 
 @asynccontextmanager
