@@ -18,6 +18,7 @@ const wanted = {
   "src/Lighthouse.sol": { Lighthouse: suite },
   "src/Liability.sol": { Liability: suite },
   "src/Jury.sol": { Jury: suite },
+  "src/Multicall.sol": { Multicall: suite },
   "fixtures/Tokens.sol": { FeeToken: tests, SilentToken: tests, RefusingToken: tests, HookedToken: tests },
   "fixtures/Crowd.sol": { Crowd: tests },
   "fixtures/Validators.sol": { OneSigner: tests, BrokenValidator: tests },

@@ -51,6 +51,8 @@ SHARE: Final = 4
 """A Result is late when a quarter of the time that was left for it is left."""
 LEAST_BLOCKS: Final = 20
 """It is late at this many blocks before the refund in any case."""
+SOON: Final = 3
+"""Blocks that leave a Result unsettled before the chain is asked when it would be late."""
 NEVER: Final = 2**63
 
 
@@ -88,7 +90,9 @@ class ChainListener:
     async def _follow(self, token: str, backoff: Backoff) -> None:
         """Read on from the position in the ledger."""
         cursor, history = await self._position()
-        following = self._chain.follow(cursor, history=history, token=token, outages=self._parts.outages)
+        following = self._chain.follow(
+            cursor, history=history, token=token, parties=[self._account], outages=self._parts.outages
+        )
         async with aclosing(following) as blocks:
             async for block in blocks:
                 if isinstance(block, Reorganisation):
@@ -156,18 +160,14 @@ class ChainListener:
     async def _read_new(self, address: str) -> None:
         """Read a new liability and, if it names this account, its orders."""
 
-        async def read() -> tuple[Liability, tuple[bytes, bytes] | None]:
-            liability = await self._chain.liabilities.get(address)
-            is_ours = self._account in (liability.promisor, liability.promisee)
-            return liability, await self._chain.liabilities.order_hashes(address) if is_ours else None
-
+        read = partial(self._chain.liabilities.get_with_orders, address)
         try:
             liability, orders = await self._chain.retrying(read, outages=self._parts.outages)
         except NotALiability:
             facts = log_event("liability-gone", liability=address)
             log.warning("the liability was reverted before it was read", extra=facts)
             return
-        if orders is not None:
+        if self._account in (liability.promisor, liability.promisee):
             await self.new_liability(liability, demand_hash=orders[0], offer_hash=orders[1])
 
     @with_liability_context
@@ -256,6 +256,7 @@ class LateResults:
         self._parts = parts
         self._liabilities = parts.chain.liabilities
         self._late_from: dict[str, int] = {}  # block, by liability
+        self._since: dict[str, int] = {}  # the block at which its Result was seen first, by liability
 
     async def run(self) -> None:
         """Look at the unsettled Results after each block, until cancelled."""
@@ -265,6 +266,7 @@ class LateResults:
             results = [decode(one.payload) for one in unsettled if one.kind == Result.kind]
             waiting = {result.liability: result for result in results if isinstance(result, Result)}
             self._late_from = {address: block for address, block in self._late_from.items() if address in waiting}
+            self._since = {address: self._since.get(address, head.head) for address in waiting}
             for address, result in waiting.items():
                 with liability_context(address):
                     await self._finalize_if_late(result)
@@ -274,6 +276,8 @@ class LateResults:
         address, head = result.liability, self._parts.chain_head.head
         try:
             if address not in self._late_from:
+                if head - self._since[address] < SOON:
+                    return
                 refundable = await self._liabilities.refundable_from(address)
                 self._late_from[address] = refundable - max(LEAST_BLOCKS, (refundable - head) // SHARE)
             if head < self._late_from[address]:

@@ -30,6 +30,9 @@ MOST_BLOCKS: Final = 20_000
 """The bounds of that in blocks, whatever time was measured between two blocks."""
 MEASURED_BLOCKS: Final = 100
 """The latest blocks, from which the time between two blocks is measured."""
+LEAST_AHEAD: Final = 4
+MOST_AHEAD: Final = 16
+"""An allowance that contracts have used up is approved for so many times what the open orders need, growing."""
 
 
 class TermsWriter:
@@ -57,7 +60,7 @@ class TermsWriter:
             "cost": cost,
             "lighthouse": await names.address(settings.lighthouse_contract),
             "validator": await names.address(validator) if validator else ZERO_ADDRESS,
-            "deadline": await self._chain.block_number() + blocks,
+            "deadline": (await self._chain.node.heads.recent()).number + blocks,
             "sender": None if settings.generation == 3 else self._signer.address,
         }
 
@@ -95,12 +98,8 @@ def is_repeated(demand: Demand, terms: Terms, *, validator_fee: int) -> bool:
 
 async def default_lifetime(chain: Chain) -> int:
     """How many blocks an order is valid by default: about `LIFETIME`, by the time between the latest blocks."""
-    last = await chain.node.latest_header()
-    first = await chain.node.header(max(1, last.number - MEASURED_BLOCKS))
-    if first is None or first.number >= last.number or first.timestamp >= last.timestamp:
-        return round(LIFETIME)
-    block_time = (last.timestamp - first.timestamp) / (last.number - first.number)
-    return min(max(round(LIFETIME / block_time), FEWEST_BLOCKS), MOST_BLOCKS)
+    block_time = await chain.node.heads.block_time(MEASURED_BLOCKS)
+    return round(LIFETIME) if block_time is None else min(max(round(LIFETIME / block_time), FEWEST_BLOCKS), MOST_BLOCKS)
 
 
 class Allowances:
@@ -111,6 +110,9 @@ class Allowances:
         self._account = account
         self._open: dict[Hashable, Mapping[str, int]] = {}
         self._withdrawn: dict[Hashable, Mapping[str, int]] = {}
+        self._approved: dict[str, int] = {}
+        """By token: what this agent approved last."""
+        self._ahead: dict[str, int] = {}
         self._approving = asyncio.Lock()
 
     async def ensure(self, order: Hashable, amounts: Mapping[str, int]) -> None:
@@ -124,8 +126,8 @@ class Allowances:
                 if amount:
                     others = (costs for key, costs in self._open.items() if key != order)
                     funds = amount + _sum(others, token)
-                    allowance = funds + _sum(self._withdrawn.values(), token)
-                    await self._ensure(token, funds=funds, allowance=allowance)
+                    needed = funds + _sum(self._withdrawn.values(), token)
+                    await self._ensure(token, funds=funds, needed=needed)
             if order not in self._withdrawn:
                 self._open[order] = amounts
 
@@ -143,22 +145,34 @@ class Allowances:
         self._open.pop(order, None)
         self._withdrawn.pop(order, None)
 
-    async def _ensure(self, token: str, *, funds: int, allowance: int) -> None:
-        balance = await self._chain.tokens.balance(self._account, token=token)
+    async def _ensure(self, token: str, *, funds: int, needed: int) -> None:
+        factory, tokens = self._chain.factory, self._chain.tokens
+        balance, allowed = await tokens.balance_and_allowance(self._account, factory, token=token)
         if balance < funds:
             raise InsufficientTokens(self._account, token, balance=balance, needed=funds)
-        factory = self._chain.factory
-        while await self._chain.tokens.allowance(self._account, factory, token=token) < allowance:
+        while allowed < needed:
+            allowance = max(needed, min(self._times(token, allowed) * needed, balance))
             facts = log_event("allowance-approved", token=token, amount=allowance)
             log.info("approving an allowance of %d of token %s for the factory", allowance, token, extra=facts)
             try:
-                await self._chain.tokens.approve(factory, allowance, token=token)
+                await tokens.approve(factory, allowance, token=token)
+                self._approved[token] = allowance
             except Reverted as error:
                 if error.reason != "OutOfGas":
                     raise
                 # An order became a contract between estimate and block: setting a used-up allowance costs more gas.
                 facts = log_event("allowance-retried", token=token, amount=allowance)
                 log.info("approving the allowance again: %s", error, extra=facts)
+            allowed = await tokens.allowance(self._account, factory, token=token)
+
+    def _times(self, token: str, allowed: int) -> int:
+        """How many times what is needed is approved: more and more, when contracts have used up what was approved.
+
+        A transaction for each order would cost more than the order.
+        """
+        if allowed < self._approved.get(token, 0):
+            self._ahead[token] = min(max(LEAST_AHEAD, 2 * self._ahead.get(token, 0)), MOST_AHEAD)
+        return self._ahead.get(token, 1)
 
 
 def _sum(orders: Iterable[Mapping[str, int]], token: str) -> int:

@@ -6,6 +6,7 @@ field or a value of another type, and then the request is made again, to the nex
 
 from __future__ import annotations
 
+from functools import lru_cache
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -17,17 +18,21 @@ from msgspec.structs import force_setattr
 
 from mesh.chain.errors import RequestRefused
 from mesh.errors import ChainError
+from schemas import keccak256
 from schemas.address import checksum_address
 from schemas.cid import format_cid
 from schemas.errors import InvalidCid
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
 MAX_ANSWER: Final = 32 << 20
 """Bytes of one answer."""
 MAX_LOGS: Final = 50_000
 """Logs in one answer."""
+NO_TRANSACTIONS: Final = bytes.fromhex("56e81f171bcc55a6ff8345e692c0f86e5b48e01b996cadc001622fb5e363b421")
+"""The root of an empty trie: a block without transactions has it."""
+BLOOM_BITS: Final = 2_048
 LONGEST_TEXT: Final = 1_000
 """Characters of a text, such as an error message, that are kept."""
 
@@ -79,13 +84,35 @@ LENGTHS: Final[Mapping[type, int]] = MappingProxyType({Word: 32, Address: 20})
 
 
 class BlockHeader(_Answer, frozen=True):
-    """A block. Hashes are 32 bytes, `timestamp` is Unix time, `base_fee` is wei (None: the chain has none)."""
+    """A block. Hashes are 32 bytes, `timestamp` is Unix time, `base_fee` is wei (None: the chain has none).
+
+    `may_log` tells by the header whether the block can hold a log.
+    """
 
     number: Count
     hash: Word
     parent_hash: Word
     timestamp: Count
     base_fee: Quantity | None = msgspec.field(default=None, name="baseFeePerGas")
+    transactions_root: Word | None = None
+    logs_bloom: Data | None = None
+
+    @property
+    def has_transactions(self) -> bool:
+        """Whether the block holds transactions, as far as its header says."""
+        return self.transactions_root != NO_TRANSACTIONS
+
+    def may_log(self, *alternatives: Iterable[bytes]) -> bool:
+        """Whether the block may hold a log with all the members of one of the alternatives: its address and topics.
+
+        False is certain; so is only what the node says of the block's logs.
+        """
+        if not self.has_transactions:
+            return False
+        if self.logs_bloom is None or not any(self.logs_bloom):  # some chains don't fill it in
+            return True
+        bloom = int.from_bytes(self.logs_bloom, "big")
+        return any(all(bloom & bits == bits for bits in map(_bloom_bits, members)) for members in alternatives)
 
 
 class Log(_Answer, frozen=True):
@@ -182,6 +209,13 @@ def decode_cid(data: bytes) -> str:
         return format_cid(data)
     except InvalidCid:
         return ""
+
+
+@lru_cache(maxsize=1_024)
+def _bloom_bits(member: bytes) -> int:
+    """The bits of an address or topic in a block's Bloom filter: three, each by eleven bits of its hash."""
+    digest = keccak256(member)
+    return sum(1 << place for place in {int.from_bytes(digest[at : at + 2], "big") % BLOOM_BITS for at in (0, 2, 4)})
 
 
 def _failure(error: object) -> RpcFailure:

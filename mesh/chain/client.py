@@ -178,19 +178,21 @@ class Chain:
         *,
         history: History | None = None,
         token: str = "",
+        parties: Iterable[str] | None = None,
         lighthouses: Iterable[str] = (),
         outages: OutageLog | None = None,
     ) -> AsyncGenerator[BlockEvents, None]:
         """Blocks with their events from the block `cursor` on, for ever, and reorganisations: `mesh.chain.following`.
 
-        Transfers and approvals are those of `token` (an address; XRT by default); a lighthouse's turns are read for
-        the addresses in `lighthouses`. Outages of the node are logged to `outages` and survived. Raises
-        `ChainWentBack` and `ReorganisedTooDeep`.
+        Transfers and approvals are those of `token` (an address; XRT by default), all or those that concern one of
+        `parties` (addresses); a lighthouse's turns are read for the addresses in `lighthouses`. Outages of the node are
+        logged to `outages` and survived. Raises `ChainWentBack` and `ReorganisedTooDeep`.
         """
         contracts = self._opened()
         sources = EventSources(
             factory=contracts.factory,
             token=token or contracts.xrt,
+            parties=None if parties is None else frozenset(parties),
             lighthouses=tuple(lighthouses),
             is_liability=contracts.version.is_liability,
             recognise=contracts.version.recognise,

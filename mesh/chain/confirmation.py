@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 from mesh.chain.errors import NodeUnreachable, RequestRefused, TransactionTimeout
@@ -96,13 +97,29 @@ async def find_receipt(
 
 
 class Confirmation:
-    """The wait for one transaction of an account, which stays among the account's pending ones."""
+    """The wait for one transaction of an account, which stays among the account's pending ones.
 
-    def __init__(self, node: Node, account: Account, pending: PendingTransactions, entry: PendingTransaction) -> None:
+    `since` is the hash of the latest block before it was sent, if that was just now.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        account: Account,
+        pending: PendingTransactions,
+        entry: PendingTransaction,
+        *,
+        since: bytes = b"",
+    ) -> None:
         self._node = node
         self._account = account
         self._pending = pending
         self._entry = entry
+        self._seen = since
+        """The hash of the latest block when the receipt was looked for last."""
+        self._replace_at = 0.0
+        self._backoff = Backoff(node.timing.outage_retry)
+        self._was_refused = False
         self._was_mined = False
         self._nonce_used = 0
         """Checks in a row that found the nonce used by another transaction."""
@@ -110,37 +127,68 @@ class Confirmation:
     async def wait(self) -> tuple[SignedTransaction, MinedTransaction]:
         """The version that was mined, and its receipt, once it has the confirmations.
 
-        Raises `NonceLost`, `TransactionTimeout`, `NodeUnreachable`.
+        The node is asked for receipts when it has a new block. Raises `NonceLost`, `TransactionTimeout`,
+        `NodeUnreachable`.
         """
-        timing = self._node.timing
-        loop = asyncio.get_running_loop()
-        polling = Backoff(timing.receipt_polling)
-        replace_at = loop.time() + timing.replace_after
+        timing, loop = self._node.timing, asyncio.get_running_loop()
+        self._replace_at = loop.time() + timing.replace_after
         try:
             async with asyncio.timeout(timing.receipt_timeout):
-                while True:
+                found = await self._look_early()
+                while found is None:
+                    await self._news()
                     found = await self._find_confirmed()
-                    if found is not None:
-                        return found
-                    pause = polling.next_delay() or timing.poll_interval
-                    if pause == timing.poll_interval and not self._was_mined:
+                    if found is None and not self._was_mined:
                         await self._check_nonce()
-                    if loop.time() >= replace_at and not self._was_mined:
-                        await self._unblock()
-                        replace_at = loop.time() + timing.replace_after
-                    await asyncio.sleep(pause)
+                        if loop.time() >= self._replace_at:
+                            await self._unblock()
+                            self._replace_at = loop.time() + timing.replace_after
         except TimeoutError:
             raise TransactionTimeout(self._entry.newest.hash, timing.receipt_timeout) from None
+        self._node.heads.expect(found[1].block_number)
+        return found
+
+    async def _look_early(self) -> tuple[SignedTransaction, MinedTransaction] | None:
+        """Look before the next block, unless that comes to our notice at once: some chains mine without delay."""
+        if self._seen and self._node.heads.are_timely:
+            return None
+        found = await self._find_confirmed()
+        if found is None and not self._was_mined:
+            await asyncio.sleep(self._node.timing.receipt_interval)
+            found = await self._find_confirmed()
+        return found
+
+    async def _news(self) -> None:
+        """Wait for a block that may concern the transaction, or until it is time to look all the same."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout_at(self._look_at()):
+                while True:
+                    head, seen = await self._node.heads.next(self._seen), self._seen
+                    self._seen = head.hash
+                    if self._was_mined or head.has_transactions or head.parent_hash != seen:
+                        return
+
+    def _look_at(self) -> float | None:
+        """When to look without a new block: a node's index may be behind its blocks."""
+        now, timing = asyncio.get_running_loop().time(), self._node.timing
+        if self._nonce_used or self._was_refused:
+            return now + timing.poll_interval
+        soon = None if self._node.heads.are_timely else now + 2 * (self._backoff.next_delay() or timing.poll_interval)
+        if self._was_mined:
+            return soon
+        return self._replace_at if soon is None else min(soon, self._replace_at)
 
     async def _find_confirmed(self) -> tuple[SignedTransaction, MinedTransaction] | None:
         """The version that was mined, if it has the confirmations. Sends it again if its block was replaced."""
         confirmations = self._node.timing.confirmations
-        head = await self._node.block_number() if confirmations > 1 else 0
+        head = (await self._node.heads.recent()).number if confirmations > 1 else 0
         tx = self._entry.newest.hash
+        self._was_refused = False
         try:
             found = await find_receipt(self._node, reversed(self._entry.versions))
         except RequestRefused as refused:
             log.debug("%s: %s", tx, refused)  # as nodes do that are still indexing; it was sent
+            self._was_refused = True
             return None
         if found is not None:
             self._was_mined = True

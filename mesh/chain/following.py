@@ -165,7 +165,6 @@ async def follow(
         else:
             outages.recovered(f"the chain can be read again, from block {follower.cursor}")
             backoff.reset()
-            await asyncio.sleep(node.timing.poll_interval)
 
 
 async def retrying(
@@ -198,13 +197,16 @@ class _Follower:
     def __init__(self, node: Node, read: ReadRange, cursor: int, history: History) -> None:
         self.cursor = cursor
         self.must_check_cursor = True
+        self._seen = b""
+        """The hash of the head that was read last."""
         self._node = node
         self._history = history
         self._ranges = RangeReader(node, read)
 
     async def read_to_head(self) -> AsyncGenerator[BlockEvents, None]:
-        """What is new since the last call: first what the chain has replaced, then the blocks up to its head."""
-        head = await self._node.latest_header()
+        """Wait for a new head, and read to it: first what the chain has replaced, then the new blocks."""
+        head = await (self._node.heads.look() if self.must_check_cursor else self._node.heads.next(self._seen))
+        self._seen = head.hash
         if self.must_check_cursor:
             await self._check_cursor(head)
             self.must_check_cursor = False
@@ -222,7 +224,8 @@ class _Follower:
                     self.cursor = block.block_number + 1
                     yield BlockEvents(block.block_number, block.events)
         except ReplacedWhileReading:
-            pass  # the next call finds what was replaced
+            self.must_check_cursor = True  # the next call finds what was replaced
+            await asyncio.sleep(self._node.timing.poll_interval)
 
     async def _check_cursor(self, head: BlockHeader) -> None:
         """Raise `ChainWentBack` if the cursor is past the head, unless the node is a few blocks behind another."""

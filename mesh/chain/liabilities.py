@@ -28,9 +28,8 @@ if TYPE_CHECKING:
 
 GETTERS: Final = (
     *("model", "objective", "result", "promisee", "promisor", "lighthouse", "lighthouseFee"),
-    *("token", "cost", "validator", "validatorFee", "isSuccess", "isFinalized"),
+    *("token", "cost", "validator", "validatorFee", "isSuccess", "isFinalized", "demandHash", "offerHash"),
 )
-
 READ_AT_ONCE: Final = 8
 """How many records a listing asks the node for at the same time."""
 
@@ -93,9 +92,13 @@ class Liabilities:
         """Whether a generation-3 order of `signer` (address) was used or withdrawn; generation 5 uses nonces."""
         return await self._contracts.version.is_order_used(order_hash, signer)
 
+    async def get_with_orders(self, address: str) -> tuple[Liability, tuple[bytes, bytes]]:
+        """The same as `get` and `order_hashes`, in one call."""
+        return await _read(self._contracts.node, await self._recognised(address))
+
     async def get(self, address: str) -> Liability:
         """The record of a liability. Raises `NotALiability` unless the factory created it."""
-        return await read_liability(self._contracts.node, await self._recognised(address))
+        return (await self.get_with_orders(address))[0]
 
     async def list(
         self, *, from_block: int = 0, promisee: str = "", promisor: str = "", lighthouse: str = ""
@@ -129,9 +132,7 @@ class Liabilities:
 
     async def order_hashes(self, liability: str) -> tuple[bytes, bytes]:
         """The hashes of the demand and of the offer that a liability was created from."""
-        functions = self._contracts.node.contract("Liability", liability).functions
-        demand_hash = await self._contracts.node.read(functions.demandHash())
-        return bytes(demand_hash), bytes(await self._contracts.node.read(functions.offerHash()))
+        return (await _read(self._contracts.node, liability))[1]
 
     async def create(self, lighthouse: str, demand: Demand, offer: Offer) -> Created:
         """Create a liability from two signed orders, as a provider of the lighthouse.
@@ -243,7 +244,7 @@ class Liabilities:
             for getter, whose in filters.items():
                 if await self._contracts.node.read(functions[getter]()) != whose:
                     return None
-            return await read_liability(self._contracts.node, address)
+            return (await _read(self._contracts.node, address))[0]
         except NoContracts:
             return None
 
@@ -253,7 +254,7 @@ class Liabilities:
         try:
             if block < 0 or not await self._is_finalized(address, block):
                 return None
-            return await read_liability(self._contracts.node, address, block=block)
+            return (await _read(self._contracts.node, address, block=block))[0]
         except NoContracts:  # not created yet in that block
             return None
 
@@ -262,15 +263,18 @@ class Liabilities:
         return bool(await self._contracts.node.read(functions.isFinalized(), block=block))
 
 
-async def read_liability(node: Node, address: str, *, block: int | None = None) -> Liability:
-    """The record of an address that is known to be a liability, as of one block (by default the latest).
+async def _read(node: Node, address: str, *, block: int | str = "latest") -> tuple[Liability, tuple[bytes, bytes]]:
+    """The record of an address that is known to be a liability, and the hashes of its demand and its offer.
 
     Raises `NodeUnreachable`, and `NoContracts` for a block before its creation.
     """
-    block = await node.block_number() if block is None else block
     functions = node.contract("Liability", address).functions
     values = await node.read_all((functions[getter]() for getter in GETTERS), block=block)
-    held: dict[str, Any] = dict(zip(GETTERS, values, strict=True))
+    *_, demand_hash, offer_hash = values
+    return _record(address, dict(zip(GETTERS, values, strict=True))), (bytes(demand_hash), bytes(offer_hash))
+
+
+def _record(address: str, held: Mapping[str, Any]) -> Liability:
     return Liability(
         address=address,
         model=decode_cid(held["model"]),

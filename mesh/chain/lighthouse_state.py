@@ -70,11 +70,15 @@ async def lighthouse_state(node: Node, address: str) -> LighthouseState:
 
     Raises `NoContracts` if there is none, `InvalidAnswer` if it has too many providers, `NodeUnreachable`.
     """
-    block = await node.block_number()
     functions = node.contract("Lighthouse", address).functions
+    rules = [functions[name]() for name in (*GETTERS[5].rules, "current")]
+    (*first, rest), *values = await node.read_all((functions.queue(ZERO_ADDRESS, PAGE), *rules), block="latest")
+    if rest == ZERO_ADDRESS:
+        return _state(address, values[:-1], values[-1], _paged({}, *first, address=address))
+    block = await node.block_number()
     stakes = await _queue(node, address, block)
-    *rules, current = await node.read_all((functions[name]() for name in (*GETTERS[5].rules, "current")), block=block)
-    return _state(address, rules, current, stakes)
+    *values, current = await node.read_all(rules, block=block)
+    return _state(address, values, current, stakes)
 
 
 async def original_state(node: Node, address: str, names: LighthouseGetters) -> LighthouseState:
@@ -113,12 +117,19 @@ async def _queue(node: Node, address: str, block: int) -> dict[str, int]:
         accounts, staked, first = await node.read(functions.queue(first, PAGE), block=block)
         if not accounts and not stakes:
             break
-        known = len(stakes)
-        stakes |= {parse_address(account): stake for account, stake in zip(accounts, staked, strict=False)}
-        if len(stakes) != known + len(accounts) or len(accounts) != len(staked) or not accounts:
-            raise InvalidAnswer(f"queue of {address}", "a page with providers twice, or without their stakes")
-        _check_count(address, len(stakes))
+        if not accounts:
+            raise InvalidAnswer(f"queue of {address}", "an empty page")
+        stakes = _paged(stakes, accounts, staked, address=address)
     return stakes
+
+
+def _paged(stakes: dict[str, int], accounts: list[str], staked: list[int], *, address: str) -> dict[str, int]:
+    """The stakes with those of another page. Raises `InvalidAnswer`."""
+    paged = stakes | {parse_address(account): stake for account, stake in zip(accounts, staked, strict=False)}
+    if len(paged) != len(stakes) + len(accounts) or len(accounts) != len(staked):
+        raise InvalidAnswer(f"queue of {address}", "a page with providers twice, or without their stakes")
+    _check_count(address, len(paged))
+    return paged
 
 
 def _check_count(address: str, count: int) -> None:

@@ -6,6 +6,7 @@ the network does. web3's own helper needs a universal resolver, which a private 
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING, Final
 
 from mesh.chain.errors import InvalidName, NoContracts, Reverted, UnknownName
@@ -37,7 +38,10 @@ MULTIHASH_ABI: Final = (
 """The function of the public resolver of 2018 for names of content; not every resolver has it."""
 
 RESOLVERS_KEPT: Final = 256
-"""Resolvers that are remembered, each for the root of names."""
+"""Resolvers that are remembered, each for the root of names; and addresses."""
+
+ADDRESS_SECONDS: Final = 300.0
+"""How long the address of a name is used before it is looked up again."""
 
 NAME_RULE: Final = "names end in .eth, .sid or .test, and hold ASCII letters, digits, - and _"
 
@@ -73,6 +77,7 @@ class Names:
         self._generation = generation
         self._node = node
         self._resolvers: dict[str, str] = {}
+        self._addresses: dict[str, tuple[str, float]] = {}
 
     async def address(self, name_or_address: str) -> str:
         """The address of a name, or the given address itself; EIP-55.
@@ -82,11 +87,17 @@ class Names:
         if not is_ens_name(name_or_address):
             return _parse_address(name_or_address)
         name = parse_name(name_or_address)
+        known, until = self._addresses.get(name, ("", 0.0))
+        if time.monotonic() < until:
+            return known
         resolver = self._node.contract("Resolver", await self._resolver(name))
         address = str(await self._node.read(resolver.functions.addr(namehash(name))))
         if address == ZERO_ADDRESS:
             raise UnknownName(name)
-        return parse_address(address)
+        if len(self._addresses) >= RESOLVERS_KEPT:
+            self._addresses.clear()
+        self._addresses[name] = parse_address(address), time.monotonic() + ADDRESS_SECONDS
+        return self._addresses[name][0]
 
     async def model(self, name_or_cid: str) -> str:
         """The CID of a model behind a name (`NAME.model.N.robonomics.eth`), or the given CID itself.

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import asyncio
+import time
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from web3 import AsyncWeb3
 from web3.providers.async_base import AsyncBaseProvider
 
-from mesh.chain.answers import ANSWERS, InvalidAnswer, SpoiledAnswer, decode_values
+from mesh.chain.answers import ANSWERS, InvalidAnswer
 from mesh.chain.artifacts import load_artifact
-from mesh.chain.errors import METHOD_NOT_FOUND, NoContracts, NodeUnreachable, RequestRefused
+from mesh.chain.errors import METHOD_NOT_FOUND, NodeUnreachable, RequestRefused
+from mesh.chain.heads import Heads
 from mesh.chain.metrics import NodeMetrics
+from mesh.chain.multicall import read, read_all
 from mesh.chain.pending import PendingTransactions
 from mesh.chain.policy import FeePolicy, Fees, GasMarket, Timing
 from mesh.chain.transaction_store import TransactionStore
@@ -32,10 +34,8 @@ if TYPE_CHECKING:
     from mesh.chain.web3_provider import Endpoint
 
 CONTRACTS_KEPT: Final = 1024
-READ_ATTEMPTS: Final = 3
-"""How often a contract's function is called while what it returns does not decode."""
-READ_AT_ONCE: Final = 100
-"""Contract functions that `read_all` calls at the same time."""
+PRIORITY_SECONDS: Final = 60.0
+"""How long the priority fee that the node suggests is used; the base fee is that of the latest block."""
 
 
 class Node:
@@ -66,6 +66,11 @@ class Node:
         self._transactions = transactions
         self._chain_folder: Path | None = None
         self._provider = open_provider(endpoint, self.timing, self.metrics)
+        self.heads = Heads(
+            self._ask_latest, self.header, interval=self.timing.poll_interval, request_pushes=self._request_pushes
+        )
+        """The latest block, for all who wait for the next one."""
+        self._priority = 0.0, 0
         self._chain_id: int | None = None
         self._web3: AsyncWeb3[Any] = AsyncWeb3(AsyncBaseProvider(), middleware=[])
         self._contract_kinds: dict[str, type[AsyncContract]] = {}
@@ -124,7 +129,10 @@ class Node:
         return header
 
     async def latest_header(self) -> BlockHeader:
-        """The latest block."""
+        """The latest block, asked for now; `heads` has it without asking, where that is enough."""
+        return await self.heads.look()
+
+    async def _ask_latest(self) -> BlockHeader:
         header = await self.header("latest")
         if header is None:
             raise NodeUnreachable(self.endpoint, "it has no blocks")
@@ -167,13 +175,16 @@ class Node:
         return int(await self._ask("eth_gasPrice"))
 
     async def gas_market(self) -> GasMarket:
-        """The price of gas in the latest block, with the priority fee that the node suggests."""
-        base = (await self.latest_header()).base_fee
-        if base is None:
+        """The price of gas in the latest block, with the priority fee that the node suggested of late."""
+        head = await self.heads.recent()
+        if head.base_fee is None:
             price = await self.gas_price()
             return GasMarket(price, Fees(price, None))
-        priority = await self._suggested_priority(base)
-        return GasMarket(base + priority, Fees(2 * base + priority, priority))
+        until, priority = self._priority
+        if time.monotonic() >= until:
+            priority = await self._suggested_priority(head.base_fee)
+            self._priority = time.monotonic() + PRIORITY_SECONDS, priority
+        return GasMarket(head.base_fee + priority, Fees(2 * head.base_fee + priority, priority))
 
     async def estimate_gas(self, call: Mapping[str, Any]) -> int:
         """Gas of a transaction in the state that pending ones leave. Raises `Reverted`."""
@@ -204,32 +215,11 @@ class Node:
 
         Raises `Reverted`, `NoContracts` if there is no such contract, `InvalidAnswer` for other data.
         """
-        request = {"to": call.address, "data": call._encode_transaction_data()}
-        types = [output["type"] for output in call.abi["outputs"]]
-        for attempt in range(READ_ATTEMPTS):
-            returned = await self.call(request, block=block)
-            try:
-                values = decode_values(types, returned)
-            except SpoiledAnswer as error:
-                failure = error
-            else:
-                return values[0] if len(values) == 1 else values
-            if not attempt and not returned and not await self.code(call.address, block=block):
-                raise NoContracts(f"contract with {call.fn_name} at {call.address}", self.chain_id)
-        raise InvalidAnswer(f"{call.fn_name} of {call.address}", str(failure))
+        return await read(self, call, block=block)
 
     async def read_all(self, calls: Iterable[AsyncContractFunction], *, block: int | str) -> list[Any]:
-        """What several functions return in the state of one block, `READ_AT_ONCE` at a time. Raises as `read` does."""
-        left, found = list(calls), []
-        while left:
-            some, left = left[:READ_AT_ONCE], left[READ_AT_ONCE:]
-            try:
-                async with asyncio.TaskGroup() as group:
-                    tasks = [group.create_task(self.read(call, block=block)) for call in some]
-            except ExceptionGroup as failed:
-                raise failed.exceptions[0] from None
-            found += [task.result() for task in tasks]
-        return found
+        """What several functions return in the state of one block, asked for in one call. Raises as `read` does."""
+        return await read_all(self, list(calls), block=block)
 
     def creation_code(self, name: str, *arguments: Any) -> bytes:
         """The data of a transaction that deploys one of our contracts (`artifacts.NAMES`)."""
@@ -261,6 +251,9 @@ class Node:
     async def _chain_name(self) -> str:
         """A name that another chain of the same number (a development chain that was restarted) does not have."""
         return f"{self.chain_id}-{(await self.block_hash(0)).hex()[:16]}"
+
+    def _request_pushes(self) -> None:
+        self._provider.push_heads(self.heads.pushed)
 
     def contract_with_abi(self, address: str, abi: Any) -> AsyncContract:
         """The contract at an address with any ABI."""

@@ -27,10 +27,11 @@ class Timing:
     """Waiting times, in seconds unless said otherwise."""
 
     poll_interval: float = 1.0
-    """Between two looks for a new block."""
+    """Between two looks for a new block, where blocks don't come at a slower pace."""
 
     receipt_interval: float = 0.1
-    """Between the first looks for a transaction's receipt; it grows up to `poll_interval`."""
+    """Before the second look for a transaction's receipt, where blocks don't come at a known pace; the others follow
+    each new block."""
 
     receipt_timeout: float = 180.0
     """How long a sent transaction is waited for."""
@@ -74,12 +75,6 @@ class Timing:
     def outage_retry(self) -> RetryPolicy:
         """For a node that is unreachable: from `poll_interval` to ten times as long, without end."""
         return RetryPolicy(initial=self.poll_interval, ceiling=10 * self.poll_interval)
-
-    @property
-    def receipt_polling(self) -> RetryPolicy:
-        """Between two looks for a receipt."""
-        first = min(self.receipt_interval, self.poll_interval)
-        return RetryPolicy(initial=first, factor=1.5, ceiling=self.poll_interval, jitter=0.0)
 
 
 class Fees(NamedTuple):

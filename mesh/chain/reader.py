@@ -12,7 +12,16 @@ from itertools import groupby
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from mesh.chain.errors import NodeUnreachable, RequestRefused
-from mesh.chain.events import ChainEvent, NewLiability, NewLighthouse, decode_log, topics_of
+from mesh.chain.events import (
+    Approval,
+    ChainEvent,
+    NewLiability,
+    NewLighthouse,
+    Transfer,
+    decode_log,
+    topics_of,
+)
+from schemas.address import address_bytes
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Awaitable, Callable, Iterable
@@ -37,20 +46,46 @@ class ReplacedWhileReading(Exception):
     """The chain was reorganised between two requests: the answers don't belong together."""
 
 
-ReadRange: TypeAlias = "Callable[[int, int], Awaitable[list[SeenBlock]]]"
-"""Reads the blocks from one to another, both included, as `read_events` does."""
+ReadRange: TypeAlias = "Callable[[int, int, BlockHeader | None], Awaitable[list[SeenBlock]]]"
+"""Reads the blocks from one to another, both included, as `read_events` does; of a single block it gets the header."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EventSources:
-    """The contracts whose events are read: the factory, a token, any lighthouses, and the factory's liabilities."""
+    """The contracts whose events are read: the factory, a token, any lighthouses, and the factory's liabilities.
+
+    The token's transfers and approvals are those that concern `parties` (addresses), or all.
+    """
 
     factory: str
     token: str
+    parties: frozenset[str] | None = None
     lighthouses: tuple[str, ...] = ()
     is_liability: Callable[[str], Awaitable[bool]]
     recognise: Callable[[str], None]
     """Called with each liability that the factory's events name, before `is_liability` is asked about its events."""
+
+    def logs_in(self, header: BlockHeader | None) -> bool:
+        """Whether a block may hold a log of the named contracts; with None, it is not known."""
+        wanted = [
+            (address_bytes(contract), topic)
+            for contract in (self.factory, *self.lighthouses)
+            for topic in _topics("Factory", "Lighthouse")
+        ]
+        of_token = [(address_bytes(self.token), topic) for topic in _topics("XRT")]
+        if self.parties is None:
+            return header is None or header.may_log(*wanted, *of_token)
+        parties = [bytes(12) + address_bytes(party) for party in self.parties]
+        return header is None or header.may_log(*wanted, *((*one, party) for one in of_token for party in parties))
+
+    def concern(self, event: ChainEvent | None) -> bool:
+        """Whether an event is one of those that are read."""
+        match event:
+            case None:
+                return False
+            case Transfer(one, other) | Approval(one, other):
+                return self.parties is None or one in self.parties or other in self.parties
+        return True
 
 
 class RangeReader:
@@ -70,7 +105,7 @@ class RangeReader:
         while first <= head.number:
             last = min(head.number, first + self._span - 1)
             try:
-                blocks = await self._read(first, last)
+                blocks = await self._read(first, last, head if first == last == head.number else None)
             except (RequestRefused, NodeUnreachable) as error:
                 if first == last:
                     raise
@@ -88,24 +123,33 @@ class RangeReader:
             self._span = min(MAX_RANGE, self._span + max(1, self._span // 4))
 
 
-async def read_events(node: Node, sources: EventSources, first: int, last: int) -> list[SeenBlock]:
+async def read_events(
+    node: Node, sources: EventSources, first: int, last: int, header: BlockHeader | None
+) -> list[SeenBlock]:
     """The blocks with events from `first` to `last`, both included, and `last` itself.
 
-    Raises `ReplacedWhileReading` when the logs of a block are of two different blocks.
+    With the `header` of a single block, the node is asked only for logs that the block may hold. Raises
+    `ReplacedWhileReading` when the logs of a block are of two different blocks.
     """
-    addresses = [sources.factory, sources.token, *sources.lighthouses]
-    logs = await node.logs(first, last, addresses=addresses, topics=topics_of("Factory", "XRT", "Lighthouse"))
+    logs: list[Log] = []
+    if sources.logs_in(header):
+        contracts = [sources.factory, sources.token, *sources.lighthouses]
+        logs = await node.logs(first, last, addresses=contracts, topics=topics_of("Factory", "XRT", "Lighthouse"))
     for log in logs:
         if isinstance(event := decode_log(log), NewLiability) and log.address == sources.factory:
             sources.recognise(event.liability)
-    endings = await node.logs(first, last, addresses=(), topics=topics_of("Liability"))
+    endings: list[Log] = []
+    if header is None or header.may_log(_topics("Liability")):
+        endings = await node.logs(first, last, addresses=(), topics=topics_of("Liability"))
     # Any contract can log the same event, and as often as it likes.
     ours = {address for address in {log.address for log in endings} if await sources.is_liability(address)}
-    return _by_block((*logs, *(log for log in endings if log.address in ours)), last)
+    return _by_block((*logs, *(log for log in endings if log.address in ours)), last, sources.concern)
 
 
-async def read_created(node: Node, factory: str, first: int, last: int) -> list[SeenBlock]:
+async def read_created(node: Node, factory: str, first: int, last: int, header: BlockHeader | None) -> list[SeenBlock]:
     """The same with the events of the factory only."""
+    if header is not None and not header.may_log(*((address_bytes(factory), topic) for topic in _topics("Factory"))):
+        return _by_block((), last)
     return _by_block(await node.logs(first, last, addresses=[factory], topics=topics_of("Factory")), last)
 
 
@@ -117,7 +161,13 @@ async def list_created(node: Node, factory: str, from_block: int) -> list[NewLia
     return [event for event in events if isinstance(event, NewLiability | NewLighthouse)]
 
 
-def _by_block(logs: Iterable[Log], last: int) -> list[SeenBlock]:
+def _topics(*contracts: str) -> list[bytes]:
+    return [bytes.fromhex(topic[2:]) for topic in topics_of(*contracts)]
+
+
+def _by_block(
+    logs: Iterable[Log], last: int, concern: Callable[[ChainEvent | None], bool] = lambda event: event is not None
+) -> list[SeenBlock]:
     ordered = sorted(logs, key=lambda log: (log.block_number, log.log_index))
     blocks = []
     for number, group in groupby(ordered, key=lambda log: log.block_number):
@@ -125,7 +175,7 @@ def _by_block(logs: Iterable[Log], last: int) -> list[SeenBlock]:
         hashes = {log.block_hash for log in of_block}
         if len(hashes) > 1:
             raise ReplacedWhileReading
-        events = tuple(event for log in of_block if (event := decode_log(log)) is not None)
+        events = tuple(event for log in of_block if concern(event := decode_log(log)) and event is not None)
         blocks.append(SeenBlock(number, hashes.pop(), events))
     if not blocks or blocks[-1].block_number != last:
         blocks.append(SeenBlock(last, b"", ()))

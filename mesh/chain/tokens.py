@@ -80,6 +80,13 @@ class Tokens:
             )
         )
 
+    async def balance_and_allowance(self, owner: str, spender: str, *, token: str | None = None) -> tuple[int, int]:
+        """The same as `balance` and `allowance`, in one call."""
+        functions, owner = (await self._token(token)).functions, await self._address(owner)
+        calls = (functions.balanceOf(owner), functions.allowance(owner, await self._address(spender)))
+        balance, allowance = await self._contracts.node.read_all(calls, block="latest")
+        return int(balance), int(allowance)
+
     async def approve(self, spender: str, value: int, *, token: str | None = None) -> str:
         """Let `spender` take up to `value` units of a token (XRT by default); the transaction's hash."""
         functions = (await self._token(token)).functions

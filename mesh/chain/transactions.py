@@ -92,9 +92,12 @@ class TransactionSender:
         pending = self._node.pending_transactions(self.account.address)
         fields: dict[str, Any] = {"to": to or b"", "data": "0x" + data.hex(), "value": value}
         while True:
-            entry = await self._sent_before(pending, fields) or await self._send_new(pending, fields)
+            before = await self._sent_before(pending, fields)
+            since = b"" if before or self._node.heads.latest is None else self._node.heads.latest.hash
+            entry = before or await self._send_new(pending, fields)
+            confirmation = Confirmation(self._node, self.account, pending, entry, since=since)
             try:
-                signed, receipt = await Confirmation(self._node, self.account, pending, entry).wait()
+                signed, receipt = await confirmation.wait()
                 await pending.settle(entry)
             except NonceLost:
                 log.info(

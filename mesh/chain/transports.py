@@ -6,15 +6,18 @@ web3's own HTTP provider opens a connection for each request, and its WebSocket 
 from __future__ import annotations
 
 import asyncio
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import msgspec
-from aiohttp import ClientResponse, ClientSession, ClientWebSocketResponse, WSMsgType
+from aiohttp import ClientError, ClientResponse, ClientSession, ClientWebSocketResponse, WSMsgType
 from web3.providers.async_base import AsyncJSONBaseProvider
 
 from mesh.chain.answers import MAX_ANSWER, SpoiledAnswer
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from web3.types import RPCEndpoint, RPCResponse
 
 
@@ -64,6 +67,19 @@ class WebSocketTransport(AsyncJSONBaseProvider):
         self._socket: ClientWebSocketResponse | None = None
         self._listening: asyncio.Task[None] | None = None
         self._waiting: dict[int, asyncio.Future[RPCResponse]] = {}
+        self._on_head: Callable[[Any], None] | None = None
+        self._subscribing: asyncio.Task[None] | None = None
+        self._subscription: Any = None
+
+    def push_heads(self, on_head: Callable[[Any], None]) -> None:
+        """Call `on_head` with each new block that the node tells of, as JSON, and with None when it stops to.
+
+        A node that has no such subscription is not asked again.
+        """
+        if self._on_head is None:
+            self._on_head = on_head
+            if self._socket is not None and not self._socket.closed:
+                self._subscribing = asyncio.create_task(self._subscribe(), name="aira-chain-heads")
 
     async def make_request(self, method: RPCEndpoint, params: Any) -> RPCResponse:
         """The node's response, with a result or an error."""
@@ -83,6 +99,9 @@ class WebSocketTransport(AsyncJSONBaseProvider):
         session, self._session, self._socket = self._session, None, None
         if session is not None:
             await session.close()
+        if self._subscribing is not None:
+            self._subscribing.cancel()
+            self._subscribing = None
         if self._listening is not None:
             await self._listening
             self._listening = None
@@ -94,7 +113,15 @@ class WebSocketTransport(AsyncJSONBaseProvider):
                 self._session = ClientSession()
                 self._socket = await self._session.ws_connect(self._url, max_msg_size=MAX_ANSWER, heartbeat=30)
                 self._listening = asyncio.create_task(self._read(self._socket), name="aira-chain-websocket")
+                if self._on_head is not None:
+                    self._subscribing = asyncio.create_task(self._subscribe(), name="aira-chain-heads")
             return self._socket
+
+    async def _subscribe(self) -> None:
+        """Ask for new blocks. A failure changes nothing: blocks are polled then."""
+        with suppress(OSError, ValueError, ClientError):
+            response = await self.make_request(cast("RPCEndpoint", "eth_subscribe"), ["newHeads"])
+            self._subscription = response.get("result")
 
     async def _read(self, socket: ClientWebSocketResponse) -> None:
         """Deliver the answers to the requests that wait for them, until the connection ends."""
@@ -102,11 +129,17 @@ class WebSocketTransport(AsyncJSONBaseProvider):
             if message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
                 self._deliver(message.data)
         self._fail_all(ConnectionResetError("the connection was closed"))
+        if self._subscription is not None and self._on_head is not None:
+            self._subscription = None
+            self._on_head(None)
 
     def _deliver(self, text: str | bytes) -> None:
         """Give an answer to the request with its id. One that names no request may be anybody's: all ask again."""
         try:
             response: Any = _decode(text)
+            if isinstance(response, dict) and response.get("method") == "eth_subscription":
+                self._take_pushed(response.get("params"))
+                return
             number = response.get("id") if isinstance(response, dict) else None
             if not isinstance(number, int):
                 raise SpoiledAnswer("an answer without the id of its request")
@@ -116,6 +149,11 @@ class WebSocketTransport(AsyncJSONBaseProvider):
         answer = self._waiting.get(number)
         if answer is not None and not answer.done():
             answer.set_result(response)
+
+    def _take_pushed(self, params: Any) -> None:
+        is_ours = isinstance(params, dict) and params.get("subscription") == self._subscription
+        if is_ours and self._on_head is not None and "result" in params:
+            self._on_head(params["result"])
 
     def _fail_all(self, error: Exception) -> None:
         for answer in self._waiting.values():

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from aiohttp import ClientError, ClientResponseError
 from web3.exceptions import Web3Exception
 from web3.providers.async_base import AsyncBaseProvider
 
-from mesh.chain.answers import ANSWERS, RpcFailure, SpoiledAnswer, decode_answer
+from mesh.chain.answers import ANSWERS, BlockHeader, RpcFailure, SpoiledAnswer, decode_answer
 from mesh.chain.errors import InvalidEndpoint, NodeUnreachable, RequestRefused, WrongChain
 from mesh.chain.metrics import NodeMetrics
 from mesh.chain.reverts import decode_revert
@@ -20,7 +21,7 @@ from mesh.log_context import log_event
 from mesh.retry import Backoff
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from mesh.chain.policy import Timing
 
@@ -34,6 +35,7 @@ Endpoint: TypeAlias = "str | AsyncBaseProvider | Sequence[str | AsyncBaseProvide
 
 SEND: Final = "eth_sendRawTransaction"
 CHAIN_ID: Final = "eth_chainId"
+NEW_HEADS: Final = "newHeads"
 TRANSIENT_STATUS: Final = frozenset({429, 500, 502, 503, 504})
 
 CHECK_TIMEOUT: Final = 2.0
@@ -74,10 +76,31 @@ class ReliableProvider:
         self._metrics = metrics
         self._expected: int | RpcFailure | None = None
         self._is_open = False
+        self._on_head: Callable[[BlockHeader | None], None] | None = None
 
     def open(self) -> None:
         """Let requests through, until `close`."""
         self._is_open = True
+
+    def push_heads(self, on_head: Callable[[BlockHeader | None], None]) -> None:
+        """Call `on_head` with new blocks as soon as the node in use tells of them; with None when it stops to.
+
+        Only over WebSocket, and only of the node that requests go to. May be called again and again.
+        """
+        self._on_head = on_head
+        first = self._upstreams[0]
+        if isinstance(first.owned, WebSocketTransport):
+            first.owned.push_heads(partial(self._take_head, first))
+
+    def _take_head(self, upstream: Upstream, pushed: Any) -> None:
+        if upstream is not self._upstreams[0] or self._on_head is None:
+            return
+        try:
+            head = None if pushed is None else decode_answer(NEW_HEADS, {"result": pushed}, BlockHeader)
+        except SpoiledAnswer as error:
+            log.debug("%s: %s", upstream.endpoint, error)
+        else:
+            self._on_head(head)
 
     async def check_chains(self, expected: int) -> None:
         """Raise `WrongChain` if a node that answers within `CHECK_TIMEOUT` is on another chain."""
@@ -153,6 +176,8 @@ class ReliableProvider:
         upstream.is_on_chain = False  # it may come back as another
         if len(self._upstreams) > 1 and self._upstreams[0] is upstream:
             self._upstreams = (*self._upstreams[1:], upstream)
+            if self._on_head is not None:
+                self._on_head(None)
             log.warning(
                 "the node %s fails (%s); switching to %s",
                 upstream.endpoint,

@@ -97,7 +97,7 @@ class LiabilityEvents:
         backoff = Backoff(self._chain.node.timing.outage_retry)
         while True:
             try:
-                blocks = self._chain.follow(self.head + 1, history=self._history, outages=self.outages)
+                blocks = self._chain.follow(self.head + 1, history=self._history, parties=(), outages=self.outages)
                 async with aclosing(blocks):
                     async for block in blocks:
                         if isinstance(block, Reorganisation):
@@ -154,12 +154,11 @@ class LiabilityEvents:
 
     async def _take_created(self, address: str, block: int) -> None:
         """Take the orders of a new liability, created in that block, out of the book."""
-        liability = await self._chain.liabilities.get(address)
+        liability, (demand_hash, offer_hash) = await self._chain.liabilities.get_with_orders(address)
         if liability.lighthouse != self._lighthouse:
             return
         self.parties.add(liability.promisee)
         self.parties.add(liability.promisor)
-        demand_hash, offer_hash = await self._chain.liabilities.order_hashes(address)
         for digest, signer in ((demand_hash, liability.promisee), (offer_hash, liability.promisor)):
             identity = digest + address_bytes(signer)
             order = self._book.remove(identity) or self._unconfirmed.get(identity)

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any, Final
 import rlp  # type: ignore[import-untyped]
 from coincurve import PrivateKey
 
+from mesh.chain.multicall import decode_calls, encode_answers
 from mesh.chain.reverts import REVERTED
 from mesh.devchain.evm import FUNDS_WEI
-from mesh.devchain.jsonrpc import SERVER_ERROR, RpcError
+from mesh.devchain.jsonrpc import SERVER_ERROR, RpcError, parse_data
 from schemas import keccak256
 from tests.simulation.model_abi import ModelRevert, artifact
 from tests.simulation.model_contracts import ModelJury, ModelNames, ModelResolver, ModelToken
@@ -112,11 +113,20 @@ class ModelChain:
         run = self._run(height)
         sender, data, value = fields.get("from") or bytes(20), fields.get("data") or b"", fields.get("value") or 0
         try:
+            if fields.get("to") is None and (calls := decode_calls(data)) is not None:
+                return encode_answers([self._answer(run, sender, parse_data(to, length=20), one) for to, one in calls])
             if fields.get("to") is None:
                 return self._create(run, sender, data)
             return run.call(sender, fields["to"], data, value=value)
         except ModelRevert as error:
             raise RpcError(REVERTED, "execution reverted", data="0x" + error.data.hex()) from None
+
+    def _answer(self, run: ModelRun, sender: bytes, to: bytes, data: bytes) -> bytes | None:
+        """What one call of many returns; None if it fails."""
+        try:
+            return run.call(sender, to, data, value=0)
+        except ModelRevert:
+            return None
 
     def estimate(self, fields: Call, height: int) -> int:
         """Gas limit with which a transaction goes through; raises as `call` does."""

@@ -95,13 +95,22 @@ async def test_a_queue_that_never_ends_is_an_invalid_answer(
     market: DeployedMarket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async with market.chain() as chain:
-        read = chain.node.read
+        read_all = chain.node.read_all
 
-        async def lying(call: Any, **options: Any) -> Any:
-            value = await read(call, **options)
-            return (*value[:2], market.provider.address) if call.fn_name == "queue" else value
+        async def lying(calls: Any, **options: Any) -> Any:
+            asked = list(calls)
+            values = await read_all(asked, **options)
+            endless = market.provider.address
+            return [
+                (*value[:2], endless) if call.fn_name == "queue" else value
+                for call, value in zip(asked, values, strict=True)
+            ]
 
-        monkeypatch.setattr(chain.node, "read", lying)
+        async def lying_once(call: Any, block: Any = "latest") -> Any:
+            return (await lying([call], block=block))[0]
+
+        monkeypatch.setattr(chain.node, "read_all", lying)
+        monkeypatch.setattr(chain.node, "read", lying_once)
         with pytest.raises(InvalidAnswer):
             await chain.lighthouses.get("airalab")
 

@@ -1,0 +1,117 @@
+"""Reading contracts: one function in one call, or many in one call, on any chain.
+
+For many, the node runs code that is never deployed: the constructor of `contracts/src/Multicall.sol` makes the calls
+and returns the answers instead of code. What a node does not answer that way is asked one by one.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+from eth_abi.abi import encode
+
+from mesh.chain.answers import InvalidAnswer, SpoiledAnswer, decode_values
+from mesh.chain.artifacts import load_artifact
+from mesh.chain.errors import NoContracts, RequestRefused, Reverted
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from web3.contract.async_contract import AsyncContractFunction
+
+log = logging.getLogger(__name__)
+
+READ_ATTEMPTS: Final = 3
+"""How often a contract's function is called while what it returns does not decode."""
+
+CALLS_AT_ONCE: Final = 100
+"""Most calls in one: the creation code has 49,152 bytes at most (EIP-3860), and what it returns 24,576 (EIP-170)."""
+
+
+class Caller(Protocol):
+    """What reading needs of a node: see `Node`."""
+
+    @property
+    def chain_id(self) -> int: ...
+    async def block_number(self) -> int: ...
+    async def code(self, address: str, *, block: int | str = "latest") -> bytes: ...
+    async def call(self, call: Mapping[str, Any], *, block: int | str = "latest") -> bytes: ...
+
+
+async def read(node: Caller, call: AsyncContractFunction, *, block: int | str) -> Any:
+    """See `Node.read`."""
+    request = {"to": call.address, "data": call._encode_transaction_data()}
+    for attempt in range(READ_ATTEMPTS):
+        returned = await node.call(request, block=block)
+        try:
+            return _decoded(call, returned)
+        except SpoiledAnswer as error:
+            failure = error
+        if not attempt and not returned and not await node.code(call.address, block=block):
+            raise NoContracts(f"contract with {call.fn_name} at {call.address}", node.chain_id)
+    raise InvalidAnswer(f"{call.fn_name} of {call.address}", str(failure))
+
+
+async def read_all(node: Caller, calls: Sequence[AsyncContractFunction], *, block: int | str) -> list[Any]:
+    """See `Node.read_all`."""
+    if block == "latest" and len(calls) > CALLS_AT_ONCE:
+        block = await node.block_number()
+    found: list[Any] = []
+    for start in range(0, len(calls), CALLS_AT_ONCE):
+        some = calls[start : start + CALLS_AT_ONCE]
+        found += await _read_at_once(node, some, block) or await _read_each(node, some, block)
+    return found
+
+
+async def _read_at_once(node: Caller, calls: Sequence[AsyncContractFunction], block: int | str) -> list[Any] | None:
+    """What the functions return; None if one of them fails, or the node refuses."""
+    requests = [(str(call.address), bytes.fromhex(call._encode_transaction_data()[2:])) for call in calls]
+    try:
+        answers = decode_answers(await node.call({"data": "0x" + encode_calls(requests).hex()}, block=block))
+        return [_decoded(call, answer) for call, answer in zip(calls, answers, strict=True)]
+    except (SpoiledAnswer, RequestRefused, Reverted, ValueError) as error:
+        log.debug("%d functions are read one by one: %s", len(calls), error)
+        return None
+
+
+async def _read_each(node: Caller, calls: Sequence[AsyncContractFunction], block: int | str) -> list[Any]:
+    number = await node.block_number() if block == "latest" and len(calls) > 1 else block
+    try:
+        async with asyncio.TaskGroup() as group:
+            tasks = [group.create_task(read(node, call, block=number)) for call in calls]
+    except ExceptionGroup as failed:
+        raise failed.exceptions[0] from None
+    return [task.result() for task in tasks]
+
+
+def _decoded(call: AsyncContractFunction, returned: bytes | None) -> Any:
+    """What a contract's function returned, several values as a tuple. Raises `SpoiledAnswer`."""
+    if returned is None:
+        raise SpoiledAnswer(f"{call.fn_name} failed")
+    values = decode_values([output["type"] for output in call.abi["outputs"]], returned)
+    return values[0] if len(values) == 1 else values
+
+
+def encode_calls(calls: Sequence[tuple[str, bytes]]) -> bytes:
+    """The creation code that makes the calls: of an address, with data."""
+    return load_artifact("Multicall").bytecode + encode(["(address,bytes)[]"], [list(calls)])
+
+
+def decode_calls(code: bytes) -> list[tuple[str, bytes]] | None:
+    """What `encode_calls` encoded; None for other code. For nodes that do not run it but know what it does."""
+    known = load_artifact("Multicall").bytecode
+    if not code.startswith(known):
+        return None
+    return [(str(target), bytes(data)) for target, data in decode_values(["(address,bytes)[]"], code[len(known) :])[0]]
+
+
+def encode_answers(answers: Sequence[bytes | None]) -> bytes:
+    """What the code returns: of each call what it returned, or None if it failed."""
+    return encode(["(bool,bytes)[]"], [[(answer is not None, answer or b"") for answer in answers]])
+
+
+def decode_answers(data: bytes) -> list[bytes | None]:
+    """The reverse of `encode_answers`. Raises `SpoiledAnswer`."""
+    return [bytes(answer) if success else None for success, answer in decode_values(["(bool,bytes)[]"], data)[0]]
