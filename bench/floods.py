@@ -16,7 +16,7 @@ import zenoh
 from msgspec.structs import replace
 
 from mesh.network import message_key
-from schemas import ZERO_ADDRESS, Demand, Offer, Result, RpcKey, Signer, cid_of_digest, encode
+from schemas import ZERO_ADDRESS, Demand, Offer, PresenceKey, Result, RpcKey, Signer, cid_of_digest, encode
 from schemas.selectors import market_selector
 
 if TYPE_CHECKING:
@@ -30,6 +30,8 @@ SLOWLY: Final = 0.1
 """Seconds between the messages of a flood that takes its time."""
 BURST: Final = 64
 """Messages that are put between two turns of the event loop."""
+TOKENS: Final = 50_000
+"""Liveliness tokens of one flood."""
 QUERIES: Final = 256
 """Queries of a flood that are open at a time."""
 
@@ -177,7 +179,6 @@ async def unknown_names(attacker: Attacker) -> None:
 
 async def query_all(attacker: Attacker, queries: Iterable[tuple[str, bytes]]) -> None:
     """Query without waiting for answers, `QUERIES` at a time."""
-    await attacker.begin()
     loop, limit = asyncio.get_running_loop(), asyncio.Semaphore(QUERIES)
 
     def ignore(_: zenoh.Reply) -> None:
@@ -195,6 +196,7 @@ async def query_all(attacker: Attacker, queries: Iterable[tuple[str, bytes]]) ->
 async def balance_queries(attacker: Attacker) -> None:
     """Calls of the robot's service for balances, each for another account: each would be a call of the node."""
     key = str(RpcKey(attacker.robot, "eth/account_xrt_balance"))
+    await attacker.begin()
     await query_all(
         attacker, ((key, b'{"account":"0x%s"}' % secrets.token_hex(20).encode()) for _ in itertools.count())
     )
@@ -203,6 +205,20 @@ async def balance_queries(attacker: Attacker) -> None:
 @flood
 async def recall_queries(attacker: Attacker) -> None:
     """Queries for the whole order book, after 10,000 demands have filled it."""
-    await attacker.put_all(attacker.wire(sign(attacker.demand()) for _ in range(PREPARED)))
-    await asyncio.sleep(1)
+    wire = attacker.wire(sign(attacker.demand()) for _ in range(PREPARED))
+    await attacker.begin()
+    await attacker.put_all(wire)
     await query_all(attacker, ((f"aira/{attacker.lighthouse}/**", b"") for _ in itertools.count()))
+
+
+@flood
+async def tokens(attacker: Attacker) -> None:
+    """50,000 liveliness tokens of agents that do not exist."""
+    await attacker.begin()
+    liveliness, declared = attacker.session.liveliness(), []
+    for _ in range(TOKENS):
+        key = str(PresenceKey(attacker.lighthouse, "agent", "0x" + secrets.token_hex(20)))
+        declared.append(liveliness.declare_token(key))
+        if len(declared) % BURST == 0:
+            await asyncio.sleep(0)
+    await asyncio.Event().wait()

@@ -6,8 +6,8 @@ batches. At most two batches are in flight; while the consumer is busy, or more 
 fills up and drops the *oldest* samples, which are counted. That costs no memory and never stalls the session, because
 the thread keeps emptying Zenoh's queue.
 
-A sample that gets through a full ring waits no longer than a ring takes to fill. Each copy that a sender sends again
-has the same chance, whatever others send: the part of all samples that is converted.
+A sample that gets through a full ring waits no longer than a ring takes to fill. One that was dropped goes first when
+it comes again (`mesh/network/ring.py`).
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import zenoh
 from mesh.errors import ClosedError
 from mesh.log_context import log_event
 from mesh.network import sending
+from mesh.network.ring import ReceiveRing
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -76,7 +77,8 @@ class Pump(Generic[T]):
     `convert` makes an item of a sample at once, or returns None to skip it. If that is expensive, give two functions
     instead: `copy` takes what is needed out of a sample at once, and `convert_all` makes items of up to `SLICE` copies
     while others wait in the ring. They run on the pump's own thread; the iterator raises what they raise. Items arrive
-    in order. `capacity` and `capacity_bytes` bound the ring, `fed_capacity` what is given to `feed`. Samples with more
+    in order, but for copies of dropped ones. `capacity` and `capacity_bytes` bound the ring, `fed_capacity` what is
+    given to `feed`. Samples with more
     than `payload_limit` bytes are refused. What is dropped is also counted in `drops`. Leaving `async with` undeclares
     the subscriber and ends the thread and the iteration; undelivered samples are lost. Supports one consumer. Raises
     `ClosedError` before it is entered.
@@ -103,10 +105,7 @@ class Pump(Generic[T]):
         self._payload_limit = payload_limit
         self._drops = drops
         self._lock = threading.Lock()
-        self._ring: deque[tuple[Any, int]] = deque()
-        self._ring_bytes = 0
-        self._capacity = capacity
-        self._capacity_bytes = capacity_bytes
+        self._ring = ReceiveRing(capacity, capacity_bytes, second_chance=convert_all is not None)
         self._fed = 0
         self._fed_capacity = fed_capacity
         self._slots = threading.Semaphore(BATCHES_IN_FLIGHT)
@@ -253,12 +252,7 @@ class Pump(Generic[T]):
                 except Exception as error:  # raised once the samples before it are converted
                     self._copy_failure = error
                     break
-                if copied is not None:
-                    ring.append((copied, size))
-                    self._ring_bytes += size
-                while len(ring) > self._capacity or (self._ring_bytes > self._capacity_bytes and len(ring) > 1):
-                    self._ring_bytes -= ring.popleft()[1]
-                    dropped += 1
+                dropped += 0 if copied is None else ring.append(copied, size)
             sample = queue.try_recv() if received < TAKEN_AT_ONCE else None
         sending.received(self._session)
         with self._lock:
@@ -280,9 +274,7 @@ class Pump(Generic[T]):
         items: list[T] = []
         try:
             for _ in range(BATCH // SLICE):
-                taken = [self._ring.popleft() for _ in range(min(SLICE, len(self._ring)))]
-                self._ring_bytes -= sum(size for _, size in taken)
-                items += self._items([copied for copied, _ in taken])
+                items += self._items(self._ring.take(SLICE))
                 if not self._ring:
                     break
                 self._take(queue)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-RESEND: Final = RetryPolicy(initial=3.0, ceiling=300.0)
+RESEND: Final = RetryPolicy(initial=0.5, ceiling=300.0)
 """How long to wait for the effect of a message before it is sent again."""
 RESEND_RATE: Final = Rate(per_second=50.0, burst=250)
 """Messages that are sent again, in all: strangers can make a robot offer, and tell it that a provider appeared."""

@@ -1,0 +1,88 @@
+"""The ring of received samples: its bounds, and the second chance of what is sent again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mesh.network.ring import REMEMBERED, ReceiveRing
+
+
+def ring(capacity: int = 4, capacity_bytes: int = 1000, *, second_chance: bool = True) -> ReceiveRing:
+    return ReceiveRing(capacity, capacity_bytes, second_chance=second_chance)
+
+
+def fill(waiting: ReceiveRing, *items: Any, size: int = 1) -> int:
+    return sum(waiting.append(item, size) for item in items)
+
+
+def test_the_oldest_are_dropped_beyond_the_number_and_the_bytes() -> None:
+    waiting = ring(second_chance=False)
+    assert fill(waiting, *range(6)) == 2
+    assert waiting.take(10) == [2, 3, 4, 5]
+
+    assert fill(waiting, *range(6), size=400) == 4
+    assert waiting.take(10) == [4, 5]
+    assert fill(waiting, "larger than the ring", size=2000) == 0
+    assert waiting.take(10) == ["larger than the ring"]
+    assert len(waiting) == 0
+
+
+def test_what_was_dropped_goes_first_when_it_comes_again() -> None:
+    waiting = ring()
+    fill(waiting, "honest", 1, 2, 3, 4)
+    assert fill(waiting, "honest") == 0, "it displaces nothing"
+
+    assert waiting.take(1) == ["honest"]
+    assert waiting.take(10) == [1, 2, 3, 4]
+
+
+def test_a_quarter_is_left_for_what_comes_for_the_first_time() -> None:
+    waiting = ring(8)
+    fill(waiting, *range(16))
+    fill(waiting, *range(8))
+
+    assert waiting.take(4) == [0, 1, 2, 8]
+    assert waiting.take(40) == [3, 4, 5, 6, 7, *range(9, 16)]
+
+
+def test_an_honest_message_passes_any_flood_of_new_ones_with_its_second_copy() -> None:
+    waiting, passed = ring(64), []
+    for number in range(1000):
+        if number in (100, 120):
+            waiting.append("honest", 1)
+        fill(waiting, *((number, each) for each in range(100)))
+        passed += waiting.take(20)
+
+    assert passed.count("honest") == 1
+
+
+def test_dropped_items_are_forgotten_after_a_while() -> None:
+    waiting = ring(1)
+    fill(waiting, "old", *range(REMEMBERED + 2))
+
+    assert len(waiting._young) + len(waiting._old) <= REMEMBERED
+    fill(waiting, "old")
+    assert waiting.take(1) == ["old"], "the only one in the ring, in place of the last"
+    assert len(waiting) == 0
+
+
+def test_without_second_chance_items_need_no_hash() -> None:
+    waiting = ring(1, second_chance=False)
+    assert fill(waiting, [1], [2], [1]) == 2
+    assert waiting.take(2) == [[1]]
+
+
+@given(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 600)) | st.integers(1, 5)))
+def test_nothing_is_lost_but_what_is_counted_and_the_bounds_hold(steps: list[Any]) -> None:
+    waiting, added, taken, dropped = ring(), 0, 0, 0
+    for step in steps:
+        if isinstance(step, tuple):
+            added += 1
+            dropped += waiting.append(*step)
+        else:
+            taken += len(waiting.take(step))
+        assert len(waiting) <= 8
+        assert added == taken + dropped + len(waiting)
