@@ -171,6 +171,20 @@ def test_the_market_of_a_provider_is_described() -> None:
     assert shown["spent"] == "0.002 ETH for 343,444 gas"
 
 
+def test_what_was_dropped_is_shown_with_its_heaviest_senders_and_absent_in_older_records() -> None:
+    older = json.loads(status().encode())
+    del older["dropped"], older["heaviest"]
+    read = Status.decode(json.dumps(older).encode())
+    assert "dropped" not in describe_status(read)
+
+    flooded = msgspec.structs.replace(
+        read, dropped={"too-large": 1200, "unfunded": 7}, heaviest={"unfunded": {ROBOT.address: 5}}
+    )
+    shown = describe_status(Status.decode(flooded.encode()))
+    assert shown["dropped"] == "1,207 (1,200 too-large, 7 unfunded)"
+    assert shown["most unfunded"] == f"{ROBOT.address} 5"
+
+
 def test_a_bridge_is_described() -> None:
     way = msgspec.structs.replace(WAY, carried=12, per_second=0.5, dropped={"no-room": 3}, waiting=4)
     shown = describe_status(msgspec.structs.replace(bridge_status(), to_ipfs=way, last_error="refused", losses=2))
