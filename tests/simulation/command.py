@@ -13,6 +13,7 @@ import subprocess
 import sys
 from asyncio import Queue
 from collections import Counter
+from contextlib import closing
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Final
 
@@ -26,7 +27,7 @@ from mesh.chain.web3_provider import ReliableProvider  # noqa: E402, F401
 from tests.simulation.deployment import ON_EVM, ON_MODEL, Deployments  # noqa: E402
 from tests.simulation.faults import KINDS  # noqa: E402
 from tests.simulation.mutants import find_mutants  # noqa: E402
-from tests.simulation.runs import Run, numbers_in, run_in_child  # noqa: E402
+from tests.simulation.runs import Run, numbers_in, run_in_children  # noqa: E402
 from tests.simulation.shrinking import Shrinking  # noqa: E402
 
 if TYPE_CHECKING:
@@ -50,18 +51,20 @@ def main(arguments: Sequence[str]) -> None:
         sys.stdout.flush()
         os._exit(0 if found_all else 1)
     total = Report(options.seed)
-    for run, report in _histories(deployed, options):
-        _add(total, report)
-        if report.violations:
-            _print_failure(report, run)
-            if options.shrink:
-                _shrink(deployed, run, options.shrink)
-        elif not options.json:
-            print(f"seed {report.seed}: {report.jobs} jobs, {report.paid} paid", flush=True)
-        if options.seconds and REAL_TIME() - began > options.seconds:
-            break
-        if report.violations and not options.keep_going:
-            break
+    shown = {"trace": options.trace, "switches": options.switches}
+    with closing(run_in_children(deployed, _histories(options), workers=options.workers, **shown)) as histories:
+        for run, report in histories:
+            _add(total, report)
+            if report.violations:
+                _print_failure(report, run)
+                if options.shrink:
+                    _shrink(deployed, run, options.shrink)
+            elif not options.json:
+                print(f"seed {report.seed}: {report.jobs} jobs, {report.paid} paid", flush=True)
+            if options.seconds and REAL_TIME() - began > options.seconds:
+                break
+            if report.violations and not options.keep_going:
+                break
     total.real_s = round(REAL_TIME() - began, 3)
     if options.json:
         print(json.dumps(asdict(total)), flush=True)
@@ -89,6 +92,7 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument(
         "--chain", choices=(ON_MODEL, ON_EVM), default=None, help="what runs the contracts; by default the seed chooses"
     )
+    parser.add_argument("--workers", type=int, default=1, help="histories at a time")
     parser.add_argument("--keep-going", action="store_true", help="do not stop at the first failure")
     parser.add_argument("--only", default="", help="the kinds of faults, with commas; `none` for none")
     parser.add_argument("--without", default="", help="kinds of faults that do not happen, with commas")
@@ -120,7 +124,7 @@ def _print_logs() -> None:
     logging.getLogger("mesh").addHandler(SimulatedHandler(sys.stdout))
 
 
-def _histories(deployments: Deployments, options: argparse.Namespace) -> Iterator[tuple[Run, Report]]:
+def _histories(options: argparse.Namespace) -> Iterator[Run]:
     left, seed = options.jobs, options.seed
     while left > 0:
         run = Run(
@@ -133,7 +137,7 @@ def _histories(deployments: Deployments, options: argparse.Namespace) -> Iterato
             options.chain or "",
             options.plant,
         )
-        yield run, run_in_child(deployments, run, trace=options.trace, switches=options.switches)
+        yield run
         left, seed = left - run.jobs, seed + 1
 
 

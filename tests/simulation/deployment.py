@@ -7,6 +7,7 @@ import random
 from dataclasses import dataclass
 from typing import Final, Literal
 
+import mesh.agent.runtime  # noqa: F401 - loaded once, before histories fork
 from mesh.chain import XRT, Account, Chain, Timing
 from mesh.chain.deploy import DeploymentPlan
 from mesh.devchain.development import ALLOWANCE, DevelopmentMarket, deploy_market

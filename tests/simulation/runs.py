@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
+import signal
 import sys
 import traceback
+from collections import deque
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+from itertools import islice
+from typing import TYPE_CHECKING, NoReturn
 
 from tests.simulation import history
 from tests.simulation.history import Report
 from tests.simulation.mutations import planted
 
 if TYPE_CHECKING:
-    from tests.simulation.deployment import Deployments
+    from collections.abc import Generator, Iterable
+
+    from tests.simulation.deployment import Deployed, Deployments
 
 
 @dataclass(frozen=True)
@@ -77,36 +83,75 @@ def numbers_in(text: str) -> frozenset[int]:
 
 def run_in_child(deployments: Deployments, run: Run, *, trace: bool = False, switches: str | None = None) -> Report:
     """Run a history in a process of its own: nothing is left of it for the next one."""
-    kind = run.chain or deployments.kind(run.seed)
-    market = deployments.market(kind)
-    reading, writing = os.pipe()
-    child = os.fork()
-    if child == 0:
-        os.close(reading)
-        try:
-            if run.plant:
-                planted(run.plant).apply()
-            plan = history.plan_of(run.seed, only=run.only, without=run.without)
-            plan.lasts = plan.lasts if run.lasts is None else run.lasts
-            report, lines = history.run_history(
-                market, run.seed, run.jobs, plan, left_out=run.left_out, switches=switches
-            )
-            if trace:
-                print(plan, *lines, sep="\n", flush=True)
-            with os.fdopen(writing, "w") as pipe:
-                json.dump(asdict(report), pipe)
-        except BaseException:
-            traceback.print_exc()
-        finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(0)
-    os.close(writing)
-    with os.fdopen(reading) as pipe:
-        said = pipe.read()
-    os.waitpid(child, 0)
-    if not said:
-        return Report(run.seed, violations=["history-failed: the process of the history ended"])
-    report = Report(**json.loads(said))
-    report.chains = {kind: 1}
-    return report
+    return Child(deployments, run, trace=trace, switches=switches).report()
+
+
+def run_in_children(
+    deployments: Deployments, runs: Iterable[Run], *, workers: int, trace: bool, switches: str | None
+) -> Generator[tuple[Run, Report]]:
+    """Run histories, `workers` at a time; what happened in each, in their order."""
+    started: deque[Child] = deque()
+    left = iter(runs)
+    try:
+        while True:
+            for run in islice(left, workers - len(started)):
+                started.append(Child(deployments, run, trace=trace, switches=switches))
+            if not started:
+                return
+            child = started.popleft()
+            yield child.run, child.report()
+    finally:
+        for child in started:
+            child.stop()
+
+
+class Child:
+    """The process of a history."""
+
+    def __init__(self, deployments: Deployments, run: Run, *, trace: bool, switches: str | None) -> None:
+        self.run = run
+        self._kind = run.chain or deployments.kind(run.seed)
+        market = deployments.market(self._kind)
+        self._pipe, writing = os.pipe()
+        self._process = os.fork()
+        if self._process == 0:
+            os.close(self._pipe)
+            _play(market, run, writing, trace=trace, switches=switches)
+        os.close(writing)
+
+    def report(self) -> Report:
+        """Wait for its end; what happened."""
+        with os.fdopen(self._pipe) as pipe:
+            said = pipe.read()
+        os.waitpid(self._process, 0)
+        if not said:
+            return Report(self.run.seed, violations=["history-failed: the process of the history ended"])
+        report = Report(**json.loads(said))
+        report.chains = {self._kind: 1}
+        return report
+
+    def stop(self) -> None:
+        """End it at once."""
+        os.kill(self._process, signal.SIGKILL)
+        os.waitpid(self._process, 0)
+        shutil.rmtree(history.FOLDER / str(self._process), ignore_errors=True)
+
+
+def _play(market: Deployed, run: Run, writing: int, *, trace: bool, switches: str | None) -> NoReturn:
+    """Run a history in this process, which ends; the report goes into the pipe."""
+    try:
+        if run.plant:
+            planted(run.plant).apply()
+        plan = history.plan_of(run.seed, only=run.only, without=run.without)
+        plan.lasts = plan.lasts if run.lasts is None else run.lasts
+        report, lines = history.run_history(market, run.seed, run.jobs, plan, left_out=run.left_out, switches=switches)
+        if trace:
+            print(plan, *lines, sep="\n", flush=True)
+        with os.fdopen(writing, "w") as pipe:
+            json.dump(asdict(report), pipe)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(0)

@@ -29,8 +29,8 @@ def test_the_seed_chooses_the_chain() -> None:
     assert Deployments(ON_MODEL).kind(kinds.index(ON_EVM)) == ON_MODEL
 
 
-def test_a_history_is_the_same_alone_and_after_another() -> None:
+def test_a_history_is_the_same_alone_and_beside_another() -> None:
     options = ("--only", "delay,duplicate,late", "--chain", "model")
-    after = simulate("--seed", "30", "--jobs", "7", *options)[0]
+    beside = simulate("--seed", "30", "--jobs", "7", "--workers", "2", *options)[0]
     alone = simulate("--seed", "31", "--jobs", "1", *options)[0]
-    assert after["trace"] == alone["trace"]
+    assert beside["trace"] == alone["trace"]
