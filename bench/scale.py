@@ -1,7 +1,7 @@
 """A market of many agents on three linked routers: what a message costs the routers, and whether any is lost.
 
-Each agent has a session, a subscription to demands for its own model, a service and a presence token, and answers each
-demand with an offer. People on all three routers send demands; a listener on one of them receives all offers, as a
+Each agent has a session, a subscription to demands for its own model and a presence token, and answers each demand with
+an offer. People on all three routers send demands; a listener on one of them receives all offers, as a
 provider does. The bars: no order lost or misdirected, the routers' processor time per message at the highest number of
 agents at most twice that at the lowest, all agents declared within ten seconds.
 
@@ -20,20 +20,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from zenoh import CongestionControl
+from zenoh.handlers import FifoChannel
 
 from common import ADDRESS, LIGHTHOUSE, SPAWN, TOKEN, show
-from mesh.network import Channel, Endpoints, Network, Services, free_endpoint
+from mesh.network import Channel, Endpoints, Network, free_endpoint
 from mesh.network.endpoints import allow_sessions
-from schemas import ZERO_ADDRESS, Demand, EventKey, Offer, Signer, cid_of_bytes, encode, market_selector
+from schemas import ZERO_ADDRESS, Demand, EventKey, Offer, RpcKey, Signer, cid_of_bytes, encode, market_selector
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from schemas import Record
-
 ROUTERS: Final = 3
 AGENTS_PER_PROCESS: Final = 125
 MAX_SESSIONS: Final = 10_000
+LEASE: Final = 120.0
+"""Seconds without processor time that a session survives: thousands of agents start on a few cores at once."""
 IN_FLIGHT: Final = 8
 """Jobs at a time: fewer than agents, or messages to one agent would travel together."""
 JOB_TIMEOUT: Final = 30.0
@@ -74,7 +75,7 @@ def routers() -> Iterator[Routers]:
 
 def _route(endpoint: str, others: tuple[str, ...]) -> None:
     async def run() -> None:
-        at = Endpoints(listen=(endpoint,), connect=others, mode="router", max_sessions=MAX_SESSIONS)
+        at = Endpoints(listen=(endpoint,), connect=others, mode="router", max_sessions=MAX_SESSIONS, lease=LEASE)
         async with Network(at):
             await asyncio.Event().wait()
 
@@ -156,12 +157,10 @@ async def _run_agents(endpoints: Sequence[str], numbers: range, agents: Agents) 
 
         async def open_agent(number: int) -> None:
             async with opening:
-                at = Endpoints(connect=(endpoints[number % ROUTERS],), timeout=START_TIMEOUT)
+                at = Endpoints(connect=(endpoints[number % ROUTERS],), timeout=START_TIMEOUT, lease=LEASE)
                 network = await stack.enter_async_context(Network(at))
             channel = await stack.enter_async_context(Channel(network.session, LIGHTHOUSE, address=ADDRESS))
             demands = await stack.enter_async_context(channel.subscribe(Demand, model=model(number)))
-            services = await stack.enter_async_context(Services(network.session, f"0x{number:040x}"))
-            services.offer("status", _no_status)
             channel.announce("agent", f"0x{number:040x}")
             working.append(tasks.create_task(_work(channel, demands, number, agents)))
 
@@ -170,10 +169,6 @@ async def _run_agents(endpoints: Sequence[str], numbers: range, agents: Agents) 
         await asyncio.to_thread(agents.leave.wait)
         for task in working:
             task.cancel()
-
-
-async def _no_status(_request: Record) -> Record:
-    raise NotImplementedError
 
 
 async def _work(channel: Channel, demands: Any, number: int, agents: Agents) -> None:
@@ -265,7 +260,9 @@ def _demand(of: str, objective: str, index: int) -> Demand:
 
 
 async def _channel(stack: AsyncExitStack, endpoint: str) -> Channel:
-    network = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,), timeout=START_TIMEOUT)))
+    network = await stack.enter_async_context(
+        Network(Endpoints(connect=(endpoint,), timeout=START_TIMEOUT, lease=LEASE))
+    )
     return await stack.enter_async_context(Channel(network.session, LIGHTHOUSE, address=ADDRESS))
 
 
@@ -275,11 +272,14 @@ async def _spread(channels: Sequence[Channel], count: int) -> None:
     for channel in channels:
         while (present := len(await channel.present())) != count:
             assert time.monotonic() < deadline, f"{present} of {count} agents are present"
-            await asyncio.sleep(0.05)
+            await asyncio.sleep(0.05 + count / 10_000)
 
 
-async def unheard(at: Routers, messages: int) -> dict[str, float]:
-    """Processor time of a router for a message whose key nobody has subscribed to as such."""
+async def unheard(at: Routers, count: int, messages: int) -> dict[str, float]:
+    """Processor time of the routers for a message whose key nobody has subscribed to as such.
+
+    One session declares a service for each agent meanwhile.
+    """
     payload = encode(Signer(b"\2" * 32).sign(_demand(model(0), model(0), 0)))
     keys = {
         "unknown_model": [market_selector(LIGHTHOUSE, "demand", model(-1 - number)) for number in range(64)],
@@ -289,6 +289,8 @@ async def unheard(at: Routers, messages: int) -> dict[str, float]:
     async with AsyncExitStack() as stack:
         sender = (await _channel(stack, at.endpoints[0]))._session
         watcher = (await _channel(stack, at.endpoints[1]))._session
+        for number in range(count):
+            watcher.declare_queryable(str(RpcKey(f"0x{number:040x}", "status")), FifoChannel(1))
         passed = asyncio.Event()
         loop = asyncio.get_running_loop()
         watcher.declare_subscriber("aira/bench/passed", lambda _: loop.call_soon_threadsafe(passed.set))
@@ -319,7 +321,7 @@ def measure(count: int, options: Any) -> dict[str, Any]:
             asyncio.run(_until_declared(at, count))
             declared = time.perf_counter() - started
             found: dict[str, Any] = asyncio.run(jobs(at, count, options.jobs))
-            found |= asyncio.run(unheard(at, options.jobs))
+            found |= asyncio.run(unheard(at, count, options.jobs))
             found["wrong"] += agents.wrong.value
             found["declared_s"] = declared
             found["router_kib_an_agent"] = (sum(map(memory, at.pids)) - empty) / count * 1024

@@ -57,6 +57,7 @@ class Endpoints:
     A router connects to other routers and retries them as long as it is open. `timeout` is the time in seconds to
     reach a first router; -1 waits forever. `tls` is the identity on `tls/` locators. `access` is Zenoh's
     `access_control`: the rights of each client of this router; `max_sessions` is how many it holds at a time.
+    `lease` is the time in seconds after which the other side counts this one as gone if it hears nothing.
     `shared_memory` exchanges large payloads with other processes of the machine in shared memory. Each session then
     locks memory, and a router with 8 MiB of it (`ulimit -l`) admits some 350 sessions.
     """
@@ -68,6 +69,7 @@ class Endpoints:
     tls: Tls | None = None
     access: Mapping[str, Any] | None = None
     max_sessions: int = MAX_SESSIONS
+    lease: float = 10.0
     shared_memory: bool = False
 
     @classmethod
@@ -109,6 +111,7 @@ class Endpoints:
             "transport/link/tx/queue/size/data": SEND_QUEUE_BATCHES,
             "transport/shared_memory/enabled": self.shared_memory,
             "transport/unicast/max_sessions": self.max_sessions,
+            "transport/link/tx/lease": round(self.lease * 1000),
             "scouting/multicast/enabled": False,
             # Otherwise a router waits half a second for others that scouting might find.
             "scouting/delay": 0,
