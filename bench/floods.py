@@ -145,6 +145,15 @@ async def unfunded_pairs(attacker: Attacker) -> None:
 
 
 @flood
+async def far_deadlines(attacker: Attacker) -> None:
+    """Free demands of fresh keys for an objective that the robot has, so that it offers, valid for 10^9 blocks."""
+    demands = (attacker.demand(objective=attacker.objective, cost=0, deadline=10**9) for _ in range(PREPARED))
+    wire = attacker.wire(sign(demand) for demand in demands)
+    await attacker.begin()
+    await attacker.put_all(wire)
+
+
+@flood
 async def duplicates(attacker: Attacker) -> None:
     """One valid demand, again and again."""
     await attacker.put_again_and_again(attacker.wire([sign(attacker.demand())]))

@@ -10,6 +10,7 @@ import asyncio
 import difflib
 import logging
 import threading
+from collections import Counter
 from contextvars import copy_context
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypeAlias
@@ -31,14 +32,16 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-FailureReason: TypeAlias = Literal["unknown-service", "no-agent", "timeout", "unreadable-reply", "agent-error"]
+FailureReason: TypeAlias = Literal["unknown-service", "no-agent", "timeout", "unreadable-reply", "agent-error", "busy"]
 
 TIMEOUT: Final = 10.0
 """Seconds to wait for a reply."""
 SPENDING_TIMEOUT: Final = 240.0
 """Seconds to wait for a reply that needs a mined transaction. Calling again too early would pay twice."""
 CONCURRENT_REQUESTS: Final = 256
-"""Requests that an agent handles at the same time; more get an error reply."""
+"""Requests for one service that an agent handles at the same time; more get an error reply."""
+CONCURRENT_IN_TOTAL: Final = 1024
+"""The same for all services together."""
 REQUESTS: Final = Rate(20, 300)
 """Requests for one service that an agent handles, a second and at once; more get an error reply. Zenoh does not say who
 asks, and each may cost a call of the node."""
@@ -47,13 +50,14 @@ REQUESTS_IN_TOTAL: Final = Rate(60, 1000)
 
 
 class Failure(Record, frozen=True):
-    """The content of an error reply: the error's message and hint."""
+    """The content of an error reply: the error's message, hint and code (`busy` for a request too many)."""
 
     error: str
     hint: str = ""
+    code: str = ""
 
 
-BUSY: Final = Failure("the agent is handling too many requests", "try again later").encode()
+BUSY: Final = Failure("the agent is handling too many requests", "try again later", "busy").encode()
 
 
 class ServiceFailed(RemoteError, code="service-failed"):
@@ -80,6 +84,8 @@ class Services:
         self._address = address
         self._queryables: list[Any] = []
         self._requests: set[asyncio.Task[None]] = set()
+        self._running: Counter[str] = Counter()
+        """The requests that are being handled, by key."""
         self._open = False
 
     async def __aenter__(self) -> Self:
@@ -115,7 +121,7 @@ class Services:
 
         def received(query: zenoh.Query) -> None:
             # Zenoh's thread answers what is too much, so that the event loop is not kept busy.
-            if len(self._requests) < CONCURRENT_REQUESTS and self._allow(service):
+            if self._has_place(key) and self._allow(service):
                 call_in_loop(loop, self._accept, query, key, request_type, handler, context=context)
                 return
             if self._drops is not None:
@@ -124,6 +130,9 @@ class Services:
                 query.reply_err(BUSY)
 
         self._queryables.append(self._session.declare_queryable(key, received))
+
+    def _has_place(self, key: str) -> bool:
+        return self._running[key] < CONCURRENT_REQUESTS and len(self._requests) < CONCURRENT_IN_TOTAL
 
     def _allow(self, service: str) -> bool:
         with self._lock:
@@ -135,13 +144,18 @@ class Services:
         if not self._open:
             query.drop()  # type: ignore[no-untyped-call]
             return
-        if len(self._requests) >= CONCURRENT_REQUESTS:
+        if not self._has_place(key):
             with query:
                 query.reply_err(BUSY)
             return
         request = asyncio.create_task(self._handle(query, key, request_type, handler), name=f"handle {key}")
         self._requests.add(request)
-        request.add_done_callback(self._requests.discard)
+        self._running[key] += 1
+        request.add_done_callback(partial(self._ended, key))
+
+    def _ended(self, key: str, request: asyncio.Task[None]) -> None:
+        self._requests.discard(request)
+        self._running[key] -= 1
 
     async def _handle(
         self, query: zenoh.Query, key: str, request_type: type[Record], handler: Callable[[Any], Awaitable[Record]]
@@ -151,7 +165,7 @@ class Services:
                 payload = b"{}" if query.payload is None else query.payload.to_bytes()
                 reply = (await handler(request_type.decode(payload))).encode()
             except AiraError as error:
-                query.reply_err(Failure(str(error), error.hint).encode())
+                query.reply_err(Failure(str(error), error.hint, error.code).encode())
             except Exception:
                 log.exception("service %s failed", key, extra=log_event("service-failed", key=key))
                 query.reply_err(Failure("the agent failed; see its log").encode())
@@ -205,4 +219,5 @@ def _failed(service: str, payload: bytes, timeout: float) -> ServiceFailed:
         failure = Failure.decode(payload)
     except InvalidRecord:
         return ServiceFailed(service, f"no reply within {timeout:g} s", reason="timeout")  # Zenoh replies `Timeout`
-    return ServiceFailed(service, failure.error, hint=failure.hint)
+    reason: FailureReason = "busy" if failure.code == "busy" else "agent-error"
+    return ServiceFailed(service, failure.error, hint=failure.hint, reason=reason)

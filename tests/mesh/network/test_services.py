@@ -204,7 +204,7 @@ async def test_requests_beyond_the_limit_get_an_error_reply(here: zenoh.Session,
         await until(lambda: services.in_progress == CONCURRENT_REQUESTS, what="the limit", seconds=30)
         with pytest.raises(ServiceFailed) as caught:
             await call(here, ADDRESS, "start", REQUEST)
-        assert (caught.value.reason, caught.value.hint) == ("agent-error", "try again later")
+        assert (caught.value.reason, caught.value.hint) == ("busy", "try again later")
         enough.set()
         answered = await asyncio.to_thread(lambda: [reply.ok is not None for one in waiting for reply in one])
         assert answered == [True] * CONCURRENT_REQUESTS
