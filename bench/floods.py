@@ -32,6 +32,8 @@ BURST: Final = 64
 """Messages that are put between two turns of the event loop."""
 TOKENS: Final = 50_000
 """Liveliness tokens of one flood."""
+LIES: Final = 65
+"""Lies that a content liar sends for each query."""
 QUERIES: Final = 256
 """Queries of a flood that are open at a time."""
 
@@ -231,3 +233,19 @@ async def tokens(attacker: Attacker) -> None:
         if len(declared) % BURST == 0:
             await asyncio.sleep(0)
     await asyncio.Event().wait()
+
+
+@flood
+async def content_liars(attacker: Attacker) -> None:
+    """Answer each query for a block with lies, before its holder does."""
+
+    def lie(query: zenoh.Query) -> None:
+        with query:
+            key = str(query.key_expr)
+            if "/cid/" in key:
+                for number in range(LIES):
+                    query.reply(key.replace("*", attacker.robot), f"lie {number}")
+
+    await attacker.begin()
+    with attacker.session.declare_queryable("aira/agent/**", lie):
+        await asyncio.Event().wait()

@@ -3,8 +3,8 @@
 `ipfs`: a bare client of one daemon publishes to a bare client of a connected daemon, as on the legacy network.
 `bridge`: a demand on a Zenoh key reaches a bare client of the second daemon. `zenoh`: the same demand reaches a
 verified subscription. The daemons are js-ipfs, or with `--daemon kubo` those that `AIRA_KUBO` names; a Kubo gets at
-most one message every 20 ms. Daemons and router run in processes of their own. Latencies are measured one message at
-a time, rates without waiting between messages.
+most one message every 20 ms, and those pauses are not measured. Daemons and router run in processes of their own.
+Latencies are measured one message at a time, rates without waiting between messages.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ ROOT: Final = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))  # for the daemons of the tests
 
 from bridges.ipfs import ChannelBridge, Daemon, RelayJournal, RelayValidator  # noqa: E402
+from bridges.ipfs.daemon import PUBLISH_INTERVAL  # noqa: E402
 from common import ADDRESS, LIGHTHOUSE, arguments, router, show, signed_demands  # noqa: E402
 from mesh.background import Background  # noqa: E402
 from mesh.network import Channel, Endpoints, Network  # noqa: E402
@@ -70,13 +71,18 @@ class Receiver:
 
 
 async def measure(
-    publish: Callable[[Demand], Awaitable[None]], receiver: Receiver, orders: Sequence[Demand]
+    publish: Callable[[Demand], Awaitable[None]], receiver: Receiver, orders: Sequence[Demand], pause: float = 0.0
 ) -> dict[str, float]:
-    """The results of one path: half of the orders one at a time, the others without waiting."""
+    """The results of one path: half of the orders one at a time, the others without waiting.
+
+    `pause` is in seconds, the least time between two messages to the daemon: it is waited for before the measurement of
+    each latency. A rate would only show the pause, so there is none then.
+    """
     wanted = {order.nonce: encode(order) for order in orders}
     half = len(orders) // 2
     taken = []
     for order in orders[:half]:
+        await asyncio.sleep(pause)
         started = time.perf_counter()
         await publish(order)
         await receiver.wait(wanted[order.nonce])
@@ -90,7 +96,7 @@ async def measure(
     return {
         "p50_ms": round(statistics.median(taken[WARM_UP:]) * 1e3, 3),
         "p99_ms": round(statistics.quantiles(taken[WARM_UP:], n=100)[98] * 1e3, 3),
-        "per_second": round((len(orders) - half) / seconds, 1),
+        **({} if pause else {"per_second": round((len(orders) - half) / seconds, 1)}),
         "lost": counts.count(0),
         "twice": sum(count > 1 for count in counts),
     }
@@ -116,6 +122,11 @@ async def until_listened(daemon: Daemon, topic: str) -> None:
     await asyncio.sleep(2)
 
 
+def pause_of(daemon: Daemon) -> float:
+    """Seconds that a daemon needs between two messages."""
+    return 0.0 if daemon.version is None or daemon.version.is_js else PUBLISH_INTERVAL
+
+
 async def over_ipfs(here: Daemon, there: Daemon, orders: Sequence[Demand]) -> dict[str, float]:
     """From a bare client of one daemon to one of another."""
     topic, receiver, ready = "bench.lighthouse.3.robonomics.eth", Receiver(), asyncio.Event()
@@ -123,7 +134,7 @@ async def over_ipfs(here: Daemon, there: Daemon, orders: Sequence[Demand]) -> di
         tasks.start(listen(there, topic, receiver, ready), "receiver")
         await ready.wait()
         await until_listened(here, topic)
-        return await measure(lambda order: here.publish(topic, encode(order)), receiver, orders)
+        return await measure(lambda order: here.publish(topic, encode(order)), receiver, orders, pause_of(here))
 
 
 async def over_bridge(
@@ -145,7 +156,7 @@ async def over_bridge(
         tasks.start(bridge.run(), "bridge")
         await ready.wait()
         await until_listened(here, LIGHTHOUSE)
-        return await measure(publishing(channel), receiver, orders)
+        return await measure(publishing(channel), receiver, orders, pause_of(here))
 
 
 async def over_zenoh(endpoint: str, orders: Sequence[Demand]) -> dict[str, float]:

@@ -19,7 +19,7 @@ from mesh.content import Exchange, Store
 from mesh.errors import ConfigurationError
 from mesh.flood import Drops
 from mesh.market.withdrawals import Withdrawals
-from mesh.network.metrics import network_families
+from mesh.network.metrics import drop_family, network_families
 from mesh.role import Role
 from schemas import Demand, Result, decode, recover
 
@@ -81,6 +81,7 @@ class IpfsBridge(Role):
         return (
             *bridge_families(channel.health() for channel in self.channels),
             *content_families(self.content.metrics()),
+            drop_family(self.drops),
             *network_families(self._network),
         )
 
