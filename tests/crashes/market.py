@@ -51,6 +51,8 @@ class CrashMarket:
         self._stack = ExitStack()
         self._running: dict[str, Serving] = {}
         self._played = 0
+        self._ended_logs: list[tuple[str, str]] = []
+        """Of processes that ended by themselves in this cell."""
 
     def __enter__(self) -> Self:
         self._stack.callback(shutil.rmtree, self.folder, ignore_errors=True)
@@ -76,15 +78,17 @@ class CrashMarket:
         work = self.folder / f"{self._played}.mcap"
         work.write_bytes(objective(*(("/say", f"{word} {self._played}") for word in WORDS), step_ns=STEP_NS))
         before = self._runner.run(self._balances())
+        self._ended_logs.clear()
         with self._disk(cell) as disk:
             try:
                 self._start_for(cell, control, work, disk)
                 wait_until((control / REACHED).exists, what=f"{cell.point}", seconds=REACH_SECONDS)
                 self._fail(cell, control, disk)
                 liability = self._ended(cell, work)
-                self._check(cell, liability, before)
+                self._check(cell, work, liability, before)
             except (AssertionError, ServerFailed) as error:
-                logs = "\n".join(f"--- {role}\n{one.log()[-3_000:]}" for role, one in self._running.items())
+                running = {role: one.log() for role, one in self._running.items()}
+                logs = "\n".join(f"--- {role}\n{log[-3_000:]}" for role, log in [*self._ended_logs, *running.items()])
                 self._stop_all()
                 raise AssertionError(f"{cell.name}: {error}\n{logs}") from None
             finally:
@@ -162,10 +166,12 @@ class CrashMarket:
             process = self._running.get(role)
             is_over = process is not None and role == "person" and "person-done" in process.log()
             if process is None or not (is_over or process.is_running):
+                if process is not None:
+                    self._ended_logs.append((f"{role}, which ended", process.log()))
                 self._stop(role)
                 self._start(role, work, disk if role == cell.victim else None)
 
-    def _check(self, cell: Cell, liability: Liability, before: dict[str, int]) -> None:
+    def _check(self, cell: Cell, work: Path, liability: Liability, before: dict[str, int]) -> None:
         """Paid once or refunded, and `aira verify` holds. Only a full disk may end a job without success."""
         assert liability.is_success or cell.fault == "disk", "the job failed"
         paid = COST if liability.is_success else 0
@@ -173,6 +179,7 @@ class CrashMarket:
         wait_until(lambda: self._runner.run(self._balances()) == expected, what=f"one payment of {paid}")
         variables = self.site.variables("person", data_dir=str(self.folder / "verify"))
         if liability.is_success:
+            self._revive(work, cell)  # the robot has the files, and may have ended since
             verified = invoke("verify", liability.address, **variables)
             assert verified.returncode == 0, (verified.stdout, verified.stderr)
 

@@ -129,7 +129,8 @@ def _play(market: Market, plan: FaultPlan) -> None:
     if errors and errors[0] is not None:
         raise errors[0]
     audit.money()
-    audit.ledgers()
+    for difference in audit.ledgers():
+        market.violated("ledger-differs", difference)
     audit.liveness()
     for address in sorted(audit.open):
         market.violated("not-finalized", address)
@@ -137,13 +138,15 @@ def _play(market: Market, plan: FaultPlan) -> None:
 
 
 def _is_settled(market: Market, audit: Audit) -> bool:
-    """Whether people have been told everything and all liabilities have ended, for some blocks."""
+    """Whether people know everything and all liabilities have ended, for some blocks, and ledgers have it all."""
     head = market.deployed.chain.evm.head
     if head == market.settled_head:
         return False
-    done = all(person.is_done for person in market.people) and all(audit.liabilities().values())
-    market.settled_blocks = market.settled_blocks + 1 if done else 0
     market.settled_head = head
+    done = all(person.is_done for person in market.people) and all(audit.liabilities().values())
+    if done and market.settled_blocks == SETTLED_BLOCKS and any(audit.ledgers()):
+        return False
+    market.settled_blocks = market.settled_blocks + 1 if done else 0
     return market.settled_blocks > SETTLED_BLOCKS
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from tests.simulation.deployment import ON_MODEL
-from tests.simulation.mutations import MUTATIONS
+from tests.simulation.mutations import CANDIDATES, MUTATIONS
 from tests.simulation.runs import Run, run_in_child
 from tests.simulation.scheduler import REAL_TIME
 
@@ -18,7 +18,7 @@ ROW = "{:<72} {:>5} {:>5} {:>6}  {}"
 
 def find_mutants(deployments: Deployments, seed: int, name: str) -> bool:
     """Search for each bug with `name` in its name, print a table, and return whether all were found."""
-    chosen = [one for one in MUTATIONS if name in one.name]
+    chosen = [one for one in (*MUTATIONS, *(CANDIDATES if name else ())) if name in one.name]
     for mutation in chosen:
         mutation.source()
     began, missed = REAL_TIME(), 0

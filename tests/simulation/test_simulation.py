@@ -3,13 +3,27 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 import subprocess
 import sys
 from typing import Any
 
-from tests.simulation.mutations import MUTATIONS
+import pytest
+
+from tests.simulation.faults import KINDS
+from tests.simulation.mutations import CANDIDATES, MUTATIONS
+from tests.simulation.runs import numbers_in, ranges
 
 FAULTS = "crash,crash_every,delay,drop,duplicate,late,leave_out,lost_after_sending,partition_every,preempt"
+
+
+HAPPEN = {
+    *("message-cut-off", "message-delayed", "message-dropped", "message-duplicated", "message-replayed"),
+    *("answer-spoilt", "node-late", "node-unreachable", "reorganisation", "transaction-left-out"),
+    *("clock-jump", "crash-planned", "disk-full", "kill", "partition", "power-failure", "write-refused"),
+}
+"""Kinds of faults as they are counted."""
 
 
 def simulate(*arguments: str) -> tuple[dict[str, Any], str]:
@@ -43,7 +57,7 @@ def test_no_invariant_is_violated() -> None:
 
 
 def test_planted_bugs_fit_the_sources() -> None:
-    for mutation in MUTATIONS:
+    for mutation in (*MUTATIONS, *CANDIDATES):
         compile(mutation.source(), mutation.name, "exec")
 
 
@@ -52,3 +66,27 @@ def test_a_planted_bug_is_found() -> None:
     ended = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
     assert ended.returncode == 0, ended.stdout + ended.stderr
     assert "1 of 1 planted bugs found" in ended.stdout
+
+
+def test_faults_of_each_kind_happen() -> None:
+    arguments = ("--seed", "6", "--jobs", "4", "--chain", "model", "--only", ",".join(KINDS), "--lasts", "400")
+    found, said = simulate(*arguments)
+    assert found["violations"] == [], said
+    assert set(found["faults"]) >= HAPPEN
+
+
+def test_a_failing_history_is_reduced_to_what_makes_it_fail() -> None:
+    """What is printed plays the smaller history, which fails in the same way."""
+    planted = "the result is signed before the objective was played"
+    command = [sys.executable, "-m", "tests.simulation", "--plant", planted, "--seed", "1", "--jobs", "4"]
+    ended = subprocess.run([*command, "--shrink", "3"], capture_output=True, text=True, timeout=600, check=False)
+    assert ended.returncode == 1
+    small = re.findall(r'ARGS="(.*) --trace"', ended.stderr)[-1]
+    assert "--jobs 4" not in small
+    found, said = simulate(*shlex.split(small))
+    assert any("recording-incomplete" in violation for violation in found["violations"]), said
+
+
+@pytest.mark.parametrize("numbers", [set(), {3}, {0, 1, 2, 7}, {5, 6, 9, 10, 11}])
+def test_numbers_of_faults_are_written_as_ranges(numbers: set[int]) -> None:
+    assert numbers_in(ranges(frozenset(numbers))) == numbers
