@@ -11,6 +11,7 @@ from mesh.chain.answers import decode_cid
 from mesh.chain.errors import NoContracts, NotALiability, OrderAlreadyUsed, Reverted
 from mesh.chain.events import NewLiability, liability_created, xrt_minted
 from mesh.chain.following import retrying
+from mesh.chain.multicall import getters
 from mesh.chain.reader import list_created
 from mesh.errors import InvalidMessage
 from schemas.address import parse_address
@@ -268,8 +269,7 @@ async def _read(node: Node, address: str, *, block: int | str = "latest") -> tup
 
     Raises `NodeUnreachable`, and `NoContracts` for a block before its creation.
     """
-    functions = node.contract("Liability", address).functions
-    values = await node.read_all((functions[getter]() for getter in GETTERS), block=block)
+    values = await node.read_all(getters("Liability", address, GETTERS), block=block)
     *_, demand_hash, offer_hash = values
     return _record(address, dict(zip(GETTERS, values, strict=True))), (bytes(demand_hash), bytes(offer_hash))
 

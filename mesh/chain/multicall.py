@@ -8,18 +8,22 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, TypeAlias
 
 from eth_abi.abi import encode
 
 from mesh.chain.answers import InvalidAnswer, SpoiledAnswer, decode_values
-from mesh.chain.artifacts import load_artifact
+from mesh.chain.artifacts import load_artifact, signature_of
 from mesh.chain.errors import NoContracts, RequestRefused, Reverted
+from schemas import keccak256
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from web3.contract.async_contract import AsyncContractFunction
+
+    ContractCall: TypeAlias = "AsyncContractFunction | Getter"
 
 log = logging.getLogger(__name__)
 
@@ -28,6 +32,30 @@ READ_ATTEMPTS: Final = 3
 
 CALLS_AT_ONCE: Final = 100
 """Most calls in one: the creation code has 49,152 bytes at most (EIP-3860), and what it returns 24,576 (EIP-170)."""
+
+
+class Getter(NamedTuple):
+    """A call of a function without arguments. web3 takes a hundred times as long to prepare one."""
+
+    address: str
+    fn_name: str
+    data: str
+    abi: Mapping[str, Any]
+
+    def _encode_transaction_data(self) -> str:
+        return self.data
+
+
+@cache
+def _getter(contract: str, name: str) -> tuple[str, Mapping[str, Any]]:
+    """The data of a call of a getter of one of our contracts, and its ABI."""
+    (abi,) = (entry for entry in load_artifact(contract).abi if entry.get("name") == name and not entry["inputs"])
+    return "0x" + keccak256(signature_of(abi).encode())[:4].hex(), abi
+
+
+def getters(contract: str, address: str, names: Iterable[str]) -> list[Getter]:
+    """Calls of the getters `names` at an address that holds one of our contracts (`artifacts.NAMES`)."""
+    return [Getter(address, name, *_getter(contract, name)) for name in names]
 
 
 class Caller(Protocol):
@@ -40,7 +68,7 @@ class Caller(Protocol):
     async def call(self, call: Mapping[str, Any], *, block: int | str = "latest") -> bytes: ...
 
 
-async def read(node: Caller, call: AsyncContractFunction, *, block: int | str) -> Any:
+async def read(node: Caller, call: ContractCall, *, block: int | str) -> Any:
     """See `Node.read`."""
     request = {"to": call.address, "data": call._encode_transaction_data()}
     for attempt in range(READ_ATTEMPTS):
@@ -54,7 +82,7 @@ async def read(node: Caller, call: AsyncContractFunction, *, block: int | str) -
     raise InvalidAnswer(f"{call.fn_name} of {call.address}", str(failure))
 
 
-async def read_all(node: Caller, calls: Sequence[AsyncContractFunction], *, block: int | str) -> list[Any]:
+async def read_all(node: Caller, calls: Sequence[ContractCall], *, block: int | str) -> list[Any]:
     """See `Node.read_all`."""
     if block == "latest" and len(calls) > CALLS_AT_ONCE:
         block = await node.block_number()
@@ -65,7 +93,7 @@ async def read_all(node: Caller, calls: Sequence[AsyncContractFunction], *, bloc
     return found
 
 
-async def _read_at_once(node: Caller, calls: Sequence[AsyncContractFunction], block: int | str) -> list[Any] | None:
+async def _read_at_once(node: Caller, calls: Sequence[ContractCall], block: int | str) -> list[Any] | None:
     """What the functions return; None if one of them fails, or the node refuses."""
     requests = [(str(call.address), bytes.fromhex(call._encode_transaction_data()[2:])) for call in calls]
     try:
@@ -76,7 +104,7 @@ async def _read_at_once(node: Caller, calls: Sequence[AsyncContractFunction], bl
         return None
 
 
-async def _read_each(node: Caller, calls: Sequence[AsyncContractFunction], block: int | str) -> list[Any]:
+async def _read_each(node: Caller, calls: Sequence[ContractCall], block: int | str) -> list[Any]:
     number = await node.block_number() if block == "latest" and len(calls) > 1 else block
     try:
         async with asyncio.TaskGroup() as group:
@@ -86,7 +114,7 @@ async def _read_each(node: Caller, calls: Sequence[AsyncContractFunction], block
     return [task.result() for task in tasks]
 
 
-def _decoded(call: AsyncContractFunction, returned: bytes | None) -> Any:
+def _decoded(call: ContractCall, returned: bytes | None) -> Any:
     """What a contract's function returned, several values as a tuple. Raises `SpoiledAnswer`."""
     if returned is None:
         raise SpoiledAnswer(f"{call.fn_name} failed")

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from web3.contract.async_contract import AsyncContractFunction
 
     from mesh.chain.answers import BlockHeader, Log, MinedTransaction
+    from mesh.chain.multicall import ContractCall
     from mesh.chain.web3_provider import Endpoint
 
 CONTRACTS_KEPT: Final = 1024
@@ -217,7 +218,7 @@ class Node:
         """
         return await read(self, call, block=block)
 
-    async def read_all(self, calls: Iterable[AsyncContractFunction], *, block: int | str) -> list[Any]:
+    async def read_all(self, calls: Iterable[ContractCall], *, block: int | str) -> list[Any]:
         """What several functions return in the state of one block, asked for in one call. Raises as `read` does."""
         return await read_all(self, list(calls), block=block)
 
