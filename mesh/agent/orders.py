@@ -1,39 +1,39 @@
-"""Orders of an account: what users see of them, and providers' rejections of them."""
+"""Orders of an account: their terms, and what users see of them."""
 
 from __future__ import annotations
 
-import asyncio
-import logging
-from contextlib import asynccontextmanager, contextmanager
+import secrets
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import StrEnum
-from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from mesh.background import Background
-from mesh.log_context import log_event
 from mesh.market.book import Refusal
-from mesh.network import call_in_loop
-from schemas import InvalidRecord, market_selector, message_hash
-from schemas.signing import Rejection
+from schemas import ZERO_ADDRESS, Demand, Offer, message_hash
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-
-    import zenoh
+    import asyncio
+    from collections.abc import Callable, Iterator, Mapping
 
     from mesh.agent.components import AgentComponents
     from mesh.agent.contract import Contract
-    from schemas import Demand, Offer
+    from mesh.chain import Chain
+    from schemas.signing import Rejection
 
     OnRejection = Callable[[Rejection], object]
+    Terms = Mapping[str, Any]
 
-log = logging.getLogger(__name__)
-
-QUEUED: Final = 64
-"""Most signed rejections that wait to be checked; more are dropped, since anybody can sign one."""
 REJECTIONS_KEPT: Final = 64
 """Most providers whose rejection of an order is remembered."""
+REPEATED: Final = ("model", "objective", "token", "cost", "lighthouse", "validator", "sender")
+"""The fields that are the same when an order is posted again; its nonce and perhaps its deadline are new."""
+LIFETIME: Final = 600.0
+"""Seconds for which an order is valid by default."""
+FEWEST_BLOCKS: Final = 50
+MOST_BLOCKS: Final = 20_000
+"""The bounds of that in blocks, whatever time was measured between two blocks."""
+MEASURED_BLOCKS: Final = 100
+"""The latest blocks, from which the time between two blocks is measured."""
 
 
 class OrderState(StrEnum):
@@ -191,61 +191,68 @@ class Order:
         return await self._actions.contract_of(self._traded, on_rejection)
 
 
-class Rejections:
-    """Rejections of one's own orders. Anybody can publish one; only those that a provider signed count."""
+class TermsWriter:
+    """Fills in and signs the orders of one account, in the generation of its settings."""
 
-    def __init__(self, parts: AgentComponents, is_open: Callable[[str], bool]) -> None:
-        self._parts = parts
-        self._is_open = is_open
+    def __init__(self, parts: AgentComponents) -> None:
+        self._settings = parts.settings
+        self._chain = parts.chain
+        self._signer = parts.signer
+        self._chain_head = parts.chain_head
 
-    @asynccontextmanager
-    async def received(self, on_rejection: Callable[[Rejection], Awaitable[None]]) -> AsyncIterator[None]:
-        """Meanwhile call `on_rejection` with each rejection of an open order that a provider of the lighthouse signed.
+    async def terms(
+        self, *, model: str, objective: str, cost: int, token: str, validator: str, lifetime: int | None
+    ) -> Terms:
+        """The fields that a demand and an offer share, with names resolved, valid for `lifetime` blocks.
 
-        It is called again if it raises that the node is away.
+        By default they are valid for about `LIFETIME` seconds.
         """
-        loop = asyncio.get_running_loop()
-        queue: asyncio.Queue[Rejection] = asyncio.Queue(QUEUED)
+        settings, names = self._settings, self._chain.names
+        blocks = await default_lifetime(self._chain) if lifetime is None else lifetime
+        return {
+            "model": await names.model(model),
+            "objective": objective,
+            "token": await names.address(token or settings.erc20_token),
+            "cost": cost,
+            "lighthouse": await names.address(settings.lighthouse_contract),
+            "validator": await names.address(validator) if validator else ZERO_ADDRESS,
+            "deadline": (await self._chain.node.heads.recent()).number + blocks,
+            "sender": None if settings.generation == 3 else self._signer.address,
+        }
 
-        def receive(sample: zenoh.Sample) -> None:
-            rejection = self._signed(sample.payload.to_bytes())
-            if rejection is not None:
-                call_in_loop(loop, _put, queue, rejection)
+    def terms_of(self, order: Demand | Offer) -> Terms:
+        """The terms of `order`, for an order of this account in the same generation that answers it.
 
-        session = self._parts.network.session
-        selector = market_selector(self._parts.channel.lighthouse, "reject", self._parts.signer.address)
-        subscriber: Any = session.declare_subscriber(selector, receive)
-        try:
-            async with Background() as tasks:
-                tasks.start(self._check_all(queue, on_rejection), "rejections")
-                yield
-        finally:
-            if not session.is_closed():
-                subscriber.undeclare()
+        The deadline is a stranger's: it counts up to the setting `deadline_limit`.
+        """
+        latest = self._chain_head.head + self._settings.deadline_limit
+        return {**self._repeated(order), "deadline": min(order.deadline, latest)}
 
-    async def _check_all(self, queue: asyncio.Queue[Rejection], on_rejection: Callable[..., Awaitable[None]]) -> None:
-        while True:
-            check = partial(self._check, await queue.get(), on_rejection)
-            await self._parts.chain.retrying(check, outages=self._parts.outages)
+    def _repeated(self, order: Demand | Offer) -> Terms:
+        terms = {field: getattr(order, field) for field in (*REPEATED, "deadline")}
+        return {**terms, "sender": None if order.generation == 3 else self._signer.address}
 
-    async def _check(self, rejection: Rejection, on_rejection: Callable[..., Awaitable[None]]) -> None:
-        lighthouse = await self._parts.chain.lighthouses.get(self._parts.settings.lighthouse_contract)
-        if rejection.provider in lighthouse.stakes:
-            await on_rejection(rejection)
-        else:
-            facts = log_event("rejection-ignored", signer=rejection.provider, reason=rejection.reason)
-            log.warning("%s is no provider, but rejects: %s", rejection.provider, rejection.reason, extra=facts)
+    async def sign(self, kind: type[Demand | Offer], terms: Terms, **fee: Any) -> Demand | Offer:
+        """An order with these terms and a fresh nonce, signed. Raises `UnsafeValidator`."""
+        is_counted = terms["sender"] is not None
+        nonce = await self._chain.liabilities.next_nonce(self._signer.address) if is_counted else secrets.token_hex(32)
+        order = kind(**terms, nonce=nonce, **fee)
+        await self._chain.validators.check(order)
+        return self._signer.sign(order)
 
-    def _signed(self, payload: bytes) -> Rejection | None:
-        """A rejection of an open order, if it is signed. Others' cost no more than reading them."""
-        try:
-            rejection = Rejection.decode(payload)
-        except InvalidRecord as error:
-            log.debug("an unreadable rejection: %s", error)
-            return None
-        return rejection if self._is_open(rejection.order) and rejection.is_signed else None
+    async def sign_again(self, order: Demand | Offer) -> Demand | Offer:
+        """An order like this one, with a fresh nonce."""
+        if isinstance(order, Demand):
+            return await self.sign(Demand, self._repeated(order), validator_fee=order.validator_fee)
+        return await self.sign(Offer, self._repeated(order), lighthouse_fee=order.lighthouse_fee)
 
 
-def _put(queue: asyncio.Queue[Rejection], rejection: Rejection) -> None:
-    if not queue.full():
-        queue.put_nowait(rejection)
+def is_repeated(demand: Demand, terms: Terms, *, validator_fee: int) -> bool:
+    """Whether a demand differs from these terms in nonce and deadline only."""
+    return demand.validator_fee == validator_fee and all(getattr(demand, field) == terms[field] for field in REPEATED)
+
+
+async def default_lifetime(chain: Chain) -> int:
+    """How many blocks an order is valid by default: about `LIFETIME`, by the time between the latest blocks."""
+    block_time = await chain.node.heads.block_time(MEASURED_BLOCKS)
+    return round(LIFETIME) if block_time is None else min(max(round(LIFETIME / block_time), FEWEST_BLOCKS), MOST_BLOCKS)

@@ -12,10 +12,10 @@ from mesh.agent.contract import Contract, WatchedContracts, fail_future
 from mesh.agent.demands import current_buyer
 from mesh.agent.errors import OrderClosed, OrderExpired
 from mesh.agent.offers import OpenOffers
-from mesh.agent.orders import Order, OrderState, Rejections, TradedOrder
-from mesh.agent.terms import Allowances, TermsWriter
+from mesh.agent.orders import Order, OrderState, TermsWriter, TradedOrder
+from mesh.agent.rejections import Rejections
 from mesh.background import Background
-from mesh.chain import OrderAlreadyUsed
+from mesh.chain import Allowances, OrderAlreadyUsed
 from mesh.errors import AiraError, ClosedError
 from mesh.flood import KnownSenders
 from mesh.log_context import log_event
@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from contextlib import AsyncExitStack
 
     from mesh.agent.components import AgentComponents
-    from mesh.agent.orders import OnRejection
-    from mesh.agent.terms import Terms
+    from mesh.agent.orders import OnRejection, Terms
     from schemas import Liability
     from schemas.signing import Rejection
 
@@ -53,7 +52,7 @@ class Trader(Lifecycle):
         self._parts = parts
         self._chain = parts.chain
         self._address = parts.signer.address
-        self._allowances = Allowances(parts.chain, self._address)
+        self._allowances = Allowances(parts.chain.tokens, parts.chain.factory, self._address)
         self.writer = TermsWriter(parts)
         """Fills in and signs orders."""
         self._orders: dict[str, TradedOrder] = {}

@@ -18,7 +18,7 @@ from mesh.chain.accounts import (
     new_private_key,
     write_keyfile,
 )
-from mesh.chain.admission import UnsafeValidator, Validators
+from mesh.chain.admission import Allowances, UnsafeValidator, Validators
 from mesh.chain.answers import BlockHeader
 from mesh.chain.client import Chain
 from mesh.chain.deploy import XRT, Deployment, DeploymentPlan, deploy
@@ -82,6 +82,7 @@ __all__ = [
     "GWEI",
     "XRT",
     "Account",
+    "Allowances",
     "Approval",
     "BlockEvents",
     "BlockHeader",

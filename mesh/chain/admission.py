@@ -1,38 +1,48 @@
-"""Which orders can be used: what they cost, whether their makers can pay, and which validators they may name.
+"""What orders need: an allowance for what they cost, makers who can pay, and a validator that they may name.
 
-A validator is no lighthouse, and nothing that could become one.
-An offer on lighthouse L with validator V is, with the same signature, a demand on lighthouse V with validator L: the
-format has the two addresses in swapped places. So a stranger whose demand names a lighthouse as validator could use the
-offer of a robot that agrees to it as that robot's demand, and take the cost from the robot. Our contracts refuse such
-orders when the liability is created; the originals don't.
+A validator is no lighthouse, and nothing that could become one. An offer on lighthouse L with validator V is, with the
+same signature, a demand on lighthouse V with validator L: the format has the two addresses in swapped places. So a
+stranger whose demand names a lighthouse as validator could use the offer of a robot that agrees to it as that robot's
+demand, and take the cost from the robot. Our contracts refuse such orders when the liability is created; the originals
+don't.
 """
 
 from __future__ import annotations
 
+import asyncio
+import logging
 import math
 import time
 from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING, Final
 
 from mesh.chain.contracts import OriginalContracts
+from mesh.chain.errors import InsufficientTokens, Reverted
 from mesh.chain.funds import SHORT_POLLS, Holding
 from mesh.chain.lighthouses import Lighthouses
 from mesh.errors import InputError
+from mesh.log_context import log_event
 from schemas.address import ZERO_ADDRESS
 from schemas.messages import Offer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Hashable, Iterable, Mapping
 
     from mesh.chain.contracts import Contracts
     from mesh.chain.funds import Funds
+    from mesh.chain.tokens import Tokens
     from schemas import Verified
     from schemas.messages import Order
+
+log = logging.getLogger(__name__)
 
 REMEMBERED: Final = 4096
 """Validators whose verdict is remembered, the latest ones."""
 RECHECK: Final = 60.0
 """Seconds after which a verdict is asked for again that a transaction can change."""
+LEAST_AHEAD: Final = 4
+MOST_AHEAD: Final = 16
+"""An allowance that contracts have used up is approved for so many times what the open orders need, growing."""
 
 
 class OrderCosts:
@@ -134,3 +144,81 @@ class Validators:
             return True, False
         has_sent = await node.transaction_count(validator) > 0
         return has_sent, has_sent
+
+
+class Allowances:
+    """The allowance of the factory: what the orders of `account` may cost, by order and token (smallest unit)."""
+
+    def __init__(self, tokens: Tokens, factory: str, account: str) -> None:
+        self._tokens = tokens
+        self._factory = factory
+        self._account = account
+        self._open: dict[Hashable, Mapping[str, int]] = {}
+        self._withdrawn: dict[Hashable, Mapping[str, int]] = {}
+        self._approved: dict[str, int] = {}
+        """By token: what this agent approved last."""
+        self._ahead: dict[str, int] = {}
+        self._approving = asyncio.Lock()
+
+    async def ensure(self, order: Hashable, amounts: Mapping[str, int]) -> None:
+        """Make sure that the factory may take `amounts` (by token) for `order` and what the other orders may cost.
+
+        The account must own what its open orders cost; withdrawn ones only need the allowance. Raises
+        `InsufficientTokens`; a new order is then not counted.
+        """
+        async with self._approving:
+            for token, amount in amounts.items():
+                if amount:
+                    others = (costs for key, costs in self._open.items() if key != order)
+                    funds = amount + _sum(others, token)
+                    needed = funds + _sum(self._withdrawn.values(), token)
+                    await self._ensure(token, funds=funds, needed=needed)
+            if order not in self._withdrawn:
+                self._open[order] = amounts
+
+    def count(self, order: Hashable, amounts: Mapping[str, int]) -> None:
+        """Count an order of an earlier run, whose allowance was approved then."""
+        self._open[order] = amounts
+
+    def withdraw(self, order: Hashable) -> None:
+        """Count an order that is withdrawn, but may become a contract all the same."""
+        if order in self._open:
+            self._withdrawn[order] = self._open.pop(order)
+
+    def release(self, order: Hashable) -> None:
+        """Stop counting an order that can't become a contract any more. Unknown ones are ignored."""
+        self._open.pop(order, None)
+        self._withdrawn.pop(order, None)
+
+    async def _ensure(self, token: str, *, funds: int, needed: int) -> None:
+        factory, tokens = self._factory, self._tokens
+        balance, allowed = await tokens.balance_and_allowance(self._account, factory, token=token)
+        if balance < funds:
+            raise InsufficientTokens(self._account, token, balance=balance, needed=funds)
+        while allowed < needed:
+            allowance = max(needed, min(self._times(token, allowed) * needed, balance))
+            facts = log_event("allowance-approved", token=token, amount=allowance)
+            log.info("approving an allowance of %d of token %s for the factory", allowance, token, extra=facts)
+            try:
+                await tokens.approve(factory, allowance, token=token)
+                self._approved[token] = allowance
+            except Reverted as error:
+                if error.reason != "OutOfGas":
+                    raise
+                # An order became a contract between estimate and block: setting a used-up allowance costs more gas.
+                facts = log_event("allowance-retried", token=token, amount=allowance)
+                log.info("approving the allowance again: %s", error, extra=facts)
+            allowed = await tokens.allowance(self._account, factory, token=token)
+
+    def _times(self, token: str, allowed: int) -> int:
+        """How many times what is needed is approved: more and more, when contracts have used up what was approved.
+
+        A transaction for each order would cost more than the order.
+        """
+        if allowed < self._approved.get(token, 0):
+            self._ahead[token] = min(max(LEAST_AHEAD, 2 * self._ahead.get(token, 0)), MOST_AHEAD)
+        return self._ahead.get(token, 1)
+
+
+def _sum(orders: Iterable[Mapping[str, int]], token: str) -> int:
+    return sum(costs.get(token, 0) for costs in orders)

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from web3.providers.async_base import AsyncBaseProvider
 
-from mesh.agent.terms import Allowances
-from mesh.chain import Chain, InsufficientTokens
+from mesh.chain import Allowances, Chain, InsufficientTokens
 from schemas import Demand, Offer
 from tests.support.market import QUICK
 from tests.support.orders import terms
@@ -54,7 +53,7 @@ async def chain(place: Place, road: Overtaken) -> AsyncIterator[Chain]:
 
 @pytest.fixture
 def allowances(place: Place, chain: Chain) -> Allowances:
-    return Allowances(chain, place.address("person"))
+    return Allowances(chain.tokens, chain.factory, place.address("person"))
 
 
 async def allowance(chain: Chain) -> int:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.agent import OrderClosed, OrderState
-from mesh.agent.terms import FEWEST_BLOCKS, LIFETIME, MOST_BLOCKS, REPEATED, default_lifetime
+from mesh.agent.orders import FEWEST_BLOCKS, LIFETIME, MOST_BLOCKS, REPEATED, default_lifetime
 from mesh.chain import InsufficientTokens
 from schemas import Demand, Offer, Withdrawal, cid_of_bytes, decode, message_hash
 from tests.mesh.agent.trades import OBJECTIVE, all_posted, job, waiting, working
