@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from mesh.agent import OrderClosed, OrderState
 from mesh.agent.orders import FEWEST_BLOCKS, LIFETIME, MOST_BLOCKS, REPEATED, default_lifetime
-from mesh.chain import InsufficientTokens
+from mesh.chain import BlockHeader, InsufficientTokens
+from mesh.chain.answers import Count, Word
+from mesh.chain.heads import Heads
 from schemas import Demand, Offer, Withdrawal, cid_of_bytes, decode, message_hash
 from tests.mesh.agent.trades import OBJECTIVE, all_posted, job, waiting, working
 from tests.support.log_events import logged_facts
@@ -208,12 +209,20 @@ class Clock:
     def __init__(self, times: Sequence[int]) -> None:
         self.times = times
         self.node = self
+        self.heads = Heads(self.latest_header, self.header, interval=1.0)
 
-    async def header(self, number: int) -> SimpleNamespace | None:
-        return SimpleNamespace(number=number, timestamp=self.times[number]) if number < len(self.times) else None
+    async def header(self, number: int) -> BlockHeader | None:
+        if number >= len(self.times):
+            return None
+        block_hash = Word(bytes(32))
+        return BlockHeader(
+            number=Count(number), timestamp=Count(self.times[number]), hash=block_hash, parent_hash=block_hash
+        )
 
-    async def latest_header(self) -> SimpleNamespace | None:
-        return await self.header(len(self.times) - 1)
+    async def latest_header(self) -> BlockHeader:
+        latest = await self.header(len(self.times) - 1)
+        assert latest is not None
+        return latest
 
 
 @pytest.mark.parametrize(
