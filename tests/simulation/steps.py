@@ -99,7 +99,8 @@ class StepAudit:
         order = person.orders[number]
         if order.is_dead and (not self._reorganisations or order.told == "nothing-found"):
             self._market.violated("promise-broken", f"{person.name} was told {order.told!r}; {liability}")
-        if person.agent_is_open and not order.is_over and demand not in person.listed:
+        is_known = bool(order.contract) or demand in person.listed  # accepted before a reorganisation and a restart
+        if person.agent_is_open and not order.is_over and not is_known:
             self._market.violated("unannounced-payment", f"{person.name}'s agent does not list {demand[:12]}")
 
     def told(self, person: PersonRole, number: int) -> None:
