@@ -127,6 +127,20 @@ MUTATIONS: Final = (
         "for stored in ():",
         CRASHES,
     ),
+    Mutation(
+        "a spoiled answer of a node escapes",
+        "mesh.chain.web3_provider:ReliableProvider.request",
+        "except CONNECTION_ERRORS as error:",
+        "except OSError as error:",
+        "spoilt",
+    ),
+    Mutation(
+        "the provider ignores withdrawals",
+        "mesh.market.settlement:Settlement._refusal",
+        "return Refusal.WITHDRAWN if order_id(order) in self._withdrawals else None",
+        "return None",
+        "replay,delay,duplicate",
+    ),
 )
 
 CANDIDATES: Final = (
@@ -173,13 +187,6 @@ CANDIDATES: Final = (
         CRASHES,
     ),
     Mutation(
-        "a spoiled answer of a node escapes",
-        "mesh.chain.web3_provider:ReliableProvider.request",
-        "except CONNECTION_ERRORS as error:",
-        "except OSError as error:",
-        "spoilt",
-    ),
-    Mutation(
         "a count that a node states is believed, whatever it is",
         "mesh.chain.answers:_decode_value",
         "if kind is Count and number >> 63:",
@@ -192,13 +199,6 @@ CANDIDATES: Final = (
         "self._epoch + self._clock.monotonic_ns()",
         "self._clock.time_ns()",
         "clock_every",
-    ),
-    Mutation(
-        "the provider ignores withdrawals",
-        "mesh.market.settlement:Settlement._refusal",
-        "return Refusal.WITHDRAWN if order_id(order) in self._withdrawals else None",
-        "return None",
-        "replay,delay,duplicate",
     ),
     Mutation(
         "the provider forgets withdrawals when it is restarted",
