@@ -79,6 +79,7 @@ async def test_each_method_is_asked_again_after_a_spoiled_answer(
             for proxy in proxies:
                 proxy.rate = 0.3
             for _ in range(3):
+                chain.node._priority = 0.0, 0  # or it is asked for once a minute
                 # A null is what a node says of a block or a transaction that it does not have.
                 with suppress(*((NodeUnreachable, AssertionError) if kind == "null" else ())):
                     await _everything(chain)
