@@ -141,6 +141,41 @@ MUTATIONS: Final = (
         "return None",
         "replay,delay,duplicate",
     ),
+    Mutation(
+        "the ledger's position runs ahead of the recording",
+        "mesh.work.playbacks:Playbacks._save",
+        "synced.position, recorded=synced.messages",
+        "run.position + 1, recorded=0",
+        CRASHES,
+    ),
+    Mutation(
+        "messages are recorded with the time of day",
+        "mesh.recording.recorder:Recorder.record",
+        "self._epoch + self._clock.monotonic_ns()",
+        "self._clock.time_ns()",
+        "clock_every",
+    ),
+    Mutation(
+        "the ledger is not synced",
+        "mesh.work.database:Database._prepare",
+        "PRAGMA synchronous = FULL",
+        "PRAGMA synchronous = OFF",
+        CRASHES,
+    ),
+    Mutation(
+        "nobody may take the cost back",
+        "mesh.chain.liabilities:RefundState.is_refundable",
+        "return not self.is_finalized",
+        "return self.is_finalized",
+        "leave",
+    ),
+    Mutation(
+        "a job that was set aside is never taken up again",
+        "mesh.work.ledger:Ledger.add_job",
+        " DO UPDATE SET aside = 0 WHERE aside",
+        " DO NOTHING",
+        REORGANISATIONS,
+    ),
 )
 
 CANDIDATES: Final = (
@@ -180,25 +215,11 @@ CANDIDATES: Final = (
         "outage_every,unreachable,late",
     ),
     Mutation(
-        "the ledger's position runs ahead of the recording",
-        "mesh.work.playbacks:Playbacks._save",
-        "synced.position, recorded=synced.messages",
-        "run.position + 1, recorded=0",
-        CRASHES,
-    ),
-    Mutation(
         "a count that a node states is believed, whatever it is",
         "mesh.chain.answers:_decode_value",
         "if kind is Count and number >> 63:",
         "if False:",
         "spoilt",
-    ),
-    Mutation(
-        "messages are recorded with the time of day",
-        "mesh.recording.recorder:Recorder.record",
-        "self._epoch + self._clock.monotonic_ns()",
-        "self._clock.time_ns()",
-        "clock_every",
     ),
     Mutation(
         "the provider forgets withdrawals when it is restarted",
@@ -215,32 +236,11 @@ CANDIDATES: Final = (
         "drop,delay,leave_out,partition_every",
     ),
     Mutation(
-        "the ledger is not synced",
-        "mesh.work.database:Database._prepare",
-        "PRAGMA synchronous = FULL",
-        "PRAGMA synchronous = OFF",
-        CRASHES,
-    ),
-    Mutation(
         "a success is signed although the recording lacks messages",
         "mesh.work.executor:Executor.finish",
         "if success and (missing :=",
         "if False and (missing :=",
         "full_every",
-    ),
-    Mutation(
-        "nobody may take the cost back",
-        "mesh.chain.liabilities:RefundState.is_refundable",
-        "return not self.is_finalized",
-        "return self.is_finalized",
-        "leave",
-    ),
-    Mutation(
-        "a job that was set aside is never taken up again",
-        "mesh.work.ledger:Ledger.add_job",
-        " DO UPDATE SET aside = 0 WHERE aside",
-        " DO NOTHING",
-        REORGANISATIONS,
     ),
     Mutation(
         "orders of a reverted contract are forgotten",
