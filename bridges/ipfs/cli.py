@@ -45,6 +45,7 @@ log = logging.getLogger(__name__)
     *options_of(NetworkSettings),
     *options_of(IpfsSettings),
     "lighthouse_contract",
+    "blocked_signers",
     "objective_size_limit",
     "content_limit",
     "fetch_timeout",

@@ -15,6 +15,7 @@ from bridges.ipfs.status import bridge_families, content_families, health_parts
 from bridges.ipfs.transfer_queue import URGENT, USUAL
 from bridges.ipfs.transfers import ContentSources, Gateway
 from bridges.ipfs.validation import ChainView, RelayValidator
+from mesh.blocklist import blocklist_at
 from mesh.content import Exchange, Store
 from mesh.errors import ConfigurationError
 from mesh.flood import Drops
@@ -59,6 +60,7 @@ class IpfsBridge(Role):
         self._chain = chain and ChainView(chain, self._lighthouses, interval=max(settings.poll_interval, 1.0))
         self._address = (address or f"0x{secrets.token_hex(20)}").lower()
         self.channels: tuple[ChannelBridge, ...] = ()
+        self._blocked = blocklist_at(settings.blocked_signers)
         self.drops: Final = Drops()
         """What strangers sent that was dropped."""
         self.daemon: Final = Daemon(settings.ipfs_http_provider, authorization=authorization_of(settings))
@@ -142,7 +144,7 @@ class IpfsBridge(Role):
     def _validator(self, lighthouse: str, withdrawals: Withdrawals) -> RelayValidator:
         chain = self._chain
         if chain is None:
-            return RelayValidator(lighthouse, withdrawals=withdrawals)
+            return RelayValidator(lighthouse, withdrawals=withdrawals, blocked=self._blocked)
         return RelayValidator(
             lighthouse,
             withdrawals=withdrawals,
@@ -150,6 +152,7 @@ class IpfsBridge(Role):
             resolver=chain.resolve,
             is_safe=chain.is_safe_validator,
             head=lambda: chain.head,
+            blocked=self._blocked,
         )
 
     def _published(self, side: Side, message: RelayMessage) -> None:

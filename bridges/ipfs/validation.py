@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
     from contextlib import AbstractAsyncContextManager
 
+    from mesh.blocklist import BlockedSigners
     from mesh.chain import Chain
 
     Resolver = Callable[[str], Awaitable[str]]
@@ -101,7 +102,8 @@ class RelayValidator:
 
     `address` returns the address that orders must name as their lighthouse, None while it isn't known; `resolver`
     resolves ENS names in messages; `is_safe` says whether orders may name a validator (address); `head` returns the
-    latest block number, or 0 while it isn't known (then no deadline is checked); `withdrawals` are those known.
+    latest block number, or 0 while it isn't known (then no deadline is checked); `withdrawals` are those known;
+    messages of `blocked` signers are not relayed.
     """
 
     def __init__(
@@ -113,12 +115,14 @@ class RelayValidator:
         is_safe: Callable[[str], Awaitable[bool]] | None = None,
         head: Callable[[], int] = lambda: 0,
         withdrawals: Withdrawals | None = None,
+        blocked: BlockedSigners = frozenset(),
     ) -> None:
         self.withdrawals: Final = Withdrawals() if withdrawals is None else withdrawals
         self._lighthouse = lighthouse
         self._address = address
         self._resolver = resolver
         self._is_safe = is_safe
+        self._blocked = blocked
         self.head: Final = head
 
     async def validate(self, payload: bytes, *, key: str | None = None) -> RelayMessage:
@@ -126,8 +130,8 @@ class RelayValidator:
 
         `key`, if given, must be the one that the message requires. The signature of order feedback is not verified,
         because what it covers is undocumented. Raises only `InvalidMessage`; its `reason` is one of `schemas.decode`,
-        or `name`, `lighthouse`, `validator`, `deadline`, `signature`, `sender`, `withdrawn`, `key`, and `kind` for a
-        message that the legacy network does not have.
+        or `name`, `lighthouse`, `validator`, `deadline`, `signature`, `sender`, `withdrawn`, `blocked`, `key`, and
+        `kind` for a message that the legacy network does not have.
         """
         message = decode(payload)
         if isinstance(message, Withdrawal):
@@ -154,6 +158,8 @@ class RelayValidator:
         self._check_order(resolved)
         digest = message_hash(resolved)
         verified = verify_hashed(resolved, digest)
+        if verified.signer in self._blocked:
+            raise InvalidMessage("blocked", f"{verified.signer} is blocked")
         if isinstance(resolved, Demand | Offer):
             if digest + address_bytes(verified.signer) in self.withdrawals:
                 raise InvalidMessage("withdrawn", "its maker has withdrawn it")

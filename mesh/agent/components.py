@@ -9,6 +9,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from mesh.blocklist import blocklist_at
 from mesh.composition import chain_of, endpoints_of
 from mesh.content import Exchange, Store
 from mesh.errors import ConfigurationError
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
     from mesh.chain import Account, Chain
     from mesh.retry import RetryPolicy
-    from mesh.settings import Settings
+    from mesh.settings import MarketSettings, Settings
     from schemas import Signer
 
 
@@ -129,7 +130,7 @@ async def working(
         chain_head = ChainHead(await chain.block_number() if handled is None else handled)
         network = await stack.enter_async_context(Network(endpoints_of(settings)))
         channel = await stack.enter_async_context(
-            await _channel_of(settings.lighthouse_contract, network, chain=chain, head=chain_head, drops=drops)
+            await _channel_of(settings, network, chain=chain, head=chain_head, drops=drops)
         )
         store = await asyncio.to_thread(
             Store, home / "content", limit=settings.objective_expanded_limit, quota=settings.content_limit
@@ -157,16 +158,18 @@ async def working(
         yield parts
 
 
-async def _channel_of(lighthouse: str, network: Network, *, chain: Chain, head: ChainHead, drops: Drops) -> Channel:
-    """The channel of a lighthouse, not yet open, which resolves names and knows the head by the chain."""
-    address = await chain.names.address(lighthouse)
+async def _channel_of(
+    settings: MarketSettings, network: Network, *, chain: Chain, head: ChainHead, drops: Drops
+) -> Channel:
+    """The channel of the lighthouse, not yet open, which resolves names and knows the head by the chain."""
     return Channel(
         network.session,
-        lighthouse,
-        address=address,
+        settings.lighthouse_contract,
+        address=await chain.names.address(settings.lighthouse_contract),
         resolver=chain.names.address,
         validators=chain.validators,
         head=lambda: head.head,
+        blocked=blocklist_at(settings.blocked_signers),
         drops=drops,
     )
 

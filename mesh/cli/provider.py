@@ -43,6 +43,7 @@ REPORT_INTERVAL: Final = 600.0
     *options_of(ChainSettings),
     "open_orders_limit",
     "deadline_limit",
+    "blocked_signers",
     *options_of(TelemetrySettings),
 )
 def command(settings: Settings) -> None:
@@ -78,6 +79,7 @@ async def _open_provider(
     settings: Settings, account: Account, telemetry: Telemetry
 ) -> AsyncIterator[tuple[Network, Provider]]:
     """The provider with its chain and network, and its metrics. Raises `AiraError` for what is not ready yet."""
+    from mesh.blocklist import blocklist_at
     from mesh.composition import chain_of, endpoints_of, withdrawals_of
     from mesh.market.provider import Provider, ProviderProcess, check_account
     from mesh.network import Network
@@ -93,6 +95,7 @@ async def _open_provider(
                 lighthouse,
                 limit=settings.open_orders_limit,
                 deadline_limit=settings.deadline_limit,
+                blocked=blocklist_at(settings.blocked_signers),
                 withdrawals=withdrawals_of(settings, account, lighthouse),
             ) as provider,
         ):

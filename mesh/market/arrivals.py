@@ -27,7 +27,10 @@ WAITING: Final = 32_768
 
 
 class Arrivals:
-    """Takes orders from subscriptions (`take`), and passes them to `settlement` (`run`), known signers first."""
+    """Takes orders from subscriptions (`take`), and passes them to `settlement` (`run`).
+
+    Those of jobs that pay go first, and among equals those of known signers.
+    """
 
     def __init__(
         self, settlement: Settlement, *, known: KnownSenders, has_room: Callable[[], Awaitable[None]], drops: Drops
@@ -42,8 +45,8 @@ class Arrivals:
         """Take the open orders of other providers, then those that are published, until cancelled."""
         await orders.recall()
         async for order in orders:
-            is_known = order.signer in self._known
-            for dropped, subscription in self._queue.put(order.signer, (order, orders), priority=int(is_known)):
+            priority = 2 * (order.message.cost > 0) + (order.signer in self._known)
+            for dropped, subscription in self._queue.put(order.signer, (order, orders), priority=priority):
                 self._drops.count("queue-full", dropped.signer)
                 subscription.forget(dropped)
 

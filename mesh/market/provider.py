@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
     import zenoh
 
+    from mesh.blocklist import BlockedSigners
     from mesh.chain import Chain
     from mesh.network import Network
     from mesh.retry import RetryPolicy
@@ -50,10 +51,10 @@ class Provider(Role):
 
     `lighthouse` is the ENS name; its chain account must have a stake there. `limit` is the most open orders, `matched`
     is called with each match before its liability is created, `retry` is the policy for transactions that fail, and
-    `open_liabilities` the most records of open liabilities in memory. Withdrawals are kept in the file
-    `withdrawals`, if given. Orders leave the book after `deadline_limit` blocks. What is dropped is counted in `drops`.
-    The caller closes session and chain. When `run` is cancelled, a transaction that was sent
-    may still be mined.
+    `open_liabilities` the most records of open liabilities in memory. Withdrawals are kept in the file `withdrawals`,
+    if given. Orders leave the book after `deadline_limit` blocks. Messages of `blocked` signers are rejected; what is
+    dropped is counted in `drops`. The caller closes session and chain. When `run` is cancelled, a transaction that was
+    sent may still be mined.
     """
 
     title = "provider"
@@ -70,6 +71,7 @@ class Provider(Role):
         open_liabilities: int = OPEN_LIABILITIES,
         withdrawals: Path | None = None,
         deadline_limit: int = DEADLINE_LIMIT,
+        blocked: BlockedSigners = frozenset(),
         drops: Drops | None = None,
     ) -> None:
         if chain.account is None:
@@ -83,6 +85,7 @@ class Provider(Role):
         self._retry = retry
         self._open_liabilities = open_liabilities
         self._deadline_limit = deadline_limit
+        self._blocked = blocked
         self.withdrawals = Withdrawals(withdrawals)
         self.ledger = EarningsLedger()
         self.drops = Drops() if drops is None else drops
@@ -107,6 +110,7 @@ class Provider(Role):
                 resolver=self._chain.names.address,
                 validators=self._chain.validators,
                 head=lambda: self.settlement.events.head,
+                blocked=self._blocked,
                 drops=self.drops,
             )
         )

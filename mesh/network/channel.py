@@ -25,6 +25,7 @@ from schemas.selectors import lighthouse_selector, market_selector, presence_sel
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
 
+    from mesh.blocklist import BlockedSigners
     from mesh.flood import Drops
     from mesh.network.lookups import ValidatorCheck
 
@@ -38,9 +39,9 @@ class Channel:
 
     `lighthouse` is the ENS name of the market. `address`, if given, is the lighthouse that orders must name;
     `resolver` resolves ENS names in messages; `validators` knows which validators orders may name (None: any); `head`
-    returns the latest block number, for deadlines; what is dropped is counted in `drops`. Leaving `async with`
-    withdraws the presence tokens and ends the watches; the caller closes the session. Raises `InvalidKey` for a name
-    that no key may contain.
+    returns the latest block number, for deadlines; messages of `blocked` signers are rejected; what is dropped is
+    counted in `drops`. Leaving `async with` withdraws the presence tokens and ends the watches; the caller closes the
+    session. Raises `InvalidKey` for a name that no key may contain.
     """
 
     def __init__(
@@ -52,6 +53,7 @@ class Channel:
         resolver: Resolver | None = None,
         validators: ValidatorCheck | None = None,
         head: Callable[[], int] = lambda: 0,
+        blocked: BlockedSigners = frozenset(),
         drops: Drops | None = None,
     ) -> None:
         self._session = session
@@ -61,6 +63,7 @@ class Channel:
         self._resolver = resolver
         self._validators = validators
         self._head = head
+        self._blocked = blocked
         self._drops = drops
         self._declarations: list[Any] = []
         self._open = False
@@ -115,6 +118,7 @@ class Channel:
             head=self._head,
             resolver=self._resolver,
             validators=self._validators,
+            blocked=self._blocked,
         )
         return Subscription(self._session, selector, validator, drops=self._drops)
 

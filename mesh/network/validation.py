@@ -35,6 +35,7 @@ from schemas.signing import verify_hashed
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
 
+    from mesh.blocklist import BlockedSigners
     from mesh.network.lookups import ValidatorCheck
 
     Resolver = Callable[[str], Awaitable[str]]
@@ -116,7 +117,8 @@ class MessageValidator(Generic[M]):
 
     `lighthouse` is the market's name in keys; `address`, if given, must be the orders' lighthouse. `head` returns the
     latest block number, or 0 when it isn't known (then no deadline is checked); `resolver` resolves ENS names;
-    `validators` knows which validators orders may name (None: any). Thread-safe, except `complete`.
+    `validators` knows which validators orders may name (None: any); messages of `blocked` signers are rejected.
+    Thread-safe, except `complete`.
 
     A message is a duplicate when hash and signature equal those of one of the last accepted messages, of
     `deduplication_limit` at most and half of them at least, that were not forgotten since; equal generation-3 terms
@@ -134,6 +136,7 @@ class MessageValidator(Generic[M]):
         head: Callable[[], int],
         resolver: Resolver | None = None,
         validators: ValidatorCheck | None = None,
+        blocked: BlockedSigners = frozenset(),
         deduplication_limit: int = DEDUPLICATION_LIMIT,
     ) -> None:
         self.kind: type[M] = kind
@@ -142,6 +145,7 @@ class MessageValidator(Generic[M]):
         self._head = head
         self._names = None if resolver is None else NameCache(resolver)
         self._validators = validators
+        self._blocked = blocked
         self._lock = threading.Lock()
         self._seen = _Accepted(deduplication_limit)
         self._invalid: Counter[str] = Counter()
@@ -192,6 +196,9 @@ class MessageValidator(Generic[M]):
             verified = verify_hashed(message, digest)
         except InvalidMessage as error:
             self.reject(error.reason)
+            return None
+        if verified.signer in self._blocked:
+            self.reject("blocked")
             return None
         if not is_complete:
             return Unresolved(message, key, fingerprint, verified.signer)

@@ -166,6 +166,9 @@ class MarketSettings:
         DEADLINE_LIMIT,
         "blocks after which a provider drops an order, and an agent's offer for a demand ends, before its deadline",
     )
+    blocked_signers: str = option(
+        "", "file of addresses, one a line, whose messages are dropped; read again when it changes (empty: none)"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

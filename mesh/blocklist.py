@@ -1,0 +1,104 @@
+"""Signers whose messages are dropped: the addresses in a file, which an operator may change at any time."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Protocol
+
+from mesh.clock import SYSTEM_CLOCK
+from mesh.errors import ConfigurationError
+from mesh.log_context import log_event
+from schemas import InvalidAddress, parse_address
+
+if TYPE_CHECKING:
+    from mesh.clock import Clock
+
+log = logging.getLogger(__name__)
+
+CHECK_INTERVAL: Final = 1.0
+"""Seconds between two looks at whether the file has changed."""
+SIZE_LIMIT: Final = 4 * 1024 * 1024
+"""The largest file, in bytes: about 90,000 addresses."""
+
+
+class BlocklistUnusable(ConfigurationError, code="blocklist-unusable"):
+    """The file of blocked signers can't be read, is too large, or has a line that is no address."""
+
+
+class BlockedSigners(Protocol):
+    """Which signers are blocked."""
+
+    def __contains__(self, signer: object) -> bool: ...
+
+
+class Blocklist:
+    """The addresses in the file `path`, one a line; `#` begins a comment. `"0x…" in blocklist` (EIP-55) asks.
+
+    The file is read again within a second of a change. A change that can't be read is logged, and the addresses from
+    before stay blocked. Thread-safe. Raises `BlocklistUnusable` when it is created from such a file.
+    """
+
+    def __init__(self, path: Path, *, clock: Clock = SYSTEM_CLOCK) -> None:
+        self._path = path
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._version = self._stat()
+        self._signers = self._read()
+        self._checked = clock.monotonic()
+
+    def __contains__(self, signer: object) -> bool:
+        if self._clock.monotonic() - self._checked >= CHECK_INTERVAL:
+            self._check()
+        return signer in self._signers
+
+    def _check(self) -> None:
+        with self._lock:
+            self._checked = self._clock.monotonic()
+            try:
+                version = self._stat()
+                if version == self._version:
+                    return
+                self._version = version
+                self._signers = self._read()
+            except BlocklistUnusable as error:
+                log.warning("the blocklist stays as it was: %s", error, extra=log_event("blocklist-unusable"))
+            else:
+                number = len(self._signers)
+                log.info("%d signers are blocked", number, extra=log_event("blocklist-read", signers=number))
+
+    def _stat(self) -> tuple[int, int, int] | None:
+        try:
+            found = self._path.stat()
+        except OSError:
+            return None  # reading it says why
+        return found.st_mtime_ns, found.st_size, found.st_ino
+
+    def _read(self) -> frozenset[str]:
+        try:
+            with self._path.open("rb") as file:
+                data = file.read(SIZE_LIMIT + 1)
+            lines = data.decode().splitlines()
+        except (OSError, UnicodeDecodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "it is not text"
+            raise BlocklistUnusable(
+                f"can't read the blocklist {self._path}: {reason}", hint="name a file with one address a line"
+            ) from None
+        if len(data) > SIZE_LIMIT:
+            raise BlocklistUnusable(f"the blocklist {self._path} is larger than {SIZE_LIMIT} bytes")
+        return frozenset(filter(None, map(self._address, range(1, len(lines) + 1), lines)))
+
+    def _address(self, number: int, line: str) -> str:
+        text = line.partition("#")[0].strip()
+        try:
+            return parse_address(text) if text else ""
+        except InvalidAddress as error:
+            raise BlocklistUnusable(
+                f"line {number} of the blocklist {self._path} is no address: {error}", hint="write one address a line"
+            ) from None
+
+
+def blocklist_at(path: str) -> BlockedSigners:
+    """The blocklist in the file that a setting names; nobody is blocked if it is empty. Raises `BlocklistUnusable`."""
+    return Blocklist(Path(path).expanduser()) if path else frozenset()
