@@ -31,6 +31,8 @@ HANDLED: Final = 32
 """Demands that are handled at once: to fetch the objective of one may take long."""
 FREE_HANDLED: Final = 16
 """Of these, demands that pay nothing."""
+FREE_RATE: Final = Rate(per_second=2.0, burst=32)
+"""Demands that pay nothing and are handled. Each offer for one may become a job."""
 CHECKED: Final = 128
 """Demands whose makers' funds are asked for at once."""
 WAITING: Final = 16_384
@@ -77,6 +79,7 @@ class DemandDispatcher:
         self._changed = asyncio.Event()
         self._running = self._running_free = 0
         self._logged = RateLimiter(per_sender=LOGGED)
+        self._free_rate = RateLimiter(per_sender=FREE_RATE, total=FREE_RATE)
 
     async def run(self) -> None:
         """Receive, check and handle demands, until cancelled."""
@@ -121,6 +124,9 @@ class DemandDispatcher:
             while self._has_place():
                 demand = self._funded.get_nowait()
                 pays = self._pay(demand) > 0
+                if not pays and not self._free_rate.allow(demand.signer):
+                    self._drop(demand, "free-rate")
+                    continue
                 self._running += 1
                 self._running_free += not pays
                 tasks.create_task(self._handle_one(demand, pays=pays), name="handler")

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from mesh.chain.contracts import Contracts
     from mesh.chain.funds import Funds
     from mesh.chain.tokens import Tokens
-    from schemas import Verified
+    from schemas import Liability, Verified
     from schemas.messages import Order
 
 log = logging.getLogger(__name__)
@@ -76,6 +76,13 @@ class OrderCosts:
             if funding is not None and min(funding) < amount:
                 return "ERC20InsufficientAllowance" if funding.allowance < amount else "ERC20InsufficientBalance"
         return ""
+
+    def worth(self, order: Order | Liability) -> int:
+        """The priority of an order, or of its liability, where there are too many: the magnitude of its cost in XRT.
+
+        It is 0 for other tokens: anybody can make a token, and have any number of it.
+        """
+        return order.cost.bit_length() if order.token == self._xrt else 0
 
     async def can_be_paid(self, order: Verified[Order], *, fresh: bool = False) -> bool:
         """Whether an order's maker lacks nothing; see `shortage`."""

@@ -29,7 +29,7 @@ WAITING: Final = 32_768
 class Arrivals:
     """Takes orders from subscriptions (`take`), and passes them to `settlement` (`run`).
 
-    Those of jobs that pay go first, and among equals those of known signers.
+    Those of jobs that pay more go first, and among equals those of known signers.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Arrivals:
         """Take the open orders of other providers, then those that are published, until cancelled."""
         await orders.recall()
         async for order in orders:
-            priority = 2 * (order.message.cost > 0) + (order.signer in self._known)
+            priority = 2 * self._settlement.worth(order) + (order.signer in self._known)
             for dropped, subscription in self._queue.put(order.signer, (order, orders), priority=priority):
                 self._drops.count("queue-full", dropped.signer)
                 subscription.forget(dropped)

@@ -175,7 +175,7 @@ class Settlement:
                 self.reject(result, "WrongSigner", f"signed by {result.signer}, not by the promisor")
             else:
                 self._unconfirmed.begin(result)
-                self._tasks.create_task(self._finalize(result))
+                self._tasks.create_task(self._finalize(result, priority=self._chain.costs.worth(liability)))
 
     async def _liability(self, address: str) -> Liability | None:
         """The record of a liability; None while the node knows none at that address."""
@@ -192,7 +192,7 @@ class Settlement:
                 await self._set_aside_unfunded(match, shortage, "its maker can't pay any more")
                 return
         try:
-            created = await self._queue.send(self._creation(match))
+            created = await self._queue.send(self._creation(match), priority=self.worth(demand))
         except MatchWithdrawn:
             self._put_back(match)
         except Reverted as error:
@@ -254,6 +254,10 @@ class Settlement:
         question = partial(self._chain.costs.shortage, order, fresh=fresh)
         return await self._chain.retrying(question, outages=self.events.lookups)
 
+    def worth(self, order: Verified[Order]) -> int:
+        """The priority of an order: see `OrderCosts.worth`."""
+        return self._chain.costs.worth(order.message)
+
     async def _is_funded(self, order: Verified[Order]) -> bool:
         return not await self.shortage(order)
 
@@ -286,11 +290,12 @@ class Settlement:
     async def _when_reachable(self, question: Callable[[], Awaitable[T]]) -> T:
         return await self._chain.retrying(question, outages=self.events.lookups, errors=(NodeUnreachable,))
 
-    async def _finalize(self, result: Verified[Result]) -> None:
+    async def _finalize(self, result: Verified[Result], *, priority: int) -> None:
         message = result.message
         with liability_context(message.liability):
             try:
-                finalized = await self._queue.send(partial(self._chain.liabilities.finalize, self._lighthouse, message))
+                finalize = partial(self._chain.liabilities.finalize, self._lighthouse, message)
+                finalized = await self._queue.send(finalize, priority=priority)
             except (Reverted, NodeUnreachable, RequestRefused) as error:
                 if not isinstance(error, Reverted) or error.reason != "AlreadyFinalized":
                     self.reject(result, _reason(error), str(error))

@@ -8,6 +8,8 @@ such a transaction is tried again, but only a few times, and not for much of the
 from __future__ import annotations
 
 import asyncio
+import heapq
+import itertools
 import logging
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -81,7 +83,8 @@ class _SendAttempts:
 
 
 class TransactionQueue:
-    """The transactions of the chain's account as a provider of `lighthouse` (address), first come, first served.
+    """The transactions of the chain's account as a provider of `lighthouse` (address): those with the highest priority
+    first, and of equals the one that came first.
 
     Turn and nonce belong to the account, so a transaction that waits for the turn, the node or cheaper gas holds up
     all others. `head` returns the latest known block. The cost of reverted transactions goes into `earnings`.
@@ -106,7 +109,10 @@ class TransactionQueue:
         self._limit = limit
         self._set_aside_limit = set_aside_limit
         self._turns = Turns(chain, lighthouse)
-        self._sending = asyncio.Lock()
+        self._sending = False
+        self._waiting: list[tuple[int, int, asyncio.Future[None]]] = []
+        """A heap of those that wait to send: the negative priority, a serial number, and what wakes them."""
+        self._numbers = itertools.count()
         self._queued = 0
         self._set_aside = 0
         self._room = asyncio.Event()
@@ -128,8 +134,8 @@ class TransactionQueue:
         await asyncio.sleep(0)  # tasks that were created just now enter the queue
         await self._room.wait()
 
-    async def send(self, transaction: Callable[[], Awaitable[T]]) -> T:
-        """Send a transaction when all that were queued before it are sent, in the provider's turn; return its outcome.
+    async def send(self, transaction: Callable[[], Awaitable[T]], *, priority: int = 0) -> T:
+        """Send a transaction when all that go before it are sent, in the provider's turn; return its outcome.
 
         It is tried again without limit while the node is down, gas is too expensive, or the account is short of ETH.
         While the node works for others but not for this transaction, it is tried again as often as the retry policy
@@ -142,7 +148,7 @@ class TransactionQueue:
         funds = Backoff(self._chain.node.timing.outage_retry)
         while True:
             try:
-                async with self._first_in_queue():
+                async with self._first_in_queue(priority):
                     return await self._send_in_turn(transaction, attempts)
             except InsufficientFunds as error:
                 # Perhaps for this transaction only: a token contract may need any amount of gas.
@@ -152,13 +158,13 @@ class TransactionQueue:
                 await self._wait_aside(attempts, error)
 
     @asynccontextmanager
-    async def _first_in_queue(self) -> AsyncIterator[None]:
-        """Wait until all that were queued before are done; those behind wait until this is left."""
+    async def _first_in_queue(self, priority: int) -> AsyncIterator[None]:
+        """Wait until all that go before are done; the others wait until this is left."""
         self._queued += 1
         if self._queued >= self._limit:
             self._room.clear()
         try:
-            await self._sending.acquire()
+            await self._acquire(priority)
         finally:
             self._queued -= 1
             if self._queued < self._limit:
@@ -166,7 +172,28 @@ class TransactionQueue:
         try:
             yield
         finally:
-            self._sending.release()
+            self._release()
+
+    async def _acquire(self, priority: int) -> None:
+        if not self._sending:
+            self._sending = True
+            return
+        waiter = asyncio.get_running_loop().create_future()
+        heapq.heappush(self._waiting, (-priority, next(self._numbers), waiter))
+        try:
+            await waiter
+        except asyncio.CancelledError:
+            if not waiter.cancelled():  # it was woken and cancelled at once
+                self._release()
+            raise
+
+    def _release(self) -> None:
+        while self._waiting:
+            *_, waiter = heapq.heappop(self._waiting)
+            if not waiter.done():
+                waiter.set_result(None)
+                return
+        self._sending = False
 
     async def _wait_aside(self, attempts: _SendAttempts, error: NodeUnreachable | RequestRefused | Reverted) -> None:
         """Wait for the next attempt at a transaction while others are sent; raise `error` where there is none."""

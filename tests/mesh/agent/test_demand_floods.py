@@ -85,7 +85,7 @@ async def test_the_same_dead_objective_takes_one_fetch(place: Place) -> None:
         await until(
             lambda: sum(robot.drops.totals().values()) >= 92, what="all but those that share a fetch are dropped"
         )
-        assert robot.drops.totals().keys() == {"objective-shared"}
+        assert robot.drops.totals().keys() == {"objective-shared", "free-rate"}
         await until(lambda: sum(robot.drops.totals().values()) == 100)
         async with asyncio.timeout(BEFORE_ITS_TURN):
             await person.demand(place.save(objective(("/go", "there"))), cost=1)
@@ -109,6 +109,16 @@ async def test_a_demand_is_handled_once_its_maker_can_pay(place: Place) -> None:
 
         await until(resend, pause=0.05)
         assert [one.message for one in handled] == [demand]
+
+
+async def test_of_many_free_demands_few_are_handled(place: Place) -> None:
+    robot = place.agent("robot")
+    handled = counting(robot)
+    async with robot, stranger(place) as channel:
+        for _ in range(100):
+            channel.publish(dead_demand(place, cost=0))
+        await until(lambda: len(handled) + robot.drops.totals().get("free-rate", 0) == 100)
+        assert robot.drops.totals()["free-rate"] >= 30
 
 
 async def test_free_demands_are_handled(place: Place) -> None:

@@ -209,7 +209,7 @@ async def test_results_for_a_finalized_or_unknown_contract_change_nothing(local:
         local.publish(
             local.result(liability.address, success=False),
             local.result(local.address("person")),
-            last := local.demand(cost=1),
+            last := local.demand(cost=0),
         )
 
         await until(lambda: verify_message(last) in provider.book.orders())

@@ -61,6 +61,25 @@ async def test_transactions_are_sent_in_their_order_one_at_a_time(local: LocalMa
     assert events == ["a begins", "a ends", "b begins", "b ends", "c begins", "c ends"]
 
 
+async def test_the_highest_priority_goes_first_also_after_others_were_cancelled(local: LocalMarket) -> None:
+    sent: list[str] = []
+    free = asyncio.Event()
+
+    async def transaction(name: str) -> None:
+        await free.wait()
+        sent.append(name)
+
+    async with queue_of(local) as queue, asyncio.TaskGroup() as tasks:
+        for name, priority in (("first", 0), ("free", 0), ("cancelled", 9), ("low", 1), ("high", 5), ("high too", 5)):
+            task = tasks.create_task(queue.send(partial(transaction, name), priority=priority), name=name)
+            await asyncio.sleep(0)
+            if name == "cancelled":
+                task.cancel()
+        free.set()
+
+    assert sent == ["first", "high", "high too", "low", "free"]
+
+
 async def test_new_work_waits_while_the_queue_is_full(local: LocalMarket) -> None:
     free = asyncio.Event()
 
