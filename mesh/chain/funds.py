@@ -54,6 +54,13 @@ class Funding(NamedTuple):
     allowance: int
 
 
+class _Answer(NamedTuple):
+    asked_at: float
+    block: bytes | None
+    """The latest block that was known then."""
+    funding: Funding | None
+
+
 class Funds:
     """What accounts have of tokens, and let the factory take. `chain.funds`. Used in one event loop."""
 
@@ -61,26 +68,33 @@ class Funds:
         self._contracts = contracts
         self._clock = clock
         self._kept = kept
-        self._known: OrderedDict[Holding, tuple[float, Funding | None]] = OrderedDict()
+        self._known: OrderedDict[Holding, _Answer] = OrderedDict()
         self._asked: dict[Holding, asyncio.Future[Funding | None]] = {}
         self._asking: asyncio.Task[None] | None = None
         self.requests = 0
         """Requests to the node so far."""
 
     async def of(self, holding: Holding, *, within: float = KEPT_POLLS, fresh: bool = False) -> Funding | None:
-        """What is known of a holding, read `within` that many poll intervals or now; None if the token can't be read.
+        """What is known of a holding, read `within` that many poll intervals, in the latest block, or now.
 
-        Raises `NodeUnreachable`.
+        None if the token can't be read. Raises `NodeUnreachable`.
         """
-        known, interval = self._known.get(holding), self._contracts.node.timing.poll_interval
-        if known is not None and not fresh and self._clock.monotonic() < known[0] + within * interval:
-            return known[1]
+        known = self._known.get(holding)
+        if known is not None and not fresh and self._is_current(known, within):
+            return known.funding
         if holding not in self._asked:
             self._asked[holding] = asyncio.get_running_loop().create_future()
         asked = self._asked[holding]
         if self._asking is None:
             self._asking = asyncio.create_task(self._ask_all(), name="funds")
         return await asyncio.shield(asked)
+
+    def _is_current(self, answer: _Answer, within: float) -> bool:
+        """Nothing changes between two blocks. But who is in a hurry may know of a block before we do."""
+        heads, interval = self._contracts.node.heads, self._contracts.node.timing.poll_interval
+        if within >= KEPT_POLLS and heads.are_timely and heads.latest and heads.latest.hash == answer.block:
+            return True
+        return self._clock.monotonic() < answer.asked_at + within * interval
 
     async def _ask_all(self) -> None:
         """Ask for what is wanted, `BATCH` at a time, until nothing is. What is wanted meanwhile comes next."""
@@ -96,7 +110,8 @@ class Funds:
             self._asked.clear()
 
     async def _answer(self, batch: list[Holding]) -> None:
-        asked_at = self._clock.monotonic()
+        asked_at, latest = self._clock.monotonic(), self._contracts.node.heads.latest
+        block = None if latest is None else latest.hash
         futures = [self._asked.pop(holding) for holding in batch]
         try:
             answers = await self._read(batch)
@@ -112,7 +127,7 @@ class Funds:
             raise
         for holding, future, answer in zip(batch, futures, answers, strict=True):
             self._known.pop(holding, None)
-            self._known[holding] = asked_at, answer
+            self._known[holding] = _Answer(asked_at, block, answer)
             if not future.cancelled():
                 future.set_result(answer)
         while len(self._known) > self._kept:

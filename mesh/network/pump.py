@@ -78,10 +78,9 @@ class Pump(Generic[T]):
     instead: `copy` takes what is needed out of a sample at once, and `convert_all` makes items of up to `SLICE` copies
     while others wait in the ring. They run on the pump's own thread; the iterator raises what they raise. Items arrive
     in order, but for copies of dropped ones. `capacity` and `capacity_bytes` bound the ring, `fed_capacity` what is
-    given to `feed`. Samples with more
-    than `payload_limit` bytes are refused. What is dropped is also counted in `drops`. Leaving `async with` undeclares
-    the subscriber and ends the thread and the iteration; undelivered samples are lost. Supports one consumer. Raises
-    `ClosedError` before it is entered.
+    given to `feed`. Samples with more than `payload_limit` bytes are refused. What is dropped is also counted in
+    `drops`. Leaving `async with` undeclares the subscriber and ends the thread and the iteration; undelivered samples
+    are lost. Supports one consumer. Raises `ClosedError` before it is entered.
     """
 
     def __init__(

@@ -1,4 +1,9 @@
-"""The SQLite file of a ledger. Calls write one after the other, and each is synced to the disk."""
+"""The SQLite file of a ledger. Calls write one after the other.
+
+A write is synced to the disk, and with it all earlier ones, unless it says that it can wait for the next one: a power
+loss then takes it back, but never an earlier write without the later ones. What can be read from the chain again can
+wait, as the cursor of the reader is written after it.
+"""
 
 from __future__ import annotations
 
@@ -88,6 +93,8 @@ class Database:
         self._path = path
         self._connection: aiosqlite.Connection | None = None
         self._using = asyncio.Lock()
+        self._syncs: bool | None = None
+        """Whether SQLite syncs each commit now; None before it was set."""
 
     async def open(self) -> None:
         """Open the file, or create it. Raises `LedgerTooNew` if a newer version wrote it."""
@@ -111,21 +118,23 @@ class Database:
         if connection is not None:
             await connection.close()
 
-    async def run(self, statement: str, values: tuple[Any, ...] = ()) -> bool:
+    async def run(self, statement: str, values: tuple[Any, ...] = (), *, sync: bool = True) -> bool:
         """Run one statement, and sync it to the disk. Returns whether it changed any rows."""
         async with self._using:
             with self._usable():
+                await self._set_sync(sync)
                 cursor = await self._opened().execute(statement, values)
         changed = cursor.rowcount > 0
         await cursor.close()
         return changed
 
-    async def run_together(self, *statements: tuple[str, tuple[Any, ...]]) -> None:
+    async def run_together(self, *statements: tuple[str, tuple[Any, ...]], sync: bool = True) -> None:
         """Run all statements in one transaction. All of them have an effect or, if it fails, none."""
         connection = self._opened()
         async with self._using:
             try:
                 with self._usable():
+                    await self._set_sync(sync)
                     await connection.execute("BEGIN IMMEDIATE")
                     for statement, values in statements:
                         await connection.execute(statement, values)
@@ -143,7 +152,6 @@ class Database:
 
     async def _prepare(self) -> None:
         await self.run("PRAGMA journal_mode = WAL")
-        await self.run("PRAGMA synchronous = FULL")
         version = (await self.rows("PRAGMA user_version"))[0][0]
         if version > VERSION:
             raise LedgerTooNew(self._path, found=version, known=VERSION)
@@ -151,6 +159,11 @@ class Database:
         if "recorded" not in [row[1] for row in await self.rows("PRAGMA table_info (jobs)")]:
             await self.run("ALTER TABLE jobs ADD COLUMN recorded INTEGER NOT NULL DEFAULT 0")
         await self.run(f"PRAGMA user_version = {VERSION}")
+
+    async def _set_sync(self, sync: bool) -> None:
+        if sync != self._syncs:
+            await self._opened().execute(f"PRAGMA synchronous = {'FULL' if sync else 'NORMAL'}")
+            self._syncs = sync
 
     def _opened(self) -> aiosqlite.Connection:
         if self._connection is None:

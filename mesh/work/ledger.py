@@ -136,21 +136,24 @@ class Ledger:
             "INSERT INTO jobs (liability, phase, record, changed) VALUES (?, ?, ?, ?)"
             " ON CONFLICT (liability) DO UPDATE SET aside = 0 WHERE aside",
             (liability.address, Phase.INCOMING, liability.encode(), time.time()),
+            sync=False,
         )
 
     async def set_aside(self, liability: str) -> None:
         """Hide a job, with everything that is known of it, until `add_job` or `bring_back` shows it again."""
-        await self._database.run("UPDATE jobs SET aside = 1 WHERE liability = ?", (liability,))
+        await self._database.run("UPDATE jobs SET aside = 1 WHERE liability = ?", (liability,), sync=False)
 
     async def bring_back(self, liability: str) -> bool:
         """Show a job that was set aside. False if there is none."""
-        return await self._database.run("UPDATE jobs SET aside = 0 WHERE liability = ? AND aside", (liability,))
+        statement = "UPDATE jobs SET aside = 0 WHERE liability = ? AND aside"
+        return await self._database.run(statement, (liability,), sync=False)
 
     async def set_phase(self, liability: str, phase: Phase, *, position: int | None = None) -> None:
         """Set the phase of the job at `liability` (address) and, if given, how many messages it has played."""
         await self._database.run(
             "UPDATE jobs SET phase = ?, position = COALESCE(?, position), changed = ? WHERE liability = ?",
             (phase, position, time.time(), liability),
+            sync=position is not None,
         )
 
     async def set_position(self, liability: str, position: int, *, recorded: int) -> None:
@@ -198,7 +201,7 @@ class Ledger:
 
     async def settle(self, identity: str) -> bool:
         """Remove a message whose effect was seen. False if it was not in the outbox."""
-        return await self._database.run("DELETE FROM outbox WHERE identity = ?", (identity,))
+        return await self._database.run("DELETE FROM outbox WHERE identity = ?", (identity,), sync=False)
 
     async def spend(self, identity: str, liability: str) -> None:
         """Take an order out of the outbox that became the contract at `liability`, and keep it for `unspend`."""
@@ -207,6 +210,7 @@ class Ledger:
             ("DELETE FROM outbox WHERE identity = ?", (identity,)),
             ("UPDATE withdrawn SET used_by = ? WHERE identity = ?", (liability, identity)),
             ("DELETE FROM spent WHERE rowid <= (SELECT MAX(rowid) FROM spent) - ?", (self._spent_kept,)),
+            sync=False,
         )
 
     async def spent(self, liability: str) -> list[Outgoing]:
@@ -227,6 +231,7 @@ class Ledger:
             (f"INSERT OR IGNORE INTO outbox ({columns}) SELECT {columns} FROM spent WHERE liability = ?", (liability,)),
             ("DELETE FROM spent WHERE liability = ?", (liability,)),
             ("UPDATE withdrawn SET used_by = '' WHERE used_by = ?", (liability,)),
+            sync=False,
         )
 
     async def withdraw(self, identity: str, withdrawal: Outgoing) -> None:
@@ -256,8 +261,8 @@ class Ledger:
 
     async def outbox(self, *, head: int) -> list[Outgoing]:
         """The messages to send, oldest first. Deletes those whose deadline block `head` has reached."""
-        await self._database.run("DELETE FROM outbox WHERE deadline <= ?", (head,))
-        await self._database.run("DELETE FROM withdrawn WHERE deadline <= ?", (head,))
+        await self._database.run("DELETE FROM outbox WHERE deadline <= ?", (head,), sync=False)
+        await self._database.run("DELETE FROM withdrawn WHERE deadline <= ?", (head,), sync=False)
         statement = "SELECT identity, kind, payload, deadline FROM outbox ORDER BY rowid"
         return _outgoing(await self._database.rows(statement))
 
@@ -278,7 +283,7 @@ class Ledger:
     async def set_cursor(self, name: str, block: int, *, history: bytes = b"") -> None:
         """Save that the reader `name` has handled all of `block`, with its encoded chain history."""
         statement = "INSERT OR REPLACE INTO cursors (name, block, history) VALUES (?, ?, ?)"
-        await self._database.run(statement, (name, block, history))
+        await self._database.run(statement, (name, block, history), sync=False)
 
 
 def _job(row: Any) -> JobRecord:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import logging  # noqa: F401 - before the locks are replaced: it keeps real ones
+import logging  # before the locks are replaced: it keeps real ones
 import os
 import sys
 import traceback
@@ -14,6 +14,7 @@ if os.environ.get("PYTHONHASHSEED") != "0":
 from tests.simulation import threads
 
 threads.install()
+logging.getLogger().setLevel(logging.CRITICAL)
 
 try:
     from tests.simulation.command import main

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import traceback
 from dataclasses import dataclass, field
@@ -28,9 +27,6 @@ if TYPE_CHECKING:
     from tests.simulation.audit import Audit
 
 WITHDRAWN: Final = (0.1, 0.2, 0.7)
-
-
-logging.getLogger().setLevel(logging.CRITICAL)
 
 
 @dataclass

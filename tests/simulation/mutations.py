@@ -157,9 +157,9 @@ MUTATIONS: Final = (
     ),
     Mutation(
         "the ledger is not synced",
-        "mesh.work.database:Database._prepare",
-        "PRAGMA synchronous = FULL",
-        "PRAGMA synchronous = OFF",
+        "mesh.work.database:Database._set_sync",
+        "'FULL' if sync else 'NORMAL'",
+        "'OFF' if sync else 'NORMAL'",
         CRASHES,
     ),
     Mutation(

@@ -226,15 +226,15 @@ async def test_a_contract_that_is_gone_when_it_is_read_does_not_stop_the_reading
 ) -> None:
     """A reorganisation took it after its event was read; the provider makes it again at another address."""
     said: list[str] = []
-    get, gone = Liabilities.get, list[str]()
+    get, gone = Liabilities.get_with_orders, list[str]()
 
-    async def get_too_late(liabilities: Liabilities, address: str) -> Liability:
+    async def get_too_late(liabilities: Liabilities, address: str) -> tuple[Liability, tuple[bytes, bytes]]:
         if not gone and liabilities._contracts.own_address == place.address("robot"):
             gone.append(address)
             await place.forget_blocks(1)
         return await get(liabilities, address)
 
-    monkeypatch.setattr(Liabilities, "get", get_too_late)
+    monkeypatch.setattr(Liabilities, "get_with_orders", get_too_late)
     async with place.agent("person") as person, place.provider(), speaking(offering(place.agent("robot")), said):
         await person.demand(words(place), cost=COST)
         await until_found(paid.once, what="the payment")
