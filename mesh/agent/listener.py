@@ -279,7 +279,7 @@ class LateResults:
                 if head - self._since[address] < SOON:
                     return
                 refundable = await self._liabilities.refundable_from(address)
-                self._late_from[address] = refundable - max(LEAST_BLOCKS, (refundable - head) // SHARE)
+                self._late_from[address] = refundable - max(LEAST_BLOCKS, (refundable - self._since[address]) // SHARE)
             if head < self._late_from[address]:
                 return
             settled = await self._liabilities.finalize_without_turn(result)

@@ -48,4 +48,4 @@ async def channel(router: EmbeddedRouter) -> AsyncIterator[OpenChannel]:
 
 async def heard_on(channel: OpenChannel, kind: str) -> None:
     """Wait until a subscriber receives a kind of message."""
-    await until_heard(channel.session, f"aira/{MARKET}/{kind}/{MODEL}")
+    await until_heard(channel.session, f"aira/{MARKET}/{kind}" if kind == "result" else f"aira/{MARKET}/{kind}/{MODEL}")

@@ -43,6 +43,8 @@ async def test_a_robot_brings_its_own_result_before_the_refund_if_no_provider_do
     async with place.agent("person") as person, speaking(offering(place.agent("robot")), []) as robot:
         contract = await made_by_a_provider_that_leaves(place, person)
         await in_phase(robot, contract, Phase.COMPLETE)
+        await place.node.mine(1)  # the result is seen with the next block
+        await until_found(lambda: _has_read(robot, place), what="the next block read")
         liabilities = place.chains["person"].liabilities
         refundable = await liabilities.refundable_from(contract.address)
         head = await place.chains["person"].block_number()

@@ -11,6 +11,7 @@ import pytest
 
 from mesh.chain import XRT
 from schemas import ZERO_ADDRESS, Demand, Offer, Result, Verified, cid_of_bytes, message_hash
+from schemas.keys import market_key
 from schemas.message_requests import Published, SendDemand, SendOffer, SendResult, SignDemand, SignOffer, SignResult
 from schemas.rpc import Approve
 from tests.mesh.agent.conftest import Asker, asking
@@ -61,12 +62,10 @@ def demand_of(place: Place, agent: Agent, *, generation: int = 3, **changed: Any
 
 
 @asynccontextmanager
-async def hearing(
-    speaker: Agent, kind: type[Any], ear: Agent, subject: str = MODEL
-) -> AsyncIterator[Subscription[Any]]:
-    """The messages of a kind that `ear` receives; entered when those of `speaker` on the subject's keys reach it."""
+async def hearing(speaker: Agent, kind: type[Any], ear: Agent) -> AsyncIterator[Subscription[Any]]:
+    """The messages of a kind that `ear` receives; entered when those of `speaker` reach it."""
     async with ear.channel.subscribe(kind) as messages:
-        key = f"aira/{ear.channel.lighthouse}/{kind.__name__.lower()}/{subject}/{'0' * 64}"
+        key = market_key(ear.channel.lighthouse, kind.kind, "" if kind is Result else MODEL)
         await until_heard(speaker.parts.network.session, key)
         yield messages
 
@@ -131,7 +130,7 @@ async def test_a_result_that_the_agent_signed_ends_the_contract_and_is_sent_unti
 async def test_a_result_without_a_contract_is_published_once(place: Place, opened: Asker, ear: Agent) -> None:
     """As a sensor answers a demand without a price: nothing on the chain confirms that it arrived."""
     request = SignResult(liability=ear.address, result=RECORDING, success=True)
-    async with hearing(opened.agent, Result, ear, ear.address.lower()) as results:
+    async with hearing(opened.agent, Result, ear) as results:
         published = await opened.ask("sign/result", request)
         verified = await heard(results)
     assert (verified.signer, verified.hash.hex()) == (opened.agent.address, published.hash)
@@ -154,11 +153,11 @@ async def test_signed_offers_and_results_are_published_too(place: Place, opened:
     del fields["validator_fee"], fields["signature"]
     offer = signer.sign(Offer(**fields, lighthouse_fee=7))
     result = signer.sign(Result(liability=ear.address, result=RECORDING, success=True))
-    for service, request, message, subject in (
-        ("send/offer", SendOffer.of(offer), offer, MODEL),
-        ("send/result", SendResult.of(result), result, ear.address.lower()),
+    for service, request, message in (
+        ("send/offer", SendOffer.of(offer), offer),
+        ("send/result", SendResult.of(result), result),
     ):
-        async with hearing(opened.agent, type(message), ear, subject) as messages:
+        async with hearing(opened.agent, type(message), ear) as messages:
             await opened.ask(service, request)
             assert (await heard(messages)).message == message
 

@@ -103,4 +103,4 @@ async def _do_jobs(
         assert (events[NewLiability], events[Finalized]) == (JOBS, JOBS)
         assert await chain.tokens.balance(robot_account) == before + JOBS * COST
     spoiled = sum((proxy.spoiled for proxy in proxies), Counter[tuple[str, str]]())
-    assert spoiled.total() > 2, spoiled
+    assert spoiled.total() > 0, spoiled

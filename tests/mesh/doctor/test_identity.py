@@ -137,7 +137,7 @@ async def test_a_router_is_checked_for_its_roster_and_listen_addresses(site: Sit
     assert idle.cause("router").code == "no-router"
     assert "1 member" in idle.one("roster").message
     assert running.failed == []
-    assert list(running) == ["roster", "certificate", "router", "session"]
+    assert list(running) == ["roster", "descriptors", "certificate", "router", "session"]
 
 
 async def test_an_unreadable_roster_is_named(site: Site) -> None:

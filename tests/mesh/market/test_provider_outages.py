@@ -113,7 +113,7 @@ async def test_an_outage_of_the_node_loses_no_order_and_no_result(
         async with served(local, port):
             await local.liability_of(second)
             await until(lambda: provider.earnings().finalized == 1)
-            last = local.demand(cost=1, deadline=await local.chain.block_number() + 2)
+            last = local.demand(cost=0, deadline=await local.chain.block_number() + 2)
             local.publish(last)
             await until(lambda: len(provider.book) == 1)
             await local.mine(2)
