@@ -31,7 +31,7 @@ HANDLED: Final = 32
 """Demands that are handled at once: to fetch the objective of one may take long."""
 FREE_HANDLED: Final = 16
 """Of these, demands that pay nothing."""
-FREE_RATE: Final = Rate(per_second=2.0, burst=32)
+FREE_RATE: Final = Rate(per_second=4.0, burst=64)
 """Demands that pay nothing and are handled. Each offer for one may become a job."""
 CHECKED: Final = 128
 """Demands whose makers' funds are asked for at once."""

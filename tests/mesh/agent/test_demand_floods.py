@@ -118,7 +118,7 @@ async def test_of_many_free_demands_few_are_handled(place: Place) -> None:
         for _ in range(100):
             channel.publish(dead_demand(place, cost=0))
         await until(lambda: len(handled) + robot.drops.totals().get("free-rate", 0) == 100)
-        assert robot.drops.totals()["free-rate"] >= 30
+        assert robot.drops.totals()["free-rate"] >= 20
 
 
 async def test_free_demands_are_handled(place: Place) -> None:
