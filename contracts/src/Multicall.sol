@@ -18,6 +18,7 @@ contract Multicall {
     constructor(Call[] memory calls) {
         Answer[] memory answers = new Answer[](calls.length);
         for (uint256 index = 0; index < calls.length; ++index) {
+            // slither-disable-next-line calls-loop (it is never deployed, and the caller chooses the calls)
             (answers[index].success, answers[index].data) = calls[index].target.staticcall(calls[index].data);
         }
         bytes memory encoded = abi.encode(answers);
