@@ -15,7 +15,7 @@ from mesh.chain.answers import ANSWERS, decode_answer
 from mesh.chain.events import ChainEvent, Finalized, NewLiability, Transfer, decode_log
 from schemas import ZERO_ADDRESS, Empty, cid_of_file
 from tests.support.compose import Project, log_text
-from tests.support.containers import BASE_IMAGE, FOUNDRY_IMAGE
+from tests.support.containers import BASE_IMAGE, FOUNDRY_IMAGE, EngineFailed
 from tests.support.objectives import timed
 from tests.support.waiting import until
 
@@ -156,7 +156,12 @@ class Job:
 
     def is_over(self) -> bool:
         """Whether the person's command has ended."""
-        return self.market.engine("inspect", "--format", "{{.State.Status}}", self.container) == "exited\n"
+        try:
+            return self.market.engine("inspect", "--format", "{{.State.Status}}", self.container) == "exited\n"
+        except EngineFailed as error:
+            if "no such process" in error.said:  # it ended while podman looked
+                return False
+            raise
 
     async def settled(self) -> dict[str, Any]:
         """Wait for the end, and check that the chain paid once and the right account; what the person printed."""
