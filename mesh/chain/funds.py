@@ -54,7 +54,7 @@ class Funding(NamedTuple):
     allowance: int
 
 
-class _Answer(NamedTuple):
+class _KnownFunding(NamedTuple):
     asked_at: float
     block: bytes | None
     """The latest block that was known then."""
@@ -68,7 +68,7 @@ class Funds:
         self._contracts = contracts
         self._clock = clock
         self._kept = kept
-        self._known: OrderedDict[Holding, _Answer] = OrderedDict()
+        self._known: OrderedDict[Holding, _KnownFunding] = OrderedDict()
         self._asked: dict[Holding, asyncio.Future[Funding | None]] = {}
         self._asking: asyncio.Task[None] | None = None
         self.requests = 0
@@ -89,7 +89,7 @@ class Funds:
             self._asking = asyncio.create_task(self._ask_all(), name="funds")
         return await asyncio.shield(asked)
 
-    def _is_current(self, answer: _Answer, within: float) -> bool:
+    def _is_current(self, answer: _KnownFunding, within: float) -> bool:
         """Nothing changes between two blocks. But who is in a hurry may know of a block before we do."""
         heads, interval = self._contracts.node.heads, self._contracts.node.timing.poll_interval
         if within >= KEPT_POLLS and heads.are_timely and heads.latest and heads.latest.hash == answer.block:
@@ -127,7 +127,7 @@ class Funds:
             raise
         for holding, future, answer in zip(batch, futures, answers, strict=True):
             self._known.pop(holding, None)
-            self._known[holding] = _Answer(asked_at, block, answer)
+            self._known[holding] = _KnownFunding(asked_at, block, answer)
             if not future.cancelled():
                 future.set_result(answer)
         while len(self._known) > self._kept:
