@@ -187,7 +187,7 @@ async def run_robot(settings: Settings, key: bytes, pipe: Any) -> None:
 
 
 async def run_person(settings: Settings, key: bytes, pipe: Any) -> None:
-    """The person's process: it demands a job whenever it is told to, and waits for its end."""
+    """The person's process: it demands a job on request, and waits for its end."""
     objective = Path(settings.data_dir) / "objective.mcap"
     write_objective(objective)
     async with Agent(MODEL, settings=settings, account=Account.from_key(key)) as person, asyncio.timeout(None):

@@ -1,7 +1,7 @@
 """Protection against floods: what strangers may use is bounded per sender and in total, and what is dropped is counted.
 
-A sender is whoever can be told apart where the limit is: the signer of a message, the Zenoh session that sent it, the
-replier of a query. Everything here remembers a bounded number of senders, since a flood may come from fresh ones.
+A sender is what a limit can distinguish: the signer of a message, the Zenoh session that sent it, the replier of a
+query. Everything here remembers a bounded number of senders, since a flood may come from fresh ones.
 """
 
 from __future__ import annotations
@@ -127,6 +127,11 @@ class FairQueue(Generic[T]):
         self._size += 1
         self._arrived.set()
         return [self._drop_newest()] if self._size > self._total else []
+
+    async def get_batch(self, limit: int) -> list[T]:
+        """Wait for the next item; take it and those behind it that wait already, `limit` in all at most."""
+        first = await self.get()
+        return [first, *(self.get_nowait() for _ in range(min(limit - 1, self._size)))]
 
     async def get(self) -> T:
         """Wait for the next item and take it."""

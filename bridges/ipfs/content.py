@@ -205,7 +205,7 @@ class ContentBridge:
 
     @contextmanager
     def _not_answering(self, cid: str) -> Iterator[None]:
-        """Don't answer this bridge's own queries for a file that is to be added."""
+        """Don't answer this bridge's own queries for a file that it is going to add."""
         self._adding[cid] += 1
         try:
             yield

@@ -97,9 +97,7 @@ class DemandDispatcher:
     async def _check(self) -> None:
         """Pass on the demands whose makers can pay."""
         while True:
-            batch = [await self._arrived.get()]
-            while len(self._arrived) and len(batch) < CHECKED:
-                batch.append(self._arrived.get_nowait())
+            batch = await self._arrived.get_batch(CHECKED)
             for demand, is_funded in zip(batch, await asyncio.gather(*map(self._is_funded, batch)), strict=True):
                 if not is_funded:
                     self._drop(demand, "unfunded")
@@ -113,17 +111,14 @@ class DemandDispatcher:
 
     def _worth(self, demand: Verified[Demand]) -> int:
         """The priority of a demand: by the magnitude of its pay, and of two alike the customer's."""
-        return 2 * self._pay(demand).bit_length() + (demand.signer in self._customers)
-
-    def _pay(self, demand: Verified[Demand]) -> int:
-        return demand.message.cost if demand.message.token == self._token else 0
+        return 2 * self._chain.costs.worth(demand.message, token=self._token) + (demand.signer in self._customers)
 
     async def _handle(self, tasks: asyncio.TaskGroup) -> None:
         while True:
             self._changed.clear()
             while self._has_place():
                 demand = self._funded.get_nowait()
-                pays = self._pay(demand) > 0
+                pays = self._chain.costs.worth(demand.message, token=self._token) > 0
                 if not pays and not self._free_rate.allow(demand.signer):
                     self._drop(demand, "free-rate")
                     continue

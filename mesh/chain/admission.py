@@ -77,12 +77,13 @@ class OrderCosts:
                 return "ERC20InsufficientAllowance" if funding.allowance < amount else "ERC20InsufficientBalance"
         return ""
 
-    def worth(self, order: Order | Liability) -> int:
-        """The priority of an order, or of its liability, where there are too many: the magnitude of its cost in XRT.
+    def worth(self, order: Order | Liability, *, token: str = "") -> int:
+        """The priority of an order, or of its liability, where there are too many: the magnitude of its cost.
 
-        It is 0 for other tokens: anybody can make a token, and have any number of it.
+        It is 0 unless the cost is in `token` (an address; XRT by default): anybody can make a token, and have any
+        number of it.
         """
-        return order.cost.bit_length() if order.token == self._xrt else 0
+        return order.cost.bit_length() if order.token == (token or self._xrt) else 0
 
     async def can_be_paid(self, order: Verified[Order], *, fresh: bool = False) -> bool:
         """Whether an order's maker lacks nothing; see `shortage`."""

@@ -86,7 +86,7 @@ LENGTHS: Final[Mapping[type, int]] = MappingProxyType({Word: 32, Address: 20})
 class BlockHeader(_Answer, frozen=True):
     """A block. Hashes are 32 bytes, `timestamp` is Unix time, `base_fee` is wei (None: the chain has none).
 
-    `may_log` tells by the header whether the block can hold a log.
+    `may_log` is whether the block can hold a log, by its header.
     """
 
     number: Count

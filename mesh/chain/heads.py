@@ -115,9 +115,9 @@ class Heads:
         request_pushes: Callable[[], None] = lambda: None,
     ) -> None:
         self.latest: BlockHeader | None = None
-        """The newest block that the node told us, if any."""
+        """The latest block that the node has returned or pushed, if any."""
         self.is_pushed = False
-        """Whether the node tells us of new blocks by itself."""
+        """Whether the node pushes new blocks."""
         self.pace = Pace(interval)
         self._ask = ask
         self._header = header
@@ -143,8 +143,8 @@ class Heads:
     async def recent(self) -> BlockHeader:
         """The latest block, as it was a poll interval ago or later; the node is asked only if it is not known."""
         if self.latest is not None:
-            since, now = self._now() - self._seen_at, self._now()
-            if since <= self._interval or self.is_pushed or self.pace.is_early(self.latest, now):
+            now = self._now()
+            if now - self._seen_at <= self._interval or self.is_pushed or self.pace.is_early(self.latest, now):
                 return self.latest
         return await self.look()
 
@@ -176,7 +176,7 @@ class Heads:
             self._announce()
 
     def pushed(self, head: BlockHeader | None) -> None:
-        """The node tells us of a block by itself; with None it stops to."""
+        """The node has pushed a block; None means that it pushes no more."""
         self.is_pushed = head is not None
         if head is not None:
             self._take(head)

@@ -72,7 +72,7 @@ class WebSocketTransport(AsyncJSONBaseProvider):
         self._subscription: Any = None
 
     def push_heads(self, on_head: Callable[[Any], None]) -> None:
-        """Call `on_head` with each new block that the node tells of, as JSON, and with None when it stops to.
+        """Call `on_head` with each new block that the node pushes, as JSON, and with None when it no longer does.
 
         A node that has no such subscription is not asked again.
         """

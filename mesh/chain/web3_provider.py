@@ -83,7 +83,7 @@ class ReliableProvider:
         self._is_open = True
 
     def push_heads(self, on_head: Callable[[BlockHeader | None], None]) -> None:
-        """Call `on_head` with new blocks as soon as the node in use tells of them; with None when it stops to.
+        """Call `on_head` with each new block that the node in use pushes, and with None when it no longer does.
 
         Only over WebSocket, and only of the node that requests go to. May be called again and again.
         """

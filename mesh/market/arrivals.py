@@ -53,16 +53,13 @@ class Arrivals:
     async def run(self) -> None:
         """Pass on what was taken, until cancelled."""
         while True:
-            batch = [(await self._queue.get())[0]]
-            while len(self._queue) and len(batch) < CHECKED:
-                batch.append(self._queue.get_nowait()[0])
+            batch = [order for order, _ in await self._queue.get_batch(CHECKED)]
             await self._has_room()
-            for order, shortage in zip(batch, await asyncio.gather(*map(self._shortage, batch)), strict=True):
+            for order, shortage in zip(
+                batch, await asyncio.gather(*map(self._settlement.shortage, batch)), strict=True
+            ):
                 if shortage:
                     self._drops.count("unfunded", order.signer)
                     self._settlement.set_aside(order, shortage)
                 else:
                     self._settlement.add(order)
-
-    async def _shortage(self, order: Verified[Order]) -> str:
-        return await self._settlement.shortage(order)

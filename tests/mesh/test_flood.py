@@ -61,6 +61,13 @@ async def test_a_higher_priority_goes_first_and_the_lowest_is_dropped() -> None:
         queue.get_nowait()
 
 
+async def test_a_batch_is_what_waits_up_to_a_limit() -> None:
+    queue: FairQueue[int] = FairQueue(per_sender=9, total=9)
+    for number in range(5):
+        queue.put("alice", number)
+    assert [await queue.get_batch(3), await queue.get_batch(3)] == [[0, 1, 2], [3, 4]]
+
+
 @given(st.lists(st.tuples(st.sampled_from("abcd"), st.booleans(), st.integers(0, 2)), max_size=300))
 def test_the_queue_stays_within_its_limits(steps: list[tuple[str, bool, int]]) -> None:
     queue: FairQueue[int] = FairQueue(per_sender=3, total=6)
