@@ -1,4 +1,4 @@
-"""Tasks that run beside the body of an `async with`."""
+"""Tasks that run beside the body of an `async with`, and calls from other threads."""
 
 from __future__ import annotations
 
@@ -6,8 +6,23 @@ import asyncio
 from typing import TYPE_CHECKING, Any, Self
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine
+    from collections.abc import Callable, Coroutine
+    from contextvars import Context
     from types import TracebackType
+
+
+def call_in_loop(
+    loop: asyncio.AbstractEventLoop, function: Callable[..., object], *arguments: Any, context: Context | None = None
+) -> None:
+    """Schedule `function` on the event loop from any thread; does nothing if the loop has been closed.
+
+    It runs in `context`, so that log events carry their source; Zenoh's threads have no context of their own.
+    """
+    try:
+        loop.call_soon_threadsafe(function, *arguments, context=context)
+    except RuntimeError:
+        if not loop.is_closed():
+            raise
 
 
 class Background:

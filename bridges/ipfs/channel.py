@@ -17,9 +17,10 @@ from bridges.ipfs.presence import BridgePresence
 from bridges.ipfs.publishers import BRIDGE_MARK, PUBLISH_RETRY, IpfsPublisher, MeshPublisher
 from bridges.ipfs.relay import QUEUE_LIMIT, MessageRelay, RelayOutcome
 from bridges.ipfs.status import BridgeHealth, changes_between, counters_of
+from mesh.background import call_in_loop
 from mesh.errors import InvalidMessage
 from mesh.log_context import log_event
-from mesh.network import Channel, NetworkChange, Pump, call_in_loop
+from mesh.network import Channel, NetworkChange, Pump
 from mesh.role import Role
 from schemas import Withdrawal, lighthouse_selector
 from schemas.keys import market_kind

@@ -13,11 +13,11 @@ import zenoh
 from bridges.ipfs.errors import IpfsError
 from bridges.ipfs.transfer_queue import USUAL, TransferQueue
 from bridges.ipfs.transfers import add_file
+from mesh.background import call_in_loop
 from mesh.content import ContentUnavailable, session_address
 from mesh.errors import ClosedError
 from mesh.flood import Drops
 from mesh.log_context import log_event
-from mesh.network import call_in_loop
 from mesh.retry import RetryPolicy
 from schemas import CidKey, InputError, cid_selector, parse_block, requested_cid
 from schemas.status import ContentMetrics

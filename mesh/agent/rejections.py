@@ -8,9 +8,8 @@ from contextlib import asynccontextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from mesh.background import Background
+from mesh.background import Background, call_in_loop
 from mesh.log_context import log_event
-from mesh.network import call_in_loop
 from schemas import InvalidRecord, market_selector
 from schemas.signing import Rejection
 

@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import zenoh
 
+from mesh.background import call_in_loop
 from mesh.doctor.checks import CheckResult, failed, passed, warning
 from mesh.doctor.machine import compare_router_clock
 from mesh.errors import RemoteError
 from mesh.identity.routers import IdentityDenied, is_loopback
-from mesh.network import Endpoints, Network, call_in_loop
+from mesh.network import Endpoints, Network
 from mesh.network.endpoints import TLS_PREFIXES
 from schemas.agent_keys import address_chunk, name_chunk
 from schemas.keys import lighthouse_chunk

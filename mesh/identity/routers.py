@@ -11,10 +11,11 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from mesh.background import call_in_loop
 from mesh.errors import ConfigurationError, RemoteError
 from mesh.identity.access_rules import access_control
 from mesh.identity.roster import read_roster
-from mesh.network import Network, Tls, call_in_loop
+from mesh.network import Network, Tls
 from mesh.network.endpoints import Endpoints, check_locators
 from schemas.agent_keys import DeviceTopicKey
 

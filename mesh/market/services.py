@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import zenoh
 
 import mesh
+from mesh.background import call_in_loop
 from mesh.chain.metrics import CachedMetrics, reading_families
 from mesh.flood import Rate, RateLimiter
-from mesh.network import call_in_loop, message_key
+from mesh.network import message_key
 from mesh.network.metrics import drop_family, message_families
 from mesh.telemetry.metrics import MetricFamily, by_label, counter, gauge, labelled
 from schemas import encode, lighthouse_selector

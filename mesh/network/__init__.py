@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING, Final
 from schemas.loading import on_demand
 
 if TYPE_CHECKING:
-    from mesh.network.channel import Channel
+    from mesh.network.channel import Channel, Subscription
     from mesh.network.connecting import NotAdmitted
     from mesh.network.endpoints import Endpoints, free_endpoint
-    from mesh.network.pump import Pump, call_in_loop
+    from mesh.network.pump import Pump
     from mesh.network.services import ServiceFailed, Services, call
     from mesh.network.session import Network, NetworkChange
-    from mesh.network.subscription import Subscription
     from mesh.network.tls import Tls
     from mesh.network.validation import MessageValidator, ValidationStatistics, message_key
 
@@ -27,11 +26,10 @@ _HOMES: Final = {
     "Pump": "mesh.network.pump",
     "ServiceFailed": "mesh.network.services",
     "Services": "mesh.network.services",
-    "Subscription": "mesh.network.subscription",
+    "Subscription": "mesh.network.channel",
     "Tls": "mesh.network.tls",
     "ValidationStatistics": "mesh.network.validation",
     "call": "mesh.network.services",
-    "call_in_loop": "mesh.network.pump",
     "free_endpoint": "mesh.network.endpoints",
     "message_key": "mesh.network.validation",
 }
@@ -53,7 +51,6 @@ __all__ = [
     "Tls",
     "ValidationStatistics",
     "call",
-    "call_in_loop",
     "free_endpoint",
     "message_key",
 ]

@@ -7,31 +7,41 @@ then call `Subscription.recall`, and you miss nothing.
 from __future__ import annotations
 
 import asyncio
-import logging
+from contextlib import suppress
 from contextvars import copy_context
-from typing import TYPE_CHECKING, Any, Self
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, Generic, Self
 
 import zenoh
 
+from mesh.background import call_in_loop
 from mesh.errors import ClosedError, InputError, InvalidKey
+from mesh.flood import Drops, FairQueue, Rate, RateLimiter
 from mesh.network import sending
-from mesh.network.pump import call_in_loop
-from mesh.network.subscription import RECALL_LIMIT, RECALL_TIMEOUT, Subscription
-from mesh.network.validation import M, MessageValidator, message_key
-from schemas import SignedMessage, encode
+from mesh.network.pump import SLICE, Pump
+from mesh.network.validation import M, MessageValidator, Unresolved, ValidationStatistics, message_key
+from schemas import MAX_MESSAGE_SIZE, SignedMessage, Verified, encode
 from schemas.keys import PresenceKey, parse_key
 from schemas.selectors import lighthouse_selector, market_selector, presence_selector
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator
+    from collections.abc import Callable, Iterator
 
     from mesh.blocklist import BlockedSigners
-    from mesh.flood import Drops
-    from mesh.network.lookups import ValidatorCheck
+    from mesh.network.lookups import Resolver, ValidatorCheck
 
-    Resolver = Callable[[str], Awaitable[str]]
-
-log = logging.getLogger(__name__)
+RECALL_TIMEOUT: Final = 5.0
+"""Seconds that providers have to answer with their open orders."""
+RECALL_LIMIT: Final = 65_536
+"""Open orders accepted from one recall, at most."""
+RECALL_BYTES: Final = 64 * 1024 * 1024
+"""Bytes of messages accepted from one recall, at most."""
+LOOKUP_LIMIT: Final = 256
+"""Messages about which the chain has to be asked that may wait for it, half of them from one signer. More are rejected:
+anybody may send unknown names. Those whose signer is not known, because they contain names, share one signer's part."""
+LOOKUP_RATE: Final = Rate(10, 64)
+"""Messages of one signer about which a subscription asks the chain."""
+LOOKUP_RATE_IN_TOTAL: Final = Rate(40, 256)
 
 
 class Channel:
@@ -60,10 +70,15 @@ class Channel:
         self.lighthouse = lighthouse.lower()
         lighthouse_selector(self.lighthouse)  # raises InvalidKey
         self.address = address
-        self._resolver = resolver
-        self._validators = validators
-        self._head = head
-        self._blocked = blocked
+        self._validator_of = partial(
+            MessageValidator,
+            lighthouse=self.lighthouse,
+            address=address,
+            head=head,
+            resolver=resolver,
+            validators=validators,
+            blocked=blocked,
+        )
         self._drops = drops
         self._declarations: list[Any] = []
         self._open = False
@@ -111,16 +126,7 @@ class Channel:
         """
         self._check_open()
         selector = market_selector(self.lighthouse, kind.kind, model)
-        validator: MessageValidator[M] = MessageValidator(
-            kind,
-            lighthouse=self.lighthouse,
-            address=self.address,
-            head=self._head,
-            resolver=self._resolver,
-            validators=self._validators,
-            blocked=self._blocked,
-        )
-        return Subscription(self._session, selector, validator, drops=self._drops)
+        return Subscription(self._session, selector, self._validator_of(kind), self._drops)
 
     def announce(self, role: str, address: str) -> None:
         """Announce the agent at `address` as present in `role`, for as long as the channel is open."""
@@ -156,13 +162,10 @@ class Channel:
     async def present(self) -> list[PresenceKey]:
         """The agents that are announced on the channel now: role and address, in the order of their keys."""
         self._check_open()
-        return await asyncio.to_thread(self._present)
-
-    def _present(self) -> list[PresenceKey]:
+        ask, selector = self._session.liveliness().get, presence_selector(self.lighthouse)
         handler: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(RECALL_LIMIT)
-        replies = self._session.liveliness().get(presence_selector(self.lighthouse), handler, timeout=RECALL_TIMEOUT)
-        texts = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
-        return list(_presence_keys(sorted(texts)))
+        replies = await asyncio.to_thread(lambda: list(ask(selector, handler, timeout=RECALL_TIMEOUT)))
+        return list(_presence_keys(sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})))
 
     def _check_open(self) -> None:
         if not self._open:
@@ -172,10 +175,125 @@ class Channel:
 def _presence_keys(texts: list[str]) -> Iterator[PresenceKey]:
     """The valid keys among `texts`: anybody may declare a token on any key."""
     for text in texts:
-        try:
+        with suppress(InvalidKey):
             key = parse_key(text)
-        except InvalidKey as error:
-            log.debug("ignored a presence token: %s", error)
-            continue
-        if isinstance(key, PresenceKey):
-            yield key
+            if isinstance(key, PresenceKey):
+                yield key
+
+
+class Subscription(Generic[M]):
+    """The verified messages of one kind, as an async iterator: `async with channel.subscribe(Demand) as demands`.
+
+    The iteration ends when `async with` is left. Supports one consumer. Messages about which the chain has to be asked
+    (ENS names, unknown validators) are delivered after that, so later ones may overtake them. Raises `ClosedError`
+    before it is entered.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, selector: str, validator: MessageValidator[M], drops: Drops | None = None
+    ) -> None:
+        self._session = session
+        self.selector: Final = selector
+        """The key expression that is subscribed to."""
+        self._validator: MessageValidator[M] = validator
+        self._drops = Drops() if drops is None else drops
+        self._pump: Pump[Verified[M] | Unresolved[M]] = Pump(
+            session,
+            selector,
+            copy=lambda sample: (str(sample.key_expr), sample.payload.to_bytes()),
+            convert_all=validator.check_all,
+            payload_limit=MAX_MESSAGE_SIZE,
+            drops=self._drops,
+        )
+        self._unresolved: FairQueue[Unresolved[M]] = FairQueue(per_sender=LOOKUP_LIMIT // 2, total=LOOKUP_LIMIT)
+        self._lookup_rate = RateLimiter(per_sender=LOOKUP_RATE, total=LOOKUP_RATE_IN_TOTAL)
+        self._queries: set[zenoh.CancellationToken] = set()
+
+    async def __aenter__(self) -> Self:
+        await self._pump.__aenter__()
+        self._lookups = asyncio.create_task(self._ask_chain(), name=f"ask the chain about {self.selector}")
+        return self
+
+    async def __aexit__(self, *exc_info: object) -> None:
+        self._lookups.cancel()
+        for query in tuple(self._queries):
+            query.cancel()  # type: ignore[no-untyped-call]
+        await self._pump.__aexit__(*exc_info)
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> Verified[M]:
+        while True:
+            if (item := self._pump.take_ready()) is None:
+                item = await anext(self._pump)
+            if not isinstance(item, Unresolved):
+                return item
+            for dropped in self._unresolved.put(item.signer, item):
+                self._drop_lookup(dropped)
+
+    def _drop_lookup(self, unresolved: Unresolved[M]) -> None:
+        self._validator.reject(unresolved.question)
+        self._drops.count("lookup", unresolved.signer)
+
+    async def recall(self) -> None:
+        """Ask the providers for the open orders; the iterator yields each new one once.
+
+        Returns when all providers have answered or after `RECALL_TIMEOUT`; having no provider is not an error.
+        Cancelling this call or leaving `async with` ends the query.
+        """
+        self._pump.check_entered()
+        query = zenoh.CancellationToken()
+        self._queries.add(query)
+        try:
+            await asyncio.to_thread(self._recall, query)
+        finally:
+            self._queries.discard(query)
+            query.cancel()  # type: ignore[no-untyped-call]
+
+    def _recall(self, query: zenoh.CancellationToken) -> None:
+        """Empty Zenoh's queue before verifying signatures: a full queue would stall the session."""
+        # Not a RingChannel, which loses what it still holds when the last reply arrives.
+        replies = self._session.get(
+            self.selector,
+            zenoh.handlers.FifoChannel(RECALL_LIMIT),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=RECALL_TIMEOUT,
+            cancellation_token=query,
+        )
+        copies, size = list[Any](), 0
+        for sample in (reply.ok for reply in replies if reply.ok is not None):
+            if len(copies) == RECALL_LIMIT or size >= RECALL_BYTES:
+                self._drops.count("recall")
+            elif (copied := self._pump.copy(sample)) is not None:
+                copies.append(copied)
+                size += len(sample.payload)
+        for start in range(0, len(copies), SLICE):
+            if not query.is_cancelled:
+                self._pump.feed(copies[start : start + SLICE])
+
+    @property
+    def kind(self) -> str:
+        """The kind of message: `demand`, `offer` or `result`."""
+        return self._validator.kind.__name__.lower()
+
+    def forget(self, verified: Verified[M]) -> None:
+        """Deliver a message once more when it is sent again; see `MessageValidator`."""
+        self._validator.forget(verified)
+
+    def statistics(self) -> ValidationStatistics:
+        """The messages received, rejected (by reason) and dropped so far."""
+        return self._validator.statistics(received=self._pump.received, dropped=self._pump.dropped)
+
+    async def _ask_chain(self) -> None:
+        """Ask the chain about one message after another. An unexpected error ends the iteration."""
+        try:
+            while True:
+                unresolved = await self._unresolved.get()
+                if not self._lookup_rate.allow(unresolved.signer):
+                    self._drop_lookup(unresolved)
+                elif (verified := await self._validator.complete(unresolved)) is not None:
+                    self._pump.insert(verified)
+        except Exception as error:
+            self._pump.fail(error)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from typing import TYPE_CHECKING, Final, Protocol
 
 from mesh.clock import SYSTEM_CLOCK
 from mesh.errors import InvalidMessage
+from mesh.flood import BoundedDict
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
@@ -39,7 +39,7 @@ class NameCache:
     def __init__(self, resolver: Resolver, *, clock: Clock = SYSTEM_CLOCK) -> None:
         self._resolver = resolver
         self._clock = clock
-        self._answers: OrderedDict[str, tuple[float, str]] = OrderedDict()
+        self._answers: BoundedDict[str, tuple[float, str]] = BoundedDict(NAMES)
 
     def known(self, names: Iterable[str]) -> dict[str, str] | None:
         """The addresses of these names, without asking; None if one has to be asked.
@@ -67,8 +67,5 @@ class NameCache:
         try:
             address, kept = await self._resolver(name), KEPT
         finally:
-            self._answers.pop(name, None)
             self._answers[name] = self._clock.monotonic() + kept, address
-            if len(self._answers) > NAMES:
-                self._answers.popitem(last=False)
         return address

@@ -7,7 +7,7 @@ fills up and drops the *oldest* samples, which are counted. That costs no memory
 the thread keeps emptying Zenoh's queue.
 
 A sample that gets through a full ring waits no longer than a ring takes to fill. One that was dropped goes first when
-it comes again (`mesh/network/ring.py`).
+it comes again: `ReceiveRing`.
 """
 
 from __future__ import annotations
@@ -21,16 +21,14 @@ from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypeVar
 
 import zenoh
 
+from mesh.background import call_in_loop
 from mesh.errors import ClosedError
+from mesh.flood import Drops, RecentDict
 from mesh.log_context import log_event
 from mesh.network import sending
-from mesh.network.ring import ReceiveRing
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from contextvars import Context
-
-    from mesh.flood import Drops
 
 log = logging.getLogger(__name__)
 
@@ -40,8 +38,8 @@ RING_CAPACITY: Final = 8192
 """Samples that the ring holds before it drops the oldest."""
 RING_BYTES: Final = 8 * 1024 * 1024
 """Bytes of payloads that the ring holds before it drops the oldest."""
-FED_CAPACITY: Final = 65_536
-"""Fed samples that may wait beside the ring; more are dropped."""
+REMEMBERED: Final = 65_536
+"""Dropped samples that the ring remembers."""
 BATCH: Final = 256
 """Samples converted for one call into the loop, at most."""
 SLICE: Final = 64
@@ -57,18 +55,58 @@ SLOT_WAIT: Final = 0.002
 """Seconds the thread waits for the consumer before it empties Zenoh's queue again."""
 
 
-def call_in_loop(
-    loop: asyncio.AbstractEventLoop, function: Callable[..., object], *arguments: Any, context: Context | None = None
-) -> None:
-    """Schedule `function` on the event loop from any thread; does nothing if the loop has been closed.
+class _Lane(deque[tuple[Any, int]]):
+    """Items with their sizes in bytes; the oldest are dropped beyond the bounds, but never the last one."""
 
-    It runs in `context`, so that log events carry their source; Zenoh's threads have no context of their own.
+    size = 0
+
+    def add(self, item: Any, size: int, capacity: int, capacity_bytes: int) -> list[Any]:
+        """Add an item; returns what was dropped for it."""
+        self.append((item, size))
+        self.size += size
+        dropped = []
+        while len(self) > capacity or (self.size > capacity_bytes and len(self) > 1):
+            dropped += self.take(1)
+        return dropped
+
+    def take(self, number: int) -> list[Any]:
+        """Remove up to `number` items, the oldest first."""
+        taken = [self.popleft() for _ in range(min(number, len(self)))]
+        self.size -= sum(size for _, size in taken)
+        return [item for item, _ in taken]
+
+
+class ReceiveRing:
+    """Received items that wait for their conversion, the oldest of which are dropped when there are too many.
+
+    With `second_chance`, which needs hashable items, an item that equals one that was dropped before waits in a lane of
+    its own, which gets three quarters of the conversions. Honest senders send again what has no effect; so in a flood
+    of ever new messages their second copy gets through, where otherwise each copy had the same small chance.
     """
-    try:
-        loop.call_soon_threadsafe(function, *arguments, context=context)
-    except RuntimeError:
-        if not loop.is_closed():
-            raise
+
+    def __init__(self, capacity: int, capacity_bytes: int, *, second_chance: bool) -> None:
+        self._bounds = capacity, capacity_bytes
+        self._first, self._again = _Lane(), _Lane()
+        self._second_chance = second_chance
+        self._dropped: RecentDict[int, None] = RecentDict(REMEMBERED)
+        """Hashes of dropped items, with a key that only this process knows."""
+
+    def __len__(self) -> int:
+        return len(self._first) + len(self._again)
+
+    def append(self, item: Any, size: int) -> int:
+        """Add an item of `size` bytes; returns how many were dropped for it."""
+        is_known = self._dropped and hash(item) in self._dropped
+        dropped = (self._again if is_known else self._first).add(item, size, *self._bounds)
+        if self._second_chance:
+            for one in dropped:
+                self._dropped[hash(one)] = None
+        return len(dropped)
+
+    def take(self, number: int) -> list[Any]:
+        """Remove up to `number` items."""
+        again = self._again.take(number - min(len(self._first), number // 4))
+        return again + self._first.take(number - len(again))
 
 
 class Pump(Generic[T]):
@@ -77,10 +115,10 @@ class Pump(Generic[T]):
     `convert` makes an item of a sample at once, or returns None to skip it. If that is expensive, give two functions
     instead: `copy` takes what is needed out of a sample at once, and `convert_all` makes items of up to `SLICE` copies
     while others wait in the ring. They run on the pump's own thread; the iterator raises what they raise. Items arrive
-    in order, but for copies of dropped ones. `capacity` and `capacity_bytes` bound the ring, `fed_capacity` what is
-    given to `feed`. Samples with more than `payload_limit` bytes are refused. What is dropped is also counted in
-    `drops`. Leaving `async with` undeclares the subscriber and ends the thread and the iteration; undelivered samples
-    are lost. Supports one consumer. Raises `ClosedError` before it is entered.
+    in order, but for copies of dropped ones. `capacity` and `capacity_bytes` bound the ring. Samples with more than
+    `payload_limit` bytes are refused. What is dropped or refused is counted in `drops`. Leaving `async with` undeclares
+    the subscriber and ends the thread and the iteration; undelivered samples are lost. Supports one consumer. Raises
+    `ClosedError` before it is entered.
     """
 
     def __init__(
@@ -93,20 +131,17 @@ class Pump(Generic[T]):
         convert_all: Callable[[list[Any]], list[T]] | None = None,
         capacity: int = RING_CAPACITY,
         capacity_bytes: int = RING_BYTES,
-        fed_capacity: int = FED_CAPACITY,
         payload_limit: int | None = None,
         drops: Drops | None = None,
     ) -> None:
         self._session = session
         self._selector = selector
         self._copy: Any = copy if convert is None else convert
-        self._convert_all = convert_all
+        self._items: Callable[[list[Any]], list[T]] = convert_all or (lambda copies: copies)
         self._payload_limit = payload_limit
-        self._drops = drops
+        self._drops = Drops() if drops is None else drops
         self._lock = threading.Lock()
         self._ring = ReceiveRing(capacity, capacity_bytes, second_chance=convert_all is not None)
-        self._fed = 0
-        self._fed_capacity = fed_capacity
         self._slots = threading.Semaphore(BATCHES_IN_FLIGHT)
         self._stopping = False
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -116,11 +151,9 @@ class Pump(Generic[T]):
         self._copy_failure: Exception | None = None
         self._failure: Exception | None = None
         self.received = 0
-        """Samples that Zenoh delivered or that were fed."""
+        """Samples that Zenoh delivered or that were copied."""
         self.dropped = 0
         """Samples that were dropped because more arrived than could be converted or consumed."""
-        self.refused = 0
-        """Samples that were refused because of their size."""
 
     async def __aenter__(self) -> Self:
         if self._loop is not None:
@@ -175,34 +208,18 @@ class Pump(Generic[T]):
         """The next item if it has arrived already: what `anext` returns then, at a fraction of its cost."""
         return self._current.popleft() if self._current and not self._stopping else None
 
-    def copy(self, sample: zenoh.Sample) -> tuple[Any, int] | None:
+    def copy(self, sample: zenoh.Sample) -> Any | None:
         """What `feed` takes of a sample from elsewhere (a query's reply), on any thread; None if it is refused."""
-        size = len(sample.payload)
-        if self._payload_limit is not None and size > self._payload_limit:
-            with self._lock:
-                self.received += 1
-            self._count_refused(1)
-            return None
-        copied = self._copy(sample)
-        return None if copied is None else (copied, size)
-
-    def feed(self, copied: tuple[Any, int]) -> None:
-        """Convert and deliver what `copy` returned, on any thread, without waiting.
-
-        Fed samples bypass the ring, so that live ones do not displace them; beyond `fed_capacity` they are dropped.
-        """
-        loop = self.check_entered()
+        is_refused = self._payload_limit is not None and len(sample.payload) > self._payload_limit
         with self._lock:
             self.received += 1
-            if self._fed >= self._fed_capacity:
-                self.dropped += 1
-                return
-            self._fed += 1
-        call_in_loop(loop, self._receive, self._items([copied[0]]), self._fed_taken)
+        if is_refused:
+            self._drops.count("too-large")
+        return None if is_refused else self._copy(sample)
 
-    def _fed_taken(self) -> None:
-        with self._lock:
-            self._fed -= 1
+    def feed(self, copies: list[Any]) -> None:
+        """Convert and deliver what `copy` returned, beside the ring, on any thread, without waiting."""
+        call_in_loop(self.check_entered(), self._receive, self._items(copies), lambda: None)
 
     def insert(self, item: T) -> None:
         """Deliver an item that was converted elsewhere. Call it on the loop's thread."""
@@ -257,16 +274,10 @@ class Pump(Generic[T]):
         with self._lock:
             self.received += received
             self.dropped += dropped
-        if dropped and self._drops is not None:
+        if dropped:
             self._drops.count("overflow", number=dropped)
         if refused:
-            self._count_refused(refused)
-
-    def _count_refused(self, number: int) -> None:
-        with self._lock:
-            self.refused += number
-        if self._drops is not None:
-            self._drops.count("too-large", number=number)
+            self._drops.count("too-large", number=refused)
 
     def _deliver_batch(self, loop: asyncio.AbstractEventLoop, queue: zenoh.handlers.Handler[zenoh.Sample]) -> None:
         """Convert up to a batch of samples, emptying Zenoh's queue in between, and pass them to the loop."""
@@ -279,9 +290,6 @@ class Pump(Generic[T]):
                 self._take(queue)
         finally:
             call_in_loop(loop, self._receive, items, self._slots.release)
-
-    def _items(self, copies: list[Any]) -> list[T]:
-        return copies if self._convert_all is None else self._convert_all(copies)
 
     def _receive(self, batch: list[T], taken: Callable[[], None]) -> None:
         if batch:

@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypeAlias
 
 import zenoh
 
+from mesh.background import call_in_loop
 from mesh.errors import AiraError, ClosedError, RemoteError
 from mesh.flood import Rate, RateLimiter
 from mesh.log_context import log_event
-from mesh.network.pump import call_in_loop
 from schemas import InvalidRecord, Record, RpcKey
 from schemas.rpc import SERVICES, SPENDING
 

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any, Self
 
 import zenoh
 
+from mesh.background import call_in_loop
 from mesh.errors import ClosedError
 from mesh.log_context import log_event
 from mesh.network import sending
 from mesh.network.connecting import SessionOpening
-from mesh.network.pump import call_in_loop
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator

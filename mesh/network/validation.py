@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeAlias, TypeVar
 import msgspec
 
 from mesh.errors import AiraError, InvalidMessage
+from mesh.flood import RecentDict
 from mesh.network.lookups import NameCache
 from schemas import (
     ZERO_ADDRESS,
@@ -33,12 +34,10 @@ from schemas.keys import market_key
 from schemas.signing import verify_hashed
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable
+    from collections.abc import Callable, Iterable
 
     from mesh.blocklist import BlockedSigners
-    from mesh.network.lookups import ValidatorCheck
-
-    Resolver = Callable[[str], Awaitable[str]]
+    from mesh.network.lookups import Resolver, ValidatorCheck
 
 log = logging.getLogger(__name__)
 
@@ -86,32 +85,6 @@ _Prepared: TypeAlias = tuple[M, str, int, bytes, int, bool]
 """A message with its key, its payload's fingerprint, its hash and identity, and whether the chain need not be asked."""
 
 
-class _Accepted:
-    """The last accepted messages, by two numbers each: the hash of the payload and that of what makes a message one.
-
-    They are 64-bit hashes with a key that only this process knows. There are two generations of up to half the limit;
-    when the younger one is full, the older one is forgotten.
-    """
-
-    def __init__(self, limit: int) -> None:
-        self._half = max(limit // 2, 1)
-        self._young: dict[int, int] = {}
-        self._old: dict[int, int] = {}
-
-    def __contains__(self, number: int) -> bool:
-        return number in self._young or number in self._old
-
-    def add(self, identity: int, fingerprint: int) -> None:
-        if len(self._young) >= 2 * self._half:
-            self._young, self._old = {}, self._young
-        self._young[identity] = fingerprint
-        self._young[fingerprint] = identity
-
-    def discard(self, identity: int) -> None:
-        for generation in (self._young, self._old):
-            generation.pop(generation.pop(identity, identity), None)
-
-
 class MessageValidator(Generic[M]):
     """Verifies the messages of one kind, and counts those that it rejects.
 
@@ -147,7 +120,8 @@ class MessageValidator(Generic[M]):
         self._validators = validators
         self._blocked = blocked
         self._lock = threading.Lock()
-        self._seen = _Accepted(deduplication_limit)
+        self._seen: RecentDict[int, int] = RecentDict(2 * deduplication_limit)
+        """Of the accepted messages, each by the other: what makes a message one, and the hash of its bytes."""
         self._invalid: Counter[str] = Counter()
         self._duplicate = 0
         self._accepted = 0
@@ -243,7 +217,8 @@ class MessageValidator(Generic[M]):
     def forget(self, verified: Verified[M]) -> None:
         """Accept an accepted message once more when it is sent again: its consumer no longer holds it."""
         with self._lock:
-            self._seen.discard(hash((verified.hash, verified.message.signature)))
+            identity = hash((verified.hash, verified.message.signature))
+            self._seen.pop(self._seen.pop(identity, identity), 0)
 
     def statistics(self, *, received: int, dropped: int) -> ValidationStatistics:
         """The counts so far, with what a subscription `received` and `dropped` before validation."""
@@ -294,6 +269,6 @@ class MessageValidator(Generic[M]):
             if identity in self._seen:
                 self._duplicate += 1
                 return False
-            self._seen.add(identity, fingerprint)
+            self._seen[identity], self._seen[fingerprint] = fingerprint, identity
             self._accepted += 1
         return True

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mesh.flood import Drops, FairQueue, Rate, RateLimiter
+from mesh.flood import BoundedDict, Drops, FairQueue, Rate, RateLimiter, RecentDict
 from tests.support.clocks import SECOND, SetClock
 
 
@@ -91,3 +91,20 @@ def test_the_heaviest_senders_are_known_among_many() -> None:
     assert drops.totals() == {"garbage": 2000, "too-large": 1}
     assert drops.report()
     assert not drops.report()
+
+
+def test_a_bounded_dict_keeps_the_keys_that_were_set_last() -> None:
+    kept: BoundedDict[str, int] = BoundedDict(2)
+    kept["a"], kept["b"], kept["a"], kept["c"] = 1, 2, 3, 4
+
+    assert dict(kept) == {"a": 3, "c": 4}
+
+
+def test_a_recent_dict_keeps_half_of_its_limit_at_least() -> None:
+    kept: RecentDict[int, int] = RecentDict(10)
+    for number in range(100):
+        kept[number] = -number
+        assert all(one in kept for one in range(max(0, number - 4), number + 1))
+        assert len(kept) <= 10
+
+    assert (kept.pop(99, 0), kept.pop(99, 0), kept.pop(95, 0), 95 in kept) == (-99, 0, -95, False)

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import json
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING
 
 import pytest
 
 from mesh.errors import RemoteError
-from mesh.network import MessageValidator, Subscription, ValidationStatistics, message_key
-from schemas import Demand, SignedMessage, encode, market_selector, message_hash
+from mesh.flood import Drops
+from mesh.network import ValidationStatistics, message_key
+from mesh.network.channel import LOOKUP_LIMIT, RECALL_LIMIT
+from schemas import Demand, SignedMessage, encode, message_hash
 from tests.mesh.network.channels import KEY, ORDER, contents, listening, opened, take
-from tests.support.orders import LIGHTHOUSE, MARKET, STRANGER, demand
-from tests.support.waiting import at_most, until, until_answered, until_heard
+from tests.support.orders import MARKET, STRANGER, demand
+from tests.support.waiting import at_most, until, until_answered
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -75,19 +77,13 @@ async def test_a_limited_number_of_messages_waits_for_names(here: zenoh.Session,
         await asyncio.Event().wait()
         raise AssertionError
 
-    validator = MessageValidator(Demand, lighthouse=MARKET, address=LIGHTHOUSE, head=lambda: 0, resolver=resolver)
-    selector = market_selector(MARKET, "demand")
-    async with (
-        Subscription(here, selector, validator, lookup_limit=2) as demands,
-        opened(there) as theirs,
-    ):
-        await until_heard(there, selector)
-        for _ in range(10):
+    async with listening(here, there, resolver=resolver) as (demands, theirs):
+        for _ in range(LOOKUP_LIMIT):
             there.put(KEY, with_name(ORDER))
         theirs.publish(message := demand())
 
         assert contents(await take(demands, 1)) == [message]
-        assert demands.statistics().invalid["name"] >= 7
+        assert demands.statistics().invalid["name"] >= LOOKUP_LIMIT // 2 - 1, "half of the places are for one signer"
 
 
 async def test_an_unexpected_resolver_error_ends_the_iteration(here: zenoh.Session, there: zenoh.Session) -> None:
@@ -164,6 +160,23 @@ async def test_no_reply_to_a_recall_is_lost(here: zenoh.Session, there: zenoh.Se
             await demands.recall()
 
         assert demands.statistics().invalid == {"not-json": 10_000}
+
+
+async def test_a_recall_takes_a_limited_number_of_messages(here: zenoh.Session, there: zenoh.Session) -> None:
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            for _ in range(RECALL_LIMIT // 8 + 1):
+                query.reply(KEY, b"-")
+
+    drops = Drops()
+    async with listening(here, there, drops=drops) as (demands, _), AsyncExitStack() as stack:
+        for _ in range(8):
+            stack.enter_context(there.declare_queryable(f"aira/{MARKET}/**", answer, complete=True))
+        await until_answered(here, demands.selector)
+        await demands.recall()
+
+        assert demands.statistics().invalid == {"not-json": RECALL_LIMIT}
+        assert drops.totals() == {"recall": 8}
 
 
 async def test_recalled_messages_are_validated(here: zenoh.Session, there: zenoh.Session) -> None:
