@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections import defaultdict
 from typing import TYPE_CHECKING, Any, Final
 
 import click
@@ -16,7 +17,7 @@ from mesh.running import run_to_end
 from mesh.settings import ChainSettings, NetworkSettings, options_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
 
     from mesh.agent import Order
     from mesh.agent.components import AgentComponents
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from mesh.settings import Settings
     from mesh.work import StoredOrder
     from schemas import Demand, Offer
+    from schemas.signing import Rejection
 
 CONFIRMATION: Final = 5.0
 """Seconds in which providers may confirm a withdrawal."""
@@ -127,8 +129,16 @@ async def _withdraw(
 ) -> None:
     from mesh.agent.components import working
     from mesh.agent.orders import OrderState
+    from mesh.agent.rejections import Rejections
     from mesh.agent.trade import Trader
     from mesh.composition import load_account
+    from mesh.market.book import Refusal
+
+    honoured = defaultdict[str, set[str]](set)
+
+    async def hear(rejection: Rejection) -> None:
+        if rejection.reason == Refusal.WITHDRAWN:
+            honoured[rejection.order].add(rejection.provider)
 
     account = await asyncio.to_thread(load_account, settings)
     async with working(settings, account, None) as parts:
@@ -137,24 +147,30 @@ async def _withdraw(
         orders = trader.orders(OrderState.OPEN, OrderState.WITHDRAWN)
         parts.outbox.hold(order.hash for order in orders if order.state is OrderState.OPEN)
         chosen = orders if everything else [_named(orders, digits) for digits in hashes]
-        withdrawn = [await order.withdraw() for order in chosen]
-        providers = len([key for key in await parts.channel.present() if key.role == "provider"])
-        facts = [
-            {
-                "hash": order.hash,
-                "kind": order.kind,
-                "deadline": order.deadline,
-                "providers": providers,
-                "confirmedBy": await _confirmations(parts, order, providers),
-                "tx": await _withdraw_on_chain(parts, order) if on_chain else None,
-            }
-            for order in withdrawn
-        ]
+        async with Rejections(parts, {order.hash for order in chosen}.__contains__).received(hear):
+            withdrawn = [await order.withdraw() for order in chosen]
+            providers = len([key for key in await parts.channel.present() if key.role == "provider"])
+            facts = [
+                {
+                    "hash": order.hash,
+                    "kind": order.kind,
+                    "deadline": order.deadline,
+                    "providers": providers,
+                    "confirmedBy": await _confirmations(
+                        parts, order, providers, honoured[order.hash] if before.state is OrderState.OPEN else None
+                    ),
+                    "honouredBy": sorted(honoured[order.hash]),
+                    "tx": await _withdraw_on_chain(parts, order) if on_chain else None,
+                }
+                for before, order in zip(chosen, withdrawn, strict=True)
+            ]
     if as_json:
         print_json(facts)
         return
     for fact in facts:
         print_line(f"{fact['kind']} {fact['hash']} is withdrawn\n  {_what_it_means(fact)}")
+        for provider in fact["honouredBy"]:
+            print_line(f"  provider {provider} honours it")
     if not facts:
         print_line("no open orders")
 
@@ -169,12 +185,19 @@ def _named(orders: Sequence[Order], digits: str) -> Order:
     return found[0]
 
 
-async def _confirmations(parts: AgentComponents, order: Order, providers: int) -> int:
-    """How many providers answer with the withdrawal when they are asked for it."""
+async def _confirmations(parts: AgentComponents, order: Order, providers: int, honoured: Collection[str] | None) -> int:
+    """How many providers answer with the withdrawal when they are asked for it.
+
+    Also waits until as many have `honoured` it; they say that once, so None for a withdrawal of an earlier run.
+    """
     confirmed, deadline = 0, asyncio.get_running_loop().time() + CONFIRMATION
-    while confirmed < providers and asyncio.get_running_loop().time() < deadline:
+
+    def is_complete() -> bool:
+        return confirmed >= providers and (honoured is None or len(honoured) >= providers)
+
+    while not is_complete() and asyncio.get_running_loop().time() < deadline:
         confirmed = await asyncio.to_thread(_answers, parts, order)
-        await asyncio.sleep(0 if confirmed >= providers else 0.2)
+        await asyncio.sleep(0 if is_complete() else 0.2)
         await parts.outbox.send_due()
     return confirmed
 

@@ -86,6 +86,7 @@ async def serve_market(
     anvil: Path | None = None,
     state: Path | None = None,
 ) -> None:
+    from mesh.agent.components import state_folder
     from mesh.devchain.development import serve_chain
     from mesh.identity.routers import check_loopback
     from mesh.market.provider import Provider, ProviderProcess
@@ -102,7 +103,13 @@ async def serve_market(
         chain = await stack.enter_async_context(served.market.chain(served.url, "provider"))
         # Each generation has its own name for the lighthouse, and so its own keys.
         markets = [Settings(generation=3).lighthouse_contract, Settings(generation=5).lighthouse_contract]
-        providers = [await stack.enter_async_context(Provider(network.session, chain, name)) for name in markets]
+        folder = await state_folder(settings, chain, served.market.accounts["provider"].address)
+        providers = [
+            await stack.enter_async_context(
+                Provider(network.session, chain, name, withdrawals=folder / f"withdrawals-{name.lower()}.sqlite")
+            )
+            for name in markets
+        ]
         process = ProviderProcess(network, chain, providers)
         stack.enter_context(telemetry.showing(measure=process.measure, health=process.health))
         tasks = await stack.enter_async_context(asyncio.TaskGroup())

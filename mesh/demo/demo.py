@@ -113,7 +113,7 @@ class Demo:
         node = await stack.enter_async_context(EmbeddedChain())
         self._market = await deploy_market(node.provider, node.funded_keys)
         self._report_contracts()
-        await self._open_provider(stack, node.provider)
+        await self._open_provider(stack, node.provider, folder)
         await self._open_agent(stack, node.provider, "robot", folder)
         self._person = await self._open_agent(stack, node.provider, "person", folder)
 
@@ -130,12 +130,13 @@ class Demo:
             xrt=deployment.xrt,
         )
 
-    async def _open_provider(self, stack: AsyncExitStack, node: AsyncBaseProvider) -> None:
+    async def _open_provider(self, stack: AsyncExitStack, node: AsyncBaseProvider, folder: Path) -> None:
         network = await stack.enter_async_context(Network(Endpoints(connect=(self._endpoint,))))
         chain = await stack.enter_async_context(self._market.chain(node, "provider"))
         lighthouse = self._market.deployment.lighthouse_name
+        withdrawals = folder / "provider" / "withdrawals.sqlite"
         provider = await stack.enter_async_context(
-            Provider(network.session, chain, lighthouse, matched=self._report_match)
+            Provider(network.session, chain, lighthouse, matched=self._report_match, withdrawals=withdrawals)
         )
         tasks = await stack.enter_async_context(Background())
         tasks.start(provider.run(), "demo provider")

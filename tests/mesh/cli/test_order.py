@@ -71,6 +71,7 @@ async def test_orders_are_listed_and_withdrawn_by_their_hash(site: Site, capsys:
         "deadline": orders[0].deadline,
         "providers": 0,
         "confirmedBy": 0,
+        "honouredBy": [],
         "tx": None,
     }
     await _list(settings, as_json=False)
@@ -93,6 +94,7 @@ async def test_the_provider_confirms_a_withdrawal_and_does_not_match_the_order(
         await _withdraw(settings_of(site, "person"), (old.hash,), everything=False, on_chain=False, as_json=True)
         (fact,) = json.loads(capsys.readouterr().out)
         assert (fact["providers"], fact["confirmedBy"]) == (1, 1)
+        assert fact["honouredBy"] == [site.accounts["provider"].address]
         async with site.robot(done) as robot, site.agent("person") as person:
             await robot.offer(objective=old.message.objective, cost=5)
             contract = await person.demand(site.job("wanted"), cost=5)
