@@ -37,7 +37,7 @@ async def test_the_chain_is_kept_in_a_file(tmp_path: Path) -> None:
             async with Node(columns(server.log())["chain"]) as node:
                 first_blocks.append(await node.header(1))
     assert first_blocks[0] == first_blocks[1]
-    assert len(list(tmp_path.glob("**/withdrawals-*.sqlite"))) == 2  # of one chain, for each generation's market
+    assert len(list(tmp_path.rglob("withdrawals-*.sqlite"))) == 2  # of one chain, for the market of each generation
 
 
 def test_a_state_file_without_anvil_is_one_clear_line(tmp_path: Path) -> None:
