@@ -150,7 +150,7 @@ async def _withdraw(
         async with Rejections(parts, {order.hash for order in chosen}.__contains__).received(hear):
             withdrawn = [await order.withdraw() for order in chosen]
             providers = len([key for key in await parts.channel.present() if key.role == "provider"])
-            facts = [
+            facts: list[dict[str, Any]] = [
                 {
                     "hash": order.hash,
                     "kind": order.kind,
