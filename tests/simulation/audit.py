@@ -8,8 +8,6 @@ from contextlib import closing
 from typing import TYPE_CHECKING, Final
 
 from mesh.chain import Chain, Finalized, NewLiability, Transfer
-from mesh.chain.answers import ANSWERS, decode_answer
-from mesh.chain.events import decode_log
 from mesh.evidence.claims import Claim
 from mesh.evidence.verification import verify
 from mesh.work.ledger import Phase
@@ -48,11 +46,9 @@ class Audit:
         self.paid_twice = 0
         self._promisors: dict[str, str] = {}
 
-    def _events(self, first: int | None = None, last: int | None = None) -> list[ChainEvent | None]:
-        """All events on the chain, or those of some blocks."""
-        chain = self._chain
-        response = {"result": list(chain.evm.logs(first or chain.began + 1, last or chain.evm.head))}
-        return [decode_log(log) for log in decode_answer("eth_getLogs", response, ANSWERS["eth_getLogs"])]
+    def _events(self) -> list[ChainEvent | None]:
+        """All events on the chain."""
+        return self._chain.events(self._chain.began + 1, self._chain.evm.head)
 
     def liabilities(self) -> dict[str, Finalized | None]:
         """All liabilities on the chain, with how they ended."""
@@ -115,8 +111,9 @@ class Audit:
                     if self._market.fails(address):
                         self._market.violated("failed-job-paid", address)
                     self._evidence(record)
+        liabilities = self.liabilities()
         for address, order in told.items():
-            is_gone = order.told in ("paid", "refunded") and address not in self.liabilities()
+            is_gone = order.told in ("paid", "refunded") and address not in liabilities
             if is_gone and not self._chain.reorganisations:
                 self._market.violated("promise-broken", f"{order.person} was told {order.told!r}; {address} is gone")
 
@@ -170,7 +167,7 @@ class Audit:
         """Of each liability: in which block it was created, in which it ended (0: in none), and with what result."""
         found: dict[str, tuple[int, int, str]] = {}
         for number in range(self._chain.began + 1, self._chain.evm.head + 1):
-            for event in self._events(number, number):
+            for event in self._chain.events(number, number):
                 if isinstance(event, NewLiability):
                     found[event.liability] = (number, 0, "")
                 elif isinstance(event, Finalized) and event.liability in found:

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import msgspec
 from web3.providers.async_base import AsyncBaseProvider
 
-from mesh.chain.answers import ANSWERS, Count
+from mesh.chain.answers import ANSWERS, Count, decode_answer
+from mesh.chain.events import decode_log
 from mesh.devchain.bounded_vm import GAS_LIMIT
 from mesh.devchain.calls import Call, Calls, parse_call
 from mesh.devchain.evm import Evm
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     import random
     from collections.abc import Callable
 
+    from mesh.chain import ChainEvent
     from tests.simulation.model import ModelChain
     from tests.simulation.model_transactions import ModelTransaction
 
@@ -112,6 +114,8 @@ class SimulatedChain:
         self.deepest = 0
         self.on_block: Callable[[], None] = lambda: None
         self._cache: dict[bytes, bytes] = {}
+        self._events: dict[int, tuple[str, list[ChainEvent | None]]] = {}
+        """By block: its hash, and what was logged in it."""
 
     def begin(self) -> None:
         """From now on blocks are mined by time."""
@@ -144,6 +148,19 @@ class SimulatedChain:
                 nonce, sender = hex(waiting.nonce), "0x" + waiting.sender.hex()
                 return {"hash": params[0], "blockHash": None, "blockNumber": None, "from": sender, "nonce": nonce}
         return self.methods.answer(method, params)
+
+    def events(self, first: int, last: int) -> list[ChainEvent | None]:
+        """What the contracts logged in some blocks; None for what is no event of theirs."""
+        found: list[ChainEvent | None] = []
+        for number in range(first, last + 1):
+            block = self.evm.block(number, transactions="hashes")
+            known = self._events.get(number)
+            if block is not None and (known is None or known[0] != block["hash"]):
+                response = {"result": list(self.evm.logs(number, number))}
+                logs = decode_answer("eth_getLogs", response, ANSWERS["eth_getLogs"])
+                known = self._events[number] = (block["hash"], [decode_log(log) for log in logs])
+            found += [] if known is None else known[1]
+        return found
 
     def submit(self, raw: bytes) -> bytes:
         """Take a signed transaction into the pool; its hash. Raises `RpcError`."""

@@ -1,7 +1,8 @@
 """What a crash of the machine leaves of a folder (what was synced, and chance decides about the rest), and full disks.
 
-Files are real. What `os.fsync` was called for is remembered here, and what SQLite has synced: each commit with
-`synchronous = FULL`; otherwise what it has moved from its log to the database. A process may crash at each commit.
+Files are real. What `os.fsync` was called for is remembered here, and what SQLite has synced: the database itself; of
+its log, each commit with `synchronous = FULL`, and what it has moved to the database. A process may crash at each
+commit.
 """
 
 from __future__ import annotations
@@ -13,8 +14,10 @@ import os
 import shutil
 import sqlite3
 import stat
+import struct
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
 from tests.simulation.threads import scheduler
 
@@ -27,7 +30,46 @@ INDEX: Final = "-shm"
 """The index of that log, which SQLite makes again."""
 FULL: Final = 2
 """SQLite's `synchronous` from which each commit is synced."""
+LOG_HEADER: Final = 32
+FRAME_HEADER: Final = 24
+"""Bytes before the first frame of a log, and before the page of each."""
+SALTS: Final = slice(16, 24)
+"""Where a log's header has what changes whenever SQLite begins it again."""
+INDEX_HEADER: Final = struct.Struct("=14xHI12x8s56xI")
+"""The index: the page's size, the log's frames, its salts, and how many frames are in the database."""
 WRITES: Final = ("INSERT", "UPDATE", "DELETE", "REPLACE", "CREATE", "ALTER", "DROP", "COMMIT")
+
+
+class LogState(NamedTuple):
+    """How far a database's log goes."""
+
+    page: int
+    frames: int
+    salts: bytes
+    moved: int
+    """Frames that are in the database, which were synced before."""
+
+    @classmethod
+    def of(cls, database: str) -> Self | None:
+        """That of a database now; None if it has no log."""
+        try:
+            index = os.open(database + INDEX, os.O_RDONLY)
+        except FileNotFoundError:
+            return None
+        try:
+            return cls(*INDEX_HEADER.unpack(os.pread(index, INDEX_HEADER.size, 0)))
+        finally:
+            os.close(index)
+
+    def cut(self, log: bytes) -> bytes:
+        """A log up to here: without what SQLite has not written over since it began the log again."""
+        if log[SALTS] != self.salts:
+            return b""
+        return log[: LOG_HEADER + self.frames * (FRAME_HEADER + self.page)]
+
+    def ending_at(self, size: int) -> Self:
+        """The same with the frames that a log of that size has."""
+        return self._replace(frames=max(0, size - LOG_HEADER) // (FRAME_HEADER + self.page))
 
 
 class SimulatedDisk:
@@ -39,6 +81,10 @@ class SimulatedDisk:
         """The folders of processes whose disk is full."""
         self.synced: dict[int, bytes] = {}
         """What files have on the disk, by inode."""
+        self.databases: set[int] = set()
+        """The inodes of databases; all that is in one is on the disk: SQLite syncs what it moves there from the log."""
+        self.logs: dict[int, LogState] = {}
+        """How far databases' logs are on the disk, by inode."""
         self._entries: dict[int, dict[str, int]] = {}
         """What directories have on the disk: names and inodes."""
         self._draw = draw
@@ -89,28 +135,44 @@ class SimulatedDisk:
                 continue
             if path.name.endswith(INDEX):
                 continue
-            kept = path.read_bytes()
+            kept, inode = path.read_bytes(), path.stat().st_ino
             if power:
                 left = self._after_power_failure(path, kept, entries or {})
                 if left is None:
                     self._draw.counts["file-lost"] += 1
                     continue
-                self._draw.counts["write-torn"] += left != kept
                 kept = left
             target.write_bytes(kept)
             shutil.copystat(path, target)
-            synced = kept if power else self.synced.get(path.stat().st_ino)
-            if synced is not None:
-                self.synced[target.stat().st_ino] = synced
+            copy = target.stat().st_ino
+            if inode in self.databases:
+                self.databases.add(copy)
+            elif inode in self.logs:
+                self.logs[copy] = self.logs[inode].ending_at(len(kept)) if power else self.logs[inode]
+            elif power:
+                self.synced[copy] = kept
+            elif inode in self.synced:
+                self.synced[copy] = self.synced[inode]
         if entries is not None:
             self._entries[folder.stat().st_ino] = entries
 
     def _after_power_failure(self, path: Path, now: bytes, entries: dict[str, int]) -> bytes | None:
         """What is left of a file; None if its name was not synced, and is lost with it."""
-        synced = self.synced.get(path.stat().st_ino)
-        if synced is None and path.name not in entries and self._draw.random.random() < 0.5:
+        inode = path.stat().st_ino
+        if inode in self.databases:
+            return now
+        if inode in self.logs:
+            latest = LogState.of(str(path).removesuffix(LOG))
+            now, synced = now if latest is None else latest.cut(now), self.logs[inode].cut(now)
+        elif inode in self.synced:
+            synced = self.synced[inode]
+        elif path.name not in entries and self._draw.random.random() < 0.5:
             return None
-        return self._torn(now, synced or b"")
+        else:
+            synced = b""
+        left = self._torn(now, synced)
+        self._draw.counts["write-torn"] += left != now
+        return left
 
     def _torn(self, now: bytes, synced: bytes) -> bytes:
         """What is left of a file: all, what was synced, or a part of what was added since."""
@@ -134,7 +196,7 @@ class SimulatedDisk:
 
         def connect_here(path: Any, *arguments: Any, **options: Any) -> sqlite3.Connection:
             connection: DatabaseConnection = connect(path, *arguments, factory=DatabaseConnection, **options)
-            connection.disk, connection.path = self, Path(path)
+            connection.disk, connection.path = self, str(path)
             return connection
 
         sqlite3.connect = connect_here  # type: ignore[assignment]
@@ -175,8 +237,9 @@ class DatabaseConnection(sqlite3.Connection):
     """A connection whose commits may fail on a full disk, and after which its process may crash."""
 
     disk: SimulatedDisk
-    path: Path
-    _moved: tuple[int, int] = (0, 0)
+    path: str
+    _log = 0
+    _moved: tuple[bytes, int] | None = None
 
     def execute(self, statement: str, *arguments: Any) -> sqlite3.Cursor:
         """Execute a statement."""
@@ -214,16 +277,22 @@ class DatabaseConnection(sqlite3.Connection):
 
     def _committed(self) -> None:
         """A commit is synced if SQLite does that, and in any case once it is moved from the log to the database."""
-        if not self.path.exists():  # of a process that is dead
-            return
-        (level,) = super().execute("PRAGMA synchronous").fetchone()
-        log, found = self.path.with_name(self.path.name + LOG), self.path.stat()
-        moved, before = (found.st_size, found.st_mtime_ns), self._moved
-        self._moved = moved
-        if moved != before:
-            self.disk.synced[found.st_ino] = self.path.read_bytes()
-        if log.exists() and (moved != before or level >= FULL):
-            self.disk.synced[log.stat().st_ino] = log.read_bytes()
+        if not self._log:
+            self._find_files()
+        latest = LogState.of(self.path)
+        if latest is not None:
+            (level,) = super().execute("PRAGMA synchronous").fetchone()
+            moved = (latest.salts, latest.moved)
+            if level >= FULL or (latest.moved and moved != self._moved):
+                self.disk.logs[self._log] = latest
+            else:
+                self.disk.logs.setdefault(self._log, latest._replace(frames=0))
+            self._moved = moved
         process = scheduler().process
         if process is not None:
             process.commit()
+
+    def _find_files(self) -> None:
+        with suppress(FileNotFoundError):
+            self.disk.databases.add(os.stat(self.path).st_ino)
+            self._log = os.stat(self.path + LOG).st_ino

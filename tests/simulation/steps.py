@@ -9,15 +9,12 @@ from eth_utils.crypto import keccak
 
 from mesh.agent.orders import OrderState
 from mesh.chain import Finalized, NewLiability, Transfer
-from mesh.chain.answers import ANSWERS, decode_answer
-from mesh.chain.events import decode_log
 from mesh.market.book import Refusal
 from schemas import ZERO_ADDRESS, Demand, InvalidMessage, InvalidRecord, decode
 from schemas.signing import Rejection
 from schemas.wire import message_hash
 
 if TYPE_CHECKING:
-    from mesh.chain import ChainEvent
     from mesh.market.book import Match
     from tests.simulation.market import Market
     from tests.simulation.messages import Sample
@@ -61,7 +58,7 @@ class StepAudit:
         head = self._chain.evm.head
         self._listed()
         changed: set[str] = set()
-        for event in self._events(self._read + 1, head):
+        for event in self._chain.events(self._read + 1, head):
             if isinstance(event, NewLiability):
                 self._created(event.liability)
             elif isinstance(event, Finalized):
@@ -76,10 +73,6 @@ class StepAudit:
             if self._balance(holder) != self._expected[holder]:
                 detail = f"{holder} has {self._balance(holder)} and should have {self._expected[holder]} wn"
                 self._market.violated("tokens-not-conserved", detail)
-
-    def _events(self, first: int, last: int) -> list[ChainEvent | None]:
-        response = {"result": list(self._chain.evm.logs(first, last))}
-        return [decode_log(log) for log in decode_answer("eth_getLogs", response, ANSWERS["eth_getLogs"])]
 
     def _moved(self, event: Transfer) -> None:
         self._expected[event.sender] -= event.value
