@@ -20,6 +20,7 @@ from mesh.devchain.evm import Evm
 from mesh.devchain.jsonrpc import SERVER_ERROR, RpcError, parse_data
 from mesh.devchain.methods import Methods
 from tests.simulation.chance import FaultDraw
+from tests.simulation.memo import Answer
 from tests.simulation.model_transactions import read_transaction
 from tests.simulation.threads import scheduler
 
@@ -113,7 +114,7 @@ class SimulatedChain:
         self.reorganisations = 0
         self.deepest = 0
         self.on_block: Callable[[], None] = lambda: None
-        self._cache: dict[bytes, bytes] = {}
+        self._cache: dict[bytes, Answer] = {}
         self._events: dict[int, tuple[str, list[ChainEvent | None]]] = {}
         """By block: its hash, and what was logged in it."""
 
@@ -124,16 +125,20 @@ class SimulatedChain:
         self._cache.clear()
 
     def answer(self, method: str, params: Any) -> Any:
-        """The result of a JSON-RPC method. Raises `RpcError`."""
+        """The result of a JSON-RPC method, which must not be changed. Raises `RpcError`."""
+        return self.response(method, params)["result"]
+
+    def response(self, method: str, params: Any) -> Answer:
+        """The same as the response of a node."""
         if method == SEND and not self.instant:
-            return "0x" + self.submit(parse_data(params[0])).hex()
+            return Answer(result="0x" + self.submit(parse_data(params[0])).hex())
         if method == SEND:
             self._cache.clear()
-            return self.methods.answer(method, params)
+            return Answer(result=self.methods.answer(method, params))
         key = method.encode() + msgspec.json.encode(params)
         if key not in self._cache:
-            self._cache[key] = msgspec.json.encode(self._answer(method, params))
-        return msgspec.json.decode(self._cache[key])
+            self._cache[key] = Answer(result=self._answer(method, params))
+        return self._cache[key]
 
     def _answer(self, method: str, params: Any) -> Any:
         if method == "eth_estimateGas":
@@ -260,15 +265,15 @@ class SimulatedNode(AsyncBaseProvider):
             await asyncio.sleep(3600)
         if draw("node-late", faults.late):
             await asyncio.sleep(draw.random.uniform(0.1, 10))
-        response: dict[str, Any] = {"jsonrpc": "2.0", "id": 0}
+        response: dict[str, Any]
         try:
-            response["result"] = self._chain.answer(method, list(params))
+            response = self._chain.response(method, params)
         except RpcError as error:
-            response["error"] = error.as_object()
+            response = {"error": error.as_object()}
         if method == SEND and draw("answer-lost", faults.lost_after_sending):
             raise ConnectionResetError(104, "Connection reset by peer")
         if draw("answer-spoilt", faults.spoilt):
-            return spoil(method, response, draw.random)
+            return spoil(method, msgspec.json.decode(msgspec.json.encode(response)), draw.random)
         return response
 
     async def is_connected(self, show_traceback: bool = False) -> bool:

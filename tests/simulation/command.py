@@ -17,7 +17,7 @@ from contextlib import closing
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Final
 
-from tests.simulation import history, router, threads
+from tests.simulation import history, memo, router, threads
 from tests.simulation.history import Report
 from tests.simulation.scheduler import REAL_TIME, SECOND
 
@@ -44,6 +44,7 @@ def main(arguments: Sequence[str]) -> None:
     executors_module: Any = executors
     executors_module._global_shutdown_lock = _thread.RLock()  # shared by all processes: never let one wait for it
     threads.number_in_sets(Queue, concurrent.futures.Future)
+    memo.install()
     began = REAL_TIME()
     deployed = Deployments(options.chain)
     if options.mutants:
