@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from mesh.background import Background
 from mesh.cli.errors import FileUnwritable, RosterMissing
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import announce, plural, print_json, print_table, printable
 from mesh.errors import AiraError
+from mesh.flood import Drops
 from mesh.log_context import log_event
 from mesh.outage_log import OutageLog
 from mesh.running import fail, run_until_stopped
@@ -38,6 +40,7 @@ SITE_SETTINGS: Final = (
     "tls_key",
     "roster",
     "max_sessions",
+    "blocked_sessions",
     "shared_memory",
 )
 ROSTER_INTERVAL: Final = 1.0
@@ -112,12 +115,15 @@ def config(settings: Settings, out: Path) -> None:
 
 
 async def serve(settings: Settings) -> None:
+    from mesh.blocklist import blocked_sessions_at
     from mesh.identity.routers import router_endpoints
     from mesh.network import Network
+    from mesh.network.connections import guard, report_traffic
     from mesh.network.endpoints import allow_sessions
     from mesh.starting import wait_for_files
 
     allow_sessions(settings.max_sessions)
+    drops, blocked = Drops(), blocked_sessions_at(settings.blocked_sessions)
     async with Telemetry(settings.metrics_listen) as telemetry:
         await wait_for_files(settings)
         endpoints = router_endpoints(settings)
@@ -131,19 +137,24 @@ async def serve(settings: Settings) -> None:
                     zenoh=network.id,
                 )
                 announce(log, "access-loaded", _describe_access(endpoints))
-                with _serve_metrics(telemetry, network):
-                    endpoints = await _wait_for_change(settings, endpoints, certificate)
+                with _serve_metrics(telemetry, network, drops):
+                    async with Background() as tasks:
+                        if blocked is not None:
+                            tasks.start(guard(network.session, blocked, drops), "blocked sessions")
+                        tasks.start(report_traffic(network.session), "traffic")
+                        tasks.start(drops.run(), "drops")
+                        endpoints = await _wait_for_change(settings, endpoints, certificate)
             log.info(
                 "the roster or the certificate changed: restarting the router", extra=log_event("router-restarted")
             )
 
 
-def _serve_metrics(telemetry: Telemetry, network: Network) -> AbstractContextManager[None]:
-    """Serve a router's metrics and health: that it listens, and its links."""
-    from mesh.network.metrics import link_state, network_families
+def _serve_metrics(telemetry: Telemetry, network: Network, drops: Drops) -> AbstractContextManager[None]:
+    """Serve a router's metrics and health: that it listens, its links, and what it dropped."""
+    from mesh.network.metrics import drop_family, link_state, network_families
 
     async def measure() -> Iterable[MetricFamily]:
-        return network_families(network)
+        return (*network_families(network), drop_family(drops))
 
     return telemetry.showing(measure=measure, health=lambda: {"router": link_state(network)})
 

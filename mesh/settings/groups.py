@@ -81,6 +81,11 @@ class RouterSettings(NetworkSettings):
     max_sessions: PositiveInt = option(
         10_000, "most sessions that `aira router` holds at a time; each needs a file descriptor"
     )
+    blocked_sessions: str = option(
+        "",
+        "file of sessions that `aira router` ends, one a line: a Zenoh id, the address in a certificate, an IP address"
+        " or a network; read again when it changes (empty: none)",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

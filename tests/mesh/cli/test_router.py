@@ -105,6 +105,21 @@ async def test_a_revoked_member_is_disconnected_and_the_others_are_not(site: Sit
             hear.undeclare()  # type: ignore[no-untyped-call]
 
 
+async def test_a_blocked_session_is_ended_without_a_restart(site: Site, tmp_path: Path) -> None:
+    arm = site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
+    screen = site.enlist(Member(name="screen", address=ANN, roles=("watcher",)))
+    blocked = tmp_path / "blocked.txt"
+    blocked.touch()
+    with Serving(*AIRA, "router", *options(site), "--blocked-sessions", blocked, says="2 members admitted") as router:
+        async with network(site, arm) as arms, network(site, screen) as screens:
+            blocked.write_text(ARM)
+            await until(lambda: arms.losses, seconds=SECONDS)
+            blocked.write_text("")
+            await speak(arms, screens, f"aira/agent/{ARM}/device/arm/state")
+            assert screens.losses == 0
+        assert "restarting the router" not in router.log()
+
+
 async def test_a_roster_that_becomes_invalid_changes_nothing(site: Site) -> None:
     arm = site.enlist(Member(name="arm", address=ARM, roles=("agent",)))
     good = site.roster.read_text()
