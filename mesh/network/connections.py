@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import zenoh
 
+from mesh.background import call_in_loop
 from mesh.blocklist import CHECK_INTERVAL
 from mesh.flood import HEAVIEST, REPORT_INTERVAL
 from mesh.log_context import log_event
-from mesh.network.pump import call_in_loop
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
