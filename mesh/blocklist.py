@@ -1,11 +1,9 @@
-"""Who is shut out: signers or sessions, in files that an operator may change at any time."""
+"""Who is shut out: the lines of a file, which an operator may change at any time."""
 
 from __future__ import annotations
 
 import logging
-import re
 import threading
-from ipaddress import IPv4Network, IPv6Address, IPv6Network, ip_address, ip_network
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
@@ -18,7 +16,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from mesh.clock import Clock
-    from mesh.network.connections import Connection
 
 log = logging.getLogger(__name__)
 
@@ -26,8 +23,6 @@ CHECK_INTERVAL: Final = 1.0
 """Seconds between two looks at whether the file has changed."""
 SIZE_LIMIT: Final = 4 * 1024 * 1024
 """The largest file, in bytes: about 90,000 addresses."""
-SESSION: Final = re.compile(r"[0-9a-f]{1,32}")
-"""A Zenoh id."""
 
 
 class BlocklistUnusable(ConfigurationError, code="blocklist-unusable"):
@@ -116,46 +111,3 @@ class Blocklist:
 def blocklist_at(path: str) -> BlockedSigners:
     """The blocklist in the file that a setting names; nobody is blocked if it is empty. Raises `BlocklistUnusable`."""
     return Blocklist(Path(path).expanduser()) if path else frozenset()
-
-
-class BlockedSessions:
-    """The sessions that the file `path` blocks.
-
-    A line is a Zenoh id, the address in a certificate, or the IP address or network (`192.0.2.0/24`) that sessions come
-    from. Raises `BlocklistUnusable`.
-    """
-
-    def __init__(self, path: Path, *, clock: Clock = SYSTEM_CLOCK) -> None:
-        self._list = Blocklist(path, parse=parse_session, clock=clock)
-        self._read: frozenset[str] = frozenset()
-        self._networks: list[IPv4Network | IPv6Network] = []
-
-    def changed(self) -> bool:
-        """Read the file if it is time; whether it has changed since the last call."""
-        before, self._read = self._read, self._list.entries
-        if self._read is not before:
-            self._networks = [ip_network(entry) for entry in self._read if "/" in entry]
-        return self._read != before
-
-    def __contains__(self, connection: Connection) -> bool:
-        address = ip_address(connection.host)
-        if isinstance(address, IPv6Address):
-            address = address.ipv4_mapped or address
-        names = {connection.session, connection.name.lower(), str(address)}
-        return not self._read.isdisjoint(names) or any(address in network for network in self._networks)
-
-
-def parse_session(text: str) -> str:
-    """What names sessions, as it is compared. Raises `InputError` and `ValueError`."""
-    text = text.lower()
-    if text.startswith("0x"):
-        return parse_address(text).lower()
-    if SESSION.fullmatch(text):
-        return text
-    network = ip_network(text, strict=False)
-    return str(network) if network.num_addresses > 1 else str(network.network_address)
-
-
-def blocked_sessions_at(path: str) -> BlockedSessions | None:
-    """The sessions that the file blocks that a setting names; None if it is empty. Raises `BlocklistUnusable`."""
-    return BlockedSessions(Path(path).expanduser()) if path else None

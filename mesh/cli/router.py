@@ -115,10 +115,9 @@ def config(settings: Settings, out: Path) -> None:
 
 
 async def serve(settings: Settings) -> None:
-    from mesh.blocklist import blocked_sessions_at
     from mesh.identity.routers import router_endpoints
     from mesh.network import Network
-    from mesh.network.connections import guard, report_traffic
+    from mesh.network.connections import blocked_sessions_at, guard, report_traffic
     from mesh.network.endpoints import allow_sessions
     from mesh.starting import wait_for_files
 

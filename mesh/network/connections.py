@@ -9,22 +9,27 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+import re
 import socket
 import struct
 from contextlib import suppress
+from ipaddress import IPv4Network, IPv6Address, IPv6Network, ip_address, ip_network
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import zenoh
 
 from mesh.background import call_in_loop
-from mesh.blocklist import CHECK_INTERVAL
+from mesh.blocklist import CHECK_INTERVAL, Blocklist
+from mesh.clock import SYSTEM_CLOCK
 from mesh.flood import HEAVIEST, REPORT_INTERVAL
 from mesh.log_context import log_event
+from schemas import parse_address
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from mesh.blocklist import BlockedSessions
+    from mesh.clock import Clock
     from mesh.flood import Drops
 
 log = logging.getLogger(__name__)
@@ -33,6 +38,8 @@ CLOSE_INTERVAL: Final = 0.05
 """Seconds between two searches for the sockets of blocked sessions that connect again and again."""
 REPORTED: Final = 1024 * 1024
 """Bytes that a router receives between two reports, below which nothing is logged."""
+SESSION: Final = re.compile(r"[0-9a-f]{1,32}")
+"""A Zenoh id."""
 DESCRIPTORS: Final = "/proc/self/fd"
 TCP_INFO_SIZE: Final = 136
 """Bytes of Linux's `tcp_info` up to and with the number of received bytes, its last field there."""
@@ -103,6 +110,49 @@ def _received(connected: socket.socket) -> int:
         return 0
     number: int = struct.unpack_from("=Q", information, TCP_INFO_SIZE - 8)[0]
     return number
+
+
+class BlockedSessions:
+    """The sessions that the file `path` blocks.
+
+    A line is a Zenoh id, the address in a certificate, or the IP address or network (`192.0.2.0/24`) that sessions come
+    from. Raises `BlocklistUnusable`.
+    """
+
+    def __init__(self, path: Path, *, clock: Clock = SYSTEM_CLOCK) -> None:
+        self._list = Blocklist(path, parse=parse_session, clock=clock)
+        self._read: frozenset[str] = frozenset()
+        self._networks: list[IPv4Network | IPv6Network] = []
+
+    def changed(self) -> bool:
+        """Read the file if it is time; whether it has changed since the last call."""
+        before, self._read = self._read, self._list.entries
+        if self._read is not before:
+            self._networks = [ip_network(entry) for entry in self._read if "/" in entry]
+        return self._read != before
+
+    def __contains__(self, connection: Connection) -> bool:
+        address = ip_address(connection.host)
+        if isinstance(address, IPv6Address):
+            address = address.ipv4_mapped or address
+        names = {connection.session, connection.name.lower(), str(address)}
+        return not self._read.isdisjoint(names) or any(address in network for network in self._networks)
+
+
+def parse_session(text: str) -> str:
+    """What names sessions, as it is compared. Raises `InputError` and `ValueError`."""
+    text = text.lower()
+    if text.startswith("0x"):
+        return parse_address(text).lower()
+    if SESSION.fullmatch(text):
+        return text
+    network = ip_network(text, strict=False)
+    return str(network) if network.num_addresses > 1 else str(network.network_address)
+
+
+def blocked_sessions_at(path: str) -> BlockedSessions | None:
+    """The sessions that the file blocks that a setting names; None if it is empty. Raises `BlocklistUnusable`."""
+    return BlockedSessions(Path(path).expanduser()) if path else None
 
 
 async def guard(session: zenoh.Session, blocked: BlockedSessions, drops: Drops) -> None:

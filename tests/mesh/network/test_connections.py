@@ -10,12 +10,19 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.background import Background
-from mesh.blocklist import BlockedSessions, parse_session
 from mesh.flood import Drops
 from mesh.identity import Member
 from mesh.identity.routers import router_endpoints
 from mesh.network import Endpoints, Network
-from mesh.network.connections import Connection, connections, guard, received, report_traffic
+from mesh.network.connections import (
+    BlockedSessions,
+    Connection,
+    connections,
+    guard,
+    parse_session,
+    received,
+    report_traffic,
+)
 from tests.support.log_events import logged_facts
 from tests.support.ports import free_port
 from tests.support.sites import Site
