@@ -1,6 +1,6 @@
 """The capacity of one machine: agents on a router, messages through it, devices, orders and jobs of a provider.
 
-Router, agents, publisher and devices run in processes of their own; provider, robot and person of the jobs share one.
+Router, agents, publisher, devices, and the roles of the jobs run in processes of their own.
 Other load on the machine lowers the results: `load` is the load average of the minute before.
 """
 
@@ -34,7 +34,7 @@ def measure(options: Any) -> dict[str, Any]:
         "messages": filtered([step for step in (1, 10, 50) if step <= options.sessions], options.messages),
         "devices": devices(options.devices),
         "orders": orders_per_second(options.orders),
-        "jobs": jobs_per_minute(options.jobs, options.at_once),
+        "jobs": jobs_per_minute(options.jobs, robots=options.robots, at_once=options.at_once),
     }
 
 
@@ -42,8 +42,6 @@ def print_table(results: dict[str, Any]) -> None:
     """Print a table for each kind of measurement."""
     for name, found in results.items():
         rows = found if isinstance(found, list) else [found]
-        if name == "jobs":
-            rows = [{"chain": chain, **row} for chain, row in found.items() if not isinstance(row, str)]
         print(f"\n{name}")
         heads = list(rows[0])
         widths = [max(len(head), *(len(str(row[head])) for row in rows)) for head in heads]
@@ -56,7 +54,14 @@ def print_table(results: dict[str, Any]) -> None:
 def main() -> None:
     """Run the benchmark."""
     options = arguments(
-        "the capacity of one machine", sessions=200, messages=20_000, devices=8, orders=10_000, jobs=20, at_once=4
+        "the capacity of one machine",
+        sessions=200,
+        messages=20_000,
+        devices=8,
+        orders=10_000,
+        jobs=100,
+        robots=20,
+        at_once=40,
     )
     results = measure(options)
     if options.json:

@@ -1,37 +1,51 @@
-"""A provider under load: orders per second that it adds to its book, and jobs per minute on two kinds of chain."""
+"""A provider under load: the orders a second that it adds to its book, and the jobs a minute that it settles.
+
+As a program it measures the jobs, and states which process the limit is: `of_a_core_percent`. Where that is not the
+provider, `provider_capacity` is what it would settle in a minute with a core of its own.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import cProfile
 import logging
+import os
+import secrets
+import sys
 import tempfile
 import time
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from one_router import TIMEOUT
+ROOT: Final = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))  # `peers` finds anvil
 
-from common import SPAWN, router, signed_demands
-from mesh import Agent
-from mesh.background import Background
-from mesh.demo.lamp import write_objective
-from mesh.devchain import EmbeddedChain
-from mesh.devchain.anvil import find_anvil, serve_anvil
-from mesh.devchain.development import deploy_market
-from mesh.market.provider import Provider
-from mesh.network import Channel, Endpoints, Network
-from mesh.settings import Settings
-from peers.catalog import PeerMissing, locate
-from schemas import cid_of_bytes
+from one_router import TIMEOUT, seconds_of  # noqa: E402
+
+from common import SPAWN, arguments, router, show, signed_demands  # noqa: E402
+from mesh import Agent  # noqa: E402
+from mesh.background import Background  # noqa: E402
+from mesh.chain import Account, Node  # noqa: E402
+from mesh.composition import chain_of  # noqa: E402
+from mesh.demo.lamp import write_objective  # noqa: E402
+from mesh.devchain import EmbeddedChain  # noqa: E402
+from mesh.devchain.anvil import find_anvil, serve_anvil  # noqa: E402
+from mesh.devchain.development import deploy_market  # noqa: E402
+from mesh.market.provider import Provider  # noqa: E402
+from mesh.network import Channel, Endpoints, Network  # noqa: E402
+from mesh.settings import Settings  # noqa: E402
+from peers.catalog import locate  # noqa: E402
+from schemas import cid_of_bytes  # noqa: E402
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Sequence
 
     from mesh.devchain.development import DevelopmentMarket
     from schemas import Demand, Verified
 
-MODEL: Final = cid_of_bytes(b"what the robot of the benchmark can do")
+PROFILE: Final = "BENCH_PROFILE"
 WINDOW: Final = 2000
 """Most orders in flight, so that none is lost."""
 
@@ -101,21 +115,6 @@ async def _publish(endpoint: str, lighthouse: str, address: str, count: int, rea
         await asyncio.sleep(TIMEOUT)
 
 
-def jobs_per_minute(count: int, at_once: int) -> dict[str, dict[str, float] | str]:
-    """Jobs from demand to payment, with one provider and one robot; `at_once` demands are open at a time."""
-    results: dict[str, dict[str, float] | str] = {}
-    with router() as (endpoint, _):
-        results["embedded"] = asyncio.run(_jobs(endpoint, embedded(), count, at_once))
-        try:
-            program = find_anvil(locate("anvil"))
-        except PeerMissing as missing:
-            results["anvil"] = str(missing)
-        else:
-            assert program is not None
-            results["anvil"] = asyncio.run(_jobs(endpoint, on_anvil(program), count, at_once))
-    return results
-
-
 @asynccontextmanager
 async def embedded() -> AsyncIterator[tuple[Any, DevelopmentMarket]]:
     """A market on an embedded chain, in this process."""
@@ -123,62 +122,109 @@ async def embedded() -> AsyncIterator[tuple[Any, DevelopmentMarket]]:
         yield node.provider, await deploy_market(node.provider, node.funded_keys)
 
 
-@asynccontextmanager
-async def on_anvil(program: Path) -> AsyncIterator[tuple[Any, DevelopmentMarket]]:
-    """A market on an anvil that mines each transaction at once."""
-    async with serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=None) as node:
-        yield node.url, await deploy_market(node.url, node.funded_keys)
+def jobs_per_minute(jobs: int, *, robots: int, at_once: int, block_time: int = 0) -> dict[str, Any]:
+    """Jobs from demand to payment: one provider, that many robots, and a person with `at_once` open demands.
+
+    Router, anvil, provider, all robots together and the person are a process each. A block is mined with each
+    transaction, or every `block_time` seconds.
+    """
+    with router() as (endpoint, pid), tempfile.TemporaryDirectory() as folder:
+        settings = Settings(connect=(endpoint,), data_dir=folder, playback="at-once")
+        return asyncio.run(_jobs(settings, pid, jobs=jobs, robots=robots, at_once=at_once, block_time=block_time))
 
 
-async def _jobs(endpoint: str, opened_market: Any, count: int, at_once: int) -> dict[str, float]:
-    async with AsyncExitStack() as stack:
-        node, market = await stack.enter_async_context(opened_market)
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        network = await stack.enter_async_context(Network(Endpoints(connect=(endpoint,))))
-        chain = await stack.enter_async_context(market.chain(node, "provider"))
-        provider = await stack.enter_async_context(Provider(network.session, chain, market.deployment.lighthouse_name))
-        tasks = await stack.enter_async_context(Background())
-        tasks.start(provider.run(), "provider")
-        await stack.enter_async_context(_robot(await _agent(stack, endpoint, node, market, "robot", folder)))
-        person = await stack.enter_async_context(await _agent(stack, endpoint, node, market, "person", folder))
-        write_objective(folder / "objective.mcap")
-        await _do_job(person, folder / "objective.mcap")  # the first job also approves allowances
-        limit, seconds_each = asyncio.Semaphore(at_once), []
+async def _jobs(
+    settings: Settings, router_pid: int, *, jobs: int, robots: int, at_once: int, block_time: int
+) -> dict[str, Any]:
+    program = find_anvil(locate("anvil"))
+    assert program is not None
+    async with (
+        serve_anvil(program, host="127.0.0.1", port=0, block_time=None, state=None) as node,
+        AsyncExitStack() as stack,
+    ):
+        market = await deploy_market(node.url, node.funded_keys)
+        if block_time:
+            async with Node(node.url) as chain:
+                await chain.request("evm_setAutomine", False)
+                await chain.request("evm_setIntervalMining", block_time)
+        settings = replace(
+            settings,
+            web3_http_provider=node.url,
+            ens_contract=market.deployment.ens,
+            lighthouse_contract=market.deployment.lighthouse_name,
+        )
+        pipes, pids = {}, {"router": router_pid, "anvil": node.pid}
+        for role, number in (("provider", 1), ("robots", robots), ("person", 1)):
+            pipes[role], theirs = SPAWN.Pipe()
+            given = (role, replace(settings, data_dir=f"{settings.data_dir}/{role}"), node.funded_keys, number, theirs)
+            process = SPAWN.Process(target=run, args=given, daemon=True)
+            process.start()
+            stack.callback(process.join)
+            assert process.pid is not None
+            pids[role] = process.pid
+        await asyncio.gather(*(_heard(pipe) for pipe in pipes.values()))
 
-        async def job() -> None:
-            async with limit:
-                started = time.perf_counter()
-                await _do_job(person, folder / "objective.mcap")
-                seconds_each.append(time.perf_counter() - started)
+        async def do(count: int) -> float:
+            pipes["person"].send((count, robots, at_once))
+            return float(await _heard(pipes["person"]))
 
-        started = time.perf_counter()
-        async with asyncio.TaskGroup() as jobs:
-            for _ in range(count):
-                jobs.create_task(job())
-        seconds = time.perf_counter() - started
+        await do(robots)  # prepares: names, allowances, connections between all
+        before = {role: seconds_of(pid) for role, pid in pids.items()}
+        seconds = await do(jobs)
+        used = {role: seconds_of(pid) - before[role] for role, pid in pids.items()}
+        for pipe in pipes.values():
+            pipe.send(None)
     return {
-        "jobs": count,
+        "jobs": jobs,
+        "robots": robots,
         "at_once": at_once,
-        "jobs_per_minute": round(count / seconds * 60),
-        "a_job_takes_s": round(sum(seconds_each) / count, 2),
+        "block_time": block_time,
+        "jobs_per_minute": round(jobs / seconds * 60),
+        "provider_cpu_ms_a_job": round(used["provider"] / jobs * 1000, 1),
+        "provider_capacity": round(60 * jobs / used["provider"]),
+        "of_a_core_percent": {role: round(one / seconds * 100) for role, one in used.items()},
     }
 
 
-async def _agent(
-    stack: AsyncExitStack, endpoint: str, node: Any, market: DevelopmentMarket, role: str, folder: Path
-) -> Agent:
-    settings = Settings(
-        connect=(endpoint,),
-        data_dir=str(folder / role),
-        lighthouse_contract=market.deployment.lighthouse_name,
-        ens_contract=market.deployment.ens,
-        playback="at-once",
-    )
-    chain = await stack.enter_async_context(market.chain(node, role))
-    return Agent(MODEL, settings=settings, account=market.accounts[role], chain=chain)
+async def _heard(pipe: Any) -> Any:
+    assert await asyncio.to_thread(pipe.poll, TIMEOUT), "the jobs take too long"
+    return pipe.recv()
 
 
-def _robot(robot: Agent) -> Agent:
+def run(role: str, settings: Settings, keys: Sequence[bytes], number: int, pipe: Any) -> None:
+    """The process of a role. The variable `PROFILE` names a folder for what cProfile says of it."""
+    logging.getLogger("mesh").setLevel(logging.ERROR)
+    profile = cProfile.Profile() if PROFILE in os.environ else nullcontext()
+    main = {"provider": _provide, "robots": _work, "person": _demand}[role]
+    with profile:
+        asyncio.run(main(settings, keys, number, pipe))
+    if isinstance(profile, cProfile.Profile):
+        profile.dump_stats(Path(os.environ[PROFILE]) / f"{role}-{os.getpid()}.prof")
+
+
+async def _provide(settings: Settings, keys: Sequence[bytes], number: int, pipe: Any) -> None:
+    async with (
+        chain_of(settings, Account.from_key(keys[0])) as chain,
+        Network(Endpoints(connect=settings.connect)) as network,
+        Provider(network.session, chain, settings.lighthouse_contract) as provider,
+        Background() as tasks,
+    ):
+        tasks.start(provider.run(), "provider")
+        pipe.send("ready")
+        await asyncio.to_thread(pipe.recv)
+
+
+async def _work(settings: Settings, keys: Sequence[bytes], number: int, pipe: Any) -> None:
+    async with AsyncExitStack() as stack:
+        for which in range(number):
+            own = replace(settings, data_dir=f"{settings.data_dir}/{which}")
+            robot = Agent(_model(which), settings=own, account=Account.from_key(secrets.token_bytes(32)))
+            await stack.enter_async_context(_offering(robot))
+        pipe.send("ready")
+        await asyncio.to_thread(pipe.recv)
+
+
+def _offering(robot: Agent) -> Agent:
     @robot.on("*")
     async def play(job: Any, message: Any) -> None:
         job.publish("/said", "done")
@@ -190,11 +236,38 @@ def _robot(robot: Agent) -> Agent:
     return robot
 
 
-async def _do_job(person: Agent, objective: Path) -> None:
-    async with asyncio.timeout(TIMEOUT):
-        contract = await person.demand(objective, cost=1)
-        outcome = await contract.outcome()
-    assert outcome.success, "a job failed"
+async def _demand(settings: Settings, keys: Sequence[bytes], number: int, pipe: Any) -> None:
+    async with Agent(settings=settings, account=Account.from_key(keys[2])) as person:
+        objective = Path(settings.data_dir) / "objective.mcap"
+        await asyncio.to_thread(write_objective, objective)
+        pipe.send("ready")
+        while (wanted := await asyncio.to_thread(pipe.recv)) is not None:
+            count, robots, at_once = wanted
+            limit, started = asyncio.Semaphore(at_once), time.perf_counter()
+
+            async def job(which: int, limit: asyncio.Semaphore = limit) -> None:
+                async with limit:
+                    contract = await person.demand(objective, cost=1, model=_model(which))
+                    assert (await contract.outcome()).success, "a job failed"
+
+            async with asyncio.TaskGroup() as jobs:
+                for which in range(count):
+                    jobs.create_task(job(which % robots))
+            pipe.send(time.perf_counter() - started)
 
 
-logging.getLogger("mesh").setLevel(logging.ERROR)
+def _model(which: int) -> str:
+    return cid_of_bytes(f"model {which}".encode())
+
+
+def main() -> None:
+    """Run the benchmark of jobs."""
+    options = arguments("jobs a minute of one provider", jobs=200, robots=20, at_once=40, block_time=0)
+    results = jobs_per_minute(
+        options.jobs, robots=options.robots, at_once=options.at_once, block_time=options.block_time
+    )
+    show(results, as_json=options.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -139,7 +139,7 @@ async def _through(endpoint: str, pid: int, count: int, messages: int) -> tuple[
     wire = [(message_key(LIGHTHOUSE, replace(demand, model=model(number))), encode(demand)) for number in range(count)]
     async with Network(Endpoints(connect=(endpoint,))) as network:
         await asyncio.sleep(SETTLE_TIME)
-        before, started = _seconds_of(pid), time.perf_counter()
+        before, started = seconds_of(pid), time.perf_counter()
         for number in range(messages):
             while number - received.value >= WINDOW:
                 await asyncio.sleep(0.0005)
@@ -149,7 +149,7 @@ async def _through(endpoint: str, pid: int, count: int, messages: int) -> tuple[
         while received.value < messages:
             assert time.monotonic() < deadline, f"{received.value} of {messages} arrived"
             await asyncio.sleep(0.001)
-        seconds, used = time.perf_counter() - started, _seconds_of(pid) - before
+        seconds, used = time.perf_counter() - started, seconds_of(pid) - before
     leave.set()
     subscribers.join()
     return seconds, used
@@ -173,7 +173,7 @@ async def _subscribe(endpoint: str, count: int, received: Any, ready: Any, leave
         await asyncio.to_thread(leave.wait)
 
 
-def _seconds_of(pid: int) -> float:
+def seconds_of(pid: int) -> float:
     """Processor time of a process."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
@@ -186,9 +186,9 @@ def devices(count: int) -> dict[str, float]:
         processes = [_edge(endpoint, number, line) for number, (_, line) in enumerate(lines)]
         try:
             time.sleep(3 + SETTLE_TIME * count / 4)
-            before, started = sum(_seconds_of(process.pid) for process in processes), time.perf_counter()
+            before, started = sum(seconds_of(process.pid) for process in processes), time.perf_counter()
             time.sleep(5)
-            core = (sum(_seconds_of(process.pid) for process in processes) - before) / (time.perf_counter() - started)
+            core = (sum(seconds_of(process.pid) for process in processes) - before) / (time.perf_counter() - started)
             used = [memory(process.pid) for process in processes]
         finally:
             for process in processes:
