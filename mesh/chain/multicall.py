@@ -106,12 +106,11 @@ async def _read_at_once(node: Caller, calls: Sequence[ContractCall], block: int 
 
 async def _read_each(node: Caller, calls: Sequence[ContractCall], block: int | str) -> list[Any]:
     number = await node.block_number() if block == "latest" and len(calls) > 1 else block
-    try:
-        async with asyncio.TaskGroup() as group:
-            tasks = [group.create_task(read(node, call, block=number)) for call in calls]
-    except ExceptionGroup as failed:
-        raise failed.exceptions[0] from None
-    return [task.result() for task in tasks]
+    answers = await asyncio.gather(*(read(node, call, block=number) for call in calls), return_exceptions=True)
+    for answer in answers:
+        if isinstance(answer, BaseException):
+            raise answer
+    return answers
 
 
 def _decoded(call: ContractCall, returned: bytes | None) -> Any:

@@ -93,9 +93,9 @@ class OrderBookService:
         if len(self._answers) < self._limit and self._rate.allow("", min(len(self._book) + 1, self._most)):
             call_in_loop(loop, self.answer, query)
             return
-        query.drop()  # type: ignore[no-untyped-call]
         if self._drops is not None:
             self._drops.count("recall")
+        query.drop()  # type: ignore[no-untyped-call]
 
     async def __aexit__(self, *exc_info: object) -> None:
         self._open = False
