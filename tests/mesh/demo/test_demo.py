@@ -183,8 +183,7 @@ def test_the_default_objective_has_the_same_bytes_each_time(tmp_path: Path) -> N
 @pytest.mark.parametrize("moment", ["router", "contracts", "objective", "match", "running", "complete"])
 def test_ctrl_c_ends_it_at_any_moment(moment: str) -> None:
     interrupted = Interrupted("demo", "--json", at=f'"event":"{moment}"')
-    assert interrupted.code == 130
-    assert interrupted.errors == ""
+    assert (interrupted.code, interrupted.errors) == (130, "")
     assert interrupted.seconds < SOON
 
 
