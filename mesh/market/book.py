@@ -51,6 +51,8 @@ class Refusal(StrEnum):
     """The book is full; try again later."""
     WITHDRAWN = "withdrawn"
     """Its maker has withdrawn it."""
+    BLOCKED = "blocked"
+    """Its maker is blocked; this is not published."""
 
 
 class Match(NamedTuple):
@@ -182,6 +184,10 @@ class OrderBook:
     def orders(self) -> Iterator[Verified[Order]]:
         """The open orders, oldest first. O(orders); the book must not change during the iteration."""
         return (node.item for node in self._nodes.values())
+
+    def of(self, signer: str) -> list[Verified[Order]]:
+        """The open orders of a signer. O(those orders)."""
+        return [self._nodes[key].item for key in self._signers.items(signer)]
 
     def _refusal(self, order: Verified[Order]) -> Refusal | None:
         message = order.message

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
+from mesh.blocklist import CHECK_INTERVAL, Blocklist
 from mesh.chain import InsufficientFunds
 from mesh.flood import Drops
 from mesh.log_context import LogSource, source_context
@@ -52,9 +53,9 @@ class Provider(Role):
     `lighthouse` is the ENS name; its chain account must have a stake there. `limit` is the most open orders, `matched`
     is called with each match before its liability is created, `retry` is the policy for transactions that fail, and
     `open_liabilities` the most records of open liabilities in memory. Withdrawals are kept in the file `withdrawals`,
-    if given. Orders leave the book after `deadline_limit` blocks. Messages of `blocked` signers are rejected; what is
-    dropped is counted in `drops`. The caller closes session and chain. When `run` is cancelled, a transaction that was
-    sent may still be mined.
+    if given. Orders leave the book after `deadline_limit` blocks. Messages of `blocked` signers are rejected, and their
+    orders leave the book; what is dropped is counted in `drops`. The caller closes session and chain. When `run` is
+    cancelled, a transaction that was sent may still be mined.
     """
 
     title = "provider"
@@ -160,6 +161,8 @@ class Provider(Role):
             async with asyncio.TaskGroup() as tasks:
                 self.settlement.start(tasks)
                 tasks.create_task(self.drops.run(), name="provider drops")
+                if isinstance(self._blocked, Blocklist):
+                    tasks.create_task(self._follow_blocklist(self._blocked), name="provider blocklist")
                 # Before the orders that they concern; one that comes later still stops what was not sent.
                 await self._withdrawn.recall()
                 tasks.create_task(self._take_withdrawals(), name="provider withdrawals")
@@ -191,6 +194,11 @@ class Provider(Role):
         for subscription in (self._demands, self._offers, self._withdrawn, self.results):
             if subscription.kind == verified.message.kind:
                 subscription.forget(verified)
+
+    async def _follow_blocklist(self, blocked: Blocklist) -> None:
+        while True:
+            self.settlement.block(await asyncio.to_thread(lambda: blocked.entries))
+            await asyncio.sleep(CHECK_INTERVAL)
 
     async def _take_withdrawals(self) -> None:
         async for withdrawal in self._withdrawn:

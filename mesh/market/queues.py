@@ -46,6 +46,13 @@ class Queues(Generic[K, T]):
         """The node that has waited longest at `key`."""
         return self._first.get(key)
 
+    def items(self, key: K) -> Iterator[T]:
+        """The items of the queue at `key`, the one that has waited longest first; it must not change meanwhile."""
+        first = node = self._first.get(key)
+        while node is not None:
+            yield node.item
+            node = None if node.after is first else node.after
+
     def append(self, key: K, node: QueueNode[T]) -> None:
         """Append a node, which is in no queue, to the queue at `key`."""
         first = self._first.get(key)

@@ -42,7 +42,7 @@ T = TypeVar("T")
 
 
 class MatchWithdrawn(ChainError, code="match-withdrawn"):
-    """An order of a match was withdrawn before a transaction was sent: no liability is created."""
+    """An order of a match was withdrawn, or its signer blocked, before a transaction was sent: none is created."""
 
 
 class Settlement:
@@ -77,6 +77,8 @@ class Settlement:
         self._forget = forget
         self._withdrawals = withdrawals
         self._drops = drops
+        self.blocked: frozenset[str] = frozenset()
+        """The signers whose orders are not taken, as `block` was last called."""
         self._publisher = RejectionPublisher(channel, chain.account, earnings, drops)
         self.reject: Final = self._publisher.reject
         self._unconfirmed = Unconfirmed(chain.node.timing.reorg_depth)
@@ -107,6 +109,9 @@ class Settlement:
 
         If the book refuses the order, returns why, and publishes a rejection unless the order is known already.
         """
+        if order.signer in self.blocked:
+            self._drop_blocked(order)
+            return Refusal.BLOCKED
         outcome = self._refusal(order) or self._book.add(order)
         for evicted in outcome.evicted if isinstance(outcome, Added) else ():
             self._drops.count("book-full", evicted.signer)
@@ -162,6 +167,17 @@ class Settlement:
         if self._unconfirmed.get(identity) is None:
             self._publisher.honour(withdrawal)
 
+    def block(self, signers: frozenset[str]) -> None:
+        """Take no orders of these signers, and drop those in the book. A transaction that was sent can't be stopped."""
+        new, self.blocked = signers - self.blocked, signers
+        for order in [order for signer in new for order in self._book.of(signer)]:
+            self._book.remove(order_id(order))
+            self._drop_blocked(order)
+
+    def _drop_blocked(self, order: Verified[Order]) -> None:
+        self._drops.count("blocked", order.signer)
+        self._forget(order)
+
     async def add_result(self, result: Verified[Result]) -> None:
         """Finalize the liability that a result names, if the result may do that."""
         with liability_context(result.message.liability):
@@ -213,14 +229,16 @@ class Settlement:
     def _creation(self, match: Match) -> Callable[[], Awaitable[Created]]:
         """What sends the transaction of a match. It raises as `Liabilities.create`, and `MatchWithdrawn`.
 
-        The latter if an order is withdrawn, and no earlier attempt may still be mined.
+        The latter if an order is withdrawn or of a blocked signer, and no earlier attempt may still be mined.
         """
         may_be_sent = False
 
         async def attempt() -> Created:
             nonlocal may_be_sent
-            if not may_be_sent and any(order_id(order) in self._withdrawals for order in match):
-                raise MatchWithdrawn("an order was withdrawn before its contract was created")
+            if not may_be_sent and any(
+                order_id(order) in self._withdrawals or order.signer in self.blocked for order in match
+            ):
+                raise MatchWithdrawn("an order was withdrawn before its contract was created, or its signer blocked")
             try:
                 return await self._chain.liabilities.create(self._lighthouse, match.demand.message, match.offer.message)
             except (NodeUnreachable, TransactionTimeout):
