@@ -24,9 +24,12 @@ def command(objective: Path | None, generation: str, out: Path | None, as_json: 
     """Run one whole job: a person's demand and a robot's offer match, a contract holds the cost, the robot plays the
     objective to its device, records it and signs the result, and the contract pays. Everything is real and local:
     Zenoh sessions, an EVM, signatures, files."""
+    from tempfile import TemporaryDirectory
+
     from mesh.demo.demo import Demo
     from mesh.demo.narration import JsonNarrator, TextNarrator
 
     narrator = JsonNarrator() if as_json else TextNarrator()
-    demo = Demo(objective=objective, generation=int(generation), out=out, narrator=narrator)
-    run_to_end(demo.run)
+    with TemporaryDirectory(prefix="aira-demo-") as folder:
+        demo = Demo(Path(folder), objective=objective, generation=int(generation), out=out, narrator=narrator)
+        run_to_end(demo.run)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import shutil
-import tempfile
 import time
 from contextlib import AsyncExitStack
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from mesh.agent import Agent, Phase
@@ -24,6 +22,8 @@ from mesh.settings import Settings
 from schemas import Demand, Verified, cid_of_bytes, cid_of_file
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from web3.providers.async_base import AsyncBaseProvider
 
     from mesh.agent import Contract, Outcome
@@ -51,13 +51,22 @@ class OutputNotWritable(ConfigurationError, code="output-not-writable"):
 class Demo:
     """The demo: router, chain, provider, robot and person.
 
+    `folder` is for its files while it runs; the caller removes it, once the event loop and its threads have ended.
     `objective` is a file (None: three blinks), `generation` that of the messages, `out` the folder where objective and
     recording are kept (None: nowhere). `timeout` is in seconds (see `TIMEOUT`).
     """
 
     def __init__(
-        self, *, objective: Path | None, generation: int, out: Path | None, narrator: Narrator, timeout: float = TIMEOUT
+        self,
+        folder: Path,
+        *,
+        objective: Path | None,
+        generation: int,
+        out: Path | None,
+        narrator: Narrator,
+        timeout: float = TIMEOUT,
     ) -> None:
+        self._folder = folder
         self._path = objective
         self._generation = generation
         self._out = out
@@ -76,19 +85,15 @@ class Demo:
         opened, and `DemoStalled`.
         """
         started = time.monotonic()
-        with tempfile.TemporaryDirectory(prefix="aira-demo-") as temporary:
-            folder = Path(temporary)
-            objective = await asyncio.to_thread(self._prepare, folder)
-            try:
-                async with AsyncExitStack() as stack:
-                    await self._open(stack, folder)
-                    await self._do_job(objective, started)
-            except TimeoutError:
-                raise DemoStalled(
-                    "the demo did not finish in time", hint="is this machine very busy? try again"
-                ) from None
+        objective = await asyncio.to_thread(self._prepare)
+        try:
+            async with AsyncExitStack() as stack:
+                await self._open(stack)
+                await self._do_job(objective, started)
+        except TimeoutError:
+            raise DemoStalled("the demo did not finish in time", hint="is this machine very busy? try again") from None
 
-    def _prepare(self, folder: Path) -> Objective:
+    def _prepare(self) -> Objective:
         """Check the objective, and make the output folder."""
         if self._out is not None:
             try:
@@ -97,13 +102,13 @@ class Demo:
                 raise OutputNotWritable(f"can't keep files in {self._out}: {error.strerror}") from None
         path = self._path
         if path is None:
-            path = folder / "blink.mcap"
+            path = self._folder / "blink.mcap"
             write_objective(path)
         elif not path.is_file():
             raise InputError(f"there is no file {path}", hint="give an MCAP file or a ROS 1 bag")
         return open_objective(path)
 
-    async def _open(self, stack: AsyncExitStack, folder: Path) -> None:
+    async def _open(self, stack: AsyncExitStack) -> None:
         """Open router, chain, provider, robot and person; `stack` closes them."""
         self._narrator.chapter("A market is founded")
         self._endpoint = free_endpoint()
@@ -113,9 +118,9 @@ class Demo:
         node = await stack.enter_async_context(EmbeddedChain())
         self._market = await deploy_market(node.provider, node.funded_keys)
         self._report_contracts()
-        await self._open_provider(stack, node.provider, folder)
-        await self._open_agent(stack, node.provider, "robot", folder)
-        self._person = await self._open_agent(stack, node.provider, "person", folder)
+        await self._open_provider(stack, node.provider)
+        await self._open_agent(stack, node.provider, "robot")
+        self._person = await self._open_agent(stack, node.provider, "person")
 
     def _report_contracts(self) -> None:
         deployment = self._market.deployment
@@ -130,11 +135,11 @@ class Demo:
             xrt=deployment.xrt,
         )
 
-    async def _open_provider(self, stack: AsyncExitStack, node: AsyncBaseProvider, folder: Path) -> None:
+    async def _open_provider(self, stack: AsyncExitStack, node: AsyncBaseProvider) -> None:
         network = await stack.enter_async_context(Network(Endpoints(connect=(self._endpoint,))))
         chain = await stack.enter_async_context(self._market.chain(node, "provider"))
         lighthouse = self._market.deployment.lighthouse_name
-        withdrawals = folder / "provider" / "withdrawals.sqlite"
+        withdrawals = self._folder / "provider" / "withdrawals.sqlite"
         provider = await stack.enter_async_context(
             Provider(network.session, chain, lighthouse, matched=self._report_match, withdrawals=withdrawals)
         )
@@ -142,10 +147,10 @@ class Demo:
         tasks.start(provider.run(), "demo provider")
         self._report_account("provider", provider.address, network.id)
 
-    async def _open_agent(self, stack: AsyncExitStack, node: AsyncBaseProvider, role: str, folder: Path) -> Agent:
+    async def _open_agent(self, stack: AsyncExitStack, node: AsyncBaseProvider, role: str) -> Agent:
         settings = Settings(
             connect=(self._endpoint,),
-            data_dir=str(folder / role),
+            data_dir=str(self._folder / role),
             lighthouse_contract=self._market.deployment.lighthouse_name,
             ens_contract=self._market.deployment.ens,
             generation=5 if self._generation == 5 else 3,

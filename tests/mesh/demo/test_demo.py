@@ -129,7 +129,7 @@ def test_a_dense_objective_has_the_time_that_the_lamp_needs(tmp_path: Path) -> N
     path = tmp_path / "dense.mcap"
     path.write_bytes(objective(*(("/blink", Empty()) for _ in range(40)), step_ns=0))
     recorder = Recorder()
-    asyncio.run(Demo(objective=path, generation=3, out=None, narrator=recorder, timeout=6.0).run())
+    asyncio.run(Demo(tmp_path, objective=path, generation=3, out=None, narrator=recorder, timeout=6.0).run())
     assert recorder.facts["paid"]
 
 
@@ -181,9 +181,11 @@ def test_the_default_objective_has_the_same_bytes_each_time(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("moment", ["router", "contracts", "objective", "match", "running", "complete"])
-def test_ctrl_c_ends_it_at_any_moment(moment: str) -> None:
-    interrupted = Interrupted("demo", "--json", at=f'"event":"{moment}"')
+def test_ctrl_c_ends_it_at_any_moment(moment: str, tmp_path: Path) -> None:
+    variables = {"TMPDIR": str(tmp_path)}
+    interrupted = Interrupted("demo", "--json", at=f'"event":"{moment}"', variables=variables)
     assert (interrupted.code, interrupted.errors) == (130, "")
+    assert list(tmp_path.iterdir()) == []
     assert interrupted.seconds < SOON
 
 
