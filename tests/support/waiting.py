@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -56,8 +57,9 @@ async def until_answered(session: zenoh.Session, selector: str) -> None:
 
 @contextmanager
 def at_most(seconds: float) -> Iterator[None]:
-    """Fail if the body takes longer."""
+    """Fail if the body takes longer. A machine with more to run than processors gets that many times as long."""
     started = time.monotonic()
     yield
     took = time.monotonic() - started
-    assert took < seconds, f"took {took:.2f} s, and {seconds:g} s are allowed"
+    allowed = seconds * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+    assert took < allowed, f"took {took:.2f} s, and {allowed:g} s are allowed"

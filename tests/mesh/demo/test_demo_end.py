@@ -67,7 +67,7 @@ async def test_a_demo_that_is_cancelled_leaves_no_task(tmp_path: Path) -> None:
         await asyncio.sleep(0.01)
         assert not running.done()
     running.cancel()
-    with at_most(20), pytest.raises(asyncio.CancelledError):
+    with at_most(2), pytest.raises(asyncio.CancelledError):
         await running
     assert asyncio.all_tasks() == {asyncio.current_task()}
 
@@ -107,7 +107,7 @@ def test_ctrl_c_leaves_no_process_no_folder_and_no_traceback(seconds: float, tmp
         process.stdout.readline()
         time.sleep(seconds)
         process.send_signal(signal.SIGINT)
-        with at_most(20):
+        with at_most(2):
             _, errors = process.communicate(timeout=30)
     assert process.returncode == 130
     assert errors == b""
