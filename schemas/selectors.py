@@ -62,9 +62,9 @@ def lighthouse_selector(lighthouse: str) -> str:
     return f"aira/{lighthouse_chunk(lighthouse)}/**"
 
 
-def presence_selector(lighthouse: str, role: str = "*") -> str:
-    """The presence tokens of all agents on a lighthouse, or of those in one role."""
-    return f"aira/{lighthouse_chunk(lighthouse)}/@agent/{_any_or(name_chunk, role)}/*"
+def presence_selector(lighthouse: str, role: str = "*", agent: str = "*") -> str:
+    """The presence tokens of all agents on a lighthouse, or of those in one role, or of one agent."""
+    return f"aira/{lighthouse_chunk(lighthouse)}/@agent/{_any_or(name_chunk, role)}/{_any_or(address_chunk, agent)}"
 
 
 def event_selector(agent: str = "*") -> str:

@@ -17,8 +17,10 @@ if TYPE_CHECKING:
 
     from bridges.ipfs.relay import MessageRelay
 
-AGENT_LIMIT: Final = 65_536
+AGENT_LIMIT: Final = 1024
 """Agents that are remembered, at most."""
+BRIDGE_LIMIT: Final = 64
+"""Other bridges that are taken into account, at most."""
 
 
 class BridgePresence:
@@ -82,7 +84,7 @@ class BridgePresence:
         if rank is None:
             if len(self.present) < AGENT_LIMIT:
                 self.present.add(key)
-        elif rank.bridge != self._bridge:
+        elif rank.bridge != self._bridge and len(self._relay.others) < BRIDGE_LIMIT:
             self._relay.bridge_joined(rank)
 
     def _gone(self, key: PresenceKey) -> None:

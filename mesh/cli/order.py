@@ -15,6 +15,7 @@ from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import plural, print_json, print_line, print_table
 from mesh.running import run_to_end
 from mesh.settings import ChainSettings, NetworkSettings, options_of
+from schemas import parse_address
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -149,7 +150,7 @@ async def _withdraw(
         chosen = orders if everything else [_named(orders, digits) for digits in hashes]
         async with Rejections(parts, {order.hash for order in chosen}.__contains__).received(hear):
             withdrawn = [await order.withdraw() for order in chosen]
-            providers = len([key for key in await parts.channel.present() if key.role == "provider"])
+            providers = await _providers(parts)
             facts: list[dict[str, Any]] = [
                 {
                     "hash": order.hash,
@@ -200,6 +201,13 @@ async def _confirmations(parts: AgentComponents, order: Order, providers: int, h
         await asyncio.sleep(0 if is_complete() else 0.2)
         await parts.outbox.send_due()
     return confirmed
+
+
+async def _providers(parts: AgentComponents) -> int:
+    """How many providers with a stake are present."""
+    lighthouse = await parts.chain.lighthouses.get(parts.settings.lighthouse_contract)
+    present = {parse_address(key.agent) for key in await parts.channel.present("provider")}
+    return len(present & set(lighthouse.stakes))
 
 
 def _answers(parts: AgentComponents, order: Order) -> int:

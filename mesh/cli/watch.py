@@ -136,8 +136,7 @@ async def _xrt(settings: Settings, session: zenoh.Session, channel: Channel) -> 
     try:
         return parse_address(settings.xrt_contract)
     except InvalidAddress:
-        providers = [peer for peer in await present(channel) if peer.role == "provider"]
-        found = await statuses(session, channel, providers)
+        found = await statuses(session, channel, await present(channel, "provider"))
     named = {how.xrt for how in found.values() if isinstance(how, Status) and how.xrt}
     return named.pop() if len(named) == 1 else None
 

@@ -10,6 +10,7 @@ import asyncio
 from contextlib import suppress
 from contextvars import copy_context
 from functools import partial
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, Generic, Self
 
 import zenoh
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from mesh.blocklist import BlockedSigners
     from mesh.network.lookups import Resolver, ValidatorCheck
 
+PRESENT_LIMIT: Final = 1024
+"""Agents that a question for presence returns, at most."""
 RECALL_TIMEOUT: Final = 5.0
 """Seconds that providers have to answer with their open orders."""
 RECALL_LIMIT: Final = 65_536
@@ -139,7 +142,7 @@ class Channel:
         appeared: Callable[[PresenceKey], object],
         *,
         gone: Callable[[PresenceKey], object] = lambda key: None,
-        role: str | None = None,
+        role: str = "*",
     ) -> None:
         """Call `appeared` for each announced agent, those of now included, and `gone` when one leaves.
 
@@ -152,20 +155,30 @@ class Channel:
 
         def changed(sample: zenoh.Sample) -> None:
             for key in _presence_keys([str(sample.key_expr)]):
-                if role is None or key.role == role:
-                    notify = appeared if sample.kind == zenoh.SampleKind.PUT else gone
-                    call_in_loop(loop, notify, key, context=context)
+                notify = appeared if sample.kind == zenoh.SampleKind.PUT else gone
+                call_in_loop(loop, notify, key, context=context)
 
-        selector = presence_selector(self.lighthouse)
+        selector = presence_selector(self.lighthouse, role)
         self._declarations.append(self._session.liveliness().declare_subscriber(selector, changed, history=True))
 
-    async def present(self) -> list[PresenceKey]:
-        """The agents that are announced on the channel now: role and address, in the order of their keys."""
+    async def present(self, role: str = "*", agent: str = "*") -> list[PresenceKey]:
+        """The agents that are announced on the channel now, or those in a `role`, or an `agent` (address).
+
+        At most `PRESENT_LIMIT`, in the order of their keys; more are counted in `drops`. Anybody may announce any
+        number of agents: ask for the role, or the agent, that matters.
+        """
         self._check_open()
-        ask, selector = self._session.liveliness().get, presence_selector(self.lighthouse)
-        handler: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(RECALL_LIMIT)
-        replies = await asyncio.to_thread(lambda: list(ask(selector, handler, timeout=RECALL_TIMEOUT)))
-        return list(_presence_keys(sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})))
+        ask, selector = self._session.liveliness().get, presence_selector(self.lighthouse, role, agent)
+        handler: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(PRESENT_LIMIT)
+
+        def collect() -> list[PresenceKey]:
+            found = {str(reply.ok.key_expr) for reply in islice(replies, PRESENT_LIMIT) if reply.ok is not None}
+            if self._drops is not None and (more := sum(1 for _ in replies)):
+                self._drops.count("presence", number=more)
+            return list(_presence_keys(sorted(found)))
+
+        replies = iter(ask(selector, handler, timeout=RECALL_TIMEOUT))
+        return await asyncio.to_thread(collect)
 
     def _check_open(self) -> None:
         if not self._open:

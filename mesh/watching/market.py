@@ -15,6 +15,7 @@ import msgspec
 
 from mesh.background import Background
 from mesh.errors import AiraError, InputError
+from mesh.flood import Rate, RateLimiter
 from mesh.network import Pump, ValidationStatistics
 from mesh.role import Lifecycle
 from schemas import (
@@ -43,6 +44,10 @@ if TYPE_CHECKING:
 
 WAITING: Final = 256
 """Events that wait for the consumer; beyond, the oldest incoming messages are dropped and counted."""
+PER_AGENT: Final = Rate(per_second=0.5, burst=4)
+"""Questions whether an agent with an unknown address is present."""
+QUESTIONS: Final = Rate(per_second=50, burst=500)
+"""Such questions in all."""
 RECENT: Final = 65_536
 """Texts that a `RecentSet` keeps."""
 
@@ -128,8 +133,8 @@ class MarketWatch(Lifecycle):
     """Events on an open channel from now on: `async with MarketWatch(session, channel) as watch`, then iterate.
 
     With `model` (CIDv0), only events about orders and liabilities of that model; a result counts once its agent has
-    reported the liability. Job events are taken from agents that are, or have been meanwhile, present on the channel.
-    For one consumer. Leaving `async with` ends it; the caller closes session and channel.
+    reported the liability. Job events are taken from agents that are present when one arrives. For one consumer.
+    Leaving `async with` ends it; the caller closes session and channel.
     """
 
     title = "market watch"
@@ -140,6 +145,7 @@ class MarketWatch(Lifecycle):
         self._model = model
         self._queue: asyncio.Queue[MarketEvent] = asyncio.Queue(WAITING)
         self._agents = RecentSet()
+        self._questions = RateLimiter(per_sender=PER_AGENT, total=QUESTIONS)
         self._orders = RecentSet()
         self._contracts = RecentSet()
         self._rejections = RecentSet()
@@ -149,9 +155,6 @@ class MarketWatch(Lifecycle):
         self._demands = await stack.enter_async_context(channel.subscribe(Demand, model=self._model))
         self._offers = await stack.enter_async_context(channel.subscribe(Offer, model=self._model))
         self._results = await stack.enter_async_context(channel.subscribe(Result))
-        channel.watch_presence(lambda key: self._agents.add(key.agent))
-        for key in await channel.present():
-            self._agents.add(key.agent)
         self._rejection_reader = ClaimReader(read_rejection, reason="rejection")
         self._event_reader = ClaimReader(read_event, reason="event")
         selector = market_selector(channel.lighthouse, "reject")
@@ -169,10 +172,6 @@ class MarketWatch(Lifecycle):
 
     def __aiter__(self) -> Self:
         return self
-
-    def knows(self, agent: str) -> bool:
-        """Whether the agent at this address is, or was meanwhile, present on the channel."""
-        return agent.lower() in self._agents
 
     async def __anext__(self) -> MarketEvent:
         return await self._queue.get()
@@ -215,9 +214,16 @@ class MarketWatch(Lifecycle):
             if wanted and self._rejections.add(f"{rejection.order} {rejection.provider} {rejection.reason}"):
                 yield rejection
 
+    async def _is_known(self, agent: str) -> bool:
+        """Whether an agent was found present on the channel. Who is unknown is asked after, at a limited rate."""
+        if agent in self._agents:
+            return True
+        is_known = self._questions.allow(agent) and bool(await self._channel.present(agent=agent))
+        return is_known and self._agents.add(agent)
+
     async def _seen_events(self) -> AsyncIterator[MarketEvent]:
         async for event in self._events:
-            if not self.knows(event.agent):
+            if not await self._is_known(event.agent):
                 self._event_reader.refuse()
             elif self._model in ("*", event.liability.model):
                 self._contracts.add(event.liability.address)

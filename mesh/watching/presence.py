@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 RoleStatus: TypeAlias = Status | BridgeStatus
 """The status that a role reports of itself."""
 
+PROVIDER: Final = "provider"
 BRIDGE: Final = "bridge"
 BRIDGE_TURN: Final = re.compile(r"bridge-turn-.*")
 """Presence tokens by which bridges take turns; no roles."""
@@ -33,9 +35,14 @@ class PresentPeer(NamedTuple):
     address: str
 
 
-async def present(channel: Channel) -> list[PresentPeer]:
-    """The agents announced on the channel now. Not verified: only a router with a roster restricts announcements."""
-    keys = await channel.present()
+async def present(channel: Channel, *roles: str) -> list[PresentPeer]:
+    """The agents announced on the channel now, in these roles or in all.
+
+    Not verified: only a router with a roster restricts announcements. At most `PRESENT_LIMIT` of any role, and of
+    providers and bridges as many besides.
+    """
+    asked = roles or (PROVIDER, BRIDGE, "*")
+    keys = [key for found in await asyncio.gather(*map(channel.present, asked)) for key in found]
     return sorted(
         {PresentPeer(key.role, parse_address(key.agent)) for key in keys if not BRIDGE_TURN.fullmatch(key.role)}
     )

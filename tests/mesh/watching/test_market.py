@@ -28,7 +28,7 @@ from tests.support.orders import (
     offer,
     result,
 )
-from tests.support.waiting import until, until_heard
+from tests.support.waiting import until, until_found, until_heard
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -152,7 +152,7 @@ async def test_an_event_of_an_agent_of_another_lighthouse_is_not_shown(market: M
 
 async def test_an_agent_that_starts_later_is_shown(market: Market) -> None:
     market.channel.announce("agent", STRANGER.address)
-    await until(lambda: market.watch.knows(STRANGER.address), what="the new agent")
+    await until_found(lambda: market.channel.present(agent=STRANGER.address), what="the new agent")
     theirs = msgspec.structs.replace(JOB, promisor=STRANGER.address)
     market.channel.put(str(EventKey(STRANGER.address, CONTRACT, "ready")), theirs.encode())
     assert (await market.next()).agent == STRANGER.address
