@@ -100,6 +100,7 @@ class ChainListener:
                     log.warning("the chain replaced all blocks after %d", block.block_number, extra=facts)
                     for event in block.reverted_events:
                         await self.revert(event)
+                    self._trader.reorganised()
                 if block.events:
                     # If it is handled only in part, and replaced before the agent is back, it is reverted like others.
                     await self._ledger.set_cursor(self.CURSOR, block.block_number - 1, history=history.encode())

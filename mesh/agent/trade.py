@@ -200,6 +200,11 @@ class Trader(Lifecycle):
         self._send_when_covered(again)
         await self._parts.outbox.release({order.identity for order in orders} - {order.identity for order in again})
 
+    def reorganised(self) -> None:
+        """A reorganisation may have reverted the approval of open orders' allowance: they wait until it is ensured."""
+        orders = [order for order in self._orders.values() if order.is_open]
+        self._send_when_covered([order for order in orders if any(self._chain.costs.of(order.signed).values())])
+
     async def new_head(self, block: int) -> None:
         """The chain has block `block`: orders, and reverted contracts, with an earlier deadline have expired."""
         for order in list(self._orders.values()):

@@ -13,7 +13,7 @@ import logging
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from mesh.chain import NodeUnreachable, NotALiability, RequestRefused, Reverted, TransactionTimeout
+from mesh.chain import NoContracts, NodeUnreachable, NotALiability, RequestRefused, Reverted, TransactionTimeout
 from mesh.errors import AiraError, ChainError, InputError
 from mesh.log_context import liability_context, log_event
 from mesh.market.book import ORDER_USED, Added, Match, Refusal, at_fault, order_id, reason_word
@@ -197,7 +197,7 @@ class Settlement:
         """The record of a liability; None while the node knows none at that address."""
         try:
             return await self._when_reachable(partial(self._chain.liabilities.get, address))
-        except (NotALiability, RequestRefused) as error:
+        except (NotALiability, NoContracts, RequestRefused) as error:  # or a reorganisation took it
             log.debug("a result waits to be sent again: %s", error)
             return None
 

@@ -31,7 +31,7 @@ STAKE: Final = 100 * XRT
 """Of the second provider, in wn: as much as the first one has."""
 PLAIN: Final = 0.5
 """How many markets are as small as possible."""
-LIFETIMES: Final = (4, 8, 60, 60, 60)
+LIFETIMES: Final = (4, 8, 60, 90, 90)
 """Blocks for which an order is valid: sometimes so few that it expires while it is matched."""
 
 

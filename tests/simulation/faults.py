@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Final
 
+from tests.simulation.deployment import BLOCK_SECONDS
 from tests.simulation.scheduler import SECOND
 
 if TYPE_CHECKING:
@@ -19,6 +20,10 @@ MOST_BLOCKS: Final = 12
 SHARES: Final = (0.0, 0.3, 0.3, 0.6)
 """How many of the kinds a history has: none in some."""
 HOUR_NS: Final = 3600 * SECOND
+TOGETHER: Final = 0.4
+"""How probable it is that one fault brings another with it."""
+TOGETHER_SECONDS: Final = 20.0
+"""Within how long."""
 
 
 @dataclass
@@ -51,6 +56,10 @@ class FaultPlan:
     leave: float = 0.0
     """That a robot leaves for good; another one stays."""
     preempt: float = 0.0
+    reorganise_after: float = 0.0
+    """That a block with events is replaced soon after it was mined."""
+    repeat_every: float = 0.0
+    """A stranger publishes all orders again that it has heard."""
     lasts: float = 0.0
     """Seconds after which all faults stop, though people go on; zero: not before people are done, or time is up."""
 
@@ -78,6 +87,8 @@ RANGES: Final[dict[str, tuple[float, float]]] = {
     "full_every": (30, 300),
     "leave": (0.3, 1.0),
     "preempt": (0.01, 0.1),
+    "reorganise_after": (0.1, 0.8),
+    "repeat_every": (20, 200),
 }
 
 
@@ -94,7 +105,7 @@ def choose(
         is_chosen, value = chance.random() < level, chance.uniform(*RANGES[name])
         if is_chosen and (only is None or name in only) and name not in without:
             setattr(plan, name, value)
-    plan.lasts = chance.choice([0.0, chance.uniform(*LASTS)])
+    plan.lasts = chance.choice([0.0, *(2 * [chance.uniform(*LASTS)])])
     return plan
 
 
@@ -107,6 +118,7 @@ class Faults:
         self._plan = plan
         self._draw = market.draw
         market.plan_crash = self._plan_crash
+        self._reorganisations = market.deployed.chain.reorganisations
 
     def start(self) -> None:
         """Begin."""
@@ -121,19 +133,28 @@ class Faults:
             faults.spoilt, faults.lost_after_sending = plan.spoilt, plan.lost_after_sending
         if self._draw("robot-left", plan.leave):
             self._scheduler.call_later(self._draw.random.uniform(5, 300), self._leave)
-        every = {
-            self._partition: plan.partition_every,
-            self._router: plan.router_every,
-            self._crash: plan.crash_every,
-            self._reorganise: plan.reorganise_every,
-            self._price: plan.price_every,
-            self._outage: plan.outage_every,
-            self._clock: plan.clock_every,
-            self._fill: plan.full_every,
+        self._every = {
+            kind: (mean, fault)
+            for kind, mean, fault in (
+                ("partition", plan.partition_every, self._partition),
+                ("router-restart", plan.router_every, self._restart_router),
+                ("crash", plan.crash_every, self._crash),
+                ("reorganisation", plan.reorganise_every, self._reorganise),
+                ("gas-price", plan.price_every, self._raise_price),
+                ("node-outage", plan.outage_every, self._end_node),
+                ("clock-jump", plan.clock_every, self._set_clock),
+                ("disk-full", plan.full_every, self._fill),
+                ("orders-repeated", plan.repeat_every, self._repeat_orders),
+            )
+            if mean
         }
-        for fault, mean in every.items():
-            if mean:
-                self._later(mean, fault, mean)
+        for kind, (mean, _) in self._every.items():
+            self._scheduler.call_later(self._draw.random.expovariate(1 / mean), self._again, kind, mean)
+        if plan.reorganise_after:
+            self._checked, self._check_block = market.deployed.chain.evm.head, market.deployed.chain.on_block
+            market.deployed.chain.on_block = self._block
+        if plan.repeat_every:
+            self._stranger = market.router.open()
 
     def stop(self) -> None:
         """No more faults: what was broken works again."""
@@ -154,16 +175,42 @@ class Faults:
             if role.process is not None:
                 role.process.crash_at_step = role.process.crash_at_commit = None
 
-    def _later(self, mean: float, fault: object, *arguments: object) -> None:
-        assert callable(fault)
-        self._scheduler.call_later(self._draw.random.expovariate(1 / mean), fault, *arguments)
+    def _again(self, kind: str, mean: float) -> None:
+        """A fault happens, and the next one of its kind is planned, while there are faults."""
+        if not self._market.is_calm:
+            self._scheduler.call_later(self._draw.random.expovariate(1 / mean), self._again, kind, mean)
+            self._happen(kind)
 
-    def _again(self, fault: object, mean: float, kind: str) -> bool:
-        """Whether the fault happens now; the next one is planned, while there are faults."""
-        if self._market.is_calm:
-            return False
-        self._later(mean, fault, mean)
-        return self._draw(kind)
+    def _happen(self, kind: str) -> None:
+        """A fault happens; perhaps it brings another one with it."""
+        if not self._market.is_calm and self._draw(kind):
+            self._every[kind][1]()
+            self._bring_another()
+
+    def _bring_another(self) -> None:
+        chance = self._draw.random
+        if self._every and chance.random() < TOGETHER:
+            other = chance.choice(list(self._every))
+            self._scheduler.call_later(chance.uniform(0, TOGETHER_SECONDS), self._happen, other)
+
+    def _block(self) -> None:
+        """A block was mined, or some were replaced."""
+        chain = self._market.deployed.chain
+        self._check_block()
+        head, reorganisations = chain.evm.head, chain.reorganisations
+        first, self._checked = min(self._checked, head - 1) + 1, head
+        is_new = reorganisations == self._reorganisations and any(chain.evm.logs(first, head))
+        self._reorganisations = reorganisations
+        if is_new and not self._market.is_calm and self._draw("event-replaced", self._plan.reorganise_after):
+            self._scheduler.call_later(self._draw.random.uniform(0, BLOCK_SECONDS), self._replace, first)
+
+    def _replace(self, first: int) -> None:
+        chain, chance = self._market.deployed.chain, self._draw.random
+        if not self._market.is_calm:
+            depth = chain.evm.head - first + 1 + chance.choice([0, 0, 1, 3])
+            chain.reorganise(min(depth, MOST_BLOCKS), forget=chance.choice([0.0, 0.5, 1.0]))
+            self._market.trace("chain", "replaced", depth=depth, head=chain.evm.head)
+            self._bring_another()
 
     def _plan_crash(self, role: Role, process: Process) -> None:
         chance = self._draw.random
@@ -180,60 +227,58 @@ class Faults:
             self._market.trace(robot.name, "leaves")
             robot.crash()
 
-    def _crash(self, mean: float) -> None:
-        if self._again(self._crash, mean, "crash"):
-            self._draw.random.choice(self._market.roles).crash()
+    def _crash(self) -> None:
+        self._draw.random.choice(self._market.roles).crash()
 
-    def _partition(self, mean: float) -> None:
+    def _partition(self) -> None:
         sessions = self._market.router.sessions
-        if self._again(self._partition, mean, "partition") and sessions:
+        if sessions:
             session = self._draw.random.choice(sessions)
             session.set_linked(False)
             self._scheduler.call_later(self._draw.random.uniform(1, 60), session.set_linked, True)
 
-    def _router(self, mean: float) -> None:
-        if self._again(self._router, mean, "router-restart"):
-            self._market.router.set_up(False)
-            self._scheduler.call_later(self._draw.random.uniform(1, 60), self._market.router.set_up, True)
+    def _restart_router(self) -> None:
+        self._market.router.set_up(False)
+        self._scheduler.call_later(self._draw.random.uniform(1, 60), self._market.router.set_up, True)
 
-    def _reorganise(self, mean: float) -> None:
-        if self._again(self._reorganise, mean, "reorganisation"):
-            chance = self._draw.random
-            depth = chance.choice([1, 1, 1, 2, 2, 3, chance.randint(1, MOST_BLOCKS)])
-            chain = self._market.deployed.chain
-            before = chain.evm.head
-            chain.reorganise(depth, forget=chance.choice([0.0, 0.0, 0.3, 1.0]))
-            self._market.trace("chain", "reorganised", depth=depth, head=f"{before}->{chain.evm.head}")
+    def _reorganise(self) -> None:
+        chance = self._draw.random
+        depth = chance.choice([1, 1, 1, 2, 2, 3, chance.randint(1, MOST_BLOCKS)])
+        chain = self._market.deployed.chain
+        before = chain.evm.head
+        chain.reorganise(depth, forget=chance.choice([0.0, 0.0, 0.3, 1.0]))
+        self._market.trace("chain", "reorganised", depth=depth, head=f"{before}->{chain.evm.head}")
 
-    def _price(self, mean: float) -> None:
-        if self._again(self._price, mean, "gas-price"):
-            faults, chance = self._market.deployed.chain.faults, self._draw.random
-            faults.price_factor = chance.choice([1.5, 3, 20, 2000])
-            self._scheduler.call_later(chance.uniform(10, 200), setattr, faults, "price_factor", 1.0)
+    def _raise_price(self) -> None:
+        faults, chance = self._market.deployed.chain.faults, self._draw.random
+        faults.price_factor = chance.choice([1.5, 3, 20, 2000])
+        self._scheduler.call_later(chance.uniform(10, 200), setattr, faults, "price_factor", 1.0)
 
-    def _outage(self, mean: float) -> None:
-        if self._again(self._outage, mean, "node-outage"):
-            chance = self._draw.random
-            faults = chance.choice(self._market.roles).node_faults
-            before, faults.unreachable = faults.unreachable, 1.0
-            ends = min(before, 0.9)
-            self._scheduler.call_later(chance.uniform(5, 120), self._outage_over, faults, ends)
+    def _end_node(self) -> None:
+        chance = self._draw.random
+        faults = chance.choice(self._market.roles).node_faults
+        before, faults.unreachable = faults.unreachable, 1.0
+        ends = min(before, 0.9)
+        self._scheduler.call_later(chance.uniform(5, 120), self._outage_over, faults, ends)
 
     def _outage_over(self, faults: object, before: float) -> None:
         faults.unreachable = 0.0 if self._market.is_calm else before  # type: ignore[attr-defined]
 
-    def _clock(self, mean: float) -> None:
-        if self._again(self._clock, mean, "clock-jump"):
-            chance = self._draw.random
-            role = chance.choice(self._market.roles)
-            role.wall_offset_ns += chance.choice([-HOUR_NS, HOUR_NS, -SECOND, 24 * HOUR_NS])
-            if role.process is not None:
-                role.process.wall_offset_ns = role.wall_offset_ns
+    def _set_clock(self) -> None:
+        chance = self._draw.random
+        role = chance.choice(self._market.roles)
+        role.wall_offset_ns += chance.choice([-HOUR_NS, HOUR_NS, -SECOND, 24 * HOUR_NS])
+        if role.process is not None:
+            role.process.wall_offset_ns = role.wall_offset_ns
 
-    def _fill(self, mean: float) -> None:
-        if self._again(self._fill, mean, "disk-full"):
-            chance, disk = self._draw.random, self._market.disk
-            name = chance.choice(self._market.roles).name
-            disk.full.add(name)
-            self._market.trace(name, "disk-full")
-            self._scheduler.call_later(chance.uniform(1, 60), disk.full.discard, name)
+    def _fill(self) -> None:
+        chance, disk = self._draw.random, self._market.disk
+        name = chance.choice(self._market.roles).name
+        disk.full.add(name)
+        self._market.trace(name, "disk-full")
+        self._scheduler.call_later(chance.uniform(1, 60), disk.full.discard, name)
+
+    def _repeat_orders(self) -> None:
+        """What is signed anybody may publish again, at any time."""
+        for sample in self._market.steps.orders.values():
+            self._market.router.publish(sample, self._stranger)

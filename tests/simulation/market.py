@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from tests.simulation.audit import Audit
 
 WITHDRAWN: Final = (0.1, 0.2, 0.7)
+REVOKED: Final = (0.0, 0.0, 0.5)
 
 
 @dataclass
@@ -60,6 +61,8 @@ class Market:
         self.cids: dict[Path, str] = {}
         self.withdrawn = self.scheduler.random.choice(WITHDRAWN)
         """How many orders people withdraw."""
+        self.revoked = self.scheduler.random.choice(REVOKED)
+        """For how many orders people take the allowance away for a while."""
         names = ("provider", "provider-1")[: self.plan.providers]
         self.providers = [ProviderRole(self, name) for name in names]
         self.robots = [RobotRole(self, f"robot-{number}") for number in range(ROBOTS)]

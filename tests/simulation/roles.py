@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from mesh.agent import Agent, JobFailed
 from mesh.agent.errors import LiabilityReverted, OrderClosed, OrderExpired
+from mesh.agent.orders import OrderState
 from mesh.chain import XRT, Chain
-from mesh.errors import AiraError, ChainError
+from mesh.errors import AiraError
 from mesh.market.provider import Provider
 from mesh.network import Endpoints, Network
 from mesh.settings import Settings
@@ -23,7 +24,7 @@ from tests.simulation.scheduler import Process
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
-    from mesh.agent import Contract, Outcome
+    from mesh.agent import Contract
     from mesh.market.book import Match
     from tests.simulation.market import Market
 
@@ -48,6 +49,8 @@ class Ordered:
     """Whether the withdrawal of the order is on the chain."""
     told: str = ""
     """The last thing: ordered, accepted, withdrawn, expired, paid, refunded, reverted, or an error's code."""
+    told_ns: int = 0
+    """When."""
 
     @property
     def is_over(self) -> bool:
@@ -247,10 +250,12 @@ class PersonRole(Role):
             self.agent = agent = Agent(MODEL, settings=self.settings(), account=self.account, chain=chain)
             async with agent:
                 self.has_begun = True
+                taking_back = asyncio.ensure_future(self._take_back(agent))
                 try:
                     await self._live(agent)
                 finally:
                     self.has_begun = False
+                    taking_back.cancel()
 
     async def _live(self, agent: Agent) -> None:
         chance = self.market.scheduler.random
@@ -271,6 +276,8 @@ class PersonRole(Role):
         order = await agent.order(objective, cost=wanted.cost, lifetime=lifetime)
         wanted.order, wanted.told = order.hash, "ordered"
         wanted.posted, wanted.deadline = self.market.deployed.chain.evm.head, order.message.deadline
+        if chance.random() < self.market.revoked:
+            self._revoking = asyncio.ensure_future(self._revoke(agent))
         if chance.random() < self.market.withdrawn:
             await asyncio.sleep(chance.uniform(0.1, 20))
             on_chain = chance.random() < 0.5
@@ -279,12 +286,22 @@ class PersonRole(Role):
             self.market.trace(self.name, "withdrew", order=order.hash[:12], on_chain=on_chain)
         return await order.contract()
 
+    async def _revoke(self, agent: Agent) -> None:
+        """Take the factory's allowance away for a while: providers then reject the order, which is still valid."""
+        chain, chance = agent.parts.chain, self.market.scheduler.random
+        with suppress(AiraError):
+            allowed = await chain.tokens.allowance(self.account.address, chain.factory)
+            await chain.tokens.approve(chain.factory, 0)
+            self.market.trace(self.name, "revoked", allowance=allowed)
+            await asyncio.sleep(chance.uniform(1, 60))
+            await chain.retrying(lambda: chain.tokens.approve(chain.factory, allowed))
+
     async def _take_up(self, agent: Agent, wanted: Ordered) -> Contract:
         """What a person finds after a crash: the contract, the open order that the agent says it has, or nothing."""
         if wanted.contract:
             return await agent.contract(wanted.contract)
         known = {order.order for order in self.orders if order is not wanted}
-        for order in agent.orders():
+        for order in agent.orders(OrderState.OPEN, OrderState.WITHDRAWN):
             if order.kind == "demand" and order.hash not in known:
                 wanted.order = order.hash
                 return await order.contract()
@@ -300,7 +317,7 @@ class PersonRole(Role):
             contract = await contract_of
             wanted.contract, wanted.told = contract.address, "accepted"
             self.market.trace(self.name, "accepted", liability=contract.address)
-            outcome = await self._outcome(agent, contract)
+            outcome = await contract.outcome()
             wanted.contract, wanted.told = contract.address, "paid" if outcome.success else "refunded"
         except OrderExpired:
             wanted.told = "expired"
@@ -313,14 +330,13 @@ class PersonRole(Role):
         self.market.trace(self.name, wanted.told, number=wanted.number)
         self.market.steps.told(self, wanted.number)
 
-    async def _outcome(self, agent: Agent, contract: Contract) -> Outcome:
-        """Wait for the end of a contract; take the cost back once that is possible."""
-        ended = asyncio.ensure_future(contract.outcome())
+    async def _take_back(self, agent: Agent) -> None:
+        """Take back the cost of each contract that nobody ended in time, also of orders that were withdrawn."""
         liabilities = agent.parts.chain.liabilities
-        while not ended.done():
-            await asyncio.wait([ended], timeout=REFUND_CHECK)
-            with suppress(ChainError):
-                if not ended.done() and (await liabilities.refund_state(contract.address)).is_refundable:
-                    await liabilities.refund(contract.address)
-                    self.market.trace(self.name, "took-back", liability=contract.address)
-        return await ended
+        while True:
+            await asyncio.sleep(REFUND_CHECK)
+            with suppress(AiraError):
+                for _, address in await agent.parts.ledger.contracts("demand"):
+                    if (await liabilities.refund_state(address)).is_refundable:
+                        await liabilities.refund(address)
+                        self.market.trace(self.name, "took-back", liability=address)

@@ -10,9 +10,10 @@ from eth_utils.crypto import keccak
 from mesh.agent.orders import OrderState
 from mesh.chain import Finalized, NewLiability, Transfer
 from mesh.market.book import Refusal
-from schemas import ZERO_ADDRESS, Demand, InvalidMessage, InvalidRecord, decode
+from schemas import ZERO_ADDRESS, Demand, InvalidMessage, InvalidRecord, Offer, address_bytes, decode
 from schemas.signing import Rejection
 from schemas.wire import message_hash
+from tests.simulation.scheduler import SECOND
 
 if TYPE_CHECKING:
     from mesh.market.book import Match
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 BALANCE_OF: Final = keccak(text="balanceOf(address)")[:4].hex()
 DEMAND_HASH: Final = keccak(text="demandHash()")[:4].hex()
+UNSETTLED_NS: Final = 200 * SECOND
+"""For how long after a reorganisation people may say what was so before it: their nodes' answers may be that old."""
 
 
 class StepAudit:
@@ -34,19 +37,26 @@ class StepAudit:
         deployment = market.deployed.market.deployment
         self._token = deployment.xrt
         holders = [account.address for account in market.deployed.accounts.values()]
+        self._providers = {address_bytes(one.account.address) for one in market.providers}
         self._begin = {one: self._balance(one) for one in (*holders, deployment.factory, deployment.lighthouse)}
         self._reorganisations = 0
+        self._reorganised_ns = -UNSETTLED_NS
+        """When the last one was."""
         self._forget()
         self.honoured: set[tuple[str, str]] = set()
         """Providers and the orders (hashes) of which they have said that they honour their withdrawal."""
         self.demands: dict[str, tuple[PersonRole, int]] = {}
         """All demands that were sent: by whom, as which of their orders."""
+        self.orders: dict[str, Sample] = {}
+        """All orders (hashes) that were published."""
 
     def _forget(self) -> None:
         self._read = self._chain.began
         self._expected: Counter[str] = Counter(self._begin)
         self._ended: set[str] = set()
         self._payouts: dict[str, int] = defaultdict(int)
+        self._submitted: set[tuple[bytes, bytes]] = set()
+        """Senders and data of the providers' transactions that did what they wanted."""
         self._liabilities: dict[str, str] = {}
         """Of each liability the demand's hash."""
 
@@ -54,6 +64,7 @@ class StepAudit:
         """A block was mined, or some were replaced."""
         if self._chain.reorganisations != self._reorganisations:
             self._reorganisations = self._chain.reorganisations
+            self._reorganised_ns = self._market.scheduler.now_ns
             self._forget()
         head = self._chain.evm.head
         self._listed()
@@ -68,11 +79,25 @@ class StepAudit:
             elif isinstance(event, Transfer):
                 self._moved(event)
                 changed |= {event.sender, event.recipient}
+        for number in range(self._read + 1, head + 1):
+            self._mined(number)
         self._read = head
         for holder in sorted(changed - {ZERO_ADDRESS}):
             if self._balance(holder) != self._expected[holder]:
                 detail = f"{holder} has {self._balance(holder)} and should have {self._expected[holder]} wn"
                 self._market.violated("tokens-not-conserved", detail)
+
+    def _mined(self, number: int) -> None:
+        """No provider sends a transaction a second time that has had its effect; not checked after reorganisations."""
+        pooled = self._chain.mined.get(number)
+        if pooled is None or self._reorganisations or pooled.sender not in self._providers:
+            return
+        sent = pooled.sender, self._chain.evm.read(pooled.raw).data
+        if sent in self._submitted:
+            self._market.violated("submitted-twice", f"by {pooled.sender.hex()} in block {number}")
+        receipt = self._chain.evm.receipt(pooled.hash)
+        if receipt is not None and int(receipt["status"], 16) == 1:
+            self._submitted.add(sent)
 
     def _moved(self, event: Transfer) -> None:
         self._expected[event.sender] -= event.value
@@ -90,7 +115,8 @@ class StepAudit:
             return
         person, number = self.demands[demand]
         order = person.orders[number]
-        if order.is_dead and (not self._reorganisations or order.told == "nothing-found"):
+        is_excused = order.told_ns < self._reorganised_ns + UNSETTLED_NS
+        if order.is_dead and (not is_excused or order.told == "nothing-found"):
             self._market.violated("promise-broken", f"{person.name} was told {order.told!r}; {liability}")
         is_known = bool(order.contract) or demand in person.listed  # accepted before a reorganisation and a restart
         if person.agent_is_open and not order.is_over and not is_known:
@@ -99,7 +125,8 @@ class StepAudit:
     def told(self, person: PersonRole, number: int) -> None:
         """A person was told something of an order."""
         order = person.orders[number]
-        if not order.is_dead or self._reorganisations:
+        order.told_ns = self._market.scheduler.now_ns
+        if not order.is_dead or order.told_ns < self._reorganised_ns + UNSETTLED_NS:
             return
         mine = {demand for demand, maker in self.demands.items() if maker == (person, number)}
         found = [liability for liability, demand in self._liabilities.items() if demand in mine]
@@ -115,7 +142,7 @@ class StepAudit:
     def sent(self, sample: Sample, sender: Session) -> None:
         """A message was published."""
         role = next((one for one in self._market.roles if sender.process is one.process), None)
-        if role is None:
+        if role is None or sender.process is None:
             return
         payload = sample.payload.to_bytes()
         if role in self._market.providers:
@@ -125,14 +152,16 @@ class StepAudit:
                 return
             if rejection.reason == Refusal.WITHDRAWN:
                 self.honoured.add((role.name, rejection.order))
-        elif role in self._market.people:
-            try:
-                message = decode(payload)
-            except InvalidMessage:
-                return
-            if isinstance(message, Demand):
-                person: Any = role
-                self.demands.setdefault(message_hash(message).hex(), (person, len(person.orders) - 1))
+            return
+        try:
+            message = decode(payload)
+        except InvalidMessage:
+            return
+        if isinstance(message, Demand | Offer):
+            self.orders.setdefault(message_hash(message).hex(), sample)
+        if isinstance(message, Demand):
+            person: Any = role
+            self.demands.setdefault(message_hash(message).hex(), (person, len(person.orders) - 1))
 
     def matched(self, provider: str, match: Match) -> None:
         """A provider matched two orders."""

@@ -37,7 +37,7 @@ def simulate(*arguments: str) -> tuple[dict[str, Any], str]:
 
 def test_in_a_quiet_market_every_job_ends() -> None:
     """Some of the jobs fail, so that not all are paid."""
-    found, said = simulate("--seed", "1", "--jobs", "2", "--only", "none")
+    found, said = simulate("--seed", "2", "--jobs", "2", "--only", "none")
     assert (found["paid"] + found["refunded"], found["violations"], found["faults"]) == (2, [], {}), said
     assert found["paid"] > 0
 

@@ -202,3 +202,22 @@ async def test_a_reorganisation_of_the_block_before_the_start_does_not_stop_the_
         await local.liability_of(demand)
         await until(lambda: provider.earnings().created == 1)
     assert local.rejections == []
+
+
+async def test_a_result_for_a_contract_that_a_reorganisation_took_does_not_stop_the_provider(forking: Forking) -> None:
+    local = forking.local
+    async with local.provider(endpoint=forking.node, timing=TIMING) as provider:
+        demand, liability = await forking.created(provider)
+        with forking.node.back("eth_estimateGas"):
+            await forking.replace_last()
+            await until(lambda: provider.earnings().created == 0)
+            received = provider.results.statistics().received
+            local.publish(local.result(liability.address))
+            await until(lambda: provider.results.statistics().received > received)
+            await asyncio.sleep(0.2)
+            assert await local.liabilities_of(demand) == []
+
+        again = await local.liability_of(demand)
+        local.publish(local.result(again.address))
+        await until_found(lambda: forking.is_finalized(again))
+    assert local.rejections == []

@@ -112,3 +112,28 @@ async def test_orders_are_sent_again_only_with_their_allowance_when_a_reorganisa
         may_work.set()
         assert (await contract.outcome()).success
         assert done == ["again"]
+
+
+async def test_the_allowance_of_an_open_order_is_ensured_again_when_a_reorganisation_reverted_it(
+    anvil: Anvil, router: EmbeddedRouter, tmp_path: Path
+) -> None:
+    """No contract is reverted, so nothing else shows the order's maker that it can't pay any more."""
+    site = await Site.found(anvil.url, anvil.private_keys, router.endpoint, tmp_path)
+    async with site.chain("person") as chain:
+        await chain.tokens.approve(chain.factory, 0)
+        founded = await chain.block_number()
+
+    async with site.agent("person") as person, asyncio.timeout(TIMEOUT):
+        chain = person.parts.chain
+
+        async def is_allowed() -> bool:
+            return await chain.tokens.allowance(site.address("person"), chain.factory) >= COST
+
+        order = await person.order(site.job("waits"), cost=COST)
+        assert await is_allowed()
+        await until(lambda: person.parts.chain_head.head > founded, what="the head", seconds=TIMEOUT)
+        await request(chain, "anvil_reorg", await chain.block_number() - founded, [])
+        assert not await is_allowed()
+        await request(chain, "evm_mine")
+        await until_found(is_allowed, what="the allowance", seconds=TIMEOUT)
+        await order.withdraw()
