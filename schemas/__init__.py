@@ -77,7 +77,7 @@ if TYPE_CHECKING:
         requested_cid,
         topic_selector,
     )
-    from schemas.signing import Signer, Verified, recover, verify, verify_hashed, verify_message
+    from schemas.signing import Signer, Verified, recover, verify, verify_message
     from schemas.unixfs import (
         CHUNK_SIZE,
         MAX_LINKS,
@@ -114,7 +114,7 @@ _NAMES: Final = {
         "cid_selector device_selector event_selector lighthouse_selector market_selector objective_selector "
         "presence_selector requested_cid topic_selector"
     ),
-    "signing": ("Signer Verified recover verify verify_hashed verify_message"),
+    "signing": ("Signer Verified recover verify verify_message"),
     "unixfs": (
         "CHUNK_SIZE MAX_LINKS UnixfsBlock UnixfsLink UnixfsNode blocks_of_stream cid_of_bytes cid_of_file "
         "cid_of_stream parse_block"
@@ -218,6 +218,5 @@ __all__ = [
     "resolve_names",
     "topic_selector",
     "verify",
-    "verify_hashed",
     "verify_message",
 ]

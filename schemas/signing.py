@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import threading
 from functools import lru_cache
-from typing import Any, Final, Generic, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypeAlias, TypeVar
 
 from coincurve import PrivateKey
 from coincurve._libsecp256k1 import ffi, lib  # type: ignore[import-not-found]
@@ -25,6 +25,9 @@ from schemas.message_fields import SIGNATURE_SIZE
 from schemas.messages import Demand, Offer, OrderFeedback, SignedMessage, TransactionFeedback
 from schemas.records import Record
 from schemas.wire import decode, message_hash
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 _M = TypeVar("_M", bound=SignedMessage)
 _M_co = TypeVar("_M_co", bound=SignedMessage, covariant=True)
@@ -60,7 +63,7 @@ class Signer:
         if len(private_key) != 32 or not 0 < int.from_bytes(private_key, "big") < _CURVE_ORDER:
             raise InputError("a private key is 32 bytes, neither zero nor beyond the order of secp256k1")
         self.__key = PrivateKey(private_key)
-        self.address: Final = _address_of(ffi.buffer(self.__key.public_key.public_key)[:])
+        self.address: Final = signer_of(ffi.buffer(self.__key.public_key.public_key)[:])
 
     def __repr__(self) -> str:
         return f"Signer({self.address})"
@@ -92,6 +95,15 @@ def recover(digest: bytes, signature: str | bytes) -> str:
     Raises `InvalidMessage` (`signature`) for any but 65 bytes with v 27 or 28 and a low s, if no key could have made
     it, and if it gives the zero address.
     """
+    return signer_of(recover_keys((signed_digest(digest, signature),))[0])
+
+
+SignedDigest: TypeAlias = tuple[bytes, bytes, int]
+"""What a key is recovered from: the 32 bytes that were signed, the signature's 65 bytes, and its recovery id."""
+
+
+def signed_digest(digest: bytes, signature: str | bytes) -> SignedDigest:
+    """What `recover_keys` takes for a 32-byte message hash and its signature. Raises as `recover`."""
     if isinstance(signature, str):
         try:
             signature = bytes.fromhex(signature.removeprefix("0x"))
@@ -103,14 +115,23 @@ def recover(digest: bytes, signature: str | bytes) -> str:
         raise InvalidMessage("signature", f"v is {signature[64]}, expected 27 or 28")
     if signature[32:64] > _HIGHEST_S:
         raise InvalidMessage("signature", "s is in the upper half of the curve's order")
+    return keccak256(_PREFIX + digest), signature, recovery_id
+
+
+def recover_keys(signed: Iterable[SignedDigest]) -> list[bytes]:
+    """The public keys, as `signer_of` takes them; empty where no key could have made the signature.
+
+    A recovery fills the processor's caches, so whatever else a message needs costs twice as much between two of them.
+    """
     buffers = _buffers
-    digest = keccak256(_PREFIX + digest)
+    signature, key, key_bytes = buffers.signature, buffers.key, buffers.key_bytes
     # Zero means that r or s is out of range, or that r belongs to no point of the curve.
-    if not _parse(_CONTEXT, buffers.signature, signature, recovery_id) or not _recover(
-        _CONTEXT, buffers.key, buffers.signature, digest
-    ):
-        raise InvalidMessage("signature", "no key could have made it")
-    return _address_of(buffers.key_bytes[:])
+    return [
+        key_bytes[:]
+        if _parse(_CONTEXT, signature, compact, recovery_id) and _recover(_CONTEXT, key, signature, digest)
+        else b""
+        for digest, compact, recovery_id in signed
+    ]
 
 
 class _Buffers(threading.local):
@@ -137,17 +158,18 @@ def verify(payload: bytes) -> Verified[SignedMessage]:
     message = decode(payload)
     if isinstance(message, (OrderFeedback, TransactionFeedback)):
         raise InvalidMessage("unsigned", f"what is signed in a {type(message).__name__} is not defined")
-    return verify_hashed(message, message_hash(message))
+    return verify_message(message)
 
 
 def verify_message(message: _M) -> Verified[_M]:
     """As `verify`, for a message that is decoded already and whose ENS names are resolved."""
-    return verify_hashed(message, message_hash(message))
+    digest = message_hash(message)
+    return verify_recovered(message, digest, recover_keys((signed_digest(digest, message.signature),))[0])
 
 
-def verify_hashed(message: _M, digest: bytes) -> Verified[_M]:
-    """As `verify_message`, for a message whose `message_hash` is known already."""
-    signer = recover(digest, message.signature)
+def verify_recovered(message: _M, digest: bytes, key: bytes) -> Verified[_M]:
+    """As `verify_message`, for a message whose `message_hash` is known, and what `recover_keys` gave for it."""
+    signer = signer_of(key)
     _check_sender(message, signer)
     return Verified(message, digest, signer)
 
@@ -192,8 +214,13 @@ def _check_sender(message: SignedMessage, signer: str) -> None:
 
 
 @lru_cache(maxsize=_CACHED)
-def _address_of(key: bytes) -> str:
-    """The address of a public key, given as the bytes of libsecp256k1's `secp256k1_pubkey`, equal for equal keys."""
+def signer_of(key: bytes) -> str:
+    """The address of a public key, given as the bytes of libsecp256k1's `secp256k1_pubkey`, equal for equal keys.
+
+    Raises `InvalidMessage` (`signature`) for no key, and if its address is zero.
+    """
+    if not key:
+        raise InvalidMessage("signature", "no key could have made it")
     source, text, size = ffi.new("secp256k1_pubkey *"), ffi.new("unsigned char[65]"), ffi.new("size_t *", 65)
     ffi.memmove(source, key, len(key))
     lib.secp256k1_ec_pubkey_serialize(_CONTEXT, text, size, source, lib.SECP256K1_EC_UNCOMPRESSED)

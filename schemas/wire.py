@@ -7,6 +7,7 @@ signatures. Hashes and contract bytes are Solidity's `abi.encodePacked` and `abi
 
 from __future__ import annotations
 
+from struct import Struct
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 import msgspec
@@ -32,34 +33,40 @@ _ENCODER: Final = msgspec.json.Encoder()
 
 _WORD: Final = 32
 _ABI_HEAD: Final = 10 * _WORD
+_MAX_UINT64: Final = 2**64 - 1
+_SMALL_ORDER: Final = Struct(">34s34s20s24xQ20s20s24xQ24xQ")
+"""What the hash of an order covers up to its nonce, if no number has more than 64 bits: in one step, so faster."""
 _TWELVE_ZEROS: Final = bytes(12)
 _WITHDRAWAL_TYPE: Final = keccak256(b"Withdrawal(bytes32 order,address lighthouse,uint256 deadline)")
 """The first word of what a withdrawal's signature covers; no order and no Result begins like this."""
 
 
-def decode(payload: bytes) -> Message:
+def decode(payload: bytes, likely: type[Any] | None = None) -> Message:
     """The message in `payload`, checked and in canonical form; its signature is present, but not verified.
 
-    Raises `InvalidMessage` and nothing else, whatever the bytes are. Its `reason` is one of `too-large`, `not-json`,
-    `unknown-kind`, `unknown-field`, `duplicate-field`, `field` (missing or of the wrong type), `address`, `cid`,
-    `nonce`, `range`, `hash`, `validator` (an order's lighthouse) and `signature`.
+    It is decoded sooner if it is of the `likely` kind. Raises `InvalidMessage` and nothing else, whatever the bytes
+    are. Its `reason` is one of `too-large`, `not-json`, `unknown-kind`, `unknown-field`, `duplicate-field`, `field`
+    (missing or of the wrong type), `address`, `cid`, `nonce`, `range`, `hash`, `validator` (an order's lighthouse) and
+    `signature`.
     """
     if len(payload) > MAX_MESSAGE_SIZE:
         raise InvalidMessage("too-large", f"it has {len(payload)} bytes; the limit is {MAX_MESSAGE_SIZE}")
-    kind = _type_of(payload)
+    kind: type[Message] = likely or _type_of(payload)
     try:
         message = _DECODERS[kind].decode(payload)
-    except msgspec.ValidationError as error:
-        if isinstance(error.__cause__, InvalidMessage):
-            raise error.__cause__ from None
-        _explain(payload, kind, str(error))
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        if isinstance(error.__cause__, InvalidMessage):  # its fields are those of this kind, so it is of this kind
+            raise error.__cause__ from None
+        if likely is not None:
+            return decode(payload)
+        if isinstance(error, msgspec.ValidationError):
+            _explain(payload, kind, str(error))
         raise InvalidMessage("not-json", str(error)) from None
     count = _FIELD_COUNTS[kind]
-    if not isinstance(message, TransactionFeedback) and not message.signature:
-        _explain(payload, kind, "the signature is empty", reason="signature")
     if isinstance(message, (Demand, Offer)) and message.sender is None:
         count -= 1
+    if not isinstance(message, TransactionFeedback) and not message.signature:
+        _explain(payload, kind, "the signature is empty", reason="signature")
     # The decoder takes the last of repeated fields. No value of a well-formed message contains a colon, so there is
     # one colon per field; any more belong to repeated fields.
     if payload.count(b":") != count:
@@ -177,28 +184,20 @@ def _explain(payload: bytes, kind: type[Message], detail: str, *, reason: str = 
 
 
 def _pack_order(message: Order) -> bytes:
-    lighthouse = address_bytes(message.lighthouse)
-    validator = address_bytes(message.validator)
+    first, second = address_bytes(message.lighthouse), address_bytes(message.validator)
     if isinstance(message, Demand):
-        parties, fee = lighthouse + validator, message.validator_fee
+        fee = message.validator_fee
     else:
-        parties, fee = validator + lighthouse, message.lighthouse_fee
+        first, second, fee = second, first, message.lighthouse_fee
     if message.sender is None:
         tail = bytes.fromhex(message.nonce)  # type: ignore[arg-type]  # a text in generation 3
     else:
-        tail = message.nonce.to_bytes(_WORD, "big") + address_bytes(message.sender)  # type: ignore[union-attr]
-    return b"".join(
-        (
-            parse_cid(message.model),
-            parse_cid(message.objective),
-            address_bytes(message.token),
-            message.cost.to_bytes(_WORD, "big"),
-            parties,
-            fee.to_bytes(_WORD, "big"),
-            message.deadline.to_bytes(_WORD, "big"),
-            tail,
-        )
-    )
+        tail = _word(message.nonce) + address_bytes(message.sender)  # type: ignore[arg-type]
+    model, objective, token = parse_cid(message.model), parse_cid(message.objective), address_bytes(message.token)
+    cost, deadline = message.cost, message.deadline
+    if cost <= _MAX_UINT64 and fee <= _MAX_UINT64 and deadline <= _MAX_UINT64:
+        return _SMALL_ORDER.pack(model, objective, token, cost, first, second, fee, deadline) + tail
+    return b"".join((model, objective, token, _word(cost), first, second, _word(fee), _word(deadline), tail))
 
 
 def _pack_result(message: Result) -> bytes:

@@ -27,11 +27,10 @@ from schemas import (
     address_bytes,
     decode,
     encode,
-    message_hash,
     names_in,
     recover,
     resolve_names,
-    verify_hashed,
+    verify_message,
 )
 from schemas.keys import market_key, market_kind
 
@@ -156,15 +155,14 @@ class RelayValidator:
         """The hash of a message that may be relayed. Raises `InvalidMessage`."""
         resolved = await self._resolved(message)
         self._check_order(resolved)
-        digest = message_hash(resolved)
-        verified = verify_hashed(resolved, digest)
+        verified = verify_message(resolved)
         if verified.signer in self._blocked:
             raise InvalidMessage("blocked", f"{verified.signer} is blocked")
         if isinstance(resolved, Demand | Offer):
-            if digest + address_bytes(verified.signer) in self.withdrawals:
+            if verified.hash + address_bytes(verified.signer) in self.withdrawals:
                 raise InvalidMessage("withdrawn", "its maker has withdrawn it")
             await self._check_validator(resolved.validator)
-        return digest.hex()
+        return verified.hash.hex()
 
     async def _resolved(self, message: SignedMessage) -> SignedMessage:
         names = names_in(message)

@@ -19,7 +19,7 @@ from mesh.background import call_in_loop
 from mesh.errors import ClosedError, InputError, InvalidKey
 from mesh.flood import Drops, FairQueue, Rate, RateLimiter
 from mesh.network import sending
-from mesh.network.pump import SLICE, Pump
+from mesh.network.pump import BATCH, Pump
 from mesh.network.validation import M, MessageValidator, Unresolved, ValidationStatistics, message_key
 from schemas import MAX_MESSAGE_SIZE, SignedMessage, Verified, encode
 from schemas.keys import PresenceKey, parse_key
@@ -282,9 +282,9 @@ class Subscription(Generic[M]):
             elif (copied := self._pump.copy(sample)) is not None:
                 copies.append(copied)
                 size += len(sample.payload)
-        for start in range(0, len(copies), SLICE):
+        for start in range(0, len(copies), BATCH):
             if not query.is_cancelled:
-                self._pump.feed(copies[start : start + SLICE])
+                self._pump.feed(copies[start : start + BATCH])
 
     @property
     def kind(self) -> str:

@@ -28,7 +28,7 @@ from mesh.log_context import log_event
 from mesh.network import sending
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
 log = logging.getLogger(__name__)
 
@@ -42,8 +42,6 @@ REMEMBERED: Final = 65_536
 """Dropped samples that the ring remembers."""
 BATCH: Final = 256
 """Samples converted for one call into the loop, at most."""
-SLICE: Final = 64
-"""Samples converted before Zenoh's queue is emptied again: a few milliseconds of signature checks."""
 BATCHES_IN_FLIGHT: Final = 2
 """Batches between the pump's thread and the consumer, at most."""
 ZENOH_QUEUE: Final = 512
@@ -72,7 +70,7 @@ class _Lane(deque[tuple[Any, int]]):
     def take(self, number: int) -> list[Any]:
         """Remove up to `number` items, the oldest first."""
         taken = [self.popleft() for _ in range(min(number, len(self)))]
-        self.size -= sum(size for _, size in taken)
+        self.size -= sum([size for _, size in taken])
         return [item for item, _ in taken]
 
 
@@ -113,12 +111,13 @@ class Pump(Generic[T]):
     """An async iterator over the converted samples on `selector`: `async with Pump(session, selector, convert)`.
 
     `convert` makes an item of a sample at once, or returns None to skip it. If that is expensive, give two functions
-    instead: `copy` takes what is needed out of a sample at once, and `convert_all` makes items of up to `SLICE` copies
-    while others wait in the ring. They run on the pump's own thread; the iterator raises what they raise. Items arrive
-    in order, but for copies of dropped ones. `capacity` and `capacity_bytes` bound the ring. Samples with more than
-    `payload_limit` bytes are refused. What is dropped or refused is counted in `drops`. Leaving `async with` undeclares
-    the subscriber and ends the thread and the iteration; undelivered samples are lost. Supports one consumer. Raises
-    `ClosedError` before it is entered.
+    instead: `copy` takes what is needed out of a sample at once, and `convert_all` makes items of up to `BATCH` copies
+    while others wait in the ring, and yields some of them every few milliseconds, so that Zenoh's queue is emptied in
+    between. They run on the pump's own thread; the iterator raises what they raise. Items arrive in order, but for
+    copies of dropped ones. `capacity` and `capacity_bytes` bound the ring. Samples with more than `payload_limit` bytes
+    are refused. What is dropped or refused is counted in `drops`. Leaving `async with` undeclares the subscriber and
+    ends the thread and the iteration; undelivered samples are lost. Supports one consumer. Raises `ClosedError` before
+    it is entered.
     """
 
     def __init__(
@@ -128,7 +127,7 @@ class Pump(Generic[T]):
         convert: Callable[[zenoh.Sample], T | None] | None = None,
         *,
         copy: Callable[[zenoh.Sample], Any] | None = None,
-        convert_all: Callable[[list[Any]], list[T]] | None = None,
+        convert_all: Callable[[list[Any]], Iterable[list[T]]] | None = None,
         capacity: int = RING_CAPACITY,
         capacity_bytes: int = RING_BYTES,
         payload_limit: int | None = None,
@@ -137,7 +136,7 @@ class Pump(Generic[T]):
         self._session = session
         self._selector = selector
         self._copy: Any = copy if convert is None else convert
-        self._items: Callable[[list[Any]], list[T]] = convert_all or (lambda copies: copies)
+        self._convert_all: Callable[[list[Any]], Iterable[list[T]]] = convert_all or (lambda copies: (copies,))
         self._payload_limit = payload_limit
         self._drops = Drops() if drops is None else drops
         self._lock = threading.Lock()
@@ -219,7 +218,8 @@ class Pump(Generic[T]):
 
     def feed(self, copies: list[Any]) -> None:
         """Convert and deliver what `copy` returned, beside the ring, on any thread, without waiting."""
-        call_in_loop(self.check_entered(), self._receive, self._items(copies), lambda: None)
+        for items in self._convert_all(copies):
+            call_in_loop(self.check_entered(), self._receive, items, lambda: None)
 
     def insert(self, item: T) -> None:
         """Deliver an item that was converted elsewhere. Call it on the loop's thread."""
@@ -234,7 +234,7 @@ class Pump(Generic[T]):
     def _run(self, loop: asyncio.AbstractEventLoop, queue: zenoh.handlers.Handler[zenoh.Sample]) -> None:
         try:
             while not self._stopping:
-                self._take(queue)
+                self._take(queue, wait=True)
                 if self._ring and self._slots.acquire(timeout=SLOT_WAIT):
                     self._deliver_batch(loop, queue)
         except zenoh.ZError:  # the queue was closed, which ends the thread
@@ -248,14 +248,14 @@ class Pump(Generic[T]):
                 while True:
                     queue.recv()
 
-    def _take(self, queue: zenoh.handlers.Handler[zenoh.Sample]) -> None:
-        """Move samples from Zenoh's queue into the ring; wait for one when both are empty."""
+    def _take(self, queue: zenoh.handlers.Handler[zenoh.Sample], *, wait: bool) -> None:
+        """Move samples from Zenoh's queue into the ring; `wait` for one when both are empty."""
         if self._copy_failure is not None:
-            if not self._ring:
+            if wait and not self._ring:
                 raise self._copy_failure
             return
         ring, limit = self._ring, self._payload_limit
-        sample = queue.try_recv() if ring else queue.recv()
+        sample = queue.recv() if wait and not ring else queue.try_recv()
         dropped = received = refused = 0
         while sample is not None:
             received += 1
@@ -281,15 +281,13 @@ class Pump(Generic[T]):
 
     def _deliver_batch(self, loop: asyncio.AbstractEventLoop, queue: zenoh.handlers.Handler[zenoh.Sample]) -> None:
         """Convert up to a batch of samples, emptying Zenoh's queue in between, and pass them to the loop."""
-        items: list[T] = []
+        batch: list[T] = []
         try:
-            for _ in range(BATCH // SLICE):
-                items += self._items(self._ring.take(SLICE))
-                if not self._ring:
-                    break
-                self._take(queue)
+            for items in self._convert_all(self._ring.take(BATCH)):
+                batch += items
+                self._take(queue, wait=False)
         finally:
-            call_in_loop(loop, self._receive, items, self._slots.release)
+            call_in_loop(loop, self._receive, batch, self._slots.release)
 
     def _receive(self, batch: list[T], taken: Callable[[], None]) -> None:
         if batch:

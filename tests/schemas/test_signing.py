@@ -8,7 +8,7 @@ from contextlib import suppress
 
 import msgspec
 import pytest
-from coincurve import PrivateKey
+from coincurve import PrivateKey, PublicKey
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
@@ -27,10 +27,10 @@ from schemas import (
     message_hash,
     recover,
     verify,
-    verify_hashed,
     verify_message,
 )
-from schemas.signing import Rejection
+from schemas.address import address_bytes
+from schemas.signing import Rejection, recover_keys, signed_digest, signer_of
 from tests.schemas.samples import (
     DEMAND,
     DEMAND_5,
@@ -72,7 +72,7 @@ def test_a_signed_message_verifies(message: SignedMessage, secret: int) -> None:
     signed = signer.sign(message)
     verified = verify(encode(signed))
     assert (verified.message, verified.hash, verified.signer) == (signed, message_hash(message), signer.address)
-    assert verify_message(signed) == verify_hashed(signed, verified.hash) == verified
+    assert verify_message(signed) == verified
 
 
 @given(st.binary(min_size=32, max_size=32))
@@ -125,6 +125,23 @@ def test_signature_of_another_length_is_refused() -> None:
 def test_any_bytes_verify_or_raise_invalid_message(signature: bytes) -> None:
     with suppress(InvalidMessage):
         assert recover(DIGEST, signature).startswith("0x")
+
+
+@given(st.lists(st.tuples(st.binary(min_size=32, max_size=32), st.binary(min_size=64, max_size=64), st.booleans())))
+def test_keys_are_recovered_as_by_the_curve_library(signatures: list[tuple[bytes, bytes, bool]]) -> None:
+    """Also those between signatures that no key could have made."""
+    signed = []
+    for digest, compact, is_odd in signatures:
+        with suppress(InvalidMessage):
+            signed.append(signed_digest(digest, compact + bytes([27 + is_odd])))
+    expected = []
+    for digest, signature, recovery_id in signed:
+        try:
+            key = PublicKey.from_signature_and_message(signature[:64] + bytes([recovery_id]), digest, hasher=None)
+            expected.append(keccak256(key.format(compressed=False)[1:])[12:])
+        except Exception:  # the library raises no narrower one
+            expected.append(b"")
+    assert [address_bytes(signer_of(key)) if key else b"" for key in recover_keys(signed)] == expected
 
 
 def test_unsigned_message_does_not_verify() -> None:

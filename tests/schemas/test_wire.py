@@ -10,6 +10,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+import schemas
 from schemas import (
     MAX_MESSAGE_SIZE,
     MAX_UINT256,
@@ -19,10 +20,10 @@ from schemas import (
     Offer,
     OrderFeedback,
     TransactionFeedback,
-    decode,
     encode,
     verify,
 )
+from schemas.messages import MESSAGE_TYPES
 from tests.schemas.samples import (
     DEMAND,
     DEMAND_5,
@@ -46,6 +47,20 @@ from tests.schemas.samples import (
 from tests.schemas.strategies import messages
 
 EVERY_KIND = (DEMAND_JSON, DEMAND_5_JSON, OFFER_JSON, RESULT_JSON, FEEDBACK_JSON, TRANSACTION_JSON)
+
+
+def outcome(data: bytes, likely: type[Message] | None) -> Message | tuple[str, str]:
+    try:
+        return schemas.decode(data, likely)
+    except InvalidMessage as error:
+        return error.reason, error.detail
+
+
+def decode(data: bytes) -> Message:
+    """The message, or the error, which are the same whatever kind is likely."""
+    for kind in MESSAGE_TYPES:
+        assert outcome(data, kind) == outcome(data, None)
+    return schemas.decode(data)
 
 
 def reason(data: bytes) -> str:

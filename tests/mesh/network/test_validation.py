@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import msgspec
 import pytest
 
 from mesh.network import ValidationStatistics, message_key, validation
-from schemas import Demand, Offer, Result, Verified, encode, message_hash, verify_hashed
+from schemas import Demand, Offer, Result, Verified, encode, message_hash
+from schemas.signing import SignedDigest, recover_keys
 from tests.mesh.network.validating import HEAD, check, counted, validator
 from tests.support.orders import (
     MARKET,
@@ -23,6 +25,9 @@ from tests.support.orders import (
     result,
     terms,
 )
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 
 @pytest.mark.parametrize(("kind", "make"), [(Demand, demand), (Offer, offer), (Result, result)])
@@ -217,18 +222,29 @@ def test_a_copy_of_an_accepted_message_is_not_decoded(monkeypatch: pytest.Monkey
 
 
 def test_the_signature_of_a_message_that_comes_twice_at_once_is_verified_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    checked, message, verifications = validator(), demand(), list[bytes]()
+    """Together, or in one batch but too far apart to be verified together."""
+    checked, recovered = validator(), list[SignedDigest]()
 
-    def verify(message: Demand, digest: bytes) -> Verified[Demand]:
-        verifications.append(digest)
-        return verify_hashed(message, digest)
+    def recover(signed: Iterable[SignedDigest]) -> list[bytes]:
+        recovered.extend(together := list(signed))
+        return recover_keys(together)
 
-    monkeypatch.setattr(validation, "verify_hashed", verify)
-    copy = json.dumps(json.loads(encode(message))).encode()
+    monkeypatch.setattr(validation, "recover_keys", recover)
+    messages = [demand() for _ in range(validation.SLICE)]
+    copies = [json.dumps(json.loads(encode(messages[place]))).encode() for place in (0, -1)]
+    payloads = [encode(messages[0]), copies[0], *map(encode, messages[1:]), copies[1]]
 
-    (found,) = checked.check_all([(message_key(MARKET, message), payload) for payload in (encode(message), copy)])
+    found = [
+        one for some in checked.check_all((message_key(MARKET, messages[0]), one) for one in payloads) for one in some
+    ]
 
-    assert isinstance(found, Verified)
-    assert found.message == message
-    assert len(verifications) == 1
-    assert checked.statistics(received=0, dropped=0).duplicate == 1
+    assert [one.message for one in found] == messages
+    assert len(recovered) == len(messages)
+    assert checked.statistics(received=0, dropped=0).duplicate == 2
+
+
+def test_each_copy_of_an_invalid_message_is_counted() -> None:
+    checked, message = validator(), msgspec.structs.replace(demand(), signature="00" * 64 + "1b")
+
+    assert not any(checked.check_all([(message_key(MARKET, message), encode(message))] * 3))
+    assert checked.statistics(received=0, dropped=0).invalid == {"signature": 3}
