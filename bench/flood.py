@@ -28,6 +28,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import bridge_flood
 from floods import FLOODS, Attacker
 
 from common import SPAWN, router
@@ -58,6 +59,8 @@ PATIENCE: Final = 40.0
 """Seconds after which a demand without a contract has failed."""
 DEADLINE: Final = 400
 """Blocks until the deadline of the attacker's orders."""
+BRIDGE_FLOOD: Final = "bridge-dead-cids"
+"""The flood of `bridge_flood.py`, which has a bridge and IPFS daemons instead of a market."""
 P50_BAR, P99_BAR, MEMORY_BAR = 2.0, 4.0, 200.0
 START: Final = 90.0
 
@@ -293,11 +296,11 @@ def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description="an open market during floods")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--only", choices=sorted(FLOODS), help="run this flood only")
+    parser.add_argument("--only", choices=sorted([*FLOODS, BRIDGE_FLOOD]), help="run this flood only")
     options = parser.parse_args()
     results = {}
-    for name in [options.only] if options.only else FLOODS:
-        results[name] = asyncio.run(measure(name))
+    for name in [options.only] if options.only else [*FLOODS, BRIDGE_FLOOD]:
+        results[name] = asyncio.run(bridge_flood.measure_all() if name == BRIDGE_FLOOD else measure(name))
         if not options.json:
             print(name, json.dumps(results[name]), sep="  ", flush=True)
     if options.json:

@@ -168,6 +168,10 @@ class BridgeStatus(Record, frozen=True, kw_only=True, rename="camel", forbid_unk
     content: ContentMetrics | None = None
     uptime: float = 0.0
     """Seconds since it started."""
+    dropped: Mapping[str, int] = {}
+    """What its process dropped since it started because there was too much of it, by reason."""
+    heaviest: Mapping[str, Mapping[str, int]] = {}
+    """The senders from whom it dropped most in the last minute, by reason, with estimated counts."""
 
 
 def bridge_status_key(bridge: str, lighthouse: str) -> str:

@@ -19,6 +19,7 @@ from bridges.ipfs.relay import QUEUE_LIMIT, MessageRelay, RelayOutcome
 from bridges.ipfs.status import BridgeHealth, changes_between, counters_of
 from mesh.background import call_in_loop
 from mesh.errors import InvalidMessage
+from mesh.flood import Drops
 from mesh.log_context import log_event
 from mesh.network import Channel, NetworkChange, Pump
 from mesh.role import Role
@@ -65,9 +66,9 @@ class ChannelBridge(Role):
     `validator` checks the messages of `lighthouse` (ENS name); `journal` belongs to this bridge alone; `swarm_peers`
     are multiaddrs to which the daemon is kept connected; `address` identifies the bridge on the mesh, by default a
     random one; `limit` bounds the queue of each direction; `published` is called with each message that this bridge
-    sent; `content` returns metrics for the status. Changed counters are logged every `report_interval` seconds.
-    `reconnect` and `publish_retry` are the delays after failures of the daemon. The caller closes network, daemon and
-    journal.
+    sent; `content` returns metrics for the status, and `drops` has what is dropped. Changed counters are logged every
+    `report_interval` seconds. `reconnect` and `publish_retry` are the delays after failures of the daemon. The caller
+    closes network, daemon and journal.
 
     An accepted message waits in the journal, even if `run` is cancelled, until the daemon has accepted it and names a
     listener. If the daemon dies during a call, the message may have gone out and is published again. What the daemon or
@@ -89,6 +90,7 @@ class ChannelBridge(Role):
         limit: int = QUEUE_LIMIT,
         published: Callable[[Side, RelayMessage], None] = lambda side, message: None,
         content: Callable[[], ContentMetrics | None] = lambda: None,
+        drops: Drops | None = None,
         report_interval: float = REPORT_INTERVAL,
         reconnect: RetryPolicy = RECONNECT,
         publish_retry: RetryPolicy = PUBLISH_RETRY,
@@ -104,13 +106,16 @@ class ChannelBridge(Role):
         self._to_ipfs = IpfsPublisher(self.link, self.relay, published, publish_retry)
         self._to_mesh = MeshPublisher(network, self.relay, published)
         self._content = content
+        self._drops = Drops() if drops is None else drops
         self._report_interval = report_interval
         self._started = time.monotonic()
         self._lookups = asyncio.Semaphore(LOOKUP_LIMIT)
 
     async def _open(self, stack: AsyncExitStack) -> None:
         session = self._network.session
-        channel = await stack.enter_async_context(Channel(session, self.lighthouse, head=self._validator.head))
+        channel = await stack.enter_async_context(
+            Channel(session, self.lighthouse, head=self._validator.head, drops=self._drops)
+        )
         self._withdrawn = await stack.enter_async_context(channel.subscribe(Withdrawal))
         self._pump: Pump[MeshMessage] = await stack.enter_async_context(
             Pump(session, lighthouse_selector(self.lighthouse), _convert)
@@ -159,6 +164,8 @@ class ChannelBridge(Role):
             to_mesh=self.relay.status(Side.MESH, per_second=self._to_mesh.rate.per_second()),
             content=self._content(),
             uptime=round(time.monotonic() - self._started, 1),
+            dropped=self._drops.totals(),
+            heaviest=self._drops.senders(),
         )
 
     def health(self) -> BridgeHealth:

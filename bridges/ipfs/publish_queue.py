@@ -69,21 +69,27 @@ class QueuedMessage:
 
 
 class PublishQueue:
-    """Holds up to `limit` messages. A message beyond that is rejected, so that no accepted one is lost."""
+    """Holds up to `limit` orders, and as many other messages. One beyond that is rejected, so that no accepted one is
+    lost.
+
+    Orders and other messages are sent in turn: a flood of orders does not delay results.
+    """
 
     def __init__(self, *, limit: int) -> None:
         self._limit = limit
-        self._own: OrderedDict[bytes, QueuedMessage] = OrderedDict()
+        self._orders: OrderedDict[bytes, QueuedMessage] = OrderedDict()
+        self._others: OrderedDict[bytes, QueuedMessage] = OrderedDict()
+        self._orders_next = False
         self._left: OrderedDict[bytes, QueuedMessage] = OrderedDict()
         self._unheard: OrderedDict[bytes, QueuedMessage] = OrderedDict()
         self._last_arrival = 0.0
 
     def __len__(self) -> int:
         """The messages that this bridge should send."""
-        return len(self._own)
+        return len(self._orders) + len(self._others)
 
     def __contains__(self, fingerprint: bytes) -> bool:
-        return fingerprint in self._own or fingerprint in self._left
+        return any(fingerprint in messages for messages in (self._orders, self._others, self._left))
 
     @property
     def left(self) -> int:
@@ -97,34 +103,37 @@ class PublishQueue:
 
     def add(self, queued: QueuedMessage) -> bool:
         """Accept a message; False if the queue is full."""
-        if len(self._own) + len(self._left) >= self._limit:
+        own = self._own(queued.message)
+        if len(own) + len(self._left) >= self._limit:
             return False
         if queued.left_to is None:
-            self._own[queued.message.fingerprint] = queued
+            own[queued.message.fingerprint] = queued
         else:
             self._leave(queued, queued.left_to, queued.since)
         return True
 
     def next(self) -> QueuedMessage | None:
-        """The oldest message that this bridge should send; it stays in the queue."""
-        return next(iter(self._own.values()), None)
+        """The oldest message that this bridge should send, of the kind whose turn it is; it stays in the queue."""
+        first, second = (self._orders, self._others) if self._orders_next else (self._others, self._orders)
+        return next(iter((first or second).values()), None)
 
     def arrived(self, fingerprint: bytes, *, now: float) -> bool:
         """The message is at its destination, whichever bridge sent it; False if it was not queued."""
         if self._left.pop(fingerprint, None) is not None:
             self._last_arrival = now
             return True
-        return self._own.pop(fingerprint, None) is not None
+        return self._pop(fingerprint)
 
     def drop(self, fingerprint: bytes) -> None:
         """Remove a message that can't be sent, or must not be sent again."""
-        for messages in (self._own, self._left, self._unheard):
+        self._pop(fingerprint)
+        for messages in (self._left, self._unheard):
             messages.pop(fingerprint, None)
 
     def find(self, digest: str) -> list[RelayMessage]:
         """The messages with a hash (hexadecimal). O(messages)."""
-        queued = [*self._own.values(), *self._left.values(), *self._unheard.values()]
-        return [one.message for one in queued if one.message.hash == digest]
+        held = (self._orders, self._others, self._left, self._unheard)
+        return [one.message for messages in held for one in messages.values() if one.message.hash == digest]
 
     def keep_unheard(self, queued: QueuedMessage) -> QueuedMessage | None:
         """Keep a message that was sent while there were no listeners; returns the oldest such one if it is dropped."""
@@ -139,14 +148,16 @@ class PublishQueue:
         """There are listeners now: put the unheard messages before all others. Returns their number."""
         again, self._unheard = self._unheard, OrderedDict()
         for fingerprint in reversed(again):
-            self._own[fingerprint] = again[fingerprint]
-            self._own.move_to_end(fingerprint, last=False)
+            own = self._own(again[fingerprint].message)
+            own[fingerprint] = again[fingerprint]
+            own.move_to_end(fingerprint, last=False)
         return len(again)
 
     def hand_over(self, to: Rank, *, now: float) -> None:
         """Another bridge is active from now on: leave it the messages that it holds too."""
-        for fingerprint in [name for name, queued in self._own.items() if queued.shared]:
-            self._leave(self._own.pop(fingerprint), to, now)
+        for own in (self._others, self._orders):
+            for fingerprint in [name for name, queued in own.items() if queued.shared]:
+                self._leave(own.pop(fingerprint), to, now)
 
     def reassign(self, gone: Rank, successor: Rank | None, *, now: float) -> None:
         """The bridge ranked `gone` no longer sends: its messages go to `successor`, or to this bridge."""
@@ -174,7 +185,18 @@ class PublishQueue:
 
     def _take(self, queued: QueuedMessage) -> None:
         queued.left_to = None
-        self._own[queued.message.fingerprint] = queued
+        self._own(queued.message)[queued.message.fingerprint] = queued
+
+    def _own(self, message: RelayMessage) -> OrderedDict[bytes, QueuedMessage]:
+        return self._orders if message.kind in ("demand", "offer") else self._others
+
+    def _pop(self, fingerprint: bytes) -> bool:
+        """Remove a message that this bridge should send; then it is the other kind's turn. False if there is none."""
+        for own in (self._others, self._orders):
+            if own.pop(fingerprint, None) is not None:
+                self._orders_next = own is self._others
+                return True
+        return False
 
     def _leave(self, queued: QueuedMessage, to: Rank, now: float) -> None:
         if not self._left:

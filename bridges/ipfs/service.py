@@ -138,6 +138,7 @@ class IpfsBridge(Role):
                 address=self._address,
                 published=self._published,
                 content=self.content.metrics,
+                drops=self.drops,
             )
         )
 

@@ -154,6 +154,10 @@ PHASES: Final = ("incoming", "ready", "running", "complete")
 def describe_status(how: RoleStatus) -> dict[str, str]:
     """A status as names and texts. The texts come from others, so they are made printable."""
     facts = _describe_bridge(how) if isinstance(how, BridgeStatus) else _describe_participant(how)
+    if how.dropped:
+        facts["dropped"] = _counts(how.dropped)
+    for reason, senders in how.heaviest.items():
+        facts[f"most {reason}"] = ", ".join(f"{sender} {count:,}" for sender, count in senders.items())
     return {printable(name): printable(fact) for name, fact in facts.items()}
 
 
@@ -183,10 +187,6 @@ def _describe_participant(how: Status) -> dict[str, str]:
     }
     facts |= {} if how.work is None else _describe_work(how.work)
     facts |= {} if how.market is None else _describe_market(how.market)
-    if how.dropped:
-        facts["dropped"] = _counts(how.dropped)
-    for reason, senders in how.heaviest.items():
-        facts[f"most {reason}"] = ", ".join(f"{sender} {count:,}" for sender, count in senders.items())
     return facts | {
         "uptime": format_duration(int(how.uptime) * 10**9),
         "version": how.version,

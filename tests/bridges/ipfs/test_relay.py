@@ -238,6 +238,18 @@ def test_a_full_queue_rejects_messages_and_loses_none(time: Time, journal: Relay
     assert relay.receive(messages[2], Side.MESH) is RelayOutcome.ACCEPTED
 
 
+def test_a_flood_of_orders_delays_no_result_and_takes_no_room_from_it(time: Time, journal: RelayJournal) -> None:
+    relay, orders = bridge(time, journal, SENIOR, limit=4), [message() for _ in range(9)]
+    results = [message()._replace(key="aira/market/result") for _ in range(2)]
+    for order in orders:
+        relay.receive(order, Side.MESH)
+    outcomes = [relay.receive(result, Side.MESH) for result in results]
+    assert set(outcomes) == {RelayOutcome.ACCEPTED}
+    first, second = (result.fingerprint for result in results)
+    queued = [order.fingerprint for order in orders[:4]]
+    assert send_all(relay, Side.IPFS) == [first, queued[0], second, *queued[1:]]
+
+
 def test_a_refused_message_is_dropped_and_counted(time: Time, journal: RelayJournal) -> None:
     relay, one = bridge(time, journal, SENIOR), message()
     relay.receive(one, Side.MESH)

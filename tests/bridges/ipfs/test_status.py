@@ -16,6 +16,8 @@ from bridges.ipfs.status import (
     counters_of,
     health_parts,
 )
+from mesh.cli.status import describe_status
+from mesh.flood import Drops
 from mesh.network import Channel, Endpoints, Network
 from mesh.telemetry.metrics import merged
 from schemas.status import ALIVE, BridgeStatus, ContentMetrics, bridge_status_key
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
 
 SECONDS = 60.0
 MARKET = "airalab.lighthouse.3.robonomics.eth"
+SIGNER = "0x" + "ab" * 20
 
 
 def samples(families: Iterable[MetricFamily]) -> dict[tuple[str, frozenset[str]], float]:
@@ -174,9 +177,10 @@ async def test_a_flood_is_one_log_event_and_losses_are_a_warning(
 async def test_a_bridge_announces_its_presence_and_answers_with_its_status(
     router: EmbeddedRouter, topic: str, tmp_path: Path
 ) -> None:
-    api = f"http://127.0.0.1:{free_port()}"
+    api, drops = f"http://127.0.0.1:{free_port()}", Drops()
+    drops.count("content-queue-full", SIGNER, 7)
     async with (
-        bridging(router.endpoint, api, topic, tmp_path / "journal") as bridge,
+        bridging(router.endpoint, api, topic, tmp_path / "journal", drops=drops) as bridge,
         Network(Endpoints(connect=(router.endpoint,))) as network,
         Channel(network.session, topic) as channel,
     ):
@@ -204,6 +208,8 @@ async def test_a_bridge_announces_its_presence_and_answers_with_its_status(
         assert (status.lighthouse, status.api, status.state, status.carries) == (topic, api, "no daemon", False)
         assert status.mesh_peers == (f"agent 0x{'12' * 20}", f"bridge {bridge.address}")
         assert status.to_ipfs.received == status.to_mesh.received == 0
+        shown = describe_status(status)
+        assert (shown["dropped"], shown["most content-queue-full"]) == ("7 (7 content-queue-full)", f"{SIGNER} 7")
 
 
 def test_a_rate_covers_the_last_seconds() -> None:
