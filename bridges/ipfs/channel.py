@@ -46,6 +46,8 @@ OVERDUE_INTERVAL: Final = 1.0
 """Seconds between two checks of messages left to other bridges."""
 REPORT_INTERVAL: Final = 60.0
 """Seconds between two log events with the counters."""
+SLICE: Final = 16
+"""Messages of the mesh that are received before the event loop does something else: a few milliseconds."""
 LOOKUP_LIMIT: Final = 256
 """Messages that may wait for the resolution of their ENS names."""
 _ENS_NAME: Final = re.compile(rb"\.(?:eth|sid|test)\"", re.IGNORECASE)
@@ -200,8 +202,11 @@ class ChannelBridge(Role):
                 await self._withdrawn.recall()
 
     async def _receive_from_mesh(self) -> None:
-        dropped = 0
+        dropped = number = 0
         async for message in self._pump:
+            number += 1
+            if number % SLICE == 0:
+                await asyncio.sleep(0)  # others publish meanwhile
             if (lost := self._pump.dropped - dropped) > 0:
                 dropped += lost
                 self.relay.dropped[Side.IPFS]["unseen"] += lost
