@@ -12,7 +12,7 @@ import click
 
 from mesh.cli.options import with_settings
 from mesh.cli.output import announce
-from mesh.errors import ConfigurationError, NetworkUnavailable
+from mesh.errors import NetworkUnavailable
 from mesh.log_context import LogSource
 from mesh.outage_log import OutageLog
 from mesh.retry import Backoff
@@ -79,14 +79,8 @@ def _address(settings: Settings) -> str | None:
 
 
 async def _serve(settings: Settings, lighthouses: tuple[str, ...]) -> None:
-    try:
-        from bridges.ipfs.addresses import base_url
-        from bridges.ipfs.service import IpfsBridge
-    except ModuleNotFoundError as error:
-        raise ConfigurationError(
-            f"the IPFS bridge needs {error.name}, which is not installed", hint="pip install 'aira-mesh[ipfs]'"
-        ) from error
-
+    from bridges.ipfs.addresses import base_url
+    from bridges.ipfs.service import IpfsBridge
     from mesh.starting import wait_for_files
     from mesh.telemetry.serving import Telemetry
 

@@ -13,14 +13,17 @@ from enum import IntEnum
 from typing import TYPE_CHECKING, Final
 
 import msgspec
-from cobs import cobs  # type: ignore[import-untyped]
 
 from bridges.serial.dialect import BoardTopic, Flow
 from bridges.serial.errors import InvalidBoardMessage
+from mesh.extras import needs_extra
 from mesh.log_context import log_event
 from schemas.agent_keys import topic_chunks
 from schemas.errors import InvalidKey, InvalidPayload
 from schemas.payloads import EMPTY, JSON, RAW, STRING, Empty, PayloadType, String
+
+with needs_extra("serial", "a serial line"):
+    from cobs import cobs  # type: ignore[import-untyped]
 
 if TYPE_CHECKING:
     from bridges.serial.dialect import LineCounters

@@ -15,11 +15,13 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, Final
 
-import serial
-
 from bridges.serial.errors import InvalidPort, LineError, PortBusy, PortForbidden, PortMissing
 from mesh.errors import InputError
+from mesh.extras import needs_extra
 from mesh.log_context import log_event
+
+with needs_extra("serial", "a serial line"):
+    import serial
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

@@ -8,59 +8,62 @@ from __future__ import annotations
 import sys
 from typing import Final
 
-from mesh.chain.accounts import (
-    Account,
-    KeyfileError,
-    SignedTransaction,
-    WrongPassword,
-    copy_keyfile,
-    keyfile_address,
-    new_private_key,
-    write_keyfile,
-)
-from mesh.chain.admission import Allowances, UnsafeValidator, Validators
-from mesh.chain.answers import BlockHeader
-from mesh.chain.client import Chain
-from mesh.chain.deploy import XRT, Deployment, DeploymentPlan, deploy
-from mesh.chain.errors import (
-    ChainWentBack,
-    FeeTooHigh,
-    InsufficientFunds,
-    InsufficientTokens,
-    InvalidName,
-    NoAccount,
-    NoContracts,
-    NodeUnreachable,
-    NotALiability,
-    NotOffered,
-    OrderAlreadyUsed,
-    ReorganisedTooDeep,
-    RequestRefused,
-    Reverted,
-    StakeTooSmall,
-    TransactionTimeout,
-    UnknownName,
-    WrongChain,
-)
-from mesh.chain.events import (
-    Approval,
-    ChainEvent,
-    Current,
-    Finalized,
-    NewLiability,
-    NewLighthouse,
-    Offline,
-    Online,
-    Transfer,
-)
-from mesh.chain.following import BlockEvents, History, Reorganisation
-from mesh.chain.liabilities import Created, RefundState, Settled
-from mesh.chain.lighthouse_state import LighthouseState
-from mesh.chain.names import namehash
-from mesh.chain.node import Node
-from mesh.chain.policy import GWEI, FeePolicy, Timing
-from mesh.chain.tokens import Token
-from mesh.chain.transactions import Receipt, TransactionSender
+from mesh.extras import needs_extra
+
+with needs_extra("chain", "the chain"):
+    from mesh.chain.accounts import (
+        Account,
+        KeyfileError,
+        SignedTransaction,
+        WrongPassword,
+        copy_keyfile,
+        keyfile_address,
+        new_private_key,
+        write_keyfile,
+    )
+    from mesh.chain.admission import Allowances, UnsafeValidator, Validators
+    from mesh.chain.answers import BlockHeader
+    from mesh.chain.client import Chain
+    from mesh.chain.deploy import XRT, Deployment, DeploymentPlan, deploy
+    from mesh.chain.errors import (
+        ChainWentBack,
+        FeeTooHigh,
+        InsufficientFunds,
+        InsufficientTokens,
+        InvalidName,
+        NoAccount,
+        NoContracts,
+        NodeUnreachable,
+        NotALiability,
+        NotOffered,
+        OrderAlreadyUsed,
+        ReorganisedTooDeep,
+        RequestRefused,
+        Reverted,
+        StakeTooSmall,
+        TransactionTimeout,
+        UnknownName,
+        WrongChain,
+    )
+    from mesh.chain.events import (
+        Approval,
+        ChainEvent,
+        Current,
+        Finalized,
+        NewLiability,
+        NewLighthouse,
+        Offline,
+        Online,
+        Transfer,
+    )
+    from mesh.chain.following import BlockEvents, History, Reorganisation
+    from mesh.chain.liabilities import Created, RefundState, Settled
+    from mesh.chain.lighthouse_state import LighthouseState
+    from mesh.chain.names import namehash
+    from mesh.chain.node import Node
+    from mesh.chain.policy import GWEI, FeePolicy, Timing
+    from mesh.chain.tokens import Token
+    from mesh.chain.transactions import Receipt, TransactionSender
 
 RECURSION_LIMIT: Final = 3_000
 """Frames: safe on a stack of 2 MB (measured; 6,000 is not), and enough for contracts that call 200 deep."""

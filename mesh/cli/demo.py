@@ -26,7 +26,10 @@ def command(objective: Path | None, generation: str, out: Path | None, as_json: 
     Zenoh sessions, an EVM, signatures, files."""
     from tempfile import TemporaryDirectory
 
-    from mesh.demo.demo import Demo
+    from mesh.extras import needs_extra
+
+    with needs_extra("demo", "the demo"):
+        from mesh.demo.demo import Demo
     from mesh.demo.narration import JsonNarrator, TextNarrator
 
     narrator = JsonNarrator() if as_json else TextNarrator()

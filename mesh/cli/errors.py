@@ -37,10 +37,6 @@ class OutputFailed(AiraError, code="output-failed"):
     """The output of a command can't be printed or written to a file."""
 
 
-class PackageMissing(ConfigurationError, code="package-missing"):
-    """A package that the command needs is not installed."""
-
-
 class NoAnswer(RemoteError, code="no-answer"):
     """No agent, provider or bridge answers for an address."""
 

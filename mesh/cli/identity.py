@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mesh.cli.errors import IdentityMissing, InvalidOptions, PackageMissing
+from mesh.cli.errors import IdentityMissing, InvalidOptions
 from mesh.cli.options import FILE, FOLDER, with_json, with_settings
 from mesh.cli.output import print_facts, print_json, printable
 from mesh.errors import AiraError
@@ -161,7 +161,6 @@ def _own_address(settings: Settings) -> str:
     """The address in the settings' certificate."""
     if not settings.tls_certificate:
         raise IdentityMissing("no certificate is set", hint="give --tls-ca, --tls-certificate and --tls-key")
-    _check_installed()
     from mesh.identity.certificates import facts_of, read_certificate
 
     path = Path(settings.tls_certificate).expanduser()
@@ -278,21 +277,12 @@ def _text(text: str) -> str:
 
 
 def _site(folder: Path) -> SiteFolder:
-    _check_installed()
     from mesh.identity.folders import SiteFolder
 
     return SiteFolder(folder)
 
 
 def _member(folder: Path) -> Any:
-    _check_installed()
     from mesh.identity.folders import MemberFolder
 
     return MemberFolder(folder)
-
-
-def _check_installed() -> None:
-    from importlib.util import find_spec
-
-    if find_spec("cryptography") is None:
-        raise PackageMissing("certificates need the package cryptography", hint="pip install 'aira-mesh[identity]'")

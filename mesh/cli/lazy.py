@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from mesh.errors import ConfigurationError
+from mesh.errors import AiraError, ConfigurationError
+from mesh.extras import PackageMissing
 from mesh.running import INTERRUPTED, fail
 
 if TYPE_CHECKING:
@@ -77,10 +78,10 @@ class LazyGroup(click.Group):
         return sorted({*self.commands, *self._lazy, *self._installed})
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """The command, imported now. Exits with 2 for an installed one that can't be imported."""
+        """The command, imported now. Exits with 2 for one that can't be imported."""
         try:
             return self._command(cmd_name)
-        except BrokenCommand as error:
+        except ConfigurationError as error:
             fail(error)
 
     def resolve_command(
@@ -98,11 +99,13 @@ class LazyGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Import the command and run it. Ctrl-C during the import also exits with 130."""
+        """Import the command and run it. Ctrl-C during the import also exits with 130, an error with 1 or 2."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
             sys.exit(INTERRUPTED)
+        except AiraError as error:
+            fail(error)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """The list of commands. Imports only installed ones, whose help is not known otherwise."""
@@ -110,7 +113,7 @@ class LazyGroup(click.Group):
             formatter.write_dl([(name, self._help_of(name)) for name in self.list_commands(ctx)])
 
     def _command(self, name: str) -> click.Command | None:
-        """The command of that name. Raises `BrokenCommand`."""
+        """The command of that name. Raises `BrokenCommand`, `PackageMissing`."""
         if name in self.commands:
             return self.commands[name]
         if name in self._lazy:
@@ -124,6 +127,8 @@ class LazyGroup(click.Group):
             loaded = entry.load()
             if not isinstance(loaded, click.Command):
                 raise TypeError(f"{entry.value} is not a click command")
+        except PackageMissing:
+            raise
         except Exception as error:  # whatever the import of another package raises
             raise BrokenCommand(name, entry, error) from error
         return loaded
@@ -133,7 +138,7 @@ class LazyGroup(click.Group):
             return self._lazy[name][1]
         try:
             command = self._command(name)
-        except BrokenCommand as error:
+        except (BrokenCommand, PackageMissing) as error:
             return str(error)
         assert command is not None
         return command.get_short_help_str(HELP_WIDTH)

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from mesh.cli.errors import PackageMissing
 from mesh.cli.files import FETCH_SETTINGS, fetch, file_or_cid, opened_store, require_readable, write_error
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import (
@@ -21,6 +20,7 @@ from mesh.cli.output import (
     progress,
     run_sync,
 )
+from mesh.extras import needs_extra
 from mesh.recording import GENEROUS, Objective, TopicRates, open_objective, rates_of
 from mesh.running import run_to_end
 from schemas import cid_of_file
@@ -170,12 +170,8 @@ def _print_schemas(objective: Objective) -> None:
 
 def draw(rates: TopicRates, path: Path, *, title: str) -> None:
     """Plot the messages per second of each topic to a PNG at `path`. Raises `PackageMissing`, `FileUnwritable`."""
-    try:
+    with needs_extra("plot", "--png"):
         from matplotlib.figure import Figure
-    except ImportError:
-        raise PackageMissing(
-            "--png needs matplotlib, which is not installed", hint="pip install 'aira-mesh[plot]'"
-        ) from None
     figure = Figure(figsize=(10, 4), layout="constrained")
     axes = figure.add_subplot()
     spans = len(next(iter(rates.counts.values()), []))

@@ -12,7 +12,8 @@ from web3.providers.async_base import AsyncBaseProvider
 from mesh.chain import restrain_recursion
 from mesh.devchain.jsonrpc import CHANGES, LIMIT_EXCEEDED, RUNS, RpcError
 from mesh.devchain.rpc_server import JsonRpcServer
-from mesh.errors import ClosedError, ConfigurationError
+from mesh.errors import ClosedError
+from mesh.extras import needs_extra
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -106,13 +107,9 @@ class EmbeddedChain:
 
     def _start(self) -> None:
         # Imported in the thread: py-evm takes most of a second to load.
-        try:
+        with needs_extra("demo", "the embedded chain"):
             from mesh.devchain.evm import Evm
             from mesh.devchain.methods import Methods
-        except ModuleNotFoundError as error:
-            raise ConfigurationError(
-                f"the embedded chain needs {error.name}, which is not installed", hint="pip install 'aira-mesh[demo]'"
-            ) from None
         restrain_recursion()
         evm = Evm(run_seconds=self._run_seconds, max_logs=self._max_logs)
         self._funded_keys = evm.funded_keys

@@ -6,7 +6,7 @@ import asyncio
 import threading
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from mesh.background import call_in_loop
 from mesh.errors import AiraError
@@ -15,18 +15,6 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
 
 T = TypeVar("T")
-
-EXTRAS: Final = {
-    "web3": "chain",
-    "eth_account": "chain",
-    "eth_abi": "chain",
-    "eth_keyfile": "chain",
-    "aiohttp": "chain,ipfs",
-    "cryptography": "identity",
-    "serial": "serial",
-    "cobs": "serial",
-}
-"""Optional packages, and the extra of aira-mesh that installs each."""
 
 
 class CheckStatus(Enum):
@@ -164,12 +152,4 @@ async def _run(
             raise
         return failed(
             f"no answer within {seconds:g} s", code="no-answer", hint="try a longer --timeout if it may be slow"
-        )
-    except ModuleNotFoundError as error:
-        if (extra := EXTRAS.get((error.name or "").partition(".")[0])) is None:
-            raise
-        return failed(
-            f"the check needs {error.name}, which is not installed",
-            code="not-installed",
-            hint=f"pip install 'aira-mesh[{extra}]'",
         )

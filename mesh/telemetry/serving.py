@@ -7,7 +7,8 @@ import concurrent.futures
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Final, NamedTuple, Self, TypeVar
 
-from mesh.errors import ClosedError, ConfigurationError
+from mesh.errors import ClosedError
+from mesh.extras import needs_extra
 from mesh.telemetry.health import STARTING, Health, health_metrics, listen_address
 
 if TYPE_CHECKING:
@@ -35,13 +36,8 @@ def open_server(
     address can't be served. For processes without an event loop; others use `Telemetry`.
     """
     host, port = listen_address(listen)
-    try:
+    with needs_extra("metrics", "metrics_listen"):
         from mesh.telemetry.server import TelemetryServer
-    except ModuleNotFoundError as error:
-        raise ConfigurationError(
-            f"metrics need {error.name}, which is not installed",
-            hint="pip install 'aira-mesh[metrics]', or leave metrics_listen empty",
-        ) from None
     return TelemetryServer(host, port, families=families, health=health)
 
 

@@ -16,10 +16,10 @@ from mesh.cli.errors import (
     InvalidDestination,
     InvalidOptions,
     NotAFileOrCid,
-    PackageMissing,
 )
 from mesh.content import Store
 from mesh.errors import AiraError, InvalidCid
+from mesh.extras import PackageMissing
 from mesh.recording import Recorder, RecordingAbout, open_objective
 from mesh.recording.errors import NotARecording, RecordingError, RecordingExists
 from mesh.recording.packing import InvalidLine

@@ -12,6 +12,7 @@ import pytest
 from mesh.doctor import Check, CheckResult, CheckStatus, failed, passed, run_checks, warning
 from mesh.doctor.checks import in_thread
 from mesh.errors import ConfigurationError, RemoteError
+from mesh.extras import PackageMissing
 from tests.support.waiting import at_most
 
 if TYPE_CHECKING:
@@ -73,10 +74,12 @@ async def test_an_unexpected_error_is_raised() -> None:
 
 
 async def test_a_missing_package_is_named_with_the_extra_that_installs_it() -> None:
-    found = await made(failing("node", ModuleNotFoundError("no", name="web3.eth")))
+    found = await made(failing("node", PackageMissing("web3", extra="chain", user="the chain")))
 
     assert found["node"] == failed(
-        "the check needs web3.eth, which is not installed", code="not-installed", hint="pip install 'aira-mesh[chain]'"
+        "the chain needs the package web3, which is not installed",
+        code="package-missing",
+        hint="pip install 'aira-mesh[chain]'",
     )
 
 

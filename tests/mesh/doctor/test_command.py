@@ -219,5 +219,5 @@ def test_a_missing_package_is_reported() -> None:
     done = run(sys.executable, "-c", SMALL, "doctor", "--json", "--role", "agent")
 
     (node,) = [each for each in objects(done) if each["name"] == "node"]
-    assert node["code"] == "not-installed"
+    assert node["code"] == "package-missing"
     assert "pip install 'aira-mesh[chain" in node["do"]

@@ -222,6 +222,6 @@ except ConfigurationError as error:
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
 
     assert done.stdout == (
-        "metrics need prometheus_client, which is not installed | "
-        "pip install 'aira-mesh[metrics]', or leave metrics_listen empty\n"
+        "metrics_listen needs the package prometheus_client, which is not installed | "
+        "pip install 'aira-mesh[metrics]'\n"
     )
