@@ -71,6 +71,10 @@ class RecentDict(Generic[K, V]):
             self._young, self._old = {}, self._young
         self._young[key] = value
 
+    def get(self, key: K, default: V) -> V:
+        """The value of a key, or `default` for an unknown one."""
+        return self._young[key] if key in self._young else self._old.get(key, default)
+
     def pop(self, key: K, default: V) -> V:
         """Remove a key; returns its value, or `default` for an unknown one."""
         return self._young.pop(key, self._old.pop(key, default))

@@ -3,27 +3,29 @@ pragma solidity ^0.8.28;
 
 /// @title Many calls in one `eth_call`, without a contract on the chain.
 /// @notice A node is asked to create this contract, and answers with what the creation returns: not code, but the
-/// answers to the calls, ABI-encoded. It is never deployed. Calls can't change anything.
+/// answers to the calls. It is never deployed. Calls can't change anything.
 contract Multicall {
-    struct Call {
-        address target;
-        bytes data;
-    }
-
-    struct Answer {
-        bool success;
-        bytes data;
-    }
-
-    constructor(Call[] memory calls) {
-        Answer[] memory answers = new Answer[](calls.length);
-        for (uint256 index = 0; index < calls.length; ++index) {
-            // slither-disable-next-line calls-loop (it is never deployed, and the caller chooses the calls)
-            (answers[index].success, answers[index].data) = calls[index].target.staticcall(calls[index].data);
-        }
-        bytes memory encoded = abi.encode(answers);
+    /// @param gasEach The most gas of each call: a stranger's contract must not take that of the others.
+    /// @param most The most bytes of each answer; what is longer is cut.
+    /// @param calls One after another: the address, the length of the data (2 bytes), and the data. The answers: whether
+    /// the call succeeded (1 byte), the length of what it returned (2 bytes), and that.
+    constructor(uint256 gasEach, uint256 most, bytes memory calls) {
         assembly ("memory-safe") {
-            return(add(encoded, 32), mload(encoded))
+            let answers := mload(0x40)
+            let answer := answers
+            let call_ := add(calls, 0x20)
+            for { let end := add(call_, mload(calls)) } lt(call_, end) {} {
+                let length := and(shr(80, mload(call_)), 0xffff)
+                let data := add(call_, 22)
+                let success := staticcall(gasEach, shr(96, mload(call_)), data, length, 0, 0)
+                let size := returndatasize()
+                if gt(size, most) { size := most }
+                mstore(answer, or(shl(248, success), shl(232, size)))
+                returndatacopy(add(answer, 3), 0, size)
+                answer := add(add(answer, 3), size)
+                call_ := add(data, length)
+            }
+            return(answers, sub(answer, answers))
         }
     }
 }

@@ -12,6 +12,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from mesh.agent.handlers import call
+from mesh.chain.admission import UNFUNDED_POLLS
 from mesh.content import ContentUnavailable
 from mesh.flood import FairQueue, Rate, RateLimiter
 from mesh.work.objectives import Buyer, ObjectiveNotFetched
@@ -33,7 +34,7 @@ FREE_HANDLED: Final = 16
 """Of these, demands that pay nothing."""
 FREE_RATE: Final = Rate(per_second=4.0, burst=64)
 """Demands that pay nothing and are handled. Each offer for one may become a job."""
-CHECKED: Final = 128
+CHECKED: Final = 512
 """Demands whose makers' funds are asked for at once."""
 WAITING: Final = 16_384
 """Demands that wait for the check of their funds, and as many for a handler."""
@@ -98,16 +99,15 @@ class DemandDispatcher:
         """Pass on the demands whose makers can pay."""
         while True:
             batch = await self._arrived.get_batch(CHECKED)
-            for demand, is_funded in zip(batch, await asyncio.gather(*map(self._is_funded, batch)), strict=True):
-                if not is_funded:
-                    self._drop(demand, "unfunded")
+            question = partial(self._chain.costs.shortages, batch)
+            shortages = await self._chain.retrying(question, outages=self._outages)
+            for demand, shortage in zip(batch, shortages, strict=True):
+                if shortage:
+                    self._drop(demand, "unfunded", after=UNFUNDED_POLLS * self._chain.node.timing.poll_interval)
                     continue
                 for dropped in self._funded.put(demand.signer, demand, priority=self._worth(demand)):
                     self._drop(dropped, "queue-full")
             self._changed.set()
-
-    async def _is_funded(self, demand: Verified[Demand]) -> bool:
-        return await self._chain.retrying(partial(self._chain.costs.can_be_paid, demand), outages=self._outages)
 
     def _worth(self, demand: Verified[Demand]) -> int:
         """The priority of a demand: by the magnitude of its pay, and of two alike the customer's."""
@@ -150,7 +150,7 @@ class DemandDispatcher:
     def _is_logged(self, error: AiraError) -> bool:
         return not isinstance(error, ObjectiveNotFetched) and self._logged.allow(error.code)
 
-    def _drop(self, demand: Verified[Demand], reason: str) -> None:
-        """Count a demand that is not handled now, and let its next copy through."""
+    def _drop(self, demand: Verified[Demand], reason: str, *, after: float = 0.0) -> None:
+        """Count a demand that is not handled now, and let its next copy through, `after` seconds."""
         self._drops.count(reason, demand.signer)
-        self._subscription.forget(demand)
+        self._subscription.forget(demand, after=after)

@@ -13,23 +13,23 @@ import asyncio
 import logging
 import math
 import time
-from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING, Final
 
 from mesh.chain.contracts import OriginalContracts
 from mesh.chain.errors import InsufficientTokens, Reverted
-from mesh.chain.funds import SHORT_POLLS, Holding
+from mesh.chain.funds import NO_TOKEN, SHORT_POLLS, Holding
 from mesh.chain.lighthouses import Lighthouses
 from mesh.errors import InputError
+from mesh.flood import BoundedDict
 from mesh.log_context import log_event
 from schemas.address import ZERO_ADDRESS
 from schemas.messages import Offer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Iterable, Mapping
+    from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 
     from mesh.chain.contracts import Contracts
-    from mesh.chain.funds import Funds
+    from mesh.chain.funds import Funding, Funds
     from mesh.chain.tokens import Tokens
     from schemas import Liability, Verified
     from schemas.messages import Order
@@ -40,6 +40,10 @@ REMEMBERED: Final = 4096
 """Validators whose verdict is remembered, the latest ones."""
 RECHECK: Final = 60.0
 """Seconds after which a verdict is asked for again that a transaction can change."""
+UNFUNDED_POLLS: Final = 15
+"""Intervals between polls of the chain after which a copy of an order is worth a look whose maker could not pay."""
+TOKEN_UNREADABLE: Final = "TokenUnreadable"
+"""The reason of a rejection when a contract does not tell balances and allowances, so that it can't be paid with."""
 LEAST_AHEAD: Final = 4
 MOST_AHEAD: Final = 16
 """An allowance that contracts have used up is approved for so many times what the open orders need, growing."""
@@ -56,26 +60,27 @@ class OrderCosts:
         """What the factory may take from the maker of an order, by token, in the token's smallest unit."""
         if isinstance(order, Offer):
             return {self._xrt: order.lighthouse_fee}
-        costs = Counter({order.token: order.cost})
-        costs[self._xrt] += order.validator_fee
+        costs = {order.token: order.cost}
+        costs[self._xrt] = costs.get(self._xrt, 0) + order.validator_fee
         return costs
 
-    async def shortage(self, order: Verified[Order], *, fresh: bool = False) -> str:
-        """What an order's maker lacks to pay what the order costs it, as the contracts call it; empty if nothing.
+    async def shortages(self, orders: Sequence[Verified[Order]], *, fresh: bool = False) -> list[str]:
+        """What each order's maker lacks to pay what the order costs it, as the contracts call it; empty if nothing.
 
-        Without `fresh`, the answer may be a few poll intervals old. Empty if a token can't be read: it is a stranger's
-        contract. Raises `NodeUnreachable`.
+        Without `fresh`, the answers may be a few poll intervals old. They are empty, too, if the node refuses them.
+        Raises `NodeUnreachable`.
         """
-        for token, amount in self.of(order.message).items():
-            if not amount:
-                continue
-            holding = Holding(token, order.signer)
-            funding = await self._funds.of(holding, fresh=fresh)
-            if funding is not None and min(funding) < amount and not fresh:
-                funding = await self._funds.of(holding, within=SHORT_POLLS)  # it may have paid in since
-            if funding is not None and min(funding) < amount:
-                return "ERC20InsufficientAllowance" if funding.allowance < amount else "ERC20InsufficientBalance"
-        return ""
+        costs = [
+            {Holding(token, order.signer): amount for token, amount in self.of(order.message).items() if amount}
+            for order in orders
+        ]
+        known = await self._funds.of((holding for one in costs for holding in one), fresh=fresh)
+        short = {holding for one in costs for holding, amount in one.items() if _lacks(known[holding], amount)}
+        if short and not fresh:
+            known = {**known, **await self._funds.of(short, within=SHORT_POLLS)}  # they may have paid in since
+        return [
+            next(filter(None, (_lacks(known[holding], amount) for holding, amount in one.items())), "") for one in costs
+        ]
 
     def worth(self, order: Order | Liability, *, token: str = "") -> int:
         """The priority of an order, or of its liability, where there are too many: the magnitude of its cost.
@@ -85,9 +90,14 @@ class OrderCosts:
         """
         return order.cost.bit_length() if order.token == (token or self._xrt) else 0
 
-    async def can_be_paid(self, order: Verified[Order], *, fresh: bool = False) -> bool:
-        """Whether an order's maker lacks nothing; see `shortage`."""
-        return not await self.shortage(order, fresh=fresh)
+
+def _lacks(funding: Funding | None, amount: int) -> str:
+    """What is missing to pay an amount; empty if nothing is, or nothing is known."""
+    if funding is None or min(funding) >= amount:
+        return ""
+    if funding == NO_TOKEN:
+        return TOKEN_UNREADABLE
+    return "ERC20InsufficientAllowance" if funding.allowance < amount else "ERC20InsufficientBalance"
 
 
 class UnsafeValidator(InputError, code="validator-unsafe"):
@@ -111,7 +121,7 @@ class Validators:
     def __init__(self, contracts: Contracts, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._contracts = contracts
         self._clock = clock
-        self._verdicts: OrderedDict[str, tuple[bool, float]] = OrderedDict()
+        self._verdicts: BoundedDict[str, tuple[bool, float]] = BoundedDict(REMEMBERED)
 
     def known(self, validator: str) -> bool | None:
         """Whether orders may name the validator (EIP-55 address); None if the chain has to be asked."""
@@ -126,9 +136,6 @@ class Validators:
         if verdict is None:
             verdict, is_final = await self._ask(validator)
             self._verdicts[validator] = (verdict, math.inf if is_final else self._clock() + RECHECK)
-            self._verdicts.move_to_end(validator)
-            if len(self._verdicts) > REMEMBERED:
-                self._verdicts.popitem(last=False)
         return verdict
 
     async def check(self, order: Order) -> None:

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from web3.contract.async_contract import AsyncContractFunction
 
     ContractCall: TypeAlias = "AsyncContractFunction | Getter"
+    Call: TypeAlias = tuple[str, bytes]
+    """An address and data."""
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +34,9 @@ READ_ATTEMPTS: Final = 3
 
 CALLS_AT_ONCE: Final = 100
 """Most calls in one: the creation code has 49,152 bytes at most (EIP-3860), and what it returns 24,576 (EIP-170)."""
+UNLIMITED_GAS: Final = 2**256 - 1
+LONGEST: Final = 0xFFFF
+"""Bytes of an answer."""
 
 
 class Getter(NamedTuple):
@@ -121,24 +126,54 @@ def _decoded(call: ContractCall, returned: bytes | None) -> Any:
     return values[0] if len(values) == 1 else values
 
 
-def encode_calls(calls: Sequence[tuple[str, bytes]]) -> bytes:
-    """The creation code that makes the calls: of an address, with data."""
-    return load_artifact("Multicall").bytecode + encode(["(address,bytes)[]"], [list(calls)])
+async def call_all(node: Caller, calls: Sequence[Call], *, gas: int, most: int) -> list[bytes | None]:
+    """What each call returns, `most` bytes of it, and None if it fails, also because it needs more than `gas`.
+
+    Raises `Reverted` and `RequestRefused`, as when all calls together are too much for the node.
+    """
+    try:
+        answers = decode_answers(await node.call({"data": "0x" + encode_calls(calls, gas=gas, most=most).hex()}))
+    except SpoiledAnswer as error:
+        raise InvalidAnswer(f"{len(calls)} calls in one", str(error)) from None
+    if len(answers) != len(calls):
+        raise InvalidAnswer(f"{len(calls)} calls in one", f"there are {len(answers)} answers")
+    return answers
 
 
-def decode_calls(code: bytes) -> list[tuple[str, bytes]] | None:
-    """What `encode_calls` encoded; None for other code. For nodes that do not run it but know what it does."""
+def encode_calls(calls: Sequence[Call], *, gas: int = UNLIMITED_GAS, most: int = LONGEST) -> bytes:
+    """The creation code that makes the calls, each with at most `gas`, for at most `most` bytes of its answer."""
+    packed = b"".join([bytes.fromhex(to[2:]) + len(data).to_bytes(2) + data for to, data in calls])
+    return load_artifact("Multicall").bytecode + encode(["uint256", "uint256", "bytes"], [gas, most, packed])
+
+
+def decode_calls(code: bytes) -> list[Call] | None:
+    """The calls that `encode_calls` encoded; None for other code. For nodes that imitate it."""
     known = load_artifact("Multicall").bytecode
     if not code.startswith(known):
         return None
-    return [(str(target), bytes(data)) for target, data in decode_values(["(address,bytes)[]"], code[len(known) :])[0]]
+    packed, calls, at = decode_values(["uint256", "uint256", "bytes"], code[len(known) :])[2], [], 0
+    while at < len(packed):
+        data = at + 22
+        end = data + int.from_bytes(packed[at + 20 : data])
+        calls.append(("0x" + packed[at : at + 20].hex(), packed[data:end]))
+        at = end
+    return calls
 
 
 def encode_answers(answers: Sequence[bytes | None]) -> bytes:
     """What the code returns: of each call what it returned, or None if it failed."""
-    return encode(["(bool,bytes)[]"], [[(answer is not None, answer or b"") for answer in answers]])
+    return b"".join([bytes([one is not None]) + len(one or b"").to_bytes(2) + (one or b"") for one in answers])
 
 
-def decode_answers(data: bytes) -> list[bytes | None]:
+def decode_answers(returned: bytes) -> list[bytes | None]:
     """The reverse of `encode_answers`. Raises `SpoiledAnswer`."""
-    return [bytes(answer) if success else None for success, answer in decode_values(["(bool,bytes)[]"], data)[0]]
+    answers: list[bytes | None] = []
+    at = 0
+    while at < len(returned):
+        data = at + 3
+        end = data + int.from_bytes(returned[at + 1 : data])
+        if end > len(returned) or returned[at] > 1:
+            raise SpoiledAnswer("the answers to many calls are cut off")
+        answers.append(returned[data:end] if returned[at] else None)
+        at = end
+    return answers

@@ -6,7 +6,6 @@ the lighthouse, to learn that from the contracts.
 
 from __future__ import annotations
 
-import asyncio
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.flood import FairQueue
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
     from mesh.network import Subscription
     from schemas import Verified
 
-CHECKED: Final = 128
+CHECKED: Final = 512
 """Orders whose makers' funds are asked for at once."""
 WAITING: Final = 32_768
 """Orders that wait for that."""
@@ -29,7 +28,7 @@ WAITING: Final = 32_768
 class Arrivals:
     """Takes orders from subscriptions (`take`), and passes them to `settlement` (`run`).
 
-    Those of jobs that pay more go first, and among equals those of known signers.
+    Those of known signers go first. What an order says that it pays counts only when its maker can pay it.
     """
 
     def __init__(
@@ -45,8 +44,8 @@ class Arrivals:
         """Take the open orders of other providers, then those that are published, until cancelled."""
         await orders.recall()
         async for order in orders:
-            priority = 2 * self._settlement.worth(order) + (order.signer in self._known)
-            for dropped, subscription in self._queue.put(order.signer, (order, orders), priority=priority):
+            is_known = order.signer in self._known
+            for dropped, subscription in self._queue.put(order.signer, (order, orders), priority=int(is_known)):
                 self._drops.count("queue-full", dropped.signer)
                 subscription.forget(dropped)
 
@@ -55,9 +54,7 @@ class Arrivals:
         while True:
             batch = [order for order, _ in await self._queue.get_batch(CHECKED)]
             await self._has_room()
-            for order, shortage in zip(
-                batch, await asyncio.gather(*map(self._settlement.shortage, batch)), strict=True
-            ):
+            for order, shortage in zip(batch, await self._settlement.shortages(batch), strict=True):
                 if shortage:
                     self._drops.count("unfunded", order.signer)
                     self._settlement.set_aside(order, shortage)

@@ -189,11 +189,11 @@ class Provider(Role):
         """The state of each part, as `aira status` shows it."""
         return self._status.health()
 
-    def _forget(self, verified: Verified[Any]) -> None:
+    def _forget(self, verified: Verified[Any], *, after: float = 0.0) -> None:
         """Let the next copy of a message through: it is not handled, or its effect was not confirmed."""
         for subscription in (self._demands, self._offers, self._withdrawn, self.results):
             if subscription.kind == verified.message.kind:
-                subscription.forget(verified)
+                subscription.forget(verified, after=after)
 
     async def _follow_blocklist(self, blocked: Blocklist) -> None:
         while True:

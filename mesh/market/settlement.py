@@ -14,6 +14,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from mesh.chain import NoContracts, NodeUnreachable, NotALiability, RequestRefused, Reverted, TransactionTimeout
+from mesh.chain.admission import UNFUNDED_POLLS
 from mesh.errors import AiraError, ChainError, InputError
 from mesh.log_context import liability_context, log_event
 from mesh.market.book import ORDER_USED, Added, Match, Refusal, at_fault, order_id, reason_word
@@ -25,7 +26,7 @@ from schemas import ZERO_ADDRESS, Result
 
 if TYPE_CHECKING:
     import asyncio
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable, Callable, Sequence
 
     from mesh.chain import Chain, Created
     from mesh.flood import Drops
@@ -61,7 +62,7 @@ class Settlement:
         earnings: EarningsLedger,
         head: int,
         matched: Callable[[Match], None],
-        forget: Callable[[Verified[Any]], None],
+        forget: Callable[..., None],
         withdrawals: Withdrawals,
         drops: Drops,
         open_limit: int = OPEN_LIABILITIES,
@@ -94,9 +95,8 @@ class Settlement:
             forget=forget,
             open_limit=open_limit,
         )
-        self._unfunded = UnfundedOrders(
-            book, self._is_funded, funded=self.add, interval=chain.node.timing.poll_interval
-        )
+        self._unfunded_pause = UNFUNDED_POLLS * chain.node.timing.poll_interval
+        self._unfunded = UnfundedOrders(book, self.shortages, funded=self.add, interval=chain.node.timing.poll_interval)
 
     def start(self, tasks: asyncio.TaskGroup) -> None:
         """Follow the chain, and from now on settle what is added, in tasks of this group."""
@@ -136,7 +136,7 @@ class Settlement:
         """Keep an order whose maker can't pay, unmatched, until it can; `reason` is the contracts' error for that."""
         if self._refusal(order) is None and order_id(order) not in self._book and self._unfunded.add(order):
             self.reject(order, reason, "its maker does not have, or does not allow the factory to take, what it costs")
-        self._forget(order)
+        self._forget(order, after=self._unfunded_pause)
 
     def _settle_again(self, message: Verified[Any]) -> None:
         if isinstance(message.message, Result):
@@ -147,7 +147,7 @@ class Settlement:
     def _refusal(self, order: Verified[Order]) -> Refusal | None:
         if order in self._unfunded:
             self._unfunded.hasten(order)
-            self._forget(order)
+            self._forget(order, after=self._unfunded_pause)
             return Refusal.DUPLICATE
         if order in self._unconfirmed:
             return Refusal.DUPLICATE
@@ -203,12 +203,12 @@ class Settlement:
 
     async def _create(self, match: Match) -> None:
         demand, offer = match
-        for order in match:
-            if shortage := await self.shortage(order):
-                await self._set_aside_unfunded(match, shortage, "its maker can't pay any more")
-                return
+        if shortage := next(filter(None, await self.shortages(match)), ""):
+            await self._set_aside_unfunded(match, shortage, "its maker can't pay any more")
+            return
         try:
-            created = await self._queue.send(self._creation(match), priority=self.worth(demand))
+            priority = self._chain.costs.worth(demand.message)
+            created = await self._queue.send(self._creation(match), priority=priority)
         except MatchWithdrawn:
             self._put_back(match)
         except Reverted as error:
@@ -255,7 +255,8 @@ class Settlement:
 
     async def _set_aside_unfunded(self, match: Match, reason: str, detail: str) -> bool:
         """Keep the orders whose makers can't pay in the book, unmatched, and tell them; False if both can."""
-        unfunded = [order for order in match if await self.shortage(order, fresh=True)]
+        shortages = await self.shortages(match, fresh=True)
+        unfunded = [order for order, shortage in zip(match, shortages, strict=True) if shortage]
         for order in match if unfunded else ():
             if self._unconfirmed.end(order):
                 continue
@@ -264,20 +265,13 @@ class Settlement:
                 continue
             self._unfunded.add(order)
             self.reject(order, reason, detail)
-            self._forget(order)
+            self._forget(order, after=self._unfunded_pause)
         return bool(unfunded)
 
-    async def shortage(self, order: Verified[Order], *, fresh: bool = False) -> str:
-        """What an order's maker lacks to pay what it costs: see `OrderCosts.shortage`. Asked until the node answers."""
-        question = partial(self._chain.costs.shortage, order, fresh=fresh)
+    async def shortages(self, orders: Sequence[Verified[Order]], *, fresh: bool = False) -> list[str]:
+        """What makers of orders lack to pay for them: see `OrderCosts.shortages`. Asked until the node answers."""
+        question = partial(self._chain.costs.shortages, orders, fresh=fresh)
         return await self._chain.retrying(question, outages=self.events.lookups)
-
-    def worth(self, order: Verified[Order]) -> int:
-        """The priority of an order: see `OrderCosts.worth`."""
-        return self._chain.costs.worth(order.message)
-
-    async def _is_funded(self, order: Verified[Order]) -> bool:
-        return not await self.shortage(order)
 
     async def _not_created(self, match: Match, rejected: tuple[Verified[Order], ...], error: AiraError) -> None:
         """Reject some orders of a match; put the other one back into the book, unless it was used meanwhile."""

@@ -11,7 +11,7 @@ from mesh.market.book import order_id
 from mesh.retry import Backoff, RetryPolicy
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable, Callable, Sequence
 
     from mesh.market.book import Order, OrderBook
     from schemas import Verified
@@ -20,20 +20,21 @@ RETRY: Final = RetryPolicy(initial=2.0, ceiling=60.0)
 """When an order's maker is asked after again."""
 LIMIT: Final = 4096
 """Orders that may wait for their makers' funds at the same time."""
-CHECKS: Final = 64
+CHECKS: Final = 256
 """Orders that are looked at in one round, at most."""
 
 
 class UnfundedOrders:
     """The orders in `book` whose makers can't pay; if one can again, its order is taken out and passed to `funded`.
 
-    `interval` is in seconds between two rounds, of at most `CHECKS` orders each.
+    `shortages` says of each order what its maker lacks. `interval` is in seconds between two rounds, of at most
+    `CHECKS` orders each.
     """
 
     def __init__(
         self,
         book: OrderBook,
-        can_pay: Callable[[Verified[Order]], Awaitable[bool]],
+        shortages: Callable[[Sequence[Verified[Order]]], Awaitable[Sequence[str]]],
         *,
         funded: Callable[[Verified[Order]], object],
         interval: float,
@@ -41,7 +42,7 @@ class UnfundedOrders:
         limit: int = LIMIT,
     ) -> None:
         self._book = book
-        self._can_pay = can_pay
+        self._shortages = shortages
         self._funded = funded
         self._interval = interval
         self._retry = retry
@@ -71,18 +72,15 @@ class UnfundedOrders:
         while True:
             await asyncio.sleep(self._interval)
             due = [order for order in (self._next_due() for _ in range(CHECKS)) if order is not None]
-            await asyncio.gather(*map(self._check, due))
-
-    async def _check(self, order: Verified[Order]) -> None:
-        can_pay = await self._can_pay(order)
-        waiting = self._waiting.pop(order_id(order), None)
-        if waiting is None or order_id(order) not in self._book:
-            return
-        if can_pay:
-            self._book.remove(order_id(order))
-            self._funded(order)
-        else:
-            self._schedule(order, waiting[1])
+            for order, shortage in zip(due, await self._shortages(due), strict=True):
+                waiting = self._waiting.pop(order_id(order), None)
+                if waiting is None or order_id(order) not in self._book:
+                    continue
+                if shortage:
+                    self._schedule(order, waiting[1])
+                else:
+                    self._book.remove(order_id(order))
+                    self._funded(order)
 
     def _next_due(self) -> Verified[Order] | None:
         """The next order that is due; forgets those that have left the book."""

@@ -213,7 +213,7 @@ class Subscription(Generic[M]):
         self._pump: Pump[Verified[M] | Unresolved[M]] = Pump(
             session,
             selector,
-            copy=lambda sample: (str(sample.key_expr), sample.payload.to_bytes()),
+            copy=self._copy,
             convert_all=validator.check_all,
             payload_limit=MAX_MESSAGE_SIZE,
             drops=self._drops,
@@ -248,6 +248,11 @@ class Subscription(Generic[M]):
     def _drop_lookup(self, unresolved: Unresolved[M]) -> None:
         self._validator.reject(unresolved.question)
         self._drops.count("lookup", unresolved.signer)
+
+    def _copy(self, sample: zenoh.Sample) -> tuple[str, bytes] | None:
+        """What is checked of a sample; None for a copy of an accepted message: it needs no place in the ring."""
+        payload = sample.payload.to_bytes()
+        return None if self._validator.is_copy(payload) else (str(sample.key_expr), payload)
 
     async def recall(self) -> None:
         """Ask the providers for the open orders; the iterator yields each new one once.
@@ -291,9 +296,9 @@ class Subscription(Generic[M]):
         """The kind of message: `demand`, `offer` or `result`."""
         return self._validator.kind.__name__.lower()
 
-    def forget(self, verified: Verified[M]) -> None:
-        """Deliver a message once more when it is sent again; see `MessageValidator`."""
-        self._validator.forget(verified)
+    def forget(self, verified: Verified[M], *, after: float = 0.0) -> None:
+        """Deliver a message once more when it is sent again, `after` seconds; see `MessageValidator`."""
+        self._validator.forget(verified, after=after)
 
     def statistics(self) -> ValidationStatistics:
         """The messages received, rejected (by reason) and dropped so far."""

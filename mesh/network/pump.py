@@ -6,8 +6,7 @@ batches. At most two batches are in flight; while the consumer is busy, or more 
 fills up and drops the *oldest* samples, which are counted. That costs no memory and never stalls the session, because
 the thread keeps emptying Zenoh's queue.
 
-A sample that gets through a full ring waits no longer than a ring takes to fill. One that was dropped goes first when
-it comes again: `ReceiveRing`.
+A sample that gets through a full ring waits no longer than a ring takes to fill. Its copy goes first: `ReceiveRing`.
 """
 
 from __future__ import annotations
@@ -39,7 +38,9 @@ RING_CAPACITY: Final = 8192
 RING_BYTES: Final = 8 * 1024 * 1024
 """Bytes of payloads that the ring holds before it drops the oldest."""
 REMEMBERED: Final = 65_536
-"""Dropped samples that the ring remembers."""
+"""Samples that the ring remembers, at most; half of them at least."""
+COPIES: Final = 4
+"""Copies of a sample that the ring tells apart: later ones are like the last of these."""
 BATCH: Final = 256
 """Samples converted for one call into the loop, at most."""
 BATCHES_IN_FLIGHT: Final = 2
@@ -58,18 +59,18 @@ class _Lane(deque[tuple[Any, int]]):
 
     size = 0
 
-    def add(self, item: Any, size: int, capacity: int, capacity_bytes: int) -> list[Any]:
-        """Add an item; returns what was dropped for it."""
+    def add(self, item: Any, size: int, capacity: int, capacity_bytes: int) -> int:
+        """Add an item; returns how many were dropped for it."""
         self.append((item, size))
         self.size += size
-        dropped = []
+        before = len(self)
         while len(self) > capacity or (self.size > capacity_bytes and len(self) > 1):
-            dropped += self.take(1)
-        return dropped
+            self.size -= self.popleft()[1]
+        return before - len(self)
 
-    def take(self, number: int) -> list[Any]:
-        """Remove up to `number` items, the oldest first."""
-        taken = [self.popleft() for _ in range(min(number, len(self)))]
+    def take(self, number: int, *, newest: bool) -> list[Any]:
+        """Remove up to `number` items, the oldest first, or the newest."""
+        taken = [self.pop() if newest else self.popleft() for _ in range(min(number, len(self)))]
         self.size -= sum([size for _, size in taken])
         return [item for item, _ in taken]
 
@@ -77,34 +78,38 @@ class _Lane(deque[tuple[Any, int]]):
 class ReceiveRing:
     """Received items that wait for their conversion, the oldest of which are dropped when there are too many.
 
-    With `second_chance`, which needs hashable items, an item that equals one that was dropped before waits in a lane of
-    its own, which gets three quarters of the conversions. Honest senders send again what has no effect; so in a flood
-    of ever new messages their second copy gets through, where otherwise each copy had the same small chance.
+    With `second_chance`, which needs hashable items, there is a lane for first copies, one for second ones, and so on.
+    All get the same share of the conversions, but for what others leave; of copies the newest go first. Honest senders
+    send again what has no effect. So in a flood of ever new messages their second copy gets through at once, also while
+    the first waits; in a flood of second copies the third does.
     """
 
     def __init__(self, capacity: int, capacity_bytes: int, *, second_chance: bool) -> None:
         self._bounds = capacity, capacity_bytes
-        self._first, self._again = _Lane(), _Lane()
         self._second_chance = second_chance
-        self._dropped: RecentDict[int, None] = RecentDict(REMEMBERED)
-        """Hashes of dropped items, with a key that only this process knows."""
+        self._lanes = [_Lane() for _ in range(COPIES if second_chance else 1)]
+        self._copies: RecentDict[int, int] = RecentDict(REMEMBERED)
+        """How often an item came, by its hash with a key that only this process knows."""
 
     def __len__(self) -> int:
-        return len(self._first) + len(self._again)
+        return sum(map(len, self._lanes))
 
     def append(self, item: Any, size: int) -> int:
         """Add an item of `size` bytes; returns how many were dropped for it."""
-        is_known = self._dropped and hash(item) in self._dropped
-        dropped = (self._again if is_known else self._first).add(item, size, *self._bounds)
+        lane = 0
         if self._second_chance:
-            for one in dropped:
-                self._dropped[hash(one)] = None
-        return len(dropped)
+            number = hash(item)
+            lane = self._copies.get(number, 0)
+            self._copies[number] = min(lane + 1, COPIES - 1)
+        return self._lanes[lane].add(item, size, *self._bounds)
 
     def take(self, number: int) -> list[Any]:
         """Remove up to `number` items."""
-        again = self._again.take(number - min(len(self._first), number // 4))
-        return again + self._first.take(number - len(again))
+        taken: list[Any] = []
+        filled = sorted(filter(None, self._lanes), key=len)
+        for left, lane in zip(range(len(filled), 0, -1), filled, strict=True):
+            taken += lane.take(-(-(number - len(taken)) // left), newest=lane is not self._lanes[0])
+        return taken
 
 
 class Pump(Generic[T]):
@@ -114,7 +119,7 @@ class Pump(Generic[T]):
     instead: `copy` takes what is needed out of a sample at once, and `convert_all` makes items of up to `BATCH` copies
     while others wait in the ring, and yields some of them every few milliseconds, so that Zenoh's queue is emptied in
     between. They run on the pump's own thread; the iterator raises what they raise. Items arrive in order, but for
-    copies of dropped ones. `capacity` and `capacity_bytes` bound the ring. Samples with more than `payload_limit` bytes
+    copies. `capacity` and `capacity_bytes` bound the ring. Samples with more than `payload_limit` bytes
     are refused. What is dropped or refused is counted in `drops`. Leaving `async with` undeclares the subscriber and
     ends the thread and the iteration; undelivered samples are lost. Supports one consumer. Raises `ClosedError` before
     it is entered.

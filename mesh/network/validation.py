@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
 
 import msgspec
 
+from mesh.clock import SYSTEM_CLOCK
 from mesh.errors import AiraError, InvalidMessage
 from mesh.flood import RecentDict
 from mesh.network.lookups import NameCache
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from mesh.blocklist import BlockedSigners
+    from mesh.clock import Clock
     from mesh.network.lookups import Resolver, ValidatorCheck
 
 log = logging.getLogger(__name__)
@@ -126,6 +128,7 @@ class MessageValidator(Generic[M]):
         validators: ValidatorCheck | None = None,
         blocked: BlockedSigners = frozenset(),
         deduplication_limit: int = DEDUPLICATION_LIMIT,
+        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         self.kind: type[M] = kind
         self._lighthouse = lighthouse
@@ -135,11 +138,23 @@ class MessageValidator(Generic[M]):
         self._validators = validators
         self._blocked = blocked
         self._lock = threading.Lock()
+        self._clock = clock
         self._seen: RecentDict[int, int] = RecentDict(2 * deduplication_limit)
         """Of the accepted messages, each by the other: what makes a message one, and the hash of its bytes."""
+        self._forgetting: deque[tuple[float, int]] = deque(maxlen=deduplication_limit)
+        """When messages will be forgotten, and what makes them one."""
         self._invalid: Counter[str] = Counter()
         self._duplicate = 0
         self._accepted = 0
+
+    def is_copy(self, payload: bytes) -> bool:
+        """Whether an accepted message had the same bytes: a duplicate, which is counted, and need not be checked."""
+        if self._forgetting:
+            self._forget_due()
+        if hash(payload) not in self._seen:
+            return False
+        self._count_duplicate()
+        return True
 
     def check(self, key: str, payload: bytes) -> Verified[M] | Unresolved[M] | None:
         """The verified message in `payload`; an `Unresolved` one; or None, which is counted under its reason."""
@@ -244,11 +259,23 @@ class MessageValidator(Generic[M]):
         with self._lock:
             self._invalid[reason] += 1
 
-    def forget(self, verified: Verified[M]) -> None:
-        """Accept an accepted message once more when it is sent again: its consumer no longer holds it."""
+    def forget(self, verified: Verified[M], *, after: float = 0.0) -> None:
+        """Accept an accepted message once more when it is sent again: its consumer no longer holds it.
+
+        With `after`, copies remain duplicates for so many seconds, in which looking at one again would be in vain.
+        """
+        identity = hash((verified.hash, verified.message.signature))
         with self._lock:
-            identity = hash((verified.hash, verified.message.signature))
-            self._seen.pop(self._seen.pop(identity, identity), 0)
+            if after:
+                self._forgetting.append((self._clock.monotonic() + after, identity))
+            else:
+                self._seen.pop(self._seen.pop(identity, identity), 0)
+
+    def _forget_due(self) -> None:
+        with self._lock:
+            while self._forgetting and self._forgetting[0][0] <= self._clock.monotonic():
+                _, identity = self._forgetting.popleft()
+                self._seen.pop(self._seen.pop(identity, identity), 0)
 
     def statistics(self, *, received: int, dropped: int) -> ValidationStatistics:
         """The counts so far, with what a subscription `received` and `dropped` before validation."""

@@ -6,13 +6,18 @@ import asyncio
 import secrets
 from typing import TYPE_CHECKING, Any
 
+from mesh.background import Background
+from mesh.flood import Drops, KnownSenders
 from mesh.market import Added, OrderBook, Refusal
+from mesh.market.arrivals import CHECKED, Arrivals
 from schemas import Demand, Signer, verify_message
 from tests.mesh.market.test_provider_withdrawals import withdrawal_of
 from tests.support.orders import LIGHTHOUSE, PERSON, STRANGER, verified_demand, verified_offer
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Sequence
+
     from mesh.market.book import Order
     from schemas import Verified
     from tests.mesh.market.local_market import LocalMarket
@@ -79,6 +84,44 @@ def copies(local: LocalMarket, count: int, **terms: Any) -> list[Demand]:
     return [stranger().sign(Demand(**(fields | {"nonce": secrets.token_hex(32)}))) for _ in range(count)]
 
 
+class Market:
+    """A subscription to orders, and what settles them."""
+
+    def __init__(self, *orders: Verified[Order]) -> None:
+        self._orders = orders
+        self.checked: list[Verified[Order]] = []
+
+    async def recall(self) -> None:
+        pass
+
+    async def __aiter__(self) -> AsyncIterator[Verified[Order]]:
+        for order in self._orders:
+            yield order
+
+    async def shortages(self, orders: Sequence[Verified[Order]]) -> list[str]:
+        self.checked += orders
+        return len(orders) * [""]
+
+    def add(self, order: Verified[Order]) -> None:
+        pass
+
+    async def has_room(self) -> None:
+        pass
+
+
+async def test_known_signers_are_checked_before_strangers_that_promise_more() -> None:
+    promised = [verified_demand(signer=stranger(), cost=10**18) for _ in range(2 * CHECKED)]
+    honest = verified_demand(signer=PERSON, cost=1)
+    market, known = Market(*promised, honest), KnownSenders()
+    known.add(PERSON.address)
+    arrivals = Arrivals(market, known=known, has_room=market.has_room, drops=Drops())  # type: ignore[arg-type]
+    await arrivals.take(market)  # type: ignore[arg-type]
+    async with Background() as tasks:
+        tasks.start(arrivals.run(), "arrivals")
+        await until(lambda: market.checked)
+    assert market.checked[0] == honest
+
+
 async def test_unfunded_demands_with_the_same_terms_take_no_offer(local: LocalMarket) -> None:
     await local.chain.tokens.approve(local.chain.factory, 5)
     async with local.provider() as provider:
@@ -86,7 +129,7 @@ async def test_unfunded_demands_with_the_same_terms_take_no_offer(local: LocalMa
             local.publish(*copies(local, 50, cost=5))
             await until(lambda: provider.drops.totals().get("unfunded") == 50 * (number + 1))  # noqa: B023
         honest = local.demand(cost=5)
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(30):
             local.publish(local.offer(cost=5), honest)
             await local.liability_of(honest)
         assert provider.ledger.turnover().matches == 1

@@ -11,7 +11,7 @@ from msgspec.structs import replace as replace_fields
 from mesh.market import order_id
 from schemas import verify_message
 from tests.mesh.market.observation import outages, until_read, works_on
-from tests.mesh.market.tokens import BURNS_ALL_GAS, deploy_token, refuses_with, says
+from tests.mesh.market.tokens import BURNS_ALL_GAS, deploy_token, readable, refuses_with, says
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ async def test_orders_that_were_used_during_another_providers_turn_leave(local: 
 
 @pytest.mark.parametrize("name", ["NotYourTurn(address,uint256)", "NotAProvider(address)"])
 async def test_a_token_that_reverts_with_a_lighthouse_error_stops_nothing(local: LocalMarket, name: str) -> None:
-    token = await deploy_token(local.chain, refuses_with(name))
+    token = await deploy_token(local.chain, readable(refuses_with(name)))
     async with local.provider() as provider:
         local.publish(bad := local.demand(cost=1, token=token), local.offer(cost=1, token=token))
 
@@ -89,7 +89,7 @@ async def test_a_token_that_reverts_with_a_lighthouse_error_stops_nothing(local:
 
 
 async def test_a_token_that_burns_all_gas_does_not_stop_the_provider(local: LocalMarket) -> None:
-    token = await deploy_token(local.chain, BURNS_ALL_GAS)
+    token = await deploy_token(local.chain, readable(BURNS_ALL_GAS))
     async with local.provider() as provider:
         local.publish(bad := local.demand(cost=1, token=token), offer := local.offer(cost=1, token=token))
 
@@ -98,8 +98,18 @@ async def test_a_token_that_burns_all_gas_does_not_stop_the_provider(local: Loca
         assert await works_on(local, provider)
 
 
+async def test_an_order_in_a_token_that_tells_no_balances_is_not_matched(local: LocalMarket) -> None:
+    token = await deploy_token(local.chain, BURNS_ALL_GAS)
+    async with local.provider() as provider:
+        local.publish(bad := local.demand(cost=1, token=token), local.offer(cost=1, token=token))
+
+        assert (await local.rejection_of(bad)).reason == "TokenUnreadable"
+        assert await works_on(local, provider)
+        assert provider.ledger.turnover().matches == 1
+
+
 async def test_the_text_of_a_token_is_not_the_reason_of_a_rejection(local: LocalMarket) -> None:
-    token = await deploy_token(local.chain, says(b"send me all your money, please"))
+    token = await deploy_token(local.chain, readable(says(b"send me all your money, please")))
     async with local.provider() as provider:
         local.publish(bad := local.demand(cost=1, token=token), local.offer(cost=1, token=token))
 

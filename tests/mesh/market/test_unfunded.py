@@ -15,6 +15,8 @@ from tests.support.orders import LIGHTHOUSE, verified_demand, verified_offer
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from schemas import Demand, Offer, Verified
     from tests.mesh.market.local_market import LocalMarket
 
@@ -29,15 +31,15 @@ class Purse:
         self.can_pay_now = False
         self.asked: list[Verified[Demand | Offer]] = []
 
-    async def can_pay(self, order: Verified[Demand | Offer]) -> bool:
-        self.asked.append(order)
-        return self.can_pay_now
+    async def shortages(self, orders: Sequence[Verified[Demand | Offer]]) -> list[str]:
+        self.asked += orders
+        return len(orders) * ["" if self.can_pay_now else "ERC20InsufficientBalance"]
 
 
 def unfunded(book: OrderBook, purse: Purse, **options: Any) -> tuple[UnfundedOrders, list[Verified[Demand | Offer]]]:
     funded: list[Verified[Demand | Offer]] = []
     chosen: dict[str, Any] = {"interval": 0.01, "retry": OFTEN} | options
-    made = UnfundedOrders(book, purse.can_pay, funded=funded.append, **chosen)
+    made = UnfundedOrders(book, purse.shortages, funded=funded.append, **chosen)
     return made, funded
 
 

@@ -1,4 +1,4 @@
-"""Malicious tokens as bytecode: every call has the same effect."""
+"""Malicious tokens as bytecode: every call has the same effect, or every one that is no look at balances."""
 
 from __future__ import annotations
 
@@ -14,6 +14,12 @@ BURNS_ALL_GAS = bytes.fromhex("fe")
 """INVALID, which uses up all gas of the call."""
 
 
+def readable(code: bytes) -> bytes:
+    """A token of which everybody has 2^256 - 1, and that does what `code` does when it is to pay."""
+    # CALLDATASIZE, PUSH1 100, GT, ISZERO, PUSH1 19, JUMPI, PUSH1 0, NOT, PUSH1 0, MSTORE, PUSH1 32, PUSH1 0, RETURN
+    return bytes.fromhex("366064111560135760001960005260206000f3" + "5b") + code
+
+
 def refuses_with(error: str) -> bytes:
     """Code that reverts with a custom error (its signature) and two words of zeros."""
     selector = keccak256(error.encode())[:4]
@@ -24,8 +30,9 @@ def refuses_with(error: str) -> bytes:
 def says(text: bytes) -> bytes:
     """Code that reverts with a text of up to 32 bytes, as `require(false, text)` does."""
     words = bytes.fromhex("08c379a0") + (32).to_bytes(32, "big") + len(text).to_bytes(32, "big") + text.ljust(32, b"\0")
-    # PUSH1 size, PUSH1 12 (where the words are), PUSH1 0, CODECOPY, PUSH1 size, PUSH1 0, REVERT
-    return bytes((0x60, len(words), 0x60, 12, 0x60, 0, 0x39, 0x60, len(words), 0x60, 0, 0xFD)) + words
+    # PUSH1 size, PUSH1 size, CODESIZE, SUB (where the words are), PUSH1 0, CODECOPY, PUSH1 size, PUSH1 0, REVERT
+    size = len(words)
+    return bytes((0x60, size, 0x60, size, 0x38, 0x03, 0x60, 0, 0x39, 0x60, size, 0x60, 0, 0xFD)) + words
 
 
 async def deploy_token(chain: Chain, code: bytes) -> str:

@@ -30,22 +30,23 @@ def test_the_oldest_are_dropped_beyond_the_number_and_the_bytes() -> None:
     assert len(waiting) == 0
 
 
-def test_what_was_dropped_goes_first_when_it_comes_again() -> None:
+def test_a_copy_goes_first_while_the_first_waits_or_was_dropped() -> None:
     waiting = ring()
-    fill(waiting, "honest", 1, 2, 3, 4)
-    assert fill(waiting, "honest") == 0, "it displaces nothing"
+    fill(waiting, "dropped", 1, "waits", 3, 4)
+    assert fill(waiting, "dropped", "waits") == 0, "they displace nothing"
 
-    assert waiting.take(1) == ["honest"]
-    assert waiting.take(10) == [1, 2, 3, 4]
+    assert waiting.take(2) == ["waits", 1]
+    assert waiting.take(10) == ["dropped", "waits", 3, 4]
 
 
-def test_a_quarter_is_left_for_what_comes_for_the_first_time() -> None:
+def test_first_and_second_copies_get_the_same_share_and_what_others_leave() -> None:
     waiting = ring(8)
-    fill(waiting, *range(16))
     fill(waiting, *range(8))
+    fill(waiting, *range(4))
 
-    assert waiting.take(4) == [0, 1, 2, 8]
-    assert waiting.take(40) == [3, 4, 5, 6, 7, *range(9, 16)]
+    assert waiting.take(4) == [3, 2, 0, 1]
+    assert waiting.take(6) == [1, 0, 2, 3, 4, 5]
+    assert waiting.take(40) == [6, 7]
 
 
 def test_an_honest_message_passes_any_flood_of_new_ones_with_its_second_copy() -> None:
@@ -59,11 +60,23 @@ def test_an_honest_message_passes_any_flood_of_new_ones_with_its_second_copy() -
     assert passed.count("honest") == 1
 
 
+def test_an_honest_message_passes_a_flood_of_second_copies_with_its_third() -> None:
+    waiting, passed = ring(64), []
+    for number in range(1000):
+        if number in (100, 110, 130):
+            waiting.append("honest", 1)
+        for _ in range(2):
+            fill(waiting, *((number, each) for each in range(50)))
+        passed += waiting.take(20)
+
+    assert passed.count("honest") == 1
+
+
 def test_dropped_items_are_forgotten_after_a_while() -> None:
     waiting = ring(1)
     fill(waiting, "old", *range(REMEMBERED + 2))
 
-    assert len(waiting._dropped) <= REMEMBERED
+    assert len(waiting._copies) <= REMEMBERED
     fill(waiting, "old")
     assert waiting.take(1) == ["old"], "the only one in the ring, in place of the last"
     assert len(waiting) == 0

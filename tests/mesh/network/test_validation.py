@@ -14,6 +14,7 @@ from mesh.network import ValidationStatistics, message_key, validation
 from schemas import Demand, Offer, Result, Verified, encode, message_hash
 from schemas.signing import SignedDigest, recover_keys
 from tests.mesh.network.validating import HEAD, check, counted, validator
+from tests.support.clocks import SECOND, SetClock
 from tests.support.orders import (
     MARKET,
     OTHER_MODEL,
@@ -180,6 +181,23 @@ def test_a_forgotten_message_is_accepted_once_more() -> None:
 
     assert check(checked, message) == accepted
     assert check(checked, message) is None
+
+
+def test_a_message_that_is_forgotten_later_is_a_duplicate_until_then() -> None:
+    clock = SetClock()
+    checked, message = validator(clock=clock), demand()
+    accepted, payload = check(checked, message), encode(message)
+    assert accepted is not None
+
+    checked.forget(accepted, after=5.0)
+    clock.pass_by(4 * SECOND)
+    assert checked.is_copy(payload)
+    clock.pass_by(SECOND)
+
+    assert not checked.is_copy(payload)
+    assert check(checked, message) == accepted
+    assert checked.is_copy(payload)
+    assert checked.statistics(received=0, dropped=0).duplicate == 2
 
 
 def test_the_deduplication_window_is_limited_and_drops_the_oldest() -> None:
