@@ -11,8 +11,6 @@ import logging
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, TypeAlias
 
-from eth_abi.abi import encode
-
 from mesh.chain.answers import InvalidAnswer, SpoiledAnswer, decode_values
 from mesh.chain.artifacts import load_artifact, signature_of
 from mesh.chain.errors import NoContracts, RequestRefused, Reverted
@@ -143,7 +141,8 @@ async def call_all(node: Caller, calls: Sequence[Call], *, gas: int, most: int) 
 def encode_calls(calls: Sequence[Call], *, gas: int = UNLIMITED_GAS, most: int = LONGEST) -> bytes:
     """The creation code that makes the calls, each with at most `gas`, for at most `most` bytes of its answer."""
     packed = b"".join([bytes.fromhex(to[2:]) + len(data).to_bytes(2) + data for to, data in calls])
-    return load_artifact("Multicall").bytecode + encode(["uint256", "uint256", "bytes"], [gas, most, packed])
+    words = b"".join([number.to_bytes(32) for number in (gas, most, 96, len(packed))])  # 96: where the length is
+    return load_artifact("Multicall").bytecode + words + packed + bytes(-len(packed) % 32)
 
 
 def decode_calls(code: bytes) -> list[Call] | None:

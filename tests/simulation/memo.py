@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import mesh.chain.answers
 import mesh.chain.events
-import mesh.chain.multicall
 import mesh.chain.web3_provider
 import schemas.signing
 from mesh.chain.answers import decode_answer
@@ -36,7 +35,6 @@ def install() -> None:
         (mesh.chain.answers, "decode", _words),
         (mesh.chain.answers, "checksum_address", bytes),
         (mesh.chain.events, "decode_values", _words),
-        (mesh.chain.multicall, "encode_calls", tuple),
         (schemas.signing, "checksum_address", bytes),
         (schemas.signing, "recover", _pair),
     ):
