@@ -49,7 +49,7 @@ class OriginalMarket:
         self.node = node
         self.owner, self.robot, self.stranger = (Account.from_key(key) for key in keys[:3])
 
-    def contract(self, name: str, address: str | None = None) -> Any:
+    def contract(self, name: str, address: Any = None) -> Any:
         artifact = json.loads(Path(ORIGINALS, f"{name}.json").read_text())
         return Web3().eth.contract(address, abi=artifact["abi"], bytecode=artifact["bytecode"])
 
@@ -108,9 +108,9 @@ class OriginalMarket:
     async def demand(self, objective: str) -> Demand:
         """The stranger's demand, whose validator is the lighthouse that it made."""
         deadline = await self.node.block_number() + BLOCKS
-        fields: dict[str, Any] = {"model": MODEL, "objective": objective, "token": self.xrt, "cost": COST, "deadline": deadline}
-        places = {"lighthouse": self.lighthouse, "validator": self.trap}
-        return self.stranger.signer.sign(Demand(**fields, **places, nonce="ab" * 32, validator_fee=0))
+        terms: dict[str, Any] = {"model": MODEL, "objective": objective, "token": self.xrt, "cost": COST}
+        terms |= {"lighthouse": self.lighthouse, "validator": self.trap, "deadline": deadline}
+        return self.stranger.signer.sign(Demand(**terms, nonce="ab" * 32, validator_fee=0))
 
     async def steal(self, offer: Offer) -> None:
         """Pair the robot's offer, as the robot's demand, with an own offer; finalize through the first lighthouse."""
