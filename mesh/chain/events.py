@@ -133,10 +133,11 @@ def _padded(data: bytes) -> bytes:
     return data + bytes(-len(data) % 32)
 
 
-def topics_of(*contracts: str) -> list[str]:
+@cache
+def topics_of(*contracts: str) -> tuple[str, ...]:
     """The topics (0x…) of the events of these contracts (keys of `EVENTS`)."""
     names = {name for contract in contracts for name in EVENTS[contract]}
-    return ["0x" + topic.hex() for topic, layout in _layouts().items() if layout[0] in names]
+    return tuple("0x" + topic.hex() for topic, layout in _layouts().items() if layout[0] in names)
 
 
 def lighthouse_created(logs: Iterable[Log]) -> NewLighthouse:

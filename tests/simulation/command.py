@@ -9,12 +9,14 @@ import concurrent.futures.thread as executors
 import json
 import logging
 import os
+import signal
 import subprocess
 import sys
 from asyncio import Queue
 from collections import Counter
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from tests.simulation import history, memo, router, threads
@@ -24,7 +26,7 @@ from tests.simulation.scheduler import REAL_TIME, SECOND
 router.install(lambda: history.CURRENT[-1])  # type: ignore[arg-type,return-value]
 
 from mesh.chain.web3_provider import ReliableProvider  # noqa: E402, F401
-from tests.simulation.deployment import ON_EVM, ON_MODEL, Deployments  # noqa: E402
+from tests.simulation.deployment import JOBS, ON_EVM, ON_MODEL, Deployments  # noqa: E402
 from tests.simulation.faults import KINDS  # noqa: E402
 from tests.simulation.mutants import find_mutants  # noqa: E402
 from tests.simulation.runs import Run, numbers_in, run_in_children  # noqa: E402
@@ -34,8 +36,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
 
-JOBS: Final = 6
-"""Jobs in one history, at most."""
+SUMMARY_SECONDS: Final = 60.0
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -52,7 +53,31 @@ def main(arguments: Sequence[str]) -> None:
         sys.stdout.flush()
         os._exit(0 if found_all else 1)
     total = Report(options.seed)
-    shown = {"trace": options.trace, "switches": options.switches}
+    with suppress(Stopped):
+        signal.signal(signal.SIGTERM, _stop)
+        _run(deployed, options, total, began)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    total.real_s = round(REAL_TIME() - began, 3)
+    _write_summary(total, options.summary)
+    if options.json:
+        print(json.dumps(asdict(total)), flush=True)
+    else:
+        _print_total(total)
+    sys.stdout.flush()
+    os._exit(1 if total.violations else 0)
+
+
+class Stopped(BaseException):
+    """SIGTERM: no more histories."""
+
+
+def _stop(number: int, frame: object) -> None:
+    raise Stopped
+
+
+def _run(deployed: Deployments, options: argparse.Namespace, total: Report, began: float) -> None:
+    """Run histories, and add what happened to the total."""
+    shown, written = {"trace": options.trace, "switches": options.switches}, began
     with closing(run_in_children(deployed, _histories(options), workers=options.workers, **shown)) as histories:
         for run, report in histories:
             _add(total, report)
@@ -62,25 +87,32 @@ def main(arguments: Sequence[str]) -> None:
                     _shrink(deployed, run, options.shrink)
             elif not options.json:
                 print(f"seed {report.seed}: {report.jobs} jobs, {report.paid} paid", flush=True)
-            if options.seconds and REAL_TIME() - began > options.seconds:
+            total.real_s = round(REAL_TIME() - began, 3)
+            if REAL_TIME() - written > SUMMARY_SECONDS:
+                written = REAL_TIME()
+                _write_summary(total, options.summary)
+            if options.seconds and total.real_s > options.seconds:
                 break
             if report.violations and not options.keep_going:
                 break
-    total.real_s = round(REAL_TIME() - began, 3)
-    if options.json:
-        print(json.dumps(asdict(total)), flush=True)
-    else:
-        _print_total(total)
-    sys.stdout.flush()
-    os._exit(1 if total.violations else 0)
+
+
+def _write_summary(total: Report, path: str) -> None:
+    """Write the object of `--json` into a file."""
+    if path:
+        new = Path(f"{path}.new")
+        new.write_text(json.dumps(asdict(total)) + "\n")
+        new.replace(path)
 
 
 def _options(arguments: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog='make simulate ARGS="…"', description=__doc__)
     parser.add_argument("--seed", type=int, default=None, help="the seed of the first history; a new one by default")
-    parser.add_argument("--jobs", type=int, default=JOBS, help=f"jobs in all; a history has up to {JOBS}")
+    parser.add_argument("--jobs", type=int, default=JOBS, help="jobs in all")
+    parser.add_argument("--history-jobs", type=int, default=JOBS, help=f"jobs in a history; above {JOBS}: a long one")
     parser.add_argument("--seconds", type=float, default=0.0, help="begin no history after so many real seconds")
     parser.add_argument("--json", action="store_true", help="print one object at the end")
+    parser.add_argument("--summary", default="", metavar="FILE", help="write that object each minute, and at SIGTERM")
     parser.add_argument("--trace", action="store_true", help="print what happened in each history")
     parser.add_argument("--log", action="store_true", help="print what the processes log, with their time and name")
     parser.add_argument("--switches", metavar="FILE", help="write each switch of threads to a file")
@@ -130,7 +162,7 @@ def _histories(options: argparse.Namespace) -> Iterator[Run]:
     while left > 0:
         run = Run(
             seed,
-            min(left, JOBS),
+            min(left, options.history_jobs),
             options.only,
             options.without,
             options.leave_out,

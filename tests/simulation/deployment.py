@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import random
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import mesh.agent.runtime  # noqa: F401 - loaded once, before histories fork
@@ -19,14 +19,24 @@ from tests.simulation.scheduler import SECOND, Process, Scheduler
 
 MODEL: Final = cid_of_bytes(b"aira-mesh simulation: a lamp\n")
 ENDPOINT: Final = "tcp/127.0.0.1:7447"
+JOBS: Final = 6
+"""Jobs in a history, at most; with more, it is a long one."""
 BLOCK_SECONDS: Final = 6.0
+LONG_BLOCK_SECONDS: Final = 12.0
+"""In long histories: as on Ethereum."""
 TIMING: Final = Timing(poll_interval=3.0, receipt_interval=1.0, replace_after=30.0)
 ON_EVM: Final = "evm"
 ON_MODEL: Final = "model"
 EVM_EVERY: Final = 20
 """One of so many seeds runs on the EVM."""
 PEOPLE: Final = 2
+MOST_PEOPLE: Final = 4
+"""In long histories."""
 ROBOTS: Final = 2
+PAUSES: Final = (30.0, 300.0)
+"""The most seconds between two jobs of a person, in long histories; the first one in the others."""
+STEPS_NS: Final = (400_000_000, 4_000_000_000)
+"""The same for nanoseconds between two messages of an objective."""
 STAKE: Final = 100 * XRT
 """Of the second provider, in wn: as much as the first one has."""
 PLAIN: Final = 0.5
@@ -55,20 +65,34 @@ class MarketPlan:
     providers: int = 1
     nodes: int = 1
     """How many each process knows."""
+    people: int = PEOPLE
+    pause: float = PAUSES[0]
+    step_ns: int = STEPS_NS[0]
+    block_seconds: float = BLOCK_SECONDS
 
     @property
     def kinds(self) -> tuple[str, ...]:
         """What is not as in a plain market."""
-        kinds = {"generation-5": self.generation == 5, "two-providers": self.providers > 1, "two-nodes": self.nodes > 1}
+        kinds = {
+            "generation-5": self.generation == 5,
+            "two-providers": self.providers > 1,
+            "two-nodes": self.nodes > 1,
+            "more-people": self.people > PEOPLE,
+            "long-pauses": self.pause > PAUSES[0],
+            "long-jobs": self.step_ns > STEPS_NS[0],
+        }
         return tuple(kind for kind, is_so in kinds.items() if is_so)
 
 
-def market_plan(seed: int) -> MarketPlan:
-    """The market of a seed."""
-    chance = random.Random(f"market {seed}")
-    if chance.random() < PLAIN:
-        return MarketPlan()
-    return MarketPlan(5 if chance.random() < 0.5 else 3, chance.choice((1, 2)), chance.choice((1, 2)))
+def market_plan(seed: int, jobs: int = JOBS) -> MarketPlan:
+    """The market of a seed, in a history of so many jobs."""
+    chance, plan = random.Random(f"market {seed}"), MarketPlan()
+    if chance.random() >= PLAIN:
+        plan = MarketPlan(5 if chance.random() < 0.5 else 3, chance.choice((1, 2)), chance.choice((1, 2)))
+    if jobs <= JOBS:
+        return plan
+    people, pause, step_ns = chance.randint(PEOPLE, MOST_PEOPLE), chance.choice(PAUSES), chance.choice(STEPS_NS)
+    return replace(plan, people=people, pause=pause, step_ns=step_ns, block_seconds=LONG_BLOCK_SECONDS)
 
 
 def found(chain: SimulatedChain, scheduler: Scheduler) -> Deployed:
@@ -76,7 +100,7 @@ def found(chain: SimulatedChain, scheduler: Scheduler) -> Deployed:
     deployed: list[Deployed] = []
     keys = chain.evm.funded_keys
     names = [f"person-{number}" for number in range(PEOPLE)] + [f"robot-{number}" for number in range(ROBOTS)]
-    names.append("provider-1")
+    names += ["provider-1", *(f"person-{number}" for number in range(PEOPLE, MOST_PEOPLE))]
     accounts = {name: Account.from_key(key) for name, key in zip(names, keys[3:], strict=False)}
 
     async def main() -> None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 from tests.simulation import loop, threads
 from tests.simulation.audit import Audit
 from tests.simulation.chance import FaultDraw
-from tests.simulation.deployment import market_plan
+from tests.simulation.deployment import PAUSES, market_plan
 from tests.simulation.faults import Faults, choose
 from tests.simulation.market import Market
 from tests.simulation.scheduler import REAL_TIME, SECOND, HistoryFailed, Process
@@ -86,7 +86,7 @@ def run_history(
     os.chdir(folder)
     try:
         draw = FaultDraw(seed, left_out)
-        market = Market(scheduler, deployed, Path("market"), jobs, draw, plan=market_plan(seed))
+        market = Market(scheduler, deployed, Path("market"), jobs, draw, plan=market_plan(seed, jobs))
         market.folder.mkdir()
         CURRENT[:] = [market.router]
         try:
@@ -110,7 +110,8 @@ def _play(market: Market, plan: FaultPlan) -> None:
     market.begin()
     faults.start()
     most = max(person.wanted for person in market.people)
-    chaos = plan.lasts or CHAOS_SECONDS * most
+    pause = market.plan.pause - PAUSES[0]
+    chaos = plan.lasts or (CHAOS_SECONDS + pause) * most
     scheduler.run(
         lambda: all(person.is_done for person in market.people), until_ns=scheduler.now_ns + round(chaos * SECOND)
     )
@@ -118,7 +119,8 @@ def _play(market: Market, plan: FaultPlan) -> None:
     market.calm_since = market.deployed.chain.evm.head
     market.trace("faults", "stopped", block=market.calm_since)
     audit = market.audit = Audit(market)
-    scheduler.run(lambda: _is_settled(market, audit), until_ns=scheduler.now_ns + CALM_SECONDS * most * SECOND)
+    calm = (CALM_SECONDS + pause) * most
+    scheduler.run(lambda: _is_settled(market, audit), until_ns=scheduler.now_ns + round(calm * SECOND))
     for person in market.people:
         for order in person.orders:
             if not order.is_over:

@@ -12,7 +12,7 @@ from mesh.recording.mcap_writer import McapWriter
 from mesh.running import cause_of
 from schemas import EMPTY, cid_of_file
 from tests.simulation.chance import FaultDraw
-from tests.simulation.deployment import BLOCK_SECONDS, PEOPLE, ROBOTS, Deployed, MarketPlan
+from tests.simulation.deployment import ROBOTS, Deployed, MarketPlan
 from tests.simulation.disk import SimulatedDisk
 from tests.simulation.roles import PersonRole, ProviderRole, RobotRole, Role
 from tests.simulation.router import Router
@@ -66,7 +66,8 @@ class Market:
         names = ("provider", "provider-1")[: self.plan.providers]
         self.providers = [ProviderRole(self, name) for name in names]
         self.robots = [RobotRole(self, f"robot-{number}") for number in range(ROBOTS)]
-        share = [self.jobs // PEOPLE + (number < self.jobs % PEOPLE) for number in range(PEOPLE)]
+        people = self.plan.people
+        share = [self.jobs // people + (number < self.jobs % people) for number in range(people)]
         self.people = [PersonRole(self, f"person-{number}", jobs) for number, jobs in enumerate(share) if jobs]
         self.roles: list[Role] = [*self.providers, *self.robots, *self.people]
         self.steps = StepAudit(self)
@@ -77,12 +78,12 @@ class Market:
         """Start everything."""
         for role in self.roles:
             self.scheduler.call_later(self.scheduler.random.uniform(0, 5), role.start)
-        self.scheduler.call_later(BLOCK_SECONDS, self._mine)
+        self.scheduler.call_later(self.plan.block_seconds, self._mine)
 
     def _mine(self) -> None:
         if not self.is_over:
             self.deployed.chain.mine()
-            self.scheduler.call_later(BLOCK_SECONDS, self._mine)
+            self.scheduler.call_later(self.plan.block_seconds, self._mine)
 
     def trace(self, who: str, what: str, **facts: Any) -> None:
         """Note what happened; the trace of a seed is always the same."""
@@ -121,7 +122,7 @@ class Market:
                 writer = McapWriter(file)
                 channel = writer.channel("/blink", EMPTY, {})
                 for number in range(messages):
-                    writer.write(channel, b"", number * 400_000_000, number * 400_000_000)
+                    writer.write(channel, b"", number * self.plan.step_ns, number * self.plan.step_ns)
                 writer.finish()
             self.objectives[messages], self.cids[path] = path, cid_of_file(path)
         return self.objectives[messages]

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import rlp  # type: ignore[import-untyped]
 from coincurve import PrivateKey
 
+from mesh.chain.answers import NO_TRANSACTIONS
 from mesh.chain.multicall import decode_calls, encode_answers
 from mesh.chain.reverts import REVERTED
 from mesh.devchain.evm import FUNDS_WEI
@@ -23,9 +24,11 @@ from tests.simulation.model_state import ModelRun, ModelState
 from tests.simulation.model_transactions import ModelTransaction, read_transaction
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from mesh.devchain.calls import Call
+
+    ModelLog = tuple[bytes, list[bytes], bytes]
 
 CHAIN_ID: Final = 131277322940537
 """That of the embedded EVM."""
@@ -172,7 +175,7 @@ class ModelChain:
         if status and one.value:
             run.set(one.to, "wei", run.get(one.to, "wei") + one.value)
         self._state.apply(self.head + 1, run.writes)
-        self._add_block(one, gas)
+        self._add_block(one, gas, run.logs if status else [])
         self._remember(one, run, status=status, created=created, gas=gas, price=price)
         return one.hash
 
@@ -209,7 +212,7 @@ class ModelChain:
                 return address
         raise ModelRevert
 
-    def _add_block(self, one: ModelTransaction | None, gas: int) -> None:
+    def _add_block(self, one: ModelTransaction | None, gas: int, logs: Sequence[ModelLog] = ()) -> None:
         self.head += 1
         parent = self._blocks[-1] if self._blocks else None
         when = int(time.time())
@@ -228,7 +231,8 @@ class ModelChain:
                 "gasLimit": hex(GAS_LIMIT),
                 "gasUsed": hex(gas),
                 "miner": "0x" + bytes(20).hex(),
-                "logsBloom": "0x" + bytes(256).hex(),
+                "logsBloom": f"0x{bloom_of(logs):0512x}",
+                "transactionsRoot": "0x" + (NO_TRANSACTIONS if one is None else keccak256(one.hash)).hex(),
                 "transactions": [] if one is None else ["0x" + one.hash.hex()],
             }
         )
@@ -267,7 +271,7 @@ class ModelChain:
             "effectiveGasPrice": hex(price),
             "type": "0x2",
             "logs": logs,
-            "logsBloom": "0x" + bytes(256).hex(),
+            "logsBloom": block["logsBloom"],
         }
         self._transactions[one.hash] = where | {
             "hash": hash_,
@@ -285,6 +289,16 @@ class ModelChain:
         }
         if logs:
             self._logs[self.head] = logs
+
+
+def bloom_of(logs: Sequence[ModelLog]) -> int:
+    """The Bloom filter of logs: three bits for each address and topic."""
+    bloom = 0
+    for address, topics, _ in logs:
+        for digest in map(keccak256, (address, *topics)):
+            for at in (0, 2, 4):
+                bloom |= 1 << int.from_bytes(digest[at : at + 2], "big") % 2048
+    return bloom
 
 
 def gas_of(to: bytes, data: bytes) -> int:

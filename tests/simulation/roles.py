@@ -262,7 +262,7 @@ class PersonRole(Role):
         if self.orders and not self.orders[-1].is_over:
             await self._finish(agent, self.orders[-1], self._take_up(agent, self.orders[-1]))
         while len(self.orders) < self.wanted:
-            await asyncio.sleep(chance.uniform(0.1, 30))
+            await asyncio.sleep(chance.uniform(0.1, self.market.plan.pause))
             wanted = Ordered(self.name, len(self.orders), cost=chance.randint(1, 50) * XRT)
             self.orders.append(wanted)
             await self._finish(agent, wanted, self._order(agent, wanted))

@@ -139,6 +139,7 @@ class Child:
 
 def _play(market: Deployed, run: Run, writing: int, *, trace: bool, switches: str | None) -> NoReturn:
     """Run a history in this process, which ends; the report goes into the pipe."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
         if run.plant:
             planted(run.plant).apply()

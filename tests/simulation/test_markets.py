@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from itertools import count
+from typing import TYPE_CHECKING
 
 from tests.simulation.deployment import EVM_EVERY, ON_EVM, ON_MODEL, Deployments, MarketPlan, market_plan
 from tests.simulation.test_simulation import simulate
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 def test_jobs_end_in_a_market_of_generation_5_with_two_providers_and_two_nodes() -> None:
@@ -34,3 +39,13 @@ def test_a_history_is_the_same_alone_and_beside_another() -> None:
     beside = simulate("--seed", "30", "--jobs", "7", "--workers", "2", *options)[0]
     alone = simulate("--seed", "31", "--jobs", "1", *options)[0]
     assert beside["trace"] == alone["trace"]
+
+
+def test_a_long_history_ends_too(tmp_path: Path) -> None:
+    """It has blocks each 12 s, and perhaps more people, long pauses and long jobs."""
+    summary = tmp_path / "summary.json"
+    options = ("--history-jobs", "10", "--only", "drop", "--chain", "model", "--summary", str(summary))
+    found, said = simulate("--seed", "301", "--jobs", "10", *options)
+    assert (found["jobs"], found["violations"], found["lost"]) == (10, [], 0), said
+    assert found["markets"]["more-people"] == found["markets"]["long-pauses"] == 1
+    assert json.loads(summary.read_text()) == found

@@ -5,9 +5,12 @@ from __future__ import annotations
 import os
 from typing import Any, Final
 
+from eth_bloom import BloomFilter
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from schemas import keccak256
+from tests.simulation.model import bloom_of
 from tests.simulation.model_history import ModelHistory, twins
 
 HISTORIES: Final = int(os.environ.get("AIRA_MODEL_HISTORIES", "30"))
@@ -35,3 +38,9 @@ def _block(chain: Any, number: int) -> dict[str, Any]:
     shown = {name: receipt[name] for name in SHOWN}
     shown["logs"] = [(log["address"], log["topics"], log["data"], log["logIndex"]) for log in receipt["logs"]]
     return shown | {name: transaction[name] for name in ("to", "nonce", "input", "value")}
+
+
+def test_a_modelled_block_has_the_bloom_filter_of_its_logs() -> None:
+    address, topics = b"\x11" * 20, [keccak256(b"NewLiability(address)"), bytes(32)]
+    assert bloom_of([(address, topics, b"")]) == int(BloomFilter.from_iterable([address, *topics]))
+    assert bloom_of([]) == 0
