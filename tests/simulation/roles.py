@@ -337,6 +337,8 @@ class PersonRole(Role):
             await asyncio.sleep(REFUND_CHECK)
             with suppress(AiraError):
                 for _, address in await agent.parts.ledger.contracts("demand"):
+                    if self.market.steps.is_ended(address):
+                        continue
                     if (await liabilities.refund_state(address)).is_refundable:
                         await liabilities.refund(address)
                         self.market.trace(self.name, "took-back", liability=address)

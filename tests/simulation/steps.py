@@ -60,6 +60,10 @@ class StepAudit:
         self._liabilities: dict[str, str] = {}
         """Of each liability the demand's hash."""
 
+    def is_ended(self, liability: str) -> bool:
+        """Whether a liability has ended on the chain."""
+        return liability in self._ended
+
     def block(self) -> None:
         """A block was mined, or some were replaced."""
         if self._chain.reorganisations != self._reorganisations:
