@@ -162,7 +162,7 @@ async def measure(name: str) -> dict[str, Any]:
     """Run one flood on a market of its own."""
     async with AsyncExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory())
-        endpoint, _ = stack.enter_context(router())
+        endpoint, pid = stack.enter_context(router())
         try:
             anvil = find_anvil(locate("anvil"))
         except PeerMissing:
@@ -179,10 +179,12 @@ async def measure(name: str) -> dict[str, Any]:
             folder=folder,
         )
         write_objective(Path(folder) / "objective.mcap")
-        return await _measure(stack, name, place, served)
+        return await _measure(stack, name, place, served, router_pid=pid)
 
 
-async def _measure(stack: AsyncExitStack, name: str, place: Place, served: DevelopmentChain) -> dict[str, Any]:
+async def _measure(
+    stack: AsyncExitStack, name: str, place: Place, served: DevelopmentChain, *, router_pid: int
+) -> dict[str, Any]:
     provider = _start_provider(place)
     stack.callback(_stop, provider)
     ready, taken = {role: SPAWN.Event() for role in ("robot", "person", "attacker")}, SPAWN.Queue()
@@ -199,7 +201,8 @@ async def _measure(stack: AsyncExitStack, name: str, place: Place, served: Devel
     await asyncio.sleep(RECOVERY + AFTER)
     until = time.monotonic()
     demands = await _collect(taken, until)
-    memory = {"provider_mb": _peak(provider.pid), "robot_mb": _peak(processes["robot"].pid)}
+    pids = {"provider": provider.pid, "robot": processes["robot"].pid, "router": router_pid}
+    memory = {f"{who}_mb": _peak(pid) for who, pid in pids.items()}
     parts = {
         "before": [seconds for at, seconds in demands if at < started],
         "during": [seconds for at, seconds in demands if started <= at < ended],
