@@ -20,6 +20,7 @@ from mesh.cli.output import (
     print_table,
     printable,
 )
+from mesh.flood import Drops
 from mesh.running import run_to_end
 from mesh.settings import NetworkSettings, options_of
 from schemas import parse_address
@@ -75,19 +76,33 @@ async def show_one(settings: Settings, named: str, *, timeout: float, as_json: b
 
 async def show_all(settings: Settings, *, timeout: float, as_json: bool) -> None:
     from mesh.agent.components import watching
-    from mesh.watching import present, statuses
+    from mesh.watching import BRIDGE, PROVIDER, present, statuses
 
-    async with watching(settings) as (network, channel):
-        peers = await present(channel)
-        found = await statuses(network.session, channel, peers, timeout=timeout)
+    drops = Drops()
+    async with watching(settings, drops=drops) as (network, channel):
+        # Those first of whom there are few: a flood of agents that do not exist keeps the session busy for seconds.
+        first = await present(channel, PROVIDER, BRIDGE)
+        found = await statuses(network.session, channel, first, timeout=timeout)
+        others = set(await present(channel)).difference(first)
+        found |= await statuses(network.session, channel, sorted(others), timeout=timeout)
+    peers = sorted(found)
     if as_json:
         listed = [{"role": peer.role, "address": peer.address, "status": _status_json(found[peer])} for peer in peers]
-        print_json({"lighthouse": channel.lighthouse, "peers": listed})
-    elif peers:
+        print_json({"lighthouse": channel.lighthouse, "peers": listed, "unlisted": _unlisted(drops)})
+        return
+    if peers:
         rows = [(peer.role, peer.address, summarize_status(found[peer])) for peer in peers]
         print_table(("role", "address", "status"), rows)
     else:
         print_line(f"no peers on {channel.lighthouse}")
+    _unlisted(drops)
+
+
+def _unlisted(drops: Drops) -> int:
+    """How many more agents are announced than are listed; says it to people."""
+    if unlisted := drops.totals().get("presence", 0):
+        click.echo(f"{plural(unlisted, 'more agent')} announced, beyond what is listed", err=True)
+    return unlisted
 
 
 def _status_json(how: RoleStatus | None) -> dict[str, Any] | None:
@@ -108,20 +123,22 @@ def peers(settings: Settings, as_json: bool) -> None:
 
 async def show_peers(settings: Settings, *, as_json: bool) -> None:
     from mesh.agent.components import watching
-    from mesh.watching import present, statuses
+    from mesh.watching import BRIDGE, PROVIDER, present, statuses
     from schemas.status import BridgeStatus
 
-    async with watching(settings) as (network, channel):
-        peers = await present(channel)
-        bridges = [peer for peer in peers if peer.role == "bridge"]
+    drops = Drops()
+    async with watching(settings, drops=drops) as (network, channel):
+        bridges = await present(channel, BRIDGE)
         found = await statuses(network.session, channel, bridges)
+        peers = sorted({*await present(channel, PROVIDER), *bridges, *await present(channel)})
     states = {peer: status for peer, status in found.items() if isinstance(status, BridgeStatus)}
     if as_json:
-        print_json(_peers_json(channel.lighthouse, peers, states))
+        print_json(_peers_json(channel.lighthouse, peers, states) | {"unlisted": _unlisted(drops)})
         return
     if peers:
         print_table(("role", "address"), [(peer.role, peer.address) for peer in peers])
     print_line(f"{plural(len(peers), 'peer')} on {channel.lighthouse}; IPFS side: {_ipfs_side(bridges, states)}")
+    _unlisted(drops)
 
 
 def _peers_json(lighthouse: str, peers: list[PresentPeer], states: dict[PresentPeer, BridgeStatus]) -> dict[str, Any]:

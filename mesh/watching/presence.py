@@ -24,6 +24,8 @@ PROVIDER: Final = "provider"
 BRIDGE: Final = "bridge"
 BRIDGE_TURN: Final = re.compile(r"bridge-turn-.*")
 """Presence tokens by which bridges take turns; no roles."""
+PATIENCE: Final = 15.0
+"""Seconds after which no more peers are asked: strangers can announce many that do not reply."""
 BATCH: Final = 64
 """Peers queried at the same time."""
 
@@ -36,13 +38,11 @@ class PresentPeer(NamedTuple):
 
 
 async def present(channel: Channel, *roles: str) -> list[PresentPeer]:
-    """The agents announced on the channel now, in these roles or in all.
+    """The agents announced on the channel now, in these roles or in all: at most `PRESENT_LIMIT` for each.
 
-    Not verified: only a router with a roster restricts announcements. At most `PRESENT_LIMIT` of any role, and of
-    providers and bridges as many besides.
+    Not verified: only a router with a roster restricts announcements.
     """
-    asked = roles or (PROVIDER, BRIDGE, "*")
-    keys = [key for found in await asyncio.gather(*map(channel.present, asked)) for key in found]
+    keys = [key for role in roles or ("*",) for key in await channel.present(role)]
     return sorted(
         {PresentPeer(key.role, parse_address(key.agent)) for key in keys if not BRIDGE_TURN.fullmatch(key.role)}
     )
@@ -64,9 +64,12 @@ async def status_of(
 async def statuses(
     session: zenoh.Session, channel: Channel, peers: Iterable[PresentPeer], *, timeout: float = TIMEOUT
 ) -> dict[PresentPeer, RoleStatus | None]:
-    """The status of each peer on the channel's lighthouse; None if it does not reply within `timeout` seconds."""
-    asked, found = list(peers), {}
+    """The status of each peer on the channel's lighthouse; None if it does not reply within `timeout` seconds, or if
+    others took `PATIENCE` seconds."""
+    asked, found, until = list(peers), {}, asyncio.get_running_loop().time() + PATIENCE
     for start in range(0, len(asked), BATCH):
+        if asyncio.get_running_loop().time() > until:
+            break
         batch = asked[start : start + BATCH]
         keys = {_key(peer, channel.lighthouse) for peer in batch}
         for status in _decoded(await query_all(session, keys, timeout=timeout)):

@@ -10,6 +10,7 @@ import msgspec
 
 from mesh.cli.status import show_peers
 from mesh.network import Channel, Endpoints, Network
+from mesh.network.channel import PRESENT_LIMIT
 from mesh.settings import Settings
 from mesh.watching import present
 from schemas.status import BridgeStatus, bridge_status_key
@@ -75,7 +76,28 @@ async def test_peers_are_listed_by_role_and_address(router: EmbeddedRouter, caps
                 {"role": "bridge", "address": STRANGER.address},
             ],
             "ipfsPeers": list(NODES),
+            "unlisted": 0,
         }
+
+
+async def test_a_flood_of_agents_hides_no_bridge(router: EmbeddedRouter, capsys: pytest.CaptureFixture[str]) -> None:
+    flood = PRESENT_LIMIT + 76
+    async with (
+        bridging(router, bridge_status()) as settings,
+        Network(Endpoints(connect=(router.endpoint,))) as attacker,
+        Channel(attacker.session, MARKET) as channel,
+    ):
+        for number in range(flood - 2):
+            channel.announce("agent", f"0x{number:040x}")
+
+        async def found() -> bool:
+            await show_peers(settings, as_json=True)
+            said = json.loads(capsys.readouterr().out)
+            assert {"role": "bridge", "address": STRANGER.address} in said["peers"]
+            assert len(said["peers"]) <= PRESENT_LIMIT + 1
+            return bool(said["unlisted"] == flood - PRESENT_LIMIT)
+
+        await until_found(found, what="all tokens", seconds=60)
 
 
 async def test_of_several_bridges_the_one_that_carries_is_used(

@@ -34,7 +34,7 @@ async def test_agents_are_counted_beyond_a_limit_and_providers_found(here: zenoh
             return drops.totals().get("presence", 0) - before == FLOOD + 2 - PRESENT_LIMIT
 
         await until_found(all_came, what="the flood")
-        assert PresentPeer("provider", ROBOT.address) in await present(watching)
+        assert PresentPeer("provider", ROBOT.address) in await present(watching, "provider")
         assert await watching.present(agent=ROBOT.address) == [
             PresenceKey(MARKET, role, ROBOT.address) for role in ("provider", "zebra")
         ]
