@@ -5,13 +5,15 @@ from __future__ import annotations
 import asyncio
 import logging
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
 from mesh.agent.errors import LiabilityReverted
 from mesh.content import ContentUnavailable
+from mesh.errors import AiraError
 from mesh.log_context import log_event
+from mesh.work.notes import Reason, read_reason
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -21,12 +23,21 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+REASON_TIMEOUT: Final = 10.0
+"""Seconds without a new block after which the recording of a failed job is given up, and with it the reason."""
+
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
-    """How a contract ended: `success` means that the promisor was paid; `result` is the recording's CID, or empty."""
+    """How a contract ended: `success` means that the promisor was paid; `result` is the recording's CID, or empty.
+
+    If it failed, `reason` says why in a line of text and `code` for programs. They come from the promisor's recording,
+    which may lie or be unavailable (`recording-unavailable`); without a result the code is `no-result`.
+    """
 
     success: bool
     result: str
+    reason: str = ""
+    code: str = ""
 
 
 class Contract:
@@ -37,6 +48,7 @@ class Contract:
         """Its record, as it was when the contract was first read."""
         self._ended = ended
         self._parts = parts
+        self._failure: Reason | None = None
 
     @property
     def address(self) -> str:
@@ -48,21 +60,39 @@ class Contract:
 
         Raises `ClosedError` if the agent ends first, and `LiabilityReverted` if a reorganisation reverted the contract
         and it was not created again by its orders' deadline.
+
+        Of a job that failed it fetches the recording, for at most `REASON_TIMEOUT`, and reads the reason.
         """
-        return await asyncio.shield(self._ended)
+        ended = await asyncio.shield(self._ended)
+        if ended.success:
+            return ended
+        if self._failure is None:
+            self._failure = await self._reason(ended)
+        return msgspec.structs.replace(ended, reason=self._failure.text, code=self._failure.code)
 
     async def recording(self) -> Path:
         """Wait for the outcome, and fetch the result's recording, every block of it checked.
 
         Raises a `ContentError` if the recording is unavailable or the contract was refunded without a result.
         """
-        outcome = await self.outcome()
-        if not outcome.result:
+        ended = await asyncio.shield(self._ended)
+        if not ended.result:
             raise ContentUnavailable("the recording", f"contract {self.address} was refunded without a result")
-        settings = self._parts.settings
-        return await self._parts.exchange.fetch(
-            outcome.result, size_limit=settings.objective_expanded_limit, timeout=settings.fetch_timeout
-        )
+        return await self._fetch(ended.result, self._parts.settings.fetch_timeout)
+
+    async def _fetch(self, cid: str, timeout: float) -> Path:
+        limit = self._parts.settings.objective_expanded_limit
+        return await self._parts.exchange.fetch(cid, size_limit=limit, timeout=timeout)
+
+    async def _reason(self, ended: Outcome) -> Reason:
+        """Why the job failed, as its recording says."""
+        if not ended.result:
+            return Reason("no result came in time", "no-result")
+        try:
+            timeout = min(REASON_TIMEOUT, self._parts.settings.fetch_timeout)
+            return await asyncio.to_thread(read_reason, await self._fetch(ended.result, timeout))
+        except AiraError as error:
+            return Reason(f"the recording, which says why, is not available: {error}", "recording-unavailable")
 
 
 @dataclass

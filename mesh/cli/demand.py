@@ -16,7 +16,7 @@ from mesh.cli.amounts import XRT, AmountText
 from mesh.cli.errors import DemandExists, InvalidOptions, JobNotDone, OutputFailed
 from mesh.cli.files import file_or_cid, require_readable, require_writable
 from mesh.cli.options import with_json, with_settings
-from mesh.cli.output import plural, print_json, print_line
+from mesh.cli.output import plural, print_json, print_line, printable
 from mesh.errors import AiraError
 from mesh.running import run_to_end
 from mesh.settings import ChainSettings, NetworkSettings, options_of
@@ -235,10 +235,10 @@ async def _wait_for_end(contract: Contract, out: Path | None, *, as_json: bool) 
         print_line(f"{'paid' if outcome.success else 'refunded'}, result {outcome.result or 'none'}")
     failure: AiraError | None = None
     if not outcome.success:
-        failure = JobNotDone(
-            "the job was not done; the cost was returned", hint=_failure_hint(contract, outcome.result)
-        )
-        facts["error"] = str(failure)
+        why = f"{printable(outcome.reason)} ({outcome.code})" if outcome.reason else "nothing says why"
+        hint = _failure_hint(contract, outcome.result)
+        failure = JobNotDone(f"the job was not done: {why}; the cost was returned", hint=hint)
+        facts |= {"error": str(failure), "reason": outcome.reason, "code": outcome.code}
     if out is not None:
         facts["recording"] = None
         try:
@@ -264,7 +264,7 @@ def _source(objective: str) -> str | Path:
 def _failure_hint(contract: Contract, result: str) -> str:
     """Where to find the reason of a failure."""
     if result:
-        return f"the recording may show why: `aira objective show {result}`"
+        return f"the recording shows more: `aira objective show {result}`"
     return f"it ended without a result; see `aira liability show {contract.address}`"
 
 

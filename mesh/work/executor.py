@@ -19,6 +19,7 @@ from mesh.log_context import liability_context, log_event, with_liability_contex
 from mesh.recording import RecordingFailed
 from mesh.work.database import LedgerUnusable
 from mesh.work.ledger import STARTABLE, TO_BE_DONE, Phase, WrongPhase, advance
+from mesh.work.notes import note_of
 from mesh.work.outbox import outgoing
 from mesh.work.run import RecordingIncomplete
 from schemas import Result
@@ -177,7 +178,7 @@ class Executor:
             run = await self._playbacks.stop(address) or await self._playbacks.create(job)
             summary = await run.close(note)
             if success and (missing := run.missing + summary.lost_played):
-                success, note = False, str(RecordingIncomplete(address, missing))
+                success, note = False, note_of(RecordingIncomplete(address, missing))
                 log.error("%s", note, extra=log_event("recording-incomplete", missing=missing))
             cid = await asyncio.to_thread(self._store.put_file, summary.path, pin=address)
             await self.owe_result(address, success=success, result=cid, note=note)
@@ -198,7 +199,7 @@ class Executor:
             objective = await self._objectives.examine(liability.objective)
         except (ContentError, InputError) as error:
             log.warning("the objective is refused: %s", error, extra=log_event("objective-refused", code=error.code))
-            await self._unless_ended(self.finish(address, success=False, note=str(error)))
+            await self._unless_ended(self.finish(address, success=False, note=note_of(error)))
             return
         async with self._changing:
             job = await self._ledger.job(address)
@@ -243,7 +244,7 @@ class Executor:
         except (LedgerUnusable, RecordingFailed):  # the job goes on when the disk is usable
             raise
         except Exception as error:
-            success, note = False, str(error) or type(error).__name__
+            success, note = False, note_of(error)
             facts = log_event("job-failed", code=getattr(error, "code", ""))
             log.warning("the job failed: %s", note, exc_info=not isinstance(error, AiraError), extra=facts)
         if self._handlers is not None or not success:

@@ -15,6 +15,7 @@ from mesh.errors import AiraError
 from mesh.log_context import log_event
 from mesh.recording import AtOnce, Unrecordable, play
 from mesh.work.job import HandlerCancelled, Job
+from mesh.work.notes import NOTE_TOPIC
 from schemas.agent_keys import LiabilityTopicKey, ObjectiveTopicKey, parse_agent_key
 from schemas.payloads import STRING, PayloadType, String, payload_type
 from schemas.selectors import topic_selector
@@ -31,8 +32,6 @@ log = logging.getLogger(__name__)
 
 QUEUED: Final = 1024
 """Most played messages that wait for their handler; then the player waits."""
-NOTE_TOPIC: Final = "/aira/note"
-"""Topic of the recording on which the agent says why a job failed."""
 FLUSH: Final = "aira/flush"
 """Encoding of the message that a run sends to itself to know that it has received everything before it."""
 

@@ -15,7 +15,7 @@ import pytest
 from mesh.agent import JobFailed, Phase
 from mesh.running import cause_of
 from mesh.work.database import LedgerUnusable
-from mesh.work.run import NOTE_TOPIC
+from mesh.work.notes import NOTE_TOPIC
 from schemas import Empty, String, cid_of_bytes
 from tests.mesh.work.executions import COST, doing_nothing, heard, recorded
 from tests.support.market import Place, offering, offering_unseen
@@ -47,16 +47,25 @@ async def refusal(place: Place, robot: Agent, content: bytes | str, **terms: Any
         contract = await person.demand(source, cost=COST, **terms)
         outcome = await contract.outcome()
         assert not outcome.success
+        assert outcome.reason
+        assert outcome.code
         assert (await place.balance("robot"), await place.balance("person")) == before
         job = await robot.parts.ledger.job(contract.address)
         assert job is not None
         assert job.success is False
         recording = await recorded(contract)
+    assert job.note == f"{outcome.reason} [{outcome.code}]"
     return job.note, "\n".join(notes(recording))
 
 
-@pytest.mark.parametrize("error", [JobFailed("the lamp is broken"), ValueError("the lamp is broken")], ids=repr)
-async def test_a_handler_that_raises_fails_its_job_and_the_promisee_is_refunded(place: Place, error: Exception) -> None:
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [(JobFailed("the lamp is broken"), "job-failed"), (ValueError("the lamp is broken"), "handler-failed")],
+    ids=["JobFailed", "ValueError"],
+)
+async def test_a_handler_that_raises_fails_its_job_and_the_promisee_is_refunded(
+    place: Place, error: Exception, code: str
+) -> None:
     robot = offering(place.agent("robot"))
     calls = 0
 
@@ -67,7 +76,7 @@ async def test_a_handler_that_raises_fails_its_job_and_the_promisee_is_refunded(
         raise error
 
     note, recorded_note = await refusal(place, robot, objective(("/go", Empty()), ("/go", Empty())))
-    assert note == recorded_note == "the lamp is broken"
+    assert note == recorded_note == f"the lamp is broken [{code}]"
     assert calls == 1
 
 
@@ -81,7 +90,7 @@ async def test_a_handler_whose_inner_task_was_cancelled_has_not_done_its_job(pla
         await inner
 
     note, _ = await refusal(place, robot, objective(("/go", Empty())))
-    assert note == "the handler of /go was cancelled"
+    assert note == "the handler of /go was cancelled [handler-cancelled]"
 
 
 async def test_a_message_of_another_type_than_the_handlers_is_refused_before_anything_is_played(place: Place) -> None:

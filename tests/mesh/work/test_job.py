@@ -10,7 +10,8 @@ import pytest
 from mesh.errors import ClosedError
 from mesh.recording import RecordedTimes
 from mesh.work.job import HandlerCancelled, Job
-from mesh.work.run import NOTE_TOPIC, QUEUED
+from mesh.work.notes import NOTE_TOPIC
+from mesh.work.run import QUEUED
 from schemas import InvalidPayload, String
 from tests.mesh.work.runs import Making, making, session
 from tests.support.objectives import objective

@@ -11,7 +11,8 @@ import zenoh
 
 from mesh.recording import json_type, open_objective
 from mesh.recording.partial import PartialFile
-from mesh.work.run import FLUSH, NOTE_TOPIC, SyncedRun
+from mesh.work.notes import NOTE_TOPIC
+from mesh.work.run import FLUSH, SyncedRun
 from schemas import Empty, String
 from tests.mesh.work.runs import AGENT, Making, making, session
 from tests.mesh.work.samples import liability
