@@ -81,8 +81,8 @@ MUTATIONS: Final = (
     Mutation(
         "a job that failed is a success",
         "mesh.work.executor:Executor._run_job",
-        "success, note = False, str(error)",
-        "success, note = True, str(error)",
+        "success, note = False, note_of(error)",
+        "success, note = True, note_of(error)",
         "late",
     ),
     Mutation(
