@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from schemas.loading import on_demand
 
@@ -53,54 +53,25 @@ if TYPE_CHECKING:
 
     __version__: str
 
-_HOMES = {
-    "Agent": "mesh.agent.agent",
-    "AiraError": "mesh.errors",
-    "ChainError": "mesh.errors",
-    "ClosedError": "mesh.errors",
-    "ConfigurationError": "mesh.errors",
-    "ContentError": "mesh.errors",
-    "ContentUnavailable": "mesh.content",
-    "Contract": "mesh.agent.contract",
-    "Demand": "schemas",
-    "Empty": "schemas",
-    "InputError": "mesh.errors",
-    "InsufficientTokens": "mesh.chain",
-    "InvalidPayload": "schemas",
-    "Job": "mesh.work.job",
-    "JobFailed": "mesh.work.job",
-    "Liability": "schemas",
-    "LiabilityReverted": "mesh.agent.errors",
-    "NetworkUnavailable": "mesh.errors",
-    "NodeUnreachable": "mesh.chain",
-    "NotALiability": "mesh.chain",
-    "Objective": "mesh.recording",
-    "ObjectiveUnfit": "mesh.work.objectives",
-    "Offer": "schemas",
-    "Order": "mesh.agent.orders",
-    "OrderClosed": "mesh.agent.errors",
-    "OrderExpired": "mesh.agent.errors",
-    "OrderState": "mesh.agent.orders",
-    "Outcome": "mesh.agent.contract",
-    "Phase": "mesh.work.ledger",
-    "Played": "mesh.recording",
-    "Recorder": "mesh.recording",
-    "RecordingAbout": "mesh.recording",
-    "RemoteError": "mesh.errors",
-    "Result": "schemas",
-    "STRING": "schemas",
-    "Settings": "mesh.settings",
-    "String": "schemas",
-    "Verified": "schemas",
-    "WrongPhase": "mesh.work.ledger",
-    "ZERO_ADDRESS": "schemas",
-    "cid_of_file": "schemas",
-    "fail": "mesh.running",
-    "open_objective": "mesh.recording",
-    "pack": "mesh.recording",
-    "run_to_end": "mesh.running",
+_NAMES: Final = {
+    "mesh.agent.agent": "Agent",
+    "mesh.agent.contract": "Contract Outcome",
+    "mesh.agent.errors": "LiabilityReverted OrderClosed OrderExpired",
+    "mesh.agent.orders": "Order OrderState",
+    "mesh.chain": "InsufficientTokens NodeUnreachable NotALiability",
+    "mesh.content": "ContentUnavailable",
+    "mesh.errors": (
+        "AiraError ChainError ClosedError ConfigurationError ContentError InputError NetworkUnavailable RemoteError"
+    ),
+    "mesh.recording": "Objective Played Recorder RecordingAbout open_objective pack",
+    "mesh.running": "fail run_to_end",
+    "mesh.settings": "Settings",
+    "mesh.work.job": "Job JobFailed",
+    "mesh.work.ledger": "Phase WrongPhase",
+    "mesh.work.objectives": "ObjectiveUnfit",
+    "schemas": "Demand Empty InvalidPayload Liability Offer Result STRING String Verified ZERO_ADDRESS cid_of_file",
 }
-_load = on_demand(__name__, _HOMES)
+_load = on_demand(__name__, _NAMES)
 
 
 if not TYPE_CHECKING:  # a type checker knows the names from above, and reports others

@@ -10,10 +10,10 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping  # msgspec reads the annotations
 from functools import lru_cache
-from typing import ClassVar, Final, Literal, TypeAlias, TypeVar
+from typing import Any, ClassVar, Final, Generic, Literal, TypeAlias, TypeVar, get_args
 
 from msgspec import Struct
-from msgspec.structs import force_setattr
+from msgspec.structs import astuple, force_setattr
 
 from schemas.address import parse_address
 from schemas.cid import parse_cid
@@ -59,10 +59,13 @@ def name_chunk(text: str) -> str:
     return text
 
 
-def check_event(text: str, *known: str) -> None:
-    """Raise `InvalidKey` for an event that is not one of `known`."""
-    if text not in known:
-        raise InvalidKey(text, f"it is not one of the events {', '.join(known)}")
+def _event_of(known: Any) -> Callable[[str], str]:
+    def check(text: str) -> str:
+        if text not in get_args(known):
+            raise InvalidKey(text, f"it is not one of the events {', '.join(get_args(known))}")
+        return text
+
+    return check
 
 
 def path_chunks(text: str) -> str:
@@ -88,11 +91,19 @@ class BaseKey(Struct, frozen=True, gc=False):
         "liability": address_chunk,
         "cid": cid_chunk,
         "device": name_chunk,
-        "event": name_chunk,
         "service": path_chunks,
         "topic": topic_chunks,
     }
     """The check of each field, by the field's name."""
+    pattern: ClassVar[str]
+    """The text of a key, with its fields in braces, in their order."""
+    _format: ClassVar[str]
+
+    def __init_subclass__(cls) -> None:
+        cls._format = re.sub("{.*?}", "%s", getattr(cls, "pattern", ""))
+
+    def __str__(self) -> str:
+        return self._format % astuple(self)
 
     def __post_init__(self) -> None:
         for field in self.__struct_fields__:
@@ -105,124 +116,95 @@ class BaseKey(Struct, frozen=True, gc=False):
 class EventKey(BaseKey, frozen=True):
     """What happened to `liability`: `incoming`, `ready`, `complete` or `finalized`; put by the agent."""
 
+    pattern: ClassVar = "aira/agent/{agent}/liability/{liability}/{event}"
+    checks: ClassVar = {**BaseKey.checks, "event": _event_of(LiabilityEvent)}
     agent: str
     liability: str
     event: LiabilityEvent
-
-    def __post_init__(self) -> None:
-        BaseKey.__post_init__(self)
-        check_event(self.event, "incoming", "ready", "complete", "finalized")
-
-    def __str__(self) -> str:
-        return f"aira/agent/{self.agent}/liability/{self.liability}/{self.event}"
 
 
 class ObjectiveTopicKey(BaseKey, frozen=True):
     """A topic of the objective of `liability`, as the agent plays it."""
 
+    pattern: ClassVar = "aira/agent/{agent}/liability/{liability}/objective{topic}"
     agent: str
     liability: str
     topic: str
-
-    def __str__(self) -> str:
-        return f"aira/agent/{self.agent}/liability/{self.liability}/objective{self.topic}"
 
 
 class LiabilityTopicKey(BaseKey, frozen=True):
     """A topic of the job for `liability`, on which the device publishes; it is recorded."""
 
+    pattern: ClassVar = "aira/agent/{agent}/liability/{liability}/topic{topic}"
     agent: str
     liability: str
     topic: str
-
-    def __str__(self) -> str:
-        return f"aira/agent/{self.agent}/liability/{self.liability}/topic{self.topic}"
 
 
 class DeviceTopicKey(BaseKey, frozen=True):
     """A topic of a device outside any job."""
 
+    pattern: ClassVar = "aira/agent/{agent}/device/{device}{topic}"
     agent: str
     device: str
     topic: str
-
-    def __str__(self) -> str:
-        return f"aira/agent/{self.agent}/device/{self.device}{self.topic}"
 
 
 class RpcKey(BaseKey, frozen=True):
     """A service of the agent, a queryable: `start`, `finish`, `eth/accounts`, …"""
 
+    pattern: ClassVar = "aira/agent/{agent}/rpc/{service}"
     agent: str
     service: str
-
-    def __str__(self) -> str:
-        return f"aira/agent/{self.agent}/rpc/{self.service}"
 
 
 class EthEventKey(BaseKey, frozen=True):
     """An event of the token that concerns the agent: `transfer` or `approval`."""
 
+    pattern: ClassVar = "aira/agent/{agent}/eth/event/{event}"
+    checks: ClassVar = {**BaseKey.checks, "event": _event_of(EthEvent)}
     agent: str
     event: EthEvent
-
-    def __post_init__(self) -> None:
-        BaseKey.__post_init__(self)
-        check_event(self.event, "transfer", "approval")
-
-    def __str__(self) -> str:
-        return f"aira/agent/{self.agent}/eth/event/{self.event}"
 
 
 class CidKey(BaseKey, frozen=True):
     """A block or a file by its CID, which the agent's store answers. `*` in place of the agent asks all stores."""
 
+    pattern: ClassVar = "aira/agent/{agent}/cid/{cid}"
     agent: str
     cid: str
-
-    def __str__(self) -> str:
-        return f"aira/agent/{self.agent}/cid/{self.cid}"
 
 
 AgentKey: TypeAlias = EventKey | ObjectiveTopicKey | LiabilityTopicKey | DeviceTopicKey | RpcKey | EthEventKey | CidKey
 
 
-def parse_agent_key(text: str) -> AgentKey:
-    """The key of an agent with this text. Raises `InvalidKey` if there is none, or if it is not in canonical form."""
-    check_length(text)
-    match text.split("/"):
-        case ["aira", "agent", agent, *path]:
-            return check_canonical(text, _parse_path(text, agent, path))
-    raise InvalidKey(text, "it is no key of an agent")
+class KeyParser(Generic[KeyT]):
+    """Parses the texts of these kinds of keys."""
+
+    def __init__(self, *kinds: type[KeyT]) -> None:
+        self._kinds = {kind.__name__: kind for kind in kinds}
+        self._expression = re.compile("|".join(f"(?P<{kind.__name__}>{_expression(kind.pattern)})" for kind in kinds))
+
+    def parse(self, text: str) -> KeyT:
+        """The key with this text. Raises `InvalidKey` if there is none, or if it is not in the canonical form."""
+        if len(text) > MAX_KEY_LENGTH:
+            raise InvalidKey(text, f"it is longer than {MAX_KEY_LENGTH} characters")
+        found = self._expression.fullmatch(text)
+        if found is None or found.lastgroup is None:
+            raise InvalidKey(text, "there is no such family")
+        kind, first = self._kinds[found.lastgroup], self._expression.groupindex[found.lastgroup]
+        key = kind(*found.groups()[first : first + len(kind.__struct_fields__)])
+        if str(key) != text:
+            raise InvalidKey(text, f"its canonical form is {key}")
+        return key
 
 
-def check_length(text: str) -> None:
-    """Raise `InvalidKey` for a text that is too long for a key."""
-    if len(text) > MAX_KEY_LENGTH:
-        raise InvalidKey(text, f"it is longer than {MAX_KEY_LENGTH} characters")
+def _expression(pattern: str) -> str:
+    """What the texts of a pattern match. A topic begins with a slash and, like a service, may have several chunks."""
+    of_field = {"topic": "/.+", "service": ".+"}
+    return re.sub("{(.*?)}", lambda name: f"({of_field.get(name[1], '[^/]+')})", pattern)
 
 
-def check_canonical(text: str, key: KeyT) -> KeyT:
-    """The key, if `text` is its canonical form. Raises `InvalidKey`."""
-    if str(key) != text:
-        raise InvalidKey(text, f"its canonical form is {key}")
-    return key
-
-
-def _parse_path(text: str, agent: str, path: list[str]) -> AgentKey:
-    match path:
-        case ["liability", liability, "objective", *topic] if topic:
-            return ObjectiveTopicKey(agent, liability, "/" + "/".join(topic))
-        case ["liability", liability, "topic", *topic] if topic:
-            return LiabilityTopicKey(agent, liability, "/" + "/".join(topic))
-        case ["liability", liability, event]:
-            return EventKey(agent, liability, event)  # type: ignore[arg-type]
-        case ["device", device, *topic] if topic:
-            return DeviceTopicKey(agent, device, "/" + "/".join(topic))
-        case ["rpc", *service]:
-            return RpcKey(agent, "/".join(service))
-        case ["eth", "event", event]:
-            return EthEventKey(agent, event)  # type: ignore[arg-type]
-        case ["cid", cid]:
-            return CidKey(agent, cid)
-    raise InvalidKey(text, "there is no such family under an agent")
+AGENT_KEYS: Final = get_args(AgentKey)
+parse_agent_key: Final = KeyParser[AgentKey](*AGENT_KEYS).parse
+"""The key of an agent with a text. Raises `InvalidKey` if there is none, or if it is not in the canonical form."""

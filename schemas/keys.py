@@ -16,19 +16,18 @@ cost of a message would grow with the number of models.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, Final, Literal, TypeAlias, get_args
 
 from schemas.address import parse_address_or_name
 from schemas.agent_keys import (
+    AGENT_KEYS,
     CACHED,
     AgentKey,
     BaseKey,
+    KeyParser,
     address_chunk,
-    check_canonical,
-    check_length,
     cid_chunk,
     name_chunk,
-    parse_agent_key,
 )
 from schemas.errors import InvalidAddress, InvalidKey
 
@@ -62,78 +61,62 @@ class _Key(BaseKey, frozen=True, gc=False):
 class DemandKey(_Key, frozen=True):
     """The Demands for `model`; put by promisees."""
 
+    pattern: ClassVar = "aira/{lighthouse}/demand/{model}"
     lighthouse: str
     model: str
-
-    def __str__(self) -> str:
-        return f"aira/{self.lighthouse}/demand/{self.model}"
 
 
 class OfferKey(_Key, frozen=True):
     """The Offers of `model`; put by promisors."""
 
+    pattern: ClassVar = "aira/{lighthouse}/offer/{model}"
     lighthouse: str
     model: str
-
-    def __str__(self) -> str:
-        return f"aira/{self.lighthouse}/offer/{self.model}"
 
 
 class WithdrawalKey(_Key, frozen=True):
     """The Withdrawals of orders; put by the orders' makers."""
 
+    pattern: ClassVar = "aira/{lighthouse}/withdrawal"
     lighthouse: str
-
-    def __str__(self) -> str:
-        return f"aira/{self.lighthouse}/withdrawal"
 
 
 class ResultKey(_Key, frozen=True):
     """The Results of liabilities; put by promisors."""
 
+    pattern: ClassVar = "aira/{lighthouse}/result"
     lighthouse: str
-
-    def __str__(self) -> str:
-        return f"aira/{self.lighthouse}/result"
 
 
 class FeedbackKey(_Key, frozen=True):
     """The feedback of generation-5 providers on orders."""
 
+    pattern: ClassVar = "aira/{lighthouse}/feedback"
     lighthouse: str
-
-    def __str__(self) -> str:
-        return f"aira/{self.lighthouse}/feedback"
 
 
 class PendingKey(_Key, frozen=True):
     """The notes of generation-5 providers of the transactions that they have sent."""
 
+    pattern: ClassVar = "aira/{lighthouse}/pending"
     lighthouse: str
-
-    def __str__(self) -> str:
-        return f"aira/{self.lighthouse}/pending"
 
 
 class RejectKey(_Key, frozen=True):
     """The providers' rejections of orders and results that `maker` has signed."""
 
+    pattern: ClassVar = "aira/{lighthouse}/reject/{maker}"
     lighthouse: str
     maker: str
-
-    def __str__(self) -> str:
-        return f"aira/{self.lighthouse}/reject/{self.maker}"
 
 
 class PresenceKey(_Key, frozen=True):
     """The liveliness token of `agent` in its role (`provider`, `agent`, `edge`, …); no wildcard matches `@agent`."""
 
+    pattern: ClassVar = "aira/{lighthouse}/@agent/{role}/{agent}"
     lighthouse: str
     role: str
     agent: str
-
-    def __str__(self) -> str:
-        return f"aira/{self.lighthouse}/@agent/{self.role}/{self.agent}"
 
 
 MarketKey: TypeAlias = DemandKey | OfferKey | WithdrawalKey | ResultKey | FeedbackKey | PendingKey | RejectKey
@@ -150,30 +133,5 @@ def market_kind(text: str) -> str:
     return text.split("/", 3)[2] if text.count("/") > 1 else ""
 
 
-def parse_key(text: str) -> Key:
-    """The key with this text. Raises `InvalidKey` if there is none, or if it is not in the canonical form."""
-    check_length(text)
-    return check_canonical(text, _parse(text))
-
-
-def _parse(text: str) -> Key:
-    match text.split("/"):
-        case ["aira", lighthouse, "demand", model]:
-            return DemandKey(lighthouse, model)
-        case ["aira", lighthouse, "offer", model]:
-            return OfferKey(lighthouse, model)
-        case ["aira", lighthouse, "withdrawal"]:
-            return WithdrawalKey(lighthouse)
-        case ["aira", lighthouse, "result"]:
-            return ResultKey(lighthouse)
-        case ["aira", "agent", *_]:
-            return parse_agent_key(text)
-        case ["aira", lighthouse, "feedback"]:
-            return FeedbackKey(lighthouse)
-        case ["aira", lighthouse, "pending"]:
-            return PendingKey(lighthouse)
-        case ["aira", lighthouse, "reject", maker]:
-            return RejectKey(lighthouse, maker)
-        case ["aira", lighthouse, "@agent", role, agent]:
-            return PresenceKey(lighthouse, role, agent)
-    raise InvalidKey(text, "there is no such family")
+parse_key: Final = KeyParser[Key](*get_args(MarketKey), PresenceKey, *AGENT_KEYS).parse
+"""The key with a text. Raises `InvalidKey` if there is none, or if it is not in the canonical form."""

@@ -10,8 +10,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
 
-def on_demand(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
-    """A `__getattr__` for `package` (its `__name__`): it imports each name from its module in `homes`, once."""
+def on_demand(package: str, names: Mapping[str, str]) -> Callable[[str], Any]:
+    """A `__getattr__` for `package` (its `__name__`): it imports each name, once.
+
+    `names` lists those of each module, separated by blanks.
+    """
+    homes = {name: module for module, listed in names.items() for name in listed.split()}
 
     def load(name: str) -> Any:
         if name not in homes:

@@ -17,18 +17,3 @@ with needs_extra("ipfs", "the IPFS bridge"):
     )
     from bridges.ipfs.journal import RelayJournal
     from bridges.ipfs.validation import RelayValidator
-
-__all__ = [
-    "AccessDenied",
-    "ChannelBridge",
-    "Daemon",
-    "DaemonRefused",
-    "DaemonUnreachable",
-    "IpfsError",
-    "JournalFailed",
-    "NoPeers",
-    "PubSubDisabled",
-    "PublishedOutOfOrder",
-    "RelayJournal",
-    "RelayValidator",
-]

@@ -19,18 +19,14 @@ if TYPE_CHECKING:
     from bridges.serial.dialect import CallStatus
     from bridges.serial.errors import CallFailed, CallInDoubt, CallNotDone, CallRefused
 
-_HOMES: Final = {
-    "CallFailed": "bridges.serial.errors",
-    "CallInDoubt": "bridges.serial.errors",
-    "CallNotDone": "bridges.serial.errors",
-    "CallRefused": "bridges.serial.errors",
-    "CallReply": "bridges.serial.device",
-    "CallStatus": "bridges.serial.dialect",
-    "Device": "bridges.serial.device",
+_NAMES: Final = {
+    "bridges.serial.device": "CallReply Device",
+    "bridges.serial.dialect": "CallStatus",
+    "bridges.serial.errors": "CallFailed CallInDoubt CallNotDone CallRefused",
 }
 
 # An edge agent runs in a few tens of megabytes, so a name is imported when it is first used.
-__getattr__ = on_demand(__name__, _HOMES)
+__getattr__ = on_demand(__name__, _NAMES)
 
 __all__ = [
     "CallFailed",

@@ -6,17 +6,3 @@ from mesh.agent.errors import LiabilityReverted, OrderClosed, OrderExpired
 from mesh.agent.orders import Order, OrderState
 from mesh.work.job import Job, JobFailed
 from mesh.work.ledger import Phase
-
-__all__ = [
-    "Agent",
-    "Contract",
-    "Job",
-    "JobFailed",
-    "LiabilityReverted",
-    "Order",
-    "OrderClosed",
-    "OrderExpired",
-    "OrderState",
-    "Outcome",
-    "Phase",
-]

@@ -192,7 +192,7 @@ class Agent(HandlerDecorators, Lifecycle):
         return await self.runtime.trader.post(Demand, terms, validator_fee=validator_fee)
 
     async def demand(
-        self, objective: str | Path, *, on_rejection: OnRejection | None = None, **terms: Unpack[DemandTerms]
+        self, objective: str | Path, *, on_rejection: OnRejection = lambda rejection: None, **terms: Unpack[DemandTerms]
     ) -> Contract:
         """Demand a job and wait for the contract: `contract = await agent.demand(…); await contract.outcome()`.
 
@@ -216,7 +216,7 @@ class Agent(HandlerDecorators, Lifecycle):
 
     async def contract(self, address: str) -> Contract:
         """The contract at `address`, of any account; `outcome` waits for its end. Raises `NotALiability`."""
-        return await self.runtime.trader.contract(address)
+        return await self.runtime.trader.contracts.read(address)
 
     async def finish(self, address: str, *, success: bool) -> str:
         """End the job of the liability at `address` now; returns the recording's CID. Raises `WrongPhase`."""

@@ -17,7 +17,7 @@ from mesh.flood import Drops
 from mesh.network import Channel, Network, Services
 from mesh.outage_log import OutageLog
 from mesh.private_files import make_private_folder
-from mesh.work.ledger import LISTENER, Ledger
+from mesh.work.ledger import Ledger
 from mesh.work.outbox import RESEND, Outbox
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ async def working(
         directory = await state_folder(settings, chain, account.address)
         ledger = await stack.enter_async_context(Ledger(directory / LEDGER))
         # What an earlier run has not read may have made contracts of orders that have expired meanwhile.
-        handled = await ledger.cursor(LISTENER)
+        handled, _ = await ledger.cursor()
         chain_head = ChainHead(await chain.block_number() if handled is None else handled)
         network = await stack.enter_async_context(Network(endpoints_of(settings)))
         channel = await stack.enter_async_context(

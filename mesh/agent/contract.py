@@ -114,13 +114,12 @@ class WatchedContracts:
         self._parts = parts
         self._watched: dict[str, _WatchedContract] = {}
 
-    @property
-    def addresses(self) -> frozenset[str]:
-        """The addresses of these contracts."""
-        return frozenset(self._watched)
+    def __len__(self) -> int:
+        return len(self._watched)
 
     async def read(self, address: str) -> Contract:
-        """The contract at `address`, read from the chain. Raises `NotALiability`."""
+        """The contract at `address` (or name), read from the chain. Raises `NotALiability`."""
+        address = await self._parts.chain.names.address(address)
         is_new = address not in self._watched
         self._watch(address)  # before it is read: it may end in between
         try:

@@ -33,7 +33,7 @@ from mesh.chain import (
 from mesh.errors import ChainError
 from mesh.log_context import liability_context, log_event, with_liability_context
 from mesh.retry import Backoff
-from mesh.work.ledger import LISTENER, TO_BE_DONE, Phase, advance
+from mesh.work.ledger import TO_BE_DONE, Phase, advance
 from mesh.work.outbox import result_identity
 from schemas import Result, decode
 
@@ -58,9 +58,6 @@ NEVER: Final = 2**63
 
 class ChainListener:
     """Reads the chain for one agent. An agent that never ran begins at the head."""
-
-    CURSOR: Final = LISTENER
-    """The name of its position in the ledger."""
 
     def __init__(self, parts: AgentComponents, trader: Trader, executor: Executor, *, on_phase: OnPhase) -> None:
         self._parts = parts
@@ -103,10 +100,10 @@ class ChainListener:
                     self._trader.reorganised()
                 if block.events:
                     # If it is handled only in part, and replaced before the agent is back, it is reverted like others.
-                    await self._ledger.set_cursor(self.CURSOR, block.block_number - 1, history=history.encode())
+                    await self._ledger.set_cursor(block.block_number - 1, history=history.encode())
                 for event in block.events:
                     await self.handle(event)
-                await self._ledger.set_cursor(self.CURSOR, block.block_number, history=history.encode())
+                await self._ledger.set_cursor(block.block_number, history=history.encode())
                 await self.new_head(block.block_number)
                 backoff.reset()
 
@@ -127,11 +124,10 @@ class ChainListener:
     async def _position(self) -> tuple[int, History]:
         """The first block to read, and the history of those before it."""
         depth = self._chain.node.timing.reorg_depth
-        last = await self._ledger.cursor(self.CURSOR)
+        last, encoded = await self._ledger.cursor()
         if last is None:
             last = await self._chain.retrying(self._chain.block_number, outages=self._parts.outages)
-            await self._ledger.set_cursor(self.CURSOR, last)
-        encoded = await self._ledger.history(self.CURSOR)
+            await self._ledger.set_cursor(last)
         history = History.decode(encoded) if encoded else History(depth)
         history.depth = depth  # the setting may have changed
         self._parts.chain_head.begin_after(last)

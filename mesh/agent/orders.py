@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
 import secrets
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
+from mesh.agent.contract import fail_future
+from mesh.agent.errors import OrderClosed, OrderExpired
 from mesh.market.book import Refusal
 from schemas import ZERO_ADDRESS, Demand, Offer, message_hash
 
 if TYPE_CHECKING:
-    import asyncio
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Mapping
 
     from mesh.agent.components import AgentComponents
     from mesh.agent.contract import Contract
@@ -63,10 +64,18 @@ class TradedOrder:
     """The last rejection by each provider."""
     on_rejection: list[OnRejection] = field(default_factory=list)
 
+    def __str__(self) -> str:
+        return f"{self.signed.kind} {self.identity}"
+
     @property
     def identity(self) -> str:
         """The order's hash, hexadecimal."""
         return message_hash(self.signed).hex()
+
+    @property
+    def deadline(self) -> int:
+        """The block before which it can become a contract."""
+        return self.signed.deadline
 
     @property
     def is_open(self) -> bool:
@@ -77,6 +86,22 @@ class TradedOrder:
     def nonce(self) -> int | None:
         """In generation 5, which counts an account's orders."""
         return int(self.signed.nonce) if self.signed.generation == 5 else None
+
+    def is_overtaken(self, used: int | None) -> bool:
+        """Whether an order of the account has used the nonce `used`, and so its nonce."""
+        return used is not None and self.nonce is not None and self.nonce <= used
+
+    @property
+    def why_closed(self) -> OrderClosed | OrderExpired:
+        """The error of those who wait for the contract of an order that is not open."""
+        if self.state is OrderState.EXPIRED:
+            return OrderExpired(self.identity, self.deadline)
+        return OrderClosed(self.identity, self.state, liability=self.liability)
+
+    def close(self, state: OrderState) -> None:
+        """It won't become a contract, as far as can be known: those who wait for that get an error."""
+        self.state = state
+        fail_future(self.created, self.why_closed)
 
     def shown(self, actions: OrderActions) -> Order:
         """The order as users see it."""
@@ -101,17 +126,15 @@ class TradedOrder:
             report(rejection)
         return True
 
-    @contextmanager
-    def reporting(self, on_rejection: OnRejection | None) -> Iterator[None]:
-        """Meanwhile report rejections, those of before first."""
-        if on_rejection is None:
-            yield
-            return
+    async def contract(self, on_rejection: OnRejection) -> Contract:
+        """Wait until it is a contract, and report rejections meanwhile, those of before first."""
+        if self.created is None:
+            self.created = asyncio.get_running_loop().create_future()
         for rejection in self.rejections.values():
             on_rejection(rejection)
         self.on_rejection.append(on_rejection)
         try:
-            yield
+            return await asyncio.shield(self.created)
         finally:
             self.on_rejection.remove(on_rejection)
 
@@ -127,7 +150,7 @@ class OrderActions(Protocol):
         """See `Order.withdraw_on_chain`."""
         ...
 
-    async def contract_of(self, order: TradedOrder, on_rejection: OnRejection | None) -> Contract:
+    async def contract_of(self, order: TradedOrder, on_rejection: OnRejection) -> Contract:
         """See `Order.contract`."""
         ...
 
@@ -181,7 +204,7 @@ class Order:
         """
         return await self._actions.withdraw_on_chain(self._traded)
 
-    async def contract(self, *, on_rejection: OnRejection | None = None) -> Contract:
+    async def contract(self, *, on_rejection: OnRejection = lambda rejection: None) -> Contract:
         """Wait until the order is a contract. Cancelling the wait changes nothing.
 
         `on_rejection` is called with each provider's signed statement that it can't use the order, those of before

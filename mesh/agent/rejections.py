@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 from mesh.background import Background, call_in_loop
 from mesh.log_context import log_event
+from mesh.market.book import Refusal
 from schemas import InvalidRecord, market_selector
 from schemas.signing import Rejection
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable
+    from collections.abc import AsyncIterator, Awaitable, Callable, Container
 
     import zenoh
 
@@ -26,61 +27,53 @@ QUEUED: Final = 64
 """Most signed rejections that wait to be checked; more are dropped, since anybody can sign one."""
 
 
-class Rejections:
-    """Rejections of one's own orders. Anybody can publish one; only those that a provider signed count."""
+@asynccontextmanager
+async def received_rejections(
+    parts: AgentComponents, orders: Container[str], on_rejection: Callable[[Rejection], Awaitable[None]]
+) -> AsyncIterator[None]:
+    """Meanwhile call `on_rejection` with each rejection of one of `orders` that a provider of the lighthouse signed.
 
-    def __init__(self, parts: AgentComponents, is_open: Callable[[str], bool]) -> None:
-        self._parts = parts
-        self._is_open = is_open
+    Anybody can publish one; only those that a provider signed count. A full order book is only logged. It is called
+    again if it raises that the node is away.
+    """
+    loop, session = asyncio.get_running_loop(), parts.network.session
+    queue: asyncio.Queue[Rejection] = asyncio.Queue(QUEUED)
 
-    @asynccontextmanager
-    async def received(self, on_rejection: Callable[[Rejection], Awaitable[None]]) -> AsyncIterator[None]:
-        """Meanwhile call `on_rejection` with each rejection of an open order that a provider of the lighthouse signed.
+    def put(rejection: Rejection) -> None:
+        if not queue.full():
+            queue.put_nowait(rejection)
 
-        It is called again if it raises that the node is away.
-        """
-        loop = asyncio.get_running_loop()
-        queue: asyncio.Queue[Rejection] = asyncio.Queue(QUEUED)
-
-        def receive(sample: zenoh.Sample) -> None:
-            rejection = self._signed(sample.payload.to_bytes())
-            if rejection is not None:
-                call_in_loop(loop, _put, queue, rejection)
-
-        session = self._parts.network.session
-        selector = market_selector(self._parts.channel.lighthouse, "reject", self._parts.signer.address)
-        subscriber: Any = session.declare_subscriber(selector, receive)
+    def receive(sample: zenoh.Sample) -> None:
         try:
-            async with Background() as tasks:
-                tasks.start(self._check_all(queue, on_rejection), "rejections")
-                yield
-        finally:
-            if not session.is_closed():
-                subscriber.undeclare()
-
-    async def _check_all(self, queue: asyncio.Queue[Rejection], on_rejection: Callable[..., Awaitable[None]]) -> None:
-        while True:
-            check = partial(self._check, await queue.get(), on_rejection)
-            await self._parts.chain.retrying(check, outages=self._parts.outages)
-
-    async def _check(self, rejection: Rejection, on_rejection: Callable[..., Awaitable[None]]) -> None:
-        lighthouse = await self._parts.chain.lighthouses.get(self._parts.settings.lighthouse_contract)
-        if rejection.provider in lighthouse.stakes:
-            await on_rejection(rejection)
-        else:
-            facts = log_event("rejection-ignored", signer=rejection.provider, reason=rejection.reason)
-            log.warning("%s is no provider, but rejects: %s", rejection.provider, rejection.reason, extra=facts)
-
-    def _signed(self, payload: bytes) -> Rejection | None:
-        """A rejection of an open order, if it is signed. Others' cost no more than reading them."""
-        try:
-            rejection = Rejection.decode(payload)
+            rejection = Rejection.decode(sample.payload.to_bytes())
         except InvalidRecord as error:
             log.debug("an unreadable rejection: %s", error)
-            return None
-        return rejection if self._is_open(rejection.order) and rejection.is_signed else None
+            return
+        if rejection.order in orders and rejection.is_signed:  # others cost no more than reading them
+            call_in_loop(loop, put, rejection)
 
+    async def check(rejection: Rejection) -> None:
+        lighthouse = await parts.chain.lighthouses.get(parts.settings.lighthouse_contract)
+        order, signer, reason = rejection.order, rejection.provider, rejection.reason
+        if signer not in lighthouse.stakes:
+            facts = log_event("rejection-ignored", signer=signer, reason=reason)
+            log.warning("%s is no provider, but rejects: %s", signer, reason, extra=facts)
+        elif reason == Refusal.FULL:
+            facts = log_event("order-deferred", order=order, provider=signer, reason=reason)
+            log.warning("provider %s has no room for the order %s now", signer, order, extra=facts)
+        else:
+            await on_rejection(rejection)
 
-def _put(queue: asyncio.Queue[Rejection], rejection: Rejection) -> None:
-    if not queue.full():
-        queue.put_nowait(rejection)
+    async def check_all() -> None:
+        while True:
+            await parts.chain.retrying(partial(check, await queue.get()), outages=parts.outages)
+
+    selector = market_selector(parts.channel.lighthouse, "reject", parts.signer.address)
+    subscriber: Any = session.declare_subscriber(selector, receive)
+    try:
+        async with Background() as tasks:
+            tasks.start(check_all(), "rejections")
+            yield
+    finally:
+        if not session.is_closed():
+            subscriber.undeclare()

@@ -6,14 +6,13 @@ import asyncio
 import logging
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from mesh.agent.contract import Contract, WatchedContracts, fail_future
 from mesh.agent.demands import current_buyer
-from mesh.agent.errors import OrderClosed, OrderExpired
 from mesh.agent.offers import OpenOffers
 from mesh.agent.orders import Order, OrderState, TermsWriter, TradedOrder
-from mesh.agent.rejections import Rejections
+from mesh.agent.rejections import received_rejections
 from mesh.background import Background
 from mesh.chain import Allowances, OrderAlreadyUsed
 from mesh.errors import AiraError, ClosedError
@@ -34,8 +33,9 @@ if TYPE_CHECKING:
     from schemas import Liability
     from schemas.signing import Rejection
 
-
 log = logging.getLogger(__name__)
+
+ENDED: Final = partial(ClosedError, "the agent has ended", hint="run it again: orders stay open until their deadline")
 
 
 class Trader(Lifecycle):
@@ -76,20 +76,16 @@ class Trader(Lifecycle):
         for order in resumed:
             if isinstance(order.signed, Offer):
                 await self._give_up(self._answers.add(order.identity, "", pays=False))
-        resumed = [order for order in resumed if order.is_open]
-        for order in resumed:
-            kind, identity, deadline = order.signed.kind, order.identity, order.signed.deadline
-            facts = log_event("order-resumed", order=identity, kind=kind, deadline=deadline)
-            log.info("the %s %s of an earlier run is open until block %d", kind, identity, deadline, extra=facts)
-        rejections = Rejections(self._parts, lambda identity: identity in self._orders)
-        await stack.enter_async_context(rejections.received(self._rejected))
+            facts = log_event("order-resumed", order=order.identity, kind=order.signed.kind, deadline=order.deadline)
+            log.info("the %s of an earlier run is open until block %d", order, order.deadline, extra=facts)
+        await stack.enter_async_context(received_rejections(self._parts, self._orders, self._rejected))
         self._tasks = await stack.enter_async_context(Background())
-        self._send_when_covered(resumed)
+        self._send_when_covered([order for order in resumed if order.is_open])
 
     async def _close(self) -> None:
         for order in self._orders.values():
-            fail_future(order.created, _ended())
-        self.contracts.fail(_ended())
+            fail_future(order.created, ENDED())
+        self.contracts.fail(ENDED())
 
     async def post(self, kind: type[Demand | Offer], terms: Terms, **fee: Any) -> Order:
         """Sign an order, ensure its allowance, and post it. Cancelling withdraws it.
@@ -116,36 +112,26 @@ class Trader(Lifecycle):
             raise
         return order.shown(self)
 
-    async def contract_of(self, order: TradedOrder, on_rejection: OnRejection | None) -> Contract:
+    async def contract_of(self, order: TradedOrder, on_rejection: OnRejection) -> Contract:
         """See `Order.contract`."""
-        match order.state:
-            case OrderState.MATCHED:
-                return await self.contracts.read(order.liability)
-            case OrderState.WITHDRAWN:
-                raise OrderClosed(order.identity, order.state)
-            case OrderState.EXPIRED:
-                raise OrderExpired(order.identity, order.signed.deadline)
+        if order.state is OrderState.MATCHED:
+            return await self.contracts.read(order.liability)
+        if not order.is_open:
+            raise order.why_closed
         if not self.is_open:
-            raise _ended()
-        if order.created is None:
-            order.created = asyncio.get_running_loop().create_future()
-        with order.reporting(on_rejection):
-            return await asyncio.shield(order.created)
-
-    async def contract(self, address: str) -> Contract:
-        """The contract at `address`, to be waited for. Raises `NotALiability`."""
-        return await self.contracts.read(await self._chain.names.address(address))
+            raise ENDED()
+        return await order.contract(on_rejection)
 
     async def withdraw(self, order: TradedOrder) -> Order:
         """See `Order.withdraw`."""
         if order.state is OrderState.MATCHED:
-            raise OrderClosed(order.identity, order.state, liability=order.liability)
+            raise order.why_closed
         if order.is_open:
-            identity, signed = order.identity, order.signed
-            self._set_withdrawn(order)
-            facts = log_event("order-withdrawn", order=identity, deadline=signed.deadline)
-            log.info("the %s %s is withdrawn", signed.kind, identity, extra=facts)
-            withdrawal = Withdrawal(order=identity, lighthouse=signed.lighthouse, deadline=signed.deadline)
+            self._allowances.withdraw(order)
+            order.close(OrderState.WITHDRAWN)
+            facts = log_event("order-withdrawn", order=order.identity, deadline=order.deadline)
+            log.info("the %s is withdrawn", order, extra=facts)
+            withdrawal = Withdrawal(order=order.identity, lighthouse=order.signed.lighthouse, deadline=order.deadline)
             await self._parts.outbox.withdraw(self._parts.signer.sign(withdrawal))
         return order.shown(self)
 
@@ -156,8 +142,7 @@ class Trader(Lifecycle):
             tx = (await self._chain.liabilities.withdraw(order.signed)).tx
         except OrderAlreadyUsed:
             await self._parts.chain_head.reached(await self._chain.block_number())
-            if order.state is OrderState.MATCHED:
-                raise OrderClosed(order.identity, order.state, liability=order.liability) from None
+            await self.withdraw(order)  # raises if the order became a contract
             tx = "an earlier transaction"
         await self._parts.ledger.use_up(order.identity, tx)
         self._forget(order)
@@ -175,17 +160,16 @@ class Trader(Lifecycle):
         known = self.contracts.created(liability, demand or offer)
         for identity in filter(None, (demand, offer)):
             if (order := self._orders.get(identity)) is not None:
-                was = "withdrawn " if order.state is OrderState.WITHDRAWN else ""
+                log.info(
+                    "created from our %s %s", order.state, order, extra=log_event("contract-created", order=identity)
+                )
                 order.state, order.liability = OrderState.MATCHED, liability.address
                 self._forget(order)
             await self._parts.outbox.spend(identity, liability.address)
-            if order is None:
-                continue
-            facts = log_event("contract-created", order=identity)
-            log.info("created from our %s%s %s", was, order.signed.kind, identity, extra=facts)
-            if order.created is not None and not order.created.done():
-                order.created.set_result(known or self.contracts.watch(liability, order=identity))
-            await self._renew_overtaken(order.nonce)
+            if order is not None:
+                if order.created is not None and not order.created.done():
+                    order.created.set_result(known or self.contracts.watch(liability, order=identity))
+                await self._renew_overtaken(order.nonce)
 
     async def liability_reverted(self, address: str) -> None:
         """A reorganisation reverted the contract at `address`: its orders are open again, until their deadline.
@@ -208,11 +192,10 @@ class Trader(Lifecycle):
     async def new_head(self, block: int) -> None:
         """The chain has block `block`: orders, and reverted contracts, with an earlier deadline have expired."""
         for order in list(self._orders.values()):
-            if order.signed.deadline <= block:
+            if order.deadline <= block:
                 self._forget(order)
                 if order.is_open:
-                    order.state = OrderState.EXPIRED
-                    fail_future(order.created, OrderExpired(order.identity, order.signed.deadline))
+                    order.close(OrderState.EXPIRED)
         self.contracts.expire(block)
         await self.load()
 
@@ -233,8 +216,7 @@ class Trader(Lifecycle):
             await self._chain.retrying(partial(self._ensure_allowance, order), outages=self._parts.outages)
         except AiraError as error:
             facts = log_event("order-not-covered", order=order.identity, code=error.code)
-            text = "the %s %s is open, but no provider can use it now: %s"
-            log.warning(text, order.signed.kind, order.identity, error, extra=facts)
+            log.warning("the %s is open, but no provider can use it now: %s", order, error, extra=facts)
         if order.identity not in self._orders:
             self._allowances.release(order)
         await self._parts.outbox.release([order.identity])
@@ -253,7 +235,8 @@ class Trader(Lifecycle):
                     self._allowances.count(order, self._chain.costs.of(signed))
                     new.append(order)
                 if stored.is_withdrawn and order.is_open:
-                    self._set_withdrawn(order)
+                    self._allowances.withdraw(order)
+                    order.close(OrderState.WITHDRAWN)
         return new
 
     async def _rejected(self, rejection: Rejection) -> None:
@@ -262,33 +245,26 @@ class Trader(Lifecycle):
         In generation 5 the nonce may be used; whether by this order is known once this agent has read the chain up to
         the block at which the nonce was read.
         """
-        identity = rejection.order
+        identity, provider, reason = rejection.order, rejection.provider, rejection.reason
         order = self._orders.get(identity)
-        if order is not None and rejection.reason == Refusal.WITHDRAWN:
+        if order is not None and reason == Refusal.WITHDRAWN:
             order.reject(rejection)
         if order is None or not order.is_open:
-            return
-        facts: dict[str, Any] = {"order": identity, "provider": rejection.provider, "reason": rejection.reason}
-        if rejection.reason == Refusal.FULL:
-            text = "provider %s has no room for the order %s now"
-            log.warning(text, rejection.provider, identity, extra=log_event("order-deferred", **facts))
             return
         used = await self._chain.liabilities.next_nonce(self._address) if order.nonce is not None else 0
         await self._parts.chain_head.reached(await self._chain.block_number())
         if (order := self._orders.get(identity)) is None or not order.is_open:
             return
-        if order.nonce is not None and order.nonce < used:
+        if order.is_overtaken(used - 1):
             await self._renew_overtaken(used - 1)
         elif order.reject(rejection):
-            text = "provider %s can't use the order %s now (%s): %s"
-            arguments = (rejection.provider, identity, rejection.reason, rejection.detail)
-            log.warning(text, *arguments, extra=log_event("order-rejected", **facts))
+            facts = log_event("order-rejected", order=identity, provider=provider, reason=reason)
+            why = f"{reason}: {rejection.detail}"
+            log.warning("provider %s can't use the %s now (%s)", provider, order, why, extra=facts)
 
     async def _renew_overtaken(self, used: int | None) -> None:
         """Sign the orders of generation 5 again whose nonce another order of the account has used."""
-        for order in list(self._orders.values()):
-            if used is None or order.nonce is None or order.nonce > used or not order.is_open:
-                continue
+        for order in [one for one in self._orders.values() if one.is_open and one.is_overtaken(used)]:
             try:
                 await self._chain.retrying(partial(self._renew, order), outages=self._parts.outages)
             except AiraError as error:
@@ -296,7 +272,7 @@ class Trader(Lifecycle):
                 await self._parts.outbox.settle(order.identity)
                 fail_future(order.created, error)
                 facts = log_event("order-abandoned", order=order.identity, code=error.code)
-                log.warning("the order %s can't be signed again: %s", order.identity, error, extra=facts)
+                log.warning("the %s can't be signed again: %s", order, error, extra=facts)
 
     async def _renew(self, order: TradedOrder) -> None:
         """Replace an order by one with the same terms and a fresh nonce."""
@@ -310,26 +286,16 @@ class Trader(Lifecycle):
             self._orders[order.identity] = order
             await self._parts.outbox.replace(identity, signed)
         facts = log_event("order-renewed", order=identity, renewed=order.identity)
-        log.info("the %s %s is signed again as %s", signed.kind, identity, order.identity, extra=facts)
+        log.info("the order %s is signed again as %s", identity, order.identity, extra=facts)
 
     async def _give_up(self, identity: str) -> None:
         """Don't send an offer any more. What providers have of it may still become a contract."""
         if (order := self._orders.get(identity)) is not None:
             self._forget(order)
-            order.state = OrderState.WITHDRAWN
-            fail_future(order.created, OrderClosed(identity, order.state))
+            order.close(OrderState.WITHDRAWN)
             await self._parts.outbox.settle(identity)
-
-    def _set_withdrawn(self, order: TradedOrder) -> None:
-        order.state = OrderState.WITHDRAWN
-        self._allowances.withdraw(order)
-        fail_future(order.created, OrderClosed(order.identity, order.state))
 
     def _forget(self, order: TradedOrder) -> None:
         self._orders.pop(order.identity, None)
         self._answers.discard(order.identity)
         self._allowances.release(order)
-
-
-def _ended() -> ClosedError:
-    return ClosedError("the agent has ended", hint="run it again: its orders stay open until their deadline")

@@ -14,14 +14,13 @@ with needs_extra("chain", "the chain"):
     from mesh.chain.accounts import (
         Account,
         KeyfileError,
-        SignedTransaction,
         WrongPassword,
         copy_keyfile,
         keyfile_address,
         new_private_key,
         write_keyfile,
     )
-    from mesh.chain.admission import Allowances, UnsafeValidator, Validators
+    from mesh.chain.admission import Allowances, UnsafeValidator
     from mesh.chain.answers import BlockHeader
     from mesh.chain.client import Chain
     from mesh.chain.deploy import XRT, Deployment, DeploymentPlan, deploy
@@ -52,7 +51,6 @@ with needs_extra("chain", "the chain"):
         Finalized,
         NewLiability,
         NewLighthouse,
-        Offline,
         Online,
         Transfer,
     )
@@ -63,7 +61,7 @@ with needs_extra("chain", "the chain"):
     from mesh.chain.node import Node
     from mesh.chain.policy import GWEI, FeePolicy, Timing
     from mesh.chain.tokens import Token
-    from mesh.chain.transactions import Receipt, TransactionSender
+    from mesh.chain.transactions import TransactionSender
 
 RECURSION_LIMIT: Final = 3_000
 """Frames: safe on a stack of 2 MB (measured; 6,000 is not), and enough for contracts that call 200 deep."""
@@ -80,65 +78,3 @@ def restrain_recursion() -> None:
 
 
 restrain_recursion()
-
-__all__ = [
-    "GWEI",
-    "XRT",
-    "Account",
-    "Allowances",
-    "Approval",
-    "BlockEvents",
-    "BlockHeader",
-    "Chain",
-    "ChainEvent",
-    "ChainWentBack",
-    "Created",
-    "Current",
-    "Deployment",
-    "DeploymentPlan",
-    "FeePolicy",
-    "FeeTooHigh",
-    "Finalized",
-    "History",
-    "InsufficientFunds",
-    "InsufficientTokens",
-    "InvalidName",
-    "KeyfileError",
-    "LighthouseState",
-    "NewLiability",
-    "NewLighthouse",
-    "NoAccount",
-    "NoContracts",
-    "Node",
-    "NodeUnreachable",
-    "NotALiability",
-    "NotOffered",
-    "Offline",
-    "Online",
-    "OrderAlreadyUsed",
-    "Receipt",
-    "RefundState",
-    "Reorganisation",
-    "ReorganisedTooDeep",
-    "RequestRefused",
-    "Reverted",
-    "Settled",
-    "SignedTransaction",
-    "StakeTooSmall",
-    "Timing",
-    "Token",
-    "TransactionSender",
-    "TransactionTimeout",
-    "Transfer",
-    "UnknownName",
-    "UnsafeValidator",
-    "Validators",
-    "WrongChain",
-    "WrongPassword",
-    "copy_keyfile",
-    "deploy",
-    "keyfile_address",
-    "namehash",
-    "new_private_key",
-    "write_keyfile",
-]

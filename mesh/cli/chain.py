@@ -16,7 +16,6 @@ from mesh.cli.lighthouse import check_lighthouse
 from mesh.cli.options import with_chain_settings, with_json, with_lighthouse_options, with_signing_settings
 from mesh.cli.output import print_facts, print_json, print_line, printable
 from mesh.errors import ChainError
-from mesh.running import run_to_end
 
 if TYPE_CHECKING:
     from mesh.chain import Account, Chain, Deployment, Node
@@ -47,16 +46,7 @@ command = LazyGroup(
 @click.option("--again", is_flag=True, help="deploy even if the chain already has the contracts; the old ones stay")
 @with_json
 @with_signing_settings()
-def deploy_contracts(settings: Settings, **options: Any) -> None:
-    """Deploy the contracts: ENS registry and names, XRT, factory, and a first lighthouse.
-
-    The settings' account pays the gas, owns the names and receives the first million XRT. Sends about twenty
-    transactions, one after another, and prints the settings that use the contracts.
-    """
-    run_to_end(lambda: _deploy(settings, **options))
-
-
-async def _deploy(
+async def deploy_contracts(
     settings: Settings,
     *,
     lighthouse: str,
@@ -66,6 +56,11 @@ async def _deploy(
     again: bool,
     as_json: bool,
 ) -> None:
+    """Deploy the contracts: ENS registry and names, XRT, factory, and a first lighthouse.
+
+    The settings' account pays the gas, owns the names and receives the first million XRT. Sends about twenty
+    transactions, one after another, and prints the settings that use the contracts.
+    """
     from mesh.chain import DeploymentPlan, deploy
     from mesh.composition import chain_of, load_account
 
@@ -160,15 +155,11 @@ CONTRACT_FACTS: Final = ("ens", "factory", "xrt", "isOurCode", "lighthouse", "li
 @command.command("status", short_help="show the node, the contracts and the account's balances")
 @with_json
 @with_chain_settings("lighthouse_contract")
-def status(settings: Settings, as_json: bool) -> None:
+async def status(settings: Settings, as_json: bool) -> None:
     """Show the node and its chain, the contracts and which code they run, and the account's balances.
 
     The exit code is 1 if the chain has no contracts; everything else is still shown.
     """
-    run_to_end(lambda: _status(settings, as_json))
-
-
-async def _status(settings: Settings, as_json: bool) -> None:
     from mesh.composition import chain_of
 
     account = await asyncio.to_thread(own_address, settings)

@@ -18,7 +18,6 @@ from mesh.cli.files import file_or_cid, require_readable, require_writable
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import plural, print_json, print_line, printable
 from mesh.errors import AiraError
-from mesh.running import run_to_end
 from mesh.settings import ChainSettings, NetworkSettings, options_of
 
 if TYPE_CHECKING:
@@ -67,20 +66,7 @@ CHOICES: Final = {
     "keyfile_password_file",
     *options_of(ChainSettings),
 )
-def command(settings: Settings, **order: Any) -> None:
-    """Publish a demand and wait for the contract, the work and the payment. Ctrl-C stops waiting, but does not withdraw
-    the demand (`aira order withdraw` does) or cancel the contract.
-
-    A demand that was interrupted stays open until its deadline. If an equal one is open, the command asks what to do;
-    without a terminal it needs --existing.
-
-    The exit code is 1 if the work was not done and the cost was returned, or if the recording (--out) is not
-    available. --json prints one object when the contract has ended; it has an `error` if the exit code is 1.
-    """
-    run_to_end(lambda: demand(settings, **order))
-
-
-async def demand(
+async def command(
     settings: Settings,
     *,
     objective: str,
@@ -90,6 +76,15 @@ async def demand(
     existing: str | None = None,
     **terms: Any,
 ) -> None:
+    """Publish a demand and wait for the contract, the work and the payment. Ctrl-C stops waiting, but does not withdraw
+    the demand (`aira order withdraw` does) or cancel the contract.
+
+    A demand that was interrupted stays open until its deadline. If an equal one is open, the command asks what to do;
+    without a terminal it needs --existing.
+
+    The exit code is 1 if the work was not done and the cost was returned, or if the recording (--out) is not
+    available. --json prints one object when the contract has ended; it has an `error` if the exit code is 1.
+    """
     from mesh.agent import Agent
 
     settings.keyfile_and_password()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from contextlib import aclosing
 from typing import TYPE_CHECKING, Any, Final, get_args
 
@@ -13,8 +12,6 @@ from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import plural, print_json, print_line, printable
 from mesh.doctor.checks import CheckStatus
 from mesh.doctor.context import DoctorContext, Role, SerialSettings, with_identity
-from mesh.errors import AiraError
-from mesh.running import fail, run_to_end
 from mesh.settings import ChainSettings, NetworkSettings, options_of
 
 if TYPE_CHECKING:
@@ -67,7 +64,7 @@ MARK: Final = 6
     "ipfs_http_provider",
     "ipfs_authorization_file",
 )
-def command(settings: Settings, as_json: bool, timeout: float, role: Role | None, **options: Any) -> None:
+async def command(settings: Settings, as_json: bool, timeout: float, role: Role | None, **options: Any) -> None:
     """Check whether this machine can run a role, and suggest a fix for each problem.
 
     Checks the router and this identity's rights there, the clocks, the chain and its contracts, the account and its
@@ -77,14 +74,9 @@ def command(settings: Settings, as_json: bool, timeout: float, role: Role | None
     Prints a line for each check: ok, warn (it works now) or FAIL; with --json an object with name, ok, found, do and
     code. A check that depends on a failed one is skipped. The exit code is 1 if a check fails.
     """
-    try:
-        context = _context_of(settings, role, **options)
-    except AiraError as error:
-        fail(error)
-    failed: list[str] = []
-    run_to_end(lambda: _examine(context, failed, seconds=timeout, as_json=as_json))
-    if failed:
-        sys.exit(1)
+    context = _context_of(settings, role, **options)
+    if await _examine(context, seconds=timeout, as_json=as_json):
+        raise click.exceptions.Exit(1)
 
 
 def _context_of(settings: Settings, role: Role | None, **options: Any) -> DoctorContext:
@@ -104,8 +96,8 @@ def _context_of(settings: Settings, role: Role | None, **options: Any) -> Doctor
     )
 
 
-async def _examine(context: DoctorContext, failed: list[str], *, seconds: float, as_json: bool) -> None:
-    """Run the checks, print each result, and append the names of failed ones to `failed`."""
+async def _examine(context: DoctorContext, *, seconds: float, as_json: bool) -> list[str]:
+    """Run the checks, and print each result; returns the names of the failed ones."""
     from mesh.doctor import checks_for, run_checks
 
     by_status: dict[CheckStatus, list[str]] = {status: [] for status in CheckStatus}
@@ -123,7 +115,7 @@ async def _examine(context: DoctorContext, failed: list[str], *, seconds: float,
                 _print_result(context, checked, width)
     if not as_json:
         _print_summary(context, len(checks), by_status, skipped)
-    failed += by_status[CheckStatus.FAIL]
+    return by_status[CheckStatus.FAIL]
 
 
 def _print_object(context: DoctorContext, checked: CompletedCheck) -> None:

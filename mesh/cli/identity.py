@@ -13,7 +13,7 @@ from mesh.cli.options import FILE, FOLDER, with_json, with_settings
 from mesh.cli.output import print_facts, print_json, printable
 from mesh.errors import AiraError
 from mesh.identity.roster import ROLES
-from mesh.running import fail, report, run_to_end
+from mesh.running import fail, report
 from mesh.settings import NetworkSettings, options_of
 
 if TYPE_CHECKING:
@@ -134,22 +134,15 @@ def renew(
 @click.option("--agent", default="", help="for an edge agent: address of the agent that its device belongs to")
 @click.option("--device", default="", help="for an edge agent: name of that device")
 @with_settings(*options_of(NetworkSettings))
-def check(settings: Settings, agent: str, device: str) -> None:
+async def check(settings: Settings, agent: str, device: str) -> None:
     """Connect with the settings' certificate, and check that the router accepts this identity's messages.
 
     A router drops denied messages without an error. The exit code is 1 if it does not admit this identity, or denies
     all its operations.
     """
-    try:
-        address = _own_address(settings)
-        if bool(agent) != bool(device):
-            raise InvalidOptions("--agent and --device must be given together")
-    except AiraError as error:
-        fail(error)
-    run_to_end(lambda: _check(settings, address, agent, device))
-
-
-async def _check(settings: Settings, address: str, agent: str, device: str) -> None:
+    address = _own_address(settings)
+    if bool(agent) != bool(device):
+        raise InvalidOptions("--agent and --device must be given together")
     from mesh.identity.routers import check_admission
     from mesh.network.endpoints import Endpoints
 

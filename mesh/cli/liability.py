@@ -13,7 +13,6 @@ from mesh.cli.chain_client import account_of, open_chain, own_address, units_of
 from mesh.cli.lazy import LazyGroup
 from mesh.cli.options import with_chain_settings, with_json
 from mesh.cli.output import plural, print_facts, print_json, print_line, print_table, short_address
-from mesh.running import run_to_end
 from schemas.address import ZERO_ADDRESS
 
 if TYPE_CHECKING:
@@ -58,18 +57,14 @@ command = LazyGroup(
 )
 @with_json
 @with_chain_settings()
-def list_liabilities(settings: Settings, **what: Any) -> None:
+async def list_liabilities(
+    settings: Settings, *, account: str | None, all_accounts: bool, state: str, from_block: int, as_json: bool
+) -> None:
     """List the liabilities of an account: first those in which it is the promisee, then those in which it is the
     promisor, each oldest first. Without an account in the settings, list all.
 
     Reading a long chain takes time; --from-block makes it faster.
     """
-    run_to_end(lambda: _list(settings, **what))
-
-
-async def _list(
-    settings: Settings, *, account: str | None, all_accounts: bool, state: str, from_block: int, as_json: bool
-) -> None:
     own = await asyncio.to_thread(own_address, settings)
     async with open_chain(settings) as chain:
         whose = (
@@ -111,12 +106,8 @@ async def _liabilities_of(chain: Chain, whose: str | None, from_block: int) -> S
 @click.argument("address")
 @with_json
 @with_chain_settings()
-def show(settings: Settings, address: str, as_json: bool) -> None:
+async def show(settings: Settings, address: str, as_json: bool) -> None:
     """Show the liability at ADDRESS: its parties, terms, cost and state, and from which block it can be refunded."""
-    run_to_end(lambda: _show(settings, address, as_json))
-
-
-async def _show(settings: Settings, address: str, as_json: bool) -> None:
     own = await asyncio.to_thread(own_address, settings)
     async with open_chain(settings) as chain:
         await print_liability(chain, await chain.liabilities.get(address), own=own, as_json=as_json)

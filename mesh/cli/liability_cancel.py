@@ -12,7 +12,6 @@ from mesh.cli.liability import OUTCOMES, liability_json, refund_words, state_of
 from mesh.cli.options import with_json, with_signing_settings
 from mesh.cli.output import print_facts, print_json, print_line
 from mesh.errors import InvalidMessage
-from mesh.running import run_to_end
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
 @click.option("--refund", is_flag=True, help="refund the promisee after the refund delay, without signatures")
 @with_json
 @with_signing_settings()
-def cancel(settings: Settings, address: str, signatures: tuple[str, ...], refund: bool, as_json: bool) -> None:
+async def cancel(settings: Settings, address: str, signatures: tuple[str, ...], refund: bool, as_json: bool) -> None:
     """Cancel the liability at ADDRESS: the promisee gets the cost back, and the promisor is not paid.
 
     Both parties must agree. The first party runs this command without --signature: it prints a signature and sends
@@ -41,9 +40,9 @@ def cancel(settings: Settings, address: str, signatures: tuple[str, ...], refund
     if refund and signatures:
         raise click.UsageError("--refund and --signature can't be used together")
     if refund:
-        run_to_end(lambda: _refund(settings, address, as_json))
+        await _refund(settings, address, as_json)
     else:
-        run_to_end(lambda: _cancel(settings, address, signatures, as_json))
+        await _cancel(settings, address, signatures, as_json)
 
 
 async def _refund(settings: Settings, address: str, as_json: bool) -> None:

@@ -16,7 +16,6 @@ from mesh.cli.liability import liability_json, print_liability, state_of
 from mesh.cli.options import with_chain_settings, with_json
 from mesh.cli.output import print_json, print_line, short_address
 from mesh.outage_log import OutageLog
-from mesh.running import run_to_end
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -41,19 +40,15 @@ log = logging.getLogger(__name__)
 )
 @with_json
 @with_chain_settings("confirmations", "poll_interval")
-def watch(settings: Settings, address: str | None, from_block: int | None, as_json: bool) -> None:
+async def watch(settings: Settings, address: str | None, from_block: int | None, as_json: bool) -> None:
     """Wait until the liability at ADDRESS has ended, then show it. If the node is unreachable, wait for it.
 
     Without ADDRESS, print each liability when it is created and when it ends, until Ctrl-C; with --json one object per
     line.
     """
     if address is None:
-        run_to_end(lambda: _watch_all(settings, from_block, as_json))
-    else:
-        run_to_end(lambda: _watch(settings, address, as_json))
-
-
-async def _watch(settings: Settings, address: str, as_json: bool) -> None:
+        await _watch_all(settings, from_block, as_json)
+        return
     own = await asyncio.to_thread(own_address, settings)
     async with open_chain(settings) as chain:
         liability = await chain.liabilities.get(address)

@@ -13,7 +13,6 @@ from mesh.cli.errors import InvalidLighthouse, NameTaken, NotALighthouse
 from mesh.cli.lazy import LazyGroup
 from mesh.cli.options import with_chain_settings, with_json, with_lighthouse_options, with_signing_settings
 from mesh.cli.output import plural, print_facts, print_json, print_line, print_table, printable
-from mesh.running import run_to_end
 
 if TYPE_CHECKING:
     from mesh.chain import Chain, LighthouseState
@@ -43,12 +42,8 @@ command = LazyGroup(
 )
 @with_json
 @with_chain_settings()
-def list_lighthouses(settings: Settings, from_block: int, as_json: bool) -> None:
+async def list_lighthouses(settings: Settings, from_block: int, as_json: bool) -> None:
     """List all lighthouses of the factory, oldest first."""
-    run_to_end(lambda: _list(settings, from_block, as_json))
-
-
-async def _list(settings: Settings, from_block: int, as_json: bool) -> None:
     async with open_chain(settings) as chain:
         found = [
             (made.name, await chain.lighthouses.get(made.lighthouse))
@@ -79,12 +74,9 @@ async def _list(settings: Settings, from_block: int, as_json: bool) -> None:
 @click.argument("name", required=False)
 @with_json
 @with_chain_settings("lighthouse_contract")
-def info(settings: Settings, name: str | None, as_json: bool) -> None:
+async def info(settings: Settings, name: str | None, as_json: bool) -> None:
     """Show a lighthouse (by default that of the settings): its rules, its providers, and whose turn it is."""
-    run_to_end(lambda: _info(settings, name or settings.lighthouse_contract, as_json))
-
-
-async def _info(settings: Settings, name: str, as_json: bool) -> None:
+    name = name or settings.lighthouse_contract
     async with open_chain(settings) as chain:
         state = await chain.lighthouses.get(await find_lighthouse(chain, name))
         block = await chain.block_number()
@@ -141,14 +133,10 @@ def _turn(state: LighthouseState) -> str | None:
 @with_lighthouse_options
 @with_json
 @with_signing_settings()
-def create(settings: Settings, **plan: Any) -> None:
+async def create(settings: Settings, *, name: str, minimal_stake: str, timeout_blocks: int, as_json: bool) -> None:
     """Create a lighthouse named NAME (1 to 32 characters of a to z, 0 to 9 and -, without - at the ends).
 
     Anyone can stake there as a provider."""
-    run_to_end(lambda: _create(settings, **plan))
-
-
-async def _create(settings: Settings, *, name: str, minimal_stake: str, timeout_blocks: int, as_json: bool) -> None:
     stake = XRT.parse(minimal_stake)
     check_lighthouse(name, minimal_stake=stake)
     async with open_signing_chain(settings) as chain:

@@ -12,7 +12,6 @@ from mesh.cli.errors import InvalidAmount, InvalidOptions, InvalidStake, NotAPro
 from mesh.cli.lighthouse import find_lighthouse
 from mesh.cli.options import with_json, with_signing_settings
 from mesh.cli.output import plural, print_facts, print_json
-from mesh.running import run_to_end
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,15 +24,11 @@ if TYPE_CHECKING:
 @click.argument("words", nargs=-1, required=True, metavar="[LIGHTHOUSE] VALUE")
 @with_json
 @with_signing_settings("lighthouse_contract")
-def join(settings: Settings, words: tuple[str, ...], as_json: bool) -> None:
+async def join(settings: Settings, words: tuple[str, ...], as_json: bool) -> None:
     """Add VALUE to the stake at LIGHTHOUSE (by default that of the settings), to become one of its providers.
 
     Approves the amount for the lighthouse first if necessary. Each minimal stake allows one transaction per turn.
     """
-    run_to_end(lambda: _join(settings, words, as_json))
-
-
-async def _join(settings: Settings, words: Sequence[str], as_json: bool) -> None:
     name, value = lighthouse_and_value(words, settings)
     if value is None:
         raise InvalidOptions("VALUE is missing", hint=f"for example: `aira lighthouse join {name} 20`")
@@ -62,16 +57,12 @@ def _check_stake(state: LighthouseState, *, staked: int, added: int) -> None:
 @click.argument("words", nargs=-1, metavar="[LIGHTHOUSE] [VALUE]")
 @with_json
 @with_signing_settings("lighthouse_contract")
-def leave(settings: Settings, words: tuple[str, ...], as_json: bool) -> None:
+async def leave(settings: Settings, words: tuple[str, ...], as_json: bool) -> None:
     """Withdraw VALUE from the stake at LIGHTHOUSE (by default that of the settings).
 
     Without VALUE, or if less than the minimum would remain, withdraw all of it. Without a stake you stop being a
     provider.
     """
-    run_to_end(lambda: _leave(settings, words, as_json))
-
-
-async def _leave(settings: Settings, words: Sequence[str], as_json: bool) -> None:
     name, value = lighthouse_and_value(words, settings)
     async with open_signing_chain(settings) as chain:
         assert chain.account is not None

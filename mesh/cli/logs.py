@@ -10,7 +10,6 @@ import click
 from mesh.cli.errors import NoAnswer
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import plural, print_line, printable, wait_for_broken_pipe
-from mesh.running import run_to_end
 from mesh.settings import NetworkSettings, options_of
 from schemas import parse_address
 from schemas.agent_keys import DeviceTopicKey, RpcKey
@@ -50,7 +49,7 @@ DEVICE_LOG: Final = "/log"
 )
 @with_json
 @with_settings(*options_of(NetworkSettings))
-def command(
+async def command(
     settings: Settings,
     address: str,
     device: str | None,
@@ -68,13 +67,10 @@ def command(
     """
     from mesh.telemetry.events import human_line, json_line
 
-    async def show() -> None:
-        agent = parse_address(address)
-        key = str(RpcKey(agent, "logs") if device is None else DeviceTopicKey(agent, device, DEVICE_LOG))
-        wanted = {"lines": lines, "level": level, "liability": liability and parse_address(liability)}
-        await _show(settings, key, wanted, line=json_line if as_json else human_line, timeout=timeout, follow=follow)
-
-    run_to_end(show)
+    agent = parse_address(address)
+    key = str(RpcKey(agent, "logs") if device is None else DeviceTopicKey(agent, device, DEVICE_LOG))
+    wanted = {"lines": lines, "level": level, "liability": liability and parse_address(liability)}
+    await _show(settings, key, wanted, line=json_line if as_json else human_line, timeout=timeout, follow=follow)
 
 
 async def _show(

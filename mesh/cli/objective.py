@@ -23,7 +23,6 @@ from mesh.cli.lazy import LazyGroup
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import format_duration, format_size, plural, print_json, printable, progress, run_sync
 from mesh.recording import GENEROUS, Limits, NotARecording, bag_to_mcap, open_objective, preflight, recover
-from mesh.running import run_to_end
 from schemas import cid_of_file
 
 if TYPE_CHECKING:
@@ -84,12 +83,8 @@ def _add(settings: Settings, files: tuple[Path, ...], *, as_json: bool) -> None:
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="file to write")
 @with_json
 @with_settings(*FETCH_SETTINGS)
-def get(settings: Settings, cid: str, out: Path, as_json: bool) -> None:
+async def get(settings: Settings, cid: str, out: Path, as_json: bool) -> None:
     """Fetch the file with this CID from the store or the mesh, and verify every block."""
-    run_to_end(lambda: _get(settings, cid, out, as_json=as_json))
-
-
-async def _get(settings: Settings, cid: str, out: Path, *, as_json: bool) -> None:
     require_new_file(out)
     async with opened_store(settings) as store:
         await fetch(settings, store, cid)

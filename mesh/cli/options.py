@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from functools import wraps
+from functools import partial, wraps
+from inspect import iscoroutinefunction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
 from mesh.errors import AiraError
-from mesh.running import fail
+from mesh.running import fail, run_to_end
 from mesh.settings import MEANING, Settings, load
 
 if TYPE_CHECKING:
@@ -40,7 +41,8 @@ TRANSACTION_SETTINGS: Final = ("data_dir", "max_fee_gwei", "confirmations", "pol
 def with_settings(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Give a command `--config` and a flag for each named setting; it is called with `settings`.
 
-    Flags override `AIRA_*` variables, which override the settings file.
+    Flags override `AIRA_*` variables, which override the settings file. A command that is a coroutine function is run
+    to its end, as `run_to_end` does.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -51,7 +53,8 @@ def with_settings(*names: str) -> Callable[[Callable[..., Any]], Callable[..., A
                 settings = load(path=config, flags=flags)
             except AiraError as error:
                 fail(error)
-            return function(settings=settings, **options)
+            work = partial(function, settings=settings, **options)
+            return run_to_end(work) if iscoroutinefunction(function) else work()
 
         decorated: Callable[..., Any] = command
         for name in reversed(names):

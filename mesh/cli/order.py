@@ -13,7 +13,6 @@ from mesh.cli.chain_client import notice_when_slow, open_chain, required_address
 from mesh.cli.errors import InvalidOptions, UnknownOrder
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import plural, print_json, print_line, print_table
-from mesh.running import run_to_end
 from mesh.settings import ChainSettings, NetworkSettings, options_of
 from schemas import parse_address
 
@@ -42,15 +41,11 @@ def command() -> None:
 @command.command("list", short_help="list the open and withdrawn orders")
 @with_json
 @with_settings("keyfile", *options_of(ChainSettings))
-def list_orders(settings: Settings, as_json: bool) -> None:
+async def list_orders(settings: Settings, as_json: bool) -> None:
     """List the orders that may still become contracts: open ones, and withdrawn ones until their deadline.
 
     A `matched` one became a contract while no agent of the account ran; `aira liability list` shows it.
     """
-    run_to_end(lambda: _list(settings, as_json))
-
-
-async def _list(settings: Settings, as_json: bool) -> None:
     from schemas import decode
 
     address = await asyncio.to_thread(required_address, settings)
@@ -113,7 +108,9 @@ def _json(stored: StoredOrder, message: Demand | Offer, state: str, head: int) -
 @with_settings(
     *options_of(NetworkSettings), "lighthouse_contract", "keyfile", "keyfile_password_file", *options_of(ChainSettings)
 )
-def withdraw(settings: Settings, hashes: tuple[str, ...], everything: bool, on_chain: bool, as_json: bool) -> None:
+async def withdraw(
+    settings: Settings, hashes: tuple[str, ...], everything: bool, on_chain: bool, as_json: bool
+) -> None:
     """Withdraw the open orders whose hashes begin with HASH.
 
     A signed withdrawal asks the providers not to use the order. A provider that is creating its contract now may still
@@ -122,12 +119,6 @@ def withdraw(settings: Settings, hashes: tuple[str, ...], everything: bool, on_c
     """
     if bool(hashes) == everything:
         raise click.UsageError("give the hashes of orders, or --all")
-    run_to_end(lambda: _withdraw(settings, hashes, everything, on_chain, as_json))
-
-
-async def _withdraw(
-    settings: Settings, hashes: tuple[str, ...], everything: bool, on_chain: bool, as_json: bool
-) -> None:
     from mesh.agent.components import working
     from mesh.agent.orders import OrderState
     from mesh.agent.rejections import Rejections

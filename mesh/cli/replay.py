@@ -17,7 +17,6 @@ from mesh.cli.files import FETCH_SETTINGS, fetch, file_or_cid, opened_store, req
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import format_duration, plural, print_json, progress
 from mesh.recording import GENEROUS, AtOnce, RecordedTimes, open_objective, play
-from mesh.running import run_to_end
 from mesh.settings import ChainSettings, options_of
 from schemas.agent_keys import DeviceTopicKey, LiabilityTopicKey, ObjectiveTopicKey, topic_chunks
 
@@ -49,7 +48,7 @@ ROLES: Final = ("objective", "device", "agent")
 @click.option("--from", "start", type=click.FloatRange(min=0), default=0.0, help="skip this many seconds at the start")
 @with_json
 @with_settings(*dict.fromkeys((*FETCH_SETTINGS, *options_of(ChainSettings))))
-def command(settings: Settings, **options: Any) -> None:
+async def command(settings: Settings, **options: Any) -> None:
     """Publish the messages of SOURCE again. SOURCE is a file, a CID, or the address of a liability with a recording.
 
     --to is the destination: `lamp` is that device of the account in --keyfile, `0x…/lamp` a device of another agent,
@@ -58,7 +57,7 @@ def command(settings: Settings, **options: Any) -> None:
 
     No contract is created and nothing is paid. Ctrl-C stops it.
     """
-    run_to_end(lambda: replay(settings, ReplayOptions(**options)))
+    await replay(settings, ReplayOptions(**options))
 
 
 class ReplayOptions(Struct, frozen=True, kw_only=True):

@@ -14,7 +14,6 @@ from mesh.cli.errors import InvalidArgument, UnknownJob, UnknownService
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import print_facts, print_json, print_line, print_table, printable
 from mesh.cli.status import describe_status
-from mesh.running import run_to_end
 from mesh.settings import NetworkSettings, options_of
 from schemas import InvalidRecord, Record, parse_address
 from schemas.logs import LogsRead
@@ -43,7 +42,7 @@ ETH_BALANCES: Final = frozenset({"eth/eth_balance", "eth/account_eth_balance"})
 )
 @with_json
 @with_settings(*options_of(NetworkSettings))
-def command(
+async def command(
     settings: Settings,
     address: str | None,
     service: str | None,
@@ -66,7 +65,7 @@ def command(
     elif address is None or service is None:
         raise click.UsageError("ADDRESS and SERVICE are required; --list shows the services")
     else:
-        run_to_end(lambda: call_service(settings, (address, service, arguments), timeout=timeout, as_json=as_json))
+        await call_service(settings, (address, service, arguments), timeout=timeout, as_json=as_json)
 
 
 def _list_services(*, as_json: bool) -> None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import TYPE_CHECKING
 
 import click
 
 from mesh.cli.options import FILE, with_json, with_settings
-from mesh.cli.output import format_size, plural, print_facts, print_json, print_table, printable, run_sync
-from mesh.running import run_to_end
+from mesh.cli.output import format_size, plural, print_facts, print_json, print_table, printable
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -28,14 +28,18 @@ def command() -> None:
 @click.argument("file", required=False, type=FILE)
 @with_json
 @with_settings("data_dir")
-def show(settings: Settings, file: Path | None, as_json: bool) -> None:
+async def show(settings: Settings, file: Path | None, as_json: bool) -> None:
     """Show the state of the agents of the data folder; they may be running. With FILE, verify the checksums of that
     backup and show its content.
     """
+    from mesh.state import examine_archive, take_inventory
+
     if file is None:
-        run_to_end(lambda: _show(settings.state_directory, as_json=as_json))
+        inventory = await take_inventory(settings.state_directory)
+        print_json(inventory) if as_json else _print_inventory(inventory)
     else:
-        run_sync(lambda: _show_archive(file, as_json=as_json))
+        contents = await asyncio.to_thread(examine_archive, file)
+        print_json(contents) if as_json else _print_archive(contents)
 
 
 @command.command("backup", short_help="write the state to a file, even while agents run")
@@ -49,12 +53,29 @@ def show(settings: Settings, file: Path | None, as_json: bool) -> None:
 )
 @with_json
 @with_settings("data_dir")
-def backup(settings: Settings, file: Path, content: str, as_json: bool) -> None:
+async def backup(settings: Settings, file: Path, content: str, as_json: bool) -> None:
     """Write the state of the agents of the data folder to FILE (tar.zst). An existing FILE is replaced at the end.
 
     The agents may be running: the backup contains what a crash at one moment would leave.
     """
-    run_to_end(lambda: _back_up(settings.state_directory, file, content, as_json=as_json))
+    from dataclasses import asdict
+
+    from mesh.state import ContentScope, back_up
+
+    done = await back_up(settings.state_directory, file, content=ContentScope(content))
+    if as_json:
+        print_json({"file": str(file), **asdict(done)})
+        return
+    print_facts(
+        {
+            "backup": file,
+            "size": format_size(done.size),
+            "accounts": ", ".join(done.accounts) or None,
+            "open jobs": done.jobs,
+            "content": plural(done.files, "file"),
+            "missing": ", ".join(done.missing) or None,
+        }
+    )
 
 
 @command.command("restore", short_help="restore a backup")
@@ -68,23 +89,31 @@ def backup(settings: Settings, file: Path, content: str, as_json: bool) -> None:
 )
 @with_json
 @with_settings("data_dir")
-def restore(settings: Settings, file: Path, existing: str, as_json: bool) -> None:
+async def restore(settings: Settings, file: Path, existing: str, as_json: bool) -> None:
     """Restore the backup FILE to the data folder, whose agents must be stopped.
 
     Changes nothing unless FILE is valid as a whole. Make sure that the agent that was backed up never runs again: two
     agents with one account would do every job twice.
     """
-    run_to_end(lambda: _restore(settings.state_directory, file, existing, as_json=as_json))
+    from mesh.state import ExistingState
+    from mesh.state import restore as restore_backup
 
-
-async def _show(folder: Path, *, as_json: bool) -> None:
-    from mesh.state import take_inventory
-
-    found = await take_inventory(folder)
+    folder = settings.state_directory
+    done = await restore_backup(file, folder, existing=ExistingState(existing))
+    jobs = {job.liability.address: job.phase.value for job in done.jobs}
     if as_json:
-        print_json(found)
-    else:
-        _print_inventory(found)
+        aside = None if done.aside is None else str(done.aside)
+        print_json({"folder": str(folder), "made": done.made, "parts": done.parts, "jobs": jobs, "aside": aside})
+        return
+    print_facts(
+        {
+            "restored to": folder,
+            "backup of": printable(done.made),
+            "old state": done.aside,
+            "open jobs": len(jobs),
+        }
+    )
+    print_facts(jobs)
 
 
 def _print_inventory(found: Inventory) -> None:
@@ -113,16 +142,6 @@ def _print_inventory(found: Inventory) -> None:
     print_facts({"pending transactions": found.transactions})
 
 
-def _show_archive(file: Path, *, as_json: bool) -> None:
-    from mesh.state import examine_archive
-
-    found = examine_archive(file)
-    if as_json:
-        print_json(found)
-    else:
-        _print_archive(found)
-
-
 def _print_archive(found: ArchiveContents) -> None:
     print_facts(
         {
@@ -135,49 +154,3 @@ def _print_archive(found: ArchiveContents) -> None:
             "checksums": "valid",
         }
     )
-
-
-async def _back_up(folder: Path, file: Path, content: str, *, as_json: bool) -> None:
-    from mesh.state import ContentScope, back_up
-
-    done = await back_up(folder, file, content=ContentScope(content))
-    if as_json:
-        print_json({"file": str(file), **_as_dict(done)})
-        return
-    print_facts(
-        {
-            "backup": file,
-            "size": format_size(done.size),
-            "accounts": ", ".join(done.accounts) or None,
-            "open jobs": done.jobs,
-            "content": plural(done.files, "file"),
-            "missing": ", ".join(done.missing) or None,
-        }
-    )
-
-
-async def _restore(folder: Path, file: Path, existing: str, *, as_json: bool) -> None:
-    from mesh.state import ExistingState
-    from mesh.state import restore as restore_backup
-
-    done = await restore_backup(file, folder, existing=ExistingState(existing))
-    jobs = {job.liability.address: job.phase.value for job in done.jobs}
-    if as_json:
-        aside = None if done.aside is None else str(done.aside)
-        print_json({"folder": str(folder), "made": done.made, "parts": done.parts, "jobs": jobs, "aside": aside})
-        return
-    print_facts(
-        {
-            "restored to": folder,
-            "backup of": printable(done.made),
-            "old state": done.aside,
-            "open jobs": len(jobs),
-        }
-    )
-    print_facts(jobs)
-
-
-def _as_dict(done: object) -> dict[str, object]:
-    from dataclasses import asdict
-
-    return asdict(done)  # type: ignore[call-overload, no-any-return]

@@ -21,7 +21,6 @@ from mesh.cli.output import (
     printable,
 )
 from mesh.flood import Drops
-from mesh.running import run_to_end
 from mesh.settings import NetworkSettings, options_of
 from schemas import parse_address
 from schemas.status import ALIVE, OFF, BridgeStatus, Status
@@ -41,16 +40,16 @@ if TYPE_CHECKING:
 )
 @with_json
 @with_settings(*options_of(NetworkSettings), "lighthouse_contract")
-def status(settings: Settings, address: str | None, timeout: float, as_json: bool) -> None:
+async def status(settings: Settings, address: str | None, timeout: float, as_json: bool) -> None:
     """Show the status of the agent, provider or bridge with ADDRESS: the health of its parts, the last block read, and
     its jobs or its market.
 
     Without ADDRESS, show one line for each peer on the lighthouse's channel; with --json one object for all.
     """
     if address is None:
-        run_to_end(lambda: show_all(settings, timeout=timeout, as_json=as_json))
+        await show_all(settings, timeout=timeout, as_json=as_json)
     else:
-        run_to_end(lambda: show_one(settings, address, timeout=timeout, as_json=as_json))
+        await show_one(settings, address, timeout=timeout, as_json=as_json)
 
 
 async def show_one(settings: Settings, named: str, *, timeout: float, as_json: bool) -> None:
@@ -113,15 +112,11 @@ def _status_json(how: RoleStatus | None) -> dict[str, Any] | None:
 @click.command("peers")
 @with_json
 @with_settings(*options_of(NetworkSettings), "lighthouse_contract")
-def peers(settings: Settings, as_json: bool) -> None:
+async def peers(settings: Settings, as_json: bool) -> None:
     """List the peers on the lighthouse's channel by role and address, and count the nodes on the IPFS side.
 
     Watchers are not listed. `aira status` shows the status of each peer.
     """
-    run_to_end(lambda: show_peers(settings, as_json=as_json))
-
-
-async def show_peers(settings: Settings, *, as_json: bool) -> None:
     from mesh.agent.components import watching
     from mesh.watching import BRIDGE, PROVIDER, present, statuses
     from schemas.status import BridgeStatus

@@ -18,7 +18,6 @@ from mesh.cli.chain_client import (
 )
 from mesh.cli.options import with_chain_settings, with_json, with_signing_settings
 from mesh.cli.output import print_facts, print_json, print_line
-from mesh.running import run_to_end
 
 if TYPE_CHECKING:
     from mesh.chain import Chain
@@ -42,12 +41,8 @@ def command() -> None:
 @with_token
 @with_json
 @with_chain_settings()
-def balance(settings: Settings, **what: Any) -> None:
+async def balance(settings: Settings, *, account: str | None, token: str | None, as_json: bool) -> None:
     """Show the balance of ACCOUNT, an address or ENS name; by default the account of the settings."""
-    run_to_end(lambda: _balance(settings, **what))
-
-
-async def _balance(settings: Settings, *, account: str | None, token: str | None, as_json: bool) -> None:
     async with open_chain(settings) as chain:
         owner = await account_of(chain, settings, account)
         unit = await unit_of(chain, token)
@@ -64,14 +59,10 @@ async def _balance(settings: Settings, *, account: str | None, token: str | None
 @with_token
 @with_json
 @with_chain_settings()
-def allowance(settings: Settings, **what: Any) -> None:
+async def allowance(settings: Settings, *, spender: str, owner: str | None, token: str | None, as_json: bool) -> None:
     """Show how much SPENDER may transfer from the account.
 
     SPENDER is `factory` (the default), a lighthouse's name, an ENS name or an address."""
-    run_to_end(lambda: _allowance(settings, **what))
-
-
-async def _allowance(settings: Settings, *, spender: str, owner: str | None, token: str | None, as_json: bool) -> None:
     async with open_chain(settings) as chain:
         whose, by = await account_of(chain, settings, owner), await spender_of(chain, spender)
         unit = await unit_of(chain, token)
@@ -89,15 +80,11 @@ async def _allowance(settings: Settings, *, spender: str, owner: str | None, tok
 @with_token
 @with_json
 @with_signing_settings()
-def approve(settings: Settings, **what: Any) -> None:
+async def approve(settings: Settings, *, spender: str, amount: str, token: str | None, as_json: bool) -> None:
     """Allow SPENDER to transfer up to AMOUNT from the account. Replaces the previous allowance; 0 revokes it.
 
     SPENDER is `factory` (for costs and fees), a lighthouse's name (for stakes), an ENS name or an address.
     """
-    run_to_end(lambda: _approve(settings, **what))
-
-
-async def _approve(settings: Settings, *, spender: str, amount: str, token: str | None, as_json: bool) -> None:
     async with open_signing_chain(settings) as chain:
         unit = await unit_of(chain, token)
         value, by = unit.parse(amount), await spender_of(chain, spender)
@@ -115,12 +102,8 @@ async def _approve(settings: Settings, *, spender: str, amount: str, token: str 
 @with_token
 @with_json
 @with_signing_settings()
-def transfer(settings: Settings, **what: Any) -> None:
+async def transfer(settings: Settings, *, to: str, amount: str, token: str | None, as_json: bool) -> None:
     """Transfer AMOUNT from the account to TO, an address or ENS name."""
-    run_to_end(lambda: _transfer(settings, **what))
-
-
-async def _transfer(settings: Settings, *, to: str, amount: str, token: str | None, as_json: bool) -> None:
     async with open_signing_chain(settings) as chain:
         unit = await unit_of(chain, token)
         value, recipient = unit.parse(amount), await chain.names.address(to)

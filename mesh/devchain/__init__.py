@@ -8,5 +8,3 @@ from mesh.extras import needs_extra
 with needs_extra("demo", "the development chain"):
     from mesh.devchain.embedded import EmbeddedChain, ServedChain, serve_embedded
     from mesh.devchain.rpc_server import JsonRpcServer
-
-__all__ = ["EmbeddedChain", "JsonRpcServer", "ServedChain", "serve_embedded"]

@@ -3,22 +3,6 @@
 `certificates` and `folders` need the extra `identity`; import them where you use them.
 """
 
-from mesh.identity.access_rules import Permission, access_control, access_of
-from mesh.identity.errors import IdentityError, RosterError
+from mesh.identity.access_rules import access_control, access_of
+from mesh.identity.errors import RosterError
 from mesh.identity.roster import ROLES, Member, Right, Role, Roster, entry_of, read_roster, roster_from
-
-__all__ = [
-    "ROLES",
-    "IdentityError",
-    "Member",
-    "Permission",
-    "Right",
-    "Role",
-    "Roster",
-    "RosterError",
-    "access_control",
-    "access_of",
-    "entry_of",
-    "read_roster",
-    "roster_from",
-]

@@ -2,5 +2,3 @@
 `mesh.market.provider`)."""
 
 from mesh.market.book import Added, Match, OrderBook, Refusal, order_id
-
-__all__ = ["Added", "Match", "OrderBook", "Refusal", "order_id"]

@@ -16,41 +16,16 @@ if TYPE_CHECKING:
     from mesh.network.tls import Tls
     from mesh.network.validation import MessageValidator, ValidationStatistics, message_key
 
-_HOMES: Final = {
-    "Channel": "mesh.network.channel",
-    "MessageValidator": "mesh.network.validation",
-    "Endpoints": "mesh.network.endpoints",
-    "Network": "mesh.network.session",
-    "NetworkChange": "mesh.network.session",
-    "NotAdmitted": "mesh.network.connecting",
-    "Pump": "mesh.network.pump",
-    "ServiceFailed": "mesh.network.services",
-    "Services": "mesh.network.services",
-    "Subscription": "mesh.network.channel",
-    "Tls": "mesh.network.tls",
-    "ValidationStatistics": "mesh.network.validation",
-    "call": "mesh.network.services",
-    "free_endpoint": "mesh.network.endpoints",
-    "message_key": "mesh.network.validation",
+_NAMES: Final = {
+    "mesh.network.channel": "Channel Subscription",
+    "mesh.network.connecting": "NotAdmitted",
+    "mesh.network.endpoints": "Endpoints free_endpoint",
+    "mesh.network.pump": "Pump",
+    "mesh.network.services": "ServiceFailed Services call",
+    "mesh.network.session": "Network NetworkChange",
+    "mesh.network.tls": "Tls",
+    "mesh.network.validation": "MessageValidator ValidationStatistics message_key",
 }
 
 # Names load on first use: an edge process opens a session without asyncio.
-__getattr__ = on_demand(__name__, _HOMES)
-
-__all__ = [
-    "Channel",
-    "Endpoints",
-    "MessageValidator",
-    "Network",
-    "NetworkChange",
-    "NotAdmitted",
-    "Pump",
-    "ServiceFailed",
-    "Services",
-    "Subscription",
-    "Tls",
-    "ValidationStatistics",
-    "call",
-    "free_endpoint",
-    "message_key",
-]
+__getattr__ = on_demand(__name__, _NAMES)

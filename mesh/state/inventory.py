@@ -20,7 +20,7 @@ from mesh.state.archive import read_archive
 from mesh.state.layout import LEDGER, PINS, RECORDINGS, NoState, StateInUse, account_folders, parts_in, transactions_in
 from mesh.work import Ledger
 from mesh.work.database import VERSION, LedgerTooNew, LedgerUnusable
-from mesh.work.ledger import LISTENER, UNFINISHED
+from mesh.work.ledger import UNFINISHED
 from schemas import Demand, Offer, decode
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ async def read_ledger(copy: Path) -> LedgerFacts:
         return LedgerFacts(
             jobs={job.liability.address: job for job in await ledger.jobs(UNFINISHED)},
             phases=await ledger.jobs_by_phase(),
-            block=await ledger.cursor(LISTENER),
+            block=(await ledger.cursor())[0],
             waiting=len(waiting),
             ordered=frozenset(order.objective for order in waiting if isinstance(order, Demand | Offer)),
         )

@@ -3,33 +3,5 @@
 from __future__ import annotations
 
 from mesh.watching.market import JobEvent, MarketCounters, MarketEvent, MarketWatch
-from mesh.watching.presence import (
-    BRIDGE,
-    PROVIDER,
-    PresentPeer,
-    RoleStatus,
-    address_of,
-    present,
-    role_of,
-    status_of,
-    statuses,
-)
+from mesh.watching.presence import BRIDGE, PROVIDER, PresentPeer, RoleStatus, present, status_of, statuses
 from mesh.watching.readings import ReadingFetcher, SensorReading
-
-__all__ = [
-    "BRIDGE",
-    "PROVIDER",
-    "JobEvent",
-    "MarketCounters",
-    "MarketEvent",
-    "MarketWatch",
-    "PresentPeer",
-    "ReadingFetcher",
-    "RoleStatus",
-    "SensorReading",
-    "address_of",
-    "present",
-    "role_of",
-    "status_of",
-    "statuses",
-]

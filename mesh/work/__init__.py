@@ -1,5 +1,3 @@
 """Work: from a liability that names an agent to a signed Result, and the memory that outlives a crash."""
 
 from mesh.work.ledger import JobRecord, Ledger, Outgoing, Phase, StoredOrder, WrongPhase
-
-__all__ = ["JobRecord", "Ledger", "Outgoing", "Phase", "StoredOrder", "WrongPhase"]

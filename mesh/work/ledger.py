@@ -11,6 +11,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final, Self
 
 import msgspec
+from msgspec.structs import astuple
 
 from mesh.errors import AiraError
 from mesh.work.database import Database
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 LISTENER: Final = "listener"
-"""The reader of the chain whose position is how far the agent has handled it."""
+"""The name of the only reader of the chain whose cursor the ledger keeps."""
 POST: Final = "INSERT OR IGNORE INTO outbox (identity, kind, payload, deadline, posted) VALUES (?, ?, ?, ?, ?)"
 SPENT_KEPT: Final = 4096
 """Most orders that are kept after they became contracts. A reorganisation replaces only the last blocks."""
@@ -94,7 +95,7 @@ class JobRecord(msgspec.Struct, frozen=True, kw_only=True):
     note: str
 
 
-class Outgoing(msgspec.Struct, frozen=True, kw_only=True):
+class Outgoing(msgspec.Struct, frozen=True):
     """A signed message that is sent until its effect is seen, or until block `deadline` (None: without end)."""
 
     identity: str
@@ -217,7 +218,8 @@ class Ledger:
         """The orders that became the contract at this address, withdrawn ones included."""
         spent = "SELECT identity, kind, payload, deadline FROM spent WHERE liability = ?"
         withdrawn = "SELECT identity, kind, payload, deadline FROM withdrawn WHERE used_by = ?"
-        return _outgoing(await self._database.rows(f"{spent} UNION ALL {withdrawn}", (liability, liability)))
+        rows = await self._database.rows(f"{spent} UNION ALL {withdrawn}", (liability, liability))
+        return [Outgoing(*row) for row in rows]
 
     async def contracts(self, kind: str) -> list[tuple[bytes, str]]:
         """The 64 latest orders of a kind that became contracts: their payloads, and the contracts' addresses."""
@@ -264,26 +266,21 @@ class Ledger:
         await self._database.run("DELETE FROM outbox WHERE deadline <= ?", (head,), sync=False)
         await self._database.run("DELETE FROM withdrawn WHERE deadline <= ?", (head,), sync=False)
         statement = "SELECT identity, kind, payload, deadline FROM outbox ORDER BY rowid"
-        return _outgoing(await self._database.rows(statement))
+        return [Outgoing(*row) for row in await self._database.rows(statement)]
 
     async def waiting_by_kind(self) -> dict[str, int]:
         """The messages in the outbox of each kind (`demand`, `offer`, `withdrawal`, `result`) that has any."""
         return dict(await self._database.rows("SELECT kind, COUNT(*) FROM outbox GROUP BY kind"))
 
-    async def cursor(self, name: str) -> int | None:
-        """The last block that the reader `name` has handled; None if it never handled one."""
-        rows = await self._database.rows("SELECT block FROM cursors WHERE name = ?", (name,))
-        return int(rows[0][0]) if rows else None
+    async def cursor(self) -> tuple[int | None, bytes]:
+        """The last block that the listener has handled (None: it never handled one), and its encoded chain history."""
+        rows = await self._database.rows("SELECT block, history FROM cursors WHERE name = ?", (LISTENER,))
+        return rows[0] if rows else (None, b"")
 
-    async def history(self, name: str) -> bytes:
-        """The encoded chain history of the reader `name` at its cursor; empty if there is none."""
-        rows = await self._database.rows("SELECT history FROM cursors WHERE name = ?", (name,))
-        return bytes(rows[0][0]) if rows else b""
-
-    async def set_cursor(self, name: str, block: int, *, history: bytes = b"") -> None:
-        """Save that the reader `name` has handled all of `block`, with its encoded chain history."""
+    async def set_cursor(self, block: int, *, history: bytes = b"") -> None:
+        """Save that the listener has handled all of `block`, with its encoded chain history."""
         statement = "INSERT OR REPLACE INTO cursors (name, block, history) VALUES (?, ?, ?)"
-        await self._database.run(statement, (name, block, history), sync=False)
+        await self._database.run(statement, (LISTENER, block, history), sync=False)
 
 
 def _job(row: Any) -> JobRecord:
@@ -298,9 +295,5 @@ def _job(row: Any) -> JobRecord:
     )
 
 
-def _outgoing(rows: Iterable[Any]) -> list[Outgoing]:
-    return [Outgoing(identity=row[0], kind=row[1], payload=row[2], deadline=row[3]) for row in rows]
-
-
 def _posted(outgoing: Outgoing) -> tuple[Any, ...]:
-    return (outgoing.identity, outgoing.kind, outgoing.payload, outgoing.deadline, time.time())
+    return (*astuple(outgoing), time.time())

@@ -109,15 +109,15 @@ MUTATIONS: Final = (
     Mutation(
         "an order is declared dead before its deadline",
         "mesh.agent.trade:Trader.new_head",
-        "order.signed.deadline <= block",
-        "order.signed.deadline <= block + 3",
+        "order.deadline <= block",
+        "order.deadline <= block + 3",
         "delay,leave_out,partition_every",
     ),
     Mutation(
         "the listener's cursor runs ahead of what it has handled",
         "mesh.agent.listener:ChainListener._follow",
-        "self.CURSOR, block.block_number - 1, history",
-        "self.CURSOR, block.block_number, history",
+        "block.block_number - 1, history",
+        "block.block_number, history",
         CRASHES,
     ),
     Mutation(

@@ -111,7 +111,7 @@ async def started(ledger: Ledger) -> None:
     """Wait until a listener has chosen its first block."""
 
     async def chosen() -> bool:
-        return await ledger.cursor(ChainListener.CURSOR) is not None
+        return (await ledger.cursor())[0] is not None
 
     await until_found(chosen)
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from mesh.agent.listener import ChainListener
 from mesh.chain import Chain, Timing
 from mesh.devchain import JsonRpcServer
 from schemas import message_hash
@@ -60,7 +59,7 @@ async def test_a_new_agent_begins_at_the_head(place: Place, ledger: Ledger) -> N
     head = await place.chains["robot"].block_number()
     async with listening(place, ledger) as listener:
         await started(ledger)
-        assert await ledger.cursor(ChainListener.CURSOR) == head
+        assert (await ledger.cursor())[0] == head
         later, *_ = await contract(place)
         await until(lambda: listener.liabilities)
     assert [liability.address for liability, *_ in listener.liabilities] == [later]
@@ -99,7 +98,7 @@ async def test_the_head_is_reported_and_saved_as_the_chain_grows(place: Place, l
         await place.node.mine(3)
         head = await place.chains["robot"].block_number()
         await until(lambda: listener.head >= head)
-    assert await ledger.cursor(ChainListener.CURSOR) == listener.head
+    assert (await ledger.cursor())[0] == listener.head
 
 
 async def test_an_outage_of_the_node_is_survived_and_logged_once(

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from web3.providers.async_base import AsyncBaseProvider
 
-from mesh.agent.listener import ChainListener
 from mesh.chain import Approval, Chain, ChainWentBack, History, NewLiability, Timing, Transfer
 from tests.mesh.agent.listeners import contract, finalize, ledger, listening, opened, started
 from tests.support.market import QUICK
@@ -23,7 +22,7 @@ __all__ = ["ledger"]
 
 
 async def test_a_chain_shorter_than_the_cursor_is_refused(place: Place, ledger: Ledger) -> None:
-    await ledger.set_cursor(ChainListener.CURSOR, 10**6)
+    await ledger.set_cursor(10**6)
     async with opened(place, ledger) as listener:
         with pytest.raises(ChainWentBack):
             await listener.run()
@@ -105,7 +104,7 @@ async def test_the_history_has_the_depth_of_the_settings_after_they_change(place
                 await contract(place)
                 head = await chain.block_number()
                 await until(lambda listener=listener, head=head: listener.head >= head)  # type: ignore[misc]
-        history = History.decode(await ledger.history(ChainListener.CURSOR))
+        history = History.decode((await ledger.cursor())[1])
         assert (history.depth, len(history.blocks)) == (depth, depth + 1)
 
 
@@ -139,7 +138,7 @@ async def test_a_node_that_is_behind_loses_no_contract(place: Place, ledger: Led
     node = Behind(place)
     robot, ens = place.market.accounts["robot"], place.market.deployment.ens
     async with Chain(node, account=robot, ens=ens, timing=QUICK) as chain:
-        await ledger.set_cursor(ChainListener.CURSOR, await chain.block_number())
+        await ledger.set_cursor(await chain.block_number())
         address, *_ = await contract(place)
         node.contract, node.calls = address, 2
         async with listening(place, ledger, chain=chain) as listener:

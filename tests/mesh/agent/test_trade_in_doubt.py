@@ -196,7 +196,7 @@ async def test_a_reverted_contract_that_is_not_created_again_fails_at_its_deadli
             assert caught.value.liability == contract.address
         with pytest.raises(LiabilityReverted):
             await contract.recording()
-        assert person.runtime.trader.contracts.addresses == frozenset()
+        assert len(person.runtime.trader.contracts) == 0
 
 
 async def test_a_contract_that_is_created_again_does_not_fail_at_the_deadline(place: Place) -> None:

@@ -65,7 +65,7 @@ async def folder(tmp_path: Path) -> Folder:
         await ledger.add_job(JOB)
         await ledger.set_phase(JOB.address, Phase.RUNNING, position=3)
         await ledger.post(outgoing(demand(objective=cid_of_bytes(OBJECTIVE))))
-        await ledger.set_cursor("listener", 99)
+        await ledger.set_cursor(99)
     made.recordings.mkdir()
     (made.recordings / f"{JOB.address}.mcap.part").write_bytes(b"what it has said so far")
     with Store(made.home / "content") as store:

@@ -83,7 +83,7 @@ async def test_a_restored_state_is_the_one_that_was_backed_up(archive: Path, fol
     assert [(job.liability, job.phase, job.position) for job in done.jobs] == [(JOB, Phase.RUNNING, 3)]
     assert done.aside is None
     async with Ledger(new.ledger) as ledger:
-        assert await ledger.cursor("listener") == 99
+        assert (await ledger.cursor())[0] == 99
         assert sum((await ledger.waiting_by_kind()).values()) == 1
     for name in (NONCE, f"{ADDRESS}/{CHAIN}/recordings/{JOB.address}.mcap.part"):
         assert (new.path / name).read_bytes() == (folder.path / name).read_bytes()
@@ -287,5 +287,5 @@ async def test_a_killed_restore_leaves_only_complete_parts(archive: Path, tmp_pa
             await asyncio.sleep(number * 0.004)
         if target.home.exists():
             async with Ledger(target.ledger) as ledger:
-                assert await ledger.cursor("listener") == 99
+                assert (await ledger.cursor())[0] == 99
             assert (target.path / NONCE).exists()

@@ -124,13 +124,13 @@ async def test_cancelling_a_completion_leaves_both_or_neither_and_later_writes_s
             await asyncio.sleep(steps * 0.0002)
             completing.cancel()
             await asyncio.wait([completing])
-            await ledger.set_cursor("after", steps)
+            await ledger.set_cursor(steps)
         async with Ledger(path) as ledger:
             job = await ledger.job(liability(name).address)
             assert job is not None
             sent = [waiting.identity for waiting in await ledger.outbox(head=0)]
             assert (job.phase is Phase.COMPLETE) == (f"of {name}" in sent)
-            assert await ledger.cursor("after") == steps
+            assert (await ledger.cursor())[0] == steps
 
 
 async def test_concurrent_writes_do_not_end_up_in_each_others_transactions(ledger: Ledger) -> None:
@@ -141,7 +141,7 @@ async def test_concurrent_writes_do_not_end_up_in_each_others_transactions(ledge
             ledger.complete(liability(name).address, success=True, result=RESULT, note="", outgoing=message(name))
             for name in names
         ),
-        *(ledger.set_cursor(name, 1) for name in names),
+        *(ledger.set_cursor(number) for number in range(20)),
     )
     assert len(await ledger.jobs((Phase.COMPLETE,))) == 20
     assert len(await ledger.outbox(head=0)) == 20
@@ -169,20 +169,12 @@ async def test_messages_go_out_in_their_order_until_their_deadline(ledger: Ledge
     assert [waiting.identity for waiting in await ledger.outbox(head=0)] == ["late", "never"], "forgotten for good"
 
 
-async def test_cursors_are_kept_by_name(ledger: Ledger) -> None:
-    assert await ledger.cursor("listener") is None
-    await ledger.set_cursor("listener", 41)
-    await ledger.set_cursor("listener", 42)
-    await ledger.set_cursor("other", 1)
-    assert await ledger.cursor("listener") == 42
-
-
 async def test_the_history_of_the_chain_is_kept_with_the_cursor(ledger: Ledger) -> None:
-    assert await ledger.history("listener") == b""
-    await ledger.set_cursor("listener", 41)
-    assert await ledger.history("listener") == b""
-    await ledger.set_cursor("listener", 42, history=b"blocks")
-    assert (await ledger.cursor("listener"), await ledger.history("listener")) == (42, b"blocks")
+    assert await ledger.cursor() == (None, b"")
+    await ledger.set_cursor(41)
+    assert await ledger.cursor() == (41, b"")
+    await ledger.set_cursor(42, history=b"blocks")
+    assert await ledger.cursor() == (42, b"blocks")
 
 
 async def test_a_spent_order_returns_when_its_contract_is_reverted(ledger: Ledger) -> None:

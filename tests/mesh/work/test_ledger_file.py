@@ -32,11 +32,11 @@ async def test_everything_survives_reopening(path: Path) -> None:
     async with Ledger(path) as ledger:
         await ledger.add_job(liability())
         await ledger.complete(liability().address, success=True, result=RESULT, note="", outgoing=message())
-        await ledger.set_cursor("listener", 42)
+        await ledger.set_cursor(42)
     async with Ledger(path) as ledger:
         assert [job.result for job in await ledger.jobs()] == [RESULT]
         assert await ledger.outbox(head=0) == [message()]
-        assert await ledger.cursor("listener") == 42
+        assert (await ledger.cursor())[0] == 42
 
 
 WRITER = """
@@ -46,7 +46,7 @@ from mesh.work import Ledger
 async def main():
     async with Ledger(Path(sys.argv[1])) as ledger:
         for block in range(10**6):
-            await ledger.set_cursor("listener", block)
+            await ledger.set_cursor(block)
             print(block, flush=True)
 asyncio.run(main())
 """
@@ -65,7 +65,7 @@ def write_until_killed(path: Path) -> int:
 async def test_written_rows_survive_a_kill(path: Path) -> None:
     last = await asyncio.to_thread(write_until_killed, path)
     async with Ledger(path) as ledger:
-        cursor = await ledger.cursor("listener")
+        cursor = (await ledger.cursor())[0]
     assert cursor is not None
     assert cursor >= last
 
@@ -167,11 +167,11 @@ async def test_a_folder_that_can_not_be_created_is_an_error(no_database: Path) -
 async def test_a_closed_ledger_raises(path: Path) -> None:
     ledger = Ledger(path)
     with pytest.raises(ClosedError):
-        await ledger.cursor("listener")
+        (await ledger.cursor())[0]
     async with ledger:
         with pytest.raises(ClosedError):
             await ledger.__aenter__()
-        await ledger.set_cursor("listener", 1)
+        await ledger.set_cursor(1)
     with pytest.raises(ClosedError):
         await ledger.add_job(liability())
 

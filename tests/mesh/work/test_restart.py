@@ -99,7 +99,7 @@ async def reading(robot: Agent) -> None:
     head = await robot.parts.chain.block_number()
 
     async def read() -> bool:
-        return (await robot.parts.ledger.cursor("listener") or 0) >= head
+        return ((await robot.parts.ledger.cursor())[0] or 0) >= head
 
     await until_found(read, what=f"block {head}")
 
@@ -115,7 +115,7 @@ async def test_a_liability_that_ended_before_the_agent_read_it_is_not_a_job(plac
         await place.chains["provider"].liabilities.finalize(place.market.deployment.lighthouse_name, failed)
         # As if it had been down since before the contract was made.
         async with Ledger(robot_memory / "ledger.sqlite") as ledger:
-            await ledger.set_cursor("listener", head)
+            await ledger.set_cursor(head)
         async with speaking(place.agent("robot"), said) as robot:
             await reading(robot)
             assert await robot.parts.ledger.job(contract.address) is None
