@@ -66,16 +66,7 @@ CHOICES: Final = {
     "keyfile_password_file",
     *options_of(ChainSettings),
 )
-async def command(
-    settings: Settings,
-    *,
-    objective: str,
-    validator_fee: str,
-    out: Path | None,
-    as_json: bool,
-    existing: str | None = None,
-    **terms: Any,
-) -> None:
+async def command(settings: Settings, **order: Any) -> None:
     """Publish a demand and wait for the contract, the work and the payment. Ctrl-C stops waiting, but does not withdraw
     the demand (`aira order withdraw` does) or cancel the contract.
 
@@ -85,6 +76,19 @@ async def command(
     The exit code is 1 if the work was not done and the cost was returned, or if the recording (--out) is not
     available. --json prints one object when the contract has ended; it has an `error` if the exit code is 1.
     """
+    await demand(settings, **order)
+
+
+async def demand(
+    settings: Settings,
+    *,
+    objective: str,
+    validator_fee: str,
+    out: Path | None,
+    as_json: bool,
+    existing: str | None = None,
+    **terms: Any,
+) -> None:
     from mesh.agent import Agent
 
     settings.keyfile_and_password()

@@ -46,6 +46,10 @@ async def list_orders(settings: Settings, as_json: bool) -> None:
 
     A `matched` one became a contract while no agent of the account ran; `aira liability list` shows it.
     """
+    await _list(settings, as_json)
+
+
+async def _list(settings: Settings, as_json: bool) -> None:
     from schemas import decode
 
     address = await asyncio.to_thread(required_address, settings)
@@ -119,9 +123,15 @@ async def withdraw(
     """
     if bool(hashes) == everything:
         raise click.UsageError("give the hashes of orders, or --all")
+    await _withdraw(settings, hashes, everything, on_chain, as_json)
+
+
+async def _withdraw(
+    settings: Settings, hashes: tuple[str, ...], everything: bool, on_chain: bool, as_json: bool
+) -> None:
     from mesh.agent.components import working
     from mesh.agent.orders import OrderState
-    from mesh.agent.rejections import Rejections
+    from mesh.agent.rejections import received_rejections
     from mesh.agent.trade import Trader
     from mesh.composition import load_account
     from mesh.market.book import Refusal
@@ -139,7 +149,7 @@ async def withdraw(
         orders = trader.orders(OrderState.OPEN, OrderState.WITHDRAWN)
         parts.outbox.hold(order.hash for order in orders if order.state is OrderState.OPEN)
         chosen = orders if everything else [_named(orders, digits) for digits in hashes]
-        async with Rejections(parts, {order.hash for order in chosen}.__contains__).received(hear):
+        async with received_rejections(parts, {order.hash for order in chosen}, hear):
             withdrawn = [await order.withdraw() for order in chosen]
             providers = await _providers(parts)
             facts: list[dict[str, Any]] = [

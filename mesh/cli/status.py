@@ -117,6 +117,10 @@ async def peers(settings: Settings, as_json: bool) -> None:
 
     Watchers are not listed. `aira status` shows the status of each peer.
     """
+    await show_peers(settings, as_json=as_json)
+
+
+async def show_peers(settings: Settings, *, as_json: bool) -> None:
     from mesh.agent.components import watching
     from mesh.watching import BRIDGE, PROVIDER, present, statuses
     from schemas.status import BridgeStatus

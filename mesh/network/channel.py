@@ -82,7 +82,7 @@ class Channel:
             validators=validators,
             blocked=blocked,
         )
-        self._drops = drops
+        self._drops = Drops() if drops is None else drops
         self._declarations: list[Any] = []
         self._open = False
 
@@ -94,10 +94,10 @@ class Channel:
 
     async def __aexit__(self, *exc_info: object) -> None:
         self._open = False
-        declarations, self._declarations = self._declarations, []
         if not self._session.is_closed():
-            for declaration in declarations:
+            for declaration in self._declarations:
                 declaration.undeclare()
+        self._declarations.clear()
 
     def publish(self, message: SignedMessage) -> str:
         """Put a signed message on its key, at most once and without waiting; return the key.
@@ -113,10 +113,7 @@ class Channel:
         return key
 
     def put(self, key: str, payload: bytes) -> None:
-        """Put bytes on a key of the mesh. A congested link drops them rather than block.
-
-        Raises `InvalidKey` for a key with a wildcard, which would reach every subscriber.
-        """
+        """Put bytes on a key; a congested link drops them. Raises `InvalidKey` for a wildcard: it would reach all."""
         self._check_open()
         if "*" in key:
             raise InvalidKey(key, "it contains a wildcard")
@@ -173,7 +170,7 @@ class Channel:
 
         def collect() -> list[PresenceKey]:
             found = {str(reply.ok.key_expr) for reply in islice(replies, PRESENT_LIMIT) if reply.ok is not None}
-            if self._drops is not None and (more := sum(1 for _ in replies)):
+            if more := sum(1 for _ in replies):
                 self._drops.count("presence", number=more)
             return list(_presence_keys(sorted(found)))
 
@@ -194,36 +191,33 @@ def _presence_keys(texts: list[str]) -> Iterator[PresenceKey]:
                 yield key
 
 
-class Subscription(Generic[M]):
+class Subscription(Pump[Verified[M] | Unresolved[M]], Generic[M]):
     """The verified messages of one kind, as an async iterator: `async with channel.subscribe(Demand) as demands`.
 
-    The iteration ends when `async with` is left. Supports one consumer. Messages about which the chain has to be asked
-    (ENS names, unknown validators) are delivered after that, so later ones may overtake them. Raises `ClosedError`
-    before it is entered.
+    Messages about which the chain has to be asked (ENS names, unknown validators) are delivered after that, so later
+    ones may overtake them.
     """
 
     def __init__(
         self, session: zenoh.Session, selector: str, validator: MessageValidator[M], drops: Drops | None = None
     ) -> None:
-        self._session = session
-        self.selector: Final = selector
-        """The key expression that is subscribed to."""
-        self._validator: MessageValidator[M] = validator
-        self._drops = Drops() if drops is None else drops
-        self._pump: Pump[Verified[M] | Unresolved[M]] = Pump(
+        super().__init__(
             session,
             selector,
             copy=self._copy,
             convert_all=validator.check_all,
             payload_limit=MAX_MESSAGE_SIZE,
-            drops=self._drops,
+            drops=drops,
         )
+        self._validator: MessageValidator[M] = validator
+        self.kind: Final = validator.kind.__name__.lower()
+        """The kind of message: `demand`, `offer` or `result`."""
         self._unresolved: FairQueue[Unresolved[M]] = FairQueue(per_sender=LOOKUP_LIMIT // 2, total=LOOKUP_LIMIT)
         self._lookup_rate = RateLimiter(per_sender=LOOKUP_RATE, total=LOOKUP_RATE_IN_TOTAL)
         self._queries: set[zenoh.CancellationToken] = set()
 
     async def __aenter__(self) -> Self:
-        await self._pump.__aenter__()
+        await super().__aenter__()
         self._lookups = asyncio.create_task(self._ask_chain(), name=f"ask the chain about {self.selector}")
         return self
 
@@ -231,15 +225,12 @@ class Subscription(Generic[M]):
         self._lookups.cancel()
         for query in tuple(self._queries):
             query.cancel()  # type: ignore[no-untyped-call]
-        await self._pump.__aexit__(*exc_info)
-
-    def __aiter__(self) -> Self:
-        return self
+        await super().__aexit__(*exc_info)
 
     async def __anext__(self) -> Verified[M]:
         while True:
-            if (item := self._pump.take_ready()) is None:
-                item = await anext(self._pump)
+            if (item := self.take_ready()) is None:
+                item = await super().__anext__()
             if not isinstance(item, Unresolved):
                 return item
             for dropped in self._unresolved.put(item.signer, item):
@@ -260,7 +251,7 @@ class Subscription(Generic[M]):
         Returns when all providers have answered or after `RECALL_TIMEOUT`; having no provider is not an error.
         Cancelling this call or leaving `async with` ends the query.
         """
-        self._pump.check_entered()
+        self.check_entered()
         query = zenoh.CancellationToken()
         self._queries.add(query)
         try:
@@ -284,17 +275,12 @@ class Subscription(Generic[M]):
         for sample in (reply.ok for reply in replies if reply.ok is not None):
             if len(copies) == RECALL_LIMIT or size >= RECALL_BYTES:
                 self._drops.count("recall")
-            elif (copied := self._pump.copy(sample)) is not None:
+            elif (copied := self.copy(sample)) is not None:
                 copies.append(copied)
                 size += len(sample.payload)
         for start in range(0, len(copies), BATCH):
             if not query.is_cancelled:
-                self._pump.feed(copies[start : start + BATCH])
-
-    @property
-    def kind(self) -> str:
-        """The kind of message: `demand`, `offer` or `result`."""
-        return self._validator.kind.__name__.lower()
+                self.feed(copies[start : start + BATCH])
 
     def forget(self, verified: Verified[M], *, after: float = 0.0) -> None:
         """Deliver a message once more when it is sent again, `after` seconds; see `MessageValidator`."""
@@ -302,7 +288,7 @@ class Subscription(Generic[M]):
 
     def statistics(self) -> ValidationStatistics:
         """The messages received, rejected (by reason) and dropped so far."""
-        return self._validator.statistics(received=self._pump.received, dropped=self._pump.dropped)
+        return self._validator.statistics(received=self.received, dropped=self.dropped)
 
     async def _ask_chain(self) -> None:
         """Ask the chain about one message after another. An unexpected error ends the iteration."""
@@ -312,6 +298,6 @@ class Subscription(Generic[M]):
                 if not self._lookup_rate.allow(unresolved.signer):
                     self._drop_lookup(unresolved)
                 elif (verified := await self._validator.complete(unresolved)) is not None:
-                    self._pump.insert(verified)
+                    self.insert(verified)
         except Exception as error:
-            self._pump.fail(error)
+            self.fail(error)

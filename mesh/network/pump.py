@@ -139,7 +139,8 @@ class Pump(Generic[T]):
         drops: Drops | None = None,
     ) -> None:
         self._session = session
-        self._selector = selector
+        self.selector: Final = selector
+        """The key expression that is subscribed to."""
         self._copy: Any = copy if convert is None else convert
         self._convert_all: Callable[[list[Any]], Iterable[list[T]]] = convert_all or (lambda copies: (copies,))
         self._payload_limit = payload_limit
@@ -162,12 +163,10 @@ class Pump(Generic[T]):
     async def __aenter__(self) -> Self:
         if self._loop is not None:
             raise ClosedError("a subscription can be entered only once", hint="subscribe again")
-        self._subscriber: Any = self._session.declare_subscriber(
-            self._selector, zenoh.handlers.FifoChannel(ZENOH_QUEUE)
-        )
+        self._subscriber: Any = self._session.declare_subscriber(self.selector, zenoh.handlers.FifoChannel(ZENOH_QUEUE))
         self._loop = asyncio.get_running_loop()
         self._thread = threading.Thread(
-            target=self._run, args=(self._loop, self._subscriber.handler), name=f"pump {self._selector}", daemon=True
+            target=self._run, args=(self._loop, self._subscriber.handler), name=f"pump {self.selector}", daemon=True
         )
         self._thread.start()
         return self
@@ -246,8 +245,8 @@ class Pump(Generic[T]):
             if not self._stopping:
                 call_in_loop(loop, self.fail, ClosedError("the network session of a subscription was closed"))
         except Exception as error:
-            failed = log_event("subscription-failed", selector=self._selector)
-            log.exception("the subscription to %s failed", self._selector, extra=failed)
+            failed = log_event("subscription-failed", selector=self.selector)
+            log.exception("the subscription to %s failed", self.selector, extra=failed)
             call_in_loop(loop, self.fail, error)
             with suppress(zenoh.ZError):  # a full queue would stall the session
                 while True:
