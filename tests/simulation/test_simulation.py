@@ -69,10 +69,16 @@ def test_a_planted_bug_is_found() -> None:
 
 
 def test_faults_of_each_kind_happen() -> None:
-    arguments = ("--seed", "2", "--jobs", "4", "--chain", "model", "--only", ",".join(KINDS), "--lasts", "400")
-    found, said = simulate(*arguments)
-    assert found["violations"] == [], said
-    assert set(found["faults"]) >= HAPPEN
+    """Which of them a seed draws changes with the code, so it takes a few."""
+    happened = set[str]()
+    for seed in map(str, range(1, 9)):
+        arguments = ("--seed", seed, "--jobs", "4", "--chain", "model", "--only", ",".join(KINDS), "--lasts", "400")
+        found, said = simulate(*arguments)
+        assert found["violations"] == [], said
+        happened |= set(found["faults"])
+        if happened >= HAPPEN:
+            return
+    assert happened >= HAPPEN
 
 
 def test_a_failing_history_is_reduced_to_what_makes_it_fail() -> None:
