@@ -50,11 +50,17 @@ BARS: Final = " ▁▂▃▄▅▆▇█"
 @with_settings(*FETCH_SETTINGS)
 def show(settings: Settings, objective: str, schemas: bool, png: Path | None, as_json: bool) -> None:
     """Show the content of OBJECTIVE, a file or a CID: its duration, topics, types, metadata, and the times of its
-    messages."""
-    path = run_sync(lambda: file_or_cid(objective))
-    if isinstance(path, str):
-        path = _fetched(settings, path)
+    messages. `aira objective cat` prints the messages."""
+    path = local_file(settings, objective)
     run_sync(lambda: _show(path, schemas=schemas, png=png, as_json=as_json))
+
+
+def local_file(settings: Settings, objective: str) -> Path:
+    """The file that a user named, or the one with that CID, fetched if needed. Exits if there is none."""
+    path = run_sync(lambda: file_or_cid(objective))
+    path = _fetched(settings, path) if isinstance(path, str) else path
+    run_sync(lambda: require_readable(path))
+    return path
 
 
 def _fetched(settings: Settings, cid: str) -> Path:
@@ -69,7 +75,6 @@ def _fetched(settings: Settings, cid: str) -> Path:
 
 
 def _show(path: Path, *, schemas: bool, png: Path | None, as_json: bool) -> None:
-    require_readable(path)
     with progress(f"reading {path.name}") as tell:
         objective = open_objective(path, GENEROUS, progress=tell)
     if png is not None:

@@ -24,7 +24,7 @@ from mesh.recording import Recorder, RecordingAbout, open_objective
 from mesh.recording.errors import NotARecording, RecordingError, RecordingExists
 from mesh.recording.packing import InvalidLine
 from schemas import cid_of_bytes, cid_of_file
-from schemas.payloads import JSON, STRING, String
+from schemas.payloads import JSON, STRING, Empty, String
 from tests.mesh.cli.calls import call
 from tests.mesh.recording.files import T0, with_messages
 from tests.support.bags import Bag, BagMessage, string
@@ -158,6 +158,29 @@ def test_show_prints_json(sound: Path) -> None:
         "schema": JSON.schema_data.decode(),
     }
     assert sum(said["counts"]["/go"]) == 2
+
+
+def test_cat_prints_the_messages_of_a_topic(tmp_path: Path) -> None:
+    path = tmp_path / "it.mcap"
+    path.write_bytes(
+        objective(("/say", String("a\x1b[2J")), ("/go", Empty()), ("/raw", b"\x01\x02"), ("/at", {"x": 1.5}))
+    )
+    done = call("cat", path)
+    assert [line.split(maxsplit=2)[2] for line in done.stdout.splitlines()] == [
+        '/say  "a\\u001b[2J"',
+        "/go  null",
+        "/raw  raw, 2 bytes: 01 02",
+        '/at  {"x":1.5}',
+    ]
+    said = [
+        json.loads(line)
+        for line in call("cat", path, "--topic", "/at", "--topic", "/raw", "--json").stdout.splitlines()
+    ]
+    assert [(one["topic"], one.get("value"), one.get("base64")) for one in said] == [
+        ("/raw", None, "AQI="),
+        ("/at", {"x": 1.5}, None),
+    ]
+    refused(call("cat", "missing"), NotAFileOrCid, "missing")
 
 
 def test_show_draws_a_plot(tmp_path: Path, sound: Path) -> None:

@@ -1,0 +1,81 @@
+"""`aira objective cat`: prints the messages of an objective or a recording."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+import msgspec
+
+from mesh.cli.files import FETCH_SETTINGS
+from mesh.cli.objective_show import local_file
+from mesh.cli.options import with_json, with_settings
+from mesh.cli.output import print_json, print_line, printable, run_sync
+from mesh.recording import GENEROUS, open_objective
+from schemas.errors import InvalidPayload
+from schemas.payloads import Empty, String, decode_value
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mesh.recording import Played
+    from mesh.settings import Settings
+
+BYTES_SHOWN: Final = 32
+"""How many bytes of a message without a known text are printed."""
+
+
+@click.command("cat")
+@click.argument("objective")
+@click.option("--topic", "topics", multiple=True, help="only messages on this topic; may be repeated [all topics]")
+@with_json
+@with_settings(*FETCH_SETTINGS)
+def cat(settings: Settings, objective: str, topics: tuple[str, ...], as_json: bool) -> None:
+    """Print the messages of OBJECTIVE, a file or a CID: seconds since its first message, topic, value. --json prints
+    an object for each; bytes are in `base64` there."""
+    path = local_file(settings, objective)
+    run_sync(lambda: print_messages(path, frozenset(topics), as_json=as_json))
+
+
+def print_messages(path: Path, topics: frozenset[str], *, as_json: bool) -> None:
+    """Print the messages on these topics (none given: on all). Raises `RecordingError`."""
+    objective = open_objective(path, GENEROUS)
+    for message in objective.messages():
+        if topics and message.topic not in topics:
+            continue
+        if as_json:
+            print_json(_facts(message))
+        else:
+            seconds = (message.log_time_ns - objective.start_ns) / 1e9
+            role = f" ({printable(message.role)})" if message.role else ""
+            print_line(f"{seconds:10.3f} s  {printable(message.topic)}{role}  {_text(message)}")
+
+
+def _facts(message: Played) -> dict[str, Any]:
+    facts = {
+        "timeNs": message.log_time_ns,
+        "topic": message.topic,
+        "type": message.type.zenoh_encoding,
+        "role": message.role,
+    }
+    value = _value(message)
+    return facts | ({"base64": value} if isinstance(value, bytes) else {"value": value})
+
+
+def _text(message: Played) -> str:
+    value = _value(message)
+    if isinstance(value, bytes):
+        shown = value[:BYTES_SHOWN].hex(" ") + (" …" if len(value) > BYTES_SHOWN else "")
+        return f"{printable(message.type.schema_name or message.type.encoding or 'bytes')}, {len(value)} bytes: {shown}"
+    return printable(msgspec.json.encode(value).decode())
+
+
+def _value(message: Played) -> Any:
+    """A text, None for an empty message, JSON data, or the bytes of what has another type or is not of its type."""
+    try:
+        value = decode_value(message.payload, message.type)
+    except InvalidPayload:
+        return message.payload
+    if isinstance(value, String):
+        return value.data
+    return None if isinstance(value, Empty) else value
