@@ -16,7 +16,7 @@ import zenoh
 from msgspec.structs import replace
 
 from mesh.network import message_key
-from schemas import ZERO_ADDRESS, Demand, Offer, PresenceKey, Result, RpcKey, Signer, cid_of_digest, encode
+from schemas import ZERO_ADDRESS, Demand, Offer, PresenceKey, Result, RpcKey, Signer, Withdrawal, cid_of_digest, encode
 from schemas.selectors import market_selector
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ class Attacker:
         await self.begin()
         await self.put_all(itertools.cycle(wire))
 
-    def wire(self, messages: Iterable[Demand | Offer | Result]) -> list[tuple[str, bytes]]:
+    def wire(self, messages: Iterable[Demand | Offer | Result | Withdrawal]) -> list[tuple[str, bytes]]:
         """Keys and payloads of messages."""
         return [(message_key(self.lighthouse, message), encode(message)) for message in messages]
 
@@ -144,6 +144,27 @@ async def unfunded_pairs(attacker: Attacker) -> None:
         offer = Offer(**shared | {"nonce": secrets.token_hex(32)}, lighthouse_fee=0)
         messages += [sign(terms), sign(offer)]
     await attacker.put_again_and_again(attacker.wire(messages))
+
+
+@flood
+async def free_offers(attacker: Attacker) -> None:
+    """Offers of fresh keys that cost nothing and match nothing, more than an order book holds."""
+    offers = []
+    for _ in range(4 * PREPARED):
+        terms = attacker.demand()
+        shared = {name: getattr(terms, name) for name in terms.__struct_fields__ if name != "validator_fee"}
+        offers.append(sign(Offer(**shared, lighthouse_fee=0)))
+    await attacker.put_again_and_again(attacker.wire(offers))
+
+
+@flood
+async def withdrawals(attacker: Attacker) -> None:
+    """Withdrawals by fresh keys of orders that nobody has."""
+    made = (
+        Withdrawal(order=secrets.token_hex(32), lighthouse=attacker.address, deadline=attacker.deadline)
+        for _ in range(PREPARED)
+    )
+    await attacker.put_again_and_again(attacker.wire(map(sign, made)))
 
 
 @flood

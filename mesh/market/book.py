@@ -3,9 +3,6 @@
 A demand and an offer match when model, objective, token, cost, lighthouse, validator and generation are equal. A book
 serves one lighthouse, and has a queue of orders for each set of the other terms. Adding, matching and removing take
 the same time at a thousand open orders and at a million; an order takes little more memory than its text.
-
-For each deadline there is a list of the keys of orders that expire then. The key of one that left earlier stays there
-until the deadline, or until the lists are rebuilt because most of their orders have left.
 """
 
 from __future__ import annotations
@@ -13,29 +10,24 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
 
-from mesh.market.queues import QueueNode, Queues
 from schemas import Demand, address_bytes
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Hashable, Iterable, Iterator
 
     from schemas import Offer, Verified
 
     Order = Demand | Offer
     Terms = tuple[str, str, str, int, str, int]
 
-HASH_SIZE: Final = 32
-STALE: Final = 4096
-"""Keys of orders that left the book which may stay in the lists, in addition to as many as are open."""
-LIMIT: Final = 1_000_000
-"""Open orders that a book holds by default."""
+K = TypeVar("K", bound="Hashable")
+T = TypeVar("T")
+
+LIMIT: Final = 32_768
+"""Open orders that a book holds by default: with up to 2 KB each, a provider stays below 200 MB."""
 UNLIMITED: Final = 2**256
-ORDER_USED: Final = "OrderUsed"
-"""The contracts' error for an order that became a liability, or was withdrawn there."""
-UNNAMED_ERROR: Final = "Reverted"
-"""The reason of a rejection when the contract's error has no name."""
 
 
 class Refusal(StrEnum):
@@ -75,6 +67,62 @@ def order_id(order: Verified[Order]) -> bytes:
     return order.hash + address_bytes(order.signer)
 
 
+class QueueNode(Generic[T]):
+    """An item in a queue. A queue is a ring: the last node's `after` is the first.
+
+    Outside a queue a node has no neighbours, not even itself: a cycle would keep the item until the next garbage
+    collection.
+    """
+
+    __slots__ = ("after", "before", "item")
+
+    def __init__(self, item: T) -> None:
+        self.item = item
+        self.before: QueueNode[T]
+        self.after: QueueNode[T]
+
+
+class Queues(Generic[K, T]):
+    """A first-in-first-out queue for each key, with removal from the middle in constant time.
+
+    An empty queue takes no memory.
+    """
+
+    def __init__(self) -> None:
+        self._first: dict[K, QueueNode[T]] = {}
+
+    def first(self, key: K) -> QueueNode[T] | None:
+        """The node that has waited longest at `key`."""
+        return self._first.get(key)
+
+    def items(self, key: K) -> Iterator[T]:
+        """The items of the queue at `key`, the one that has waited longest first; it must not change meanwhile."""
+        first = node = self._first.get(key)
+        while node is not None:
+            yield node.item
+            node = None if node.after is first else node.after
+
+    def append(self, key: K, node: QueueNode[T]) -> None:
+        """Append a node, which is in no queue, to the queue at `key`."""
+        first = self._first.get(key)
+        if first is None:
+            self._first[key] = node.before = node.after = node
+        else:
+            last = first.before
+            last.after = first.before = node
+            node.before, node.after = last, first
+
+    def remove(self, key: K, node: QueueNode[T]) -> None:
+        """Remove a node from the queue at `key`, which it must be in."""
+        if node.after is node:
+            del self._first[key]
+        else:
+            node.before.after, node.after.before = node.after, node.before
+            if self._first[key] is node:
+                self._first[key] = node.after
+        del node.before, node.after
+
+
 class OrderBook:
     """The open orders of the lighthouse at `lighthouse` (EIP-55 address), `limit` of them at most.
 
@@ -92,25 +140,25 @@ class OrderBook:
         self._head = 0
         self._nodes: dict[bytes, _BookNode] = {}
         self._signers: Queues[str, bytes] = Queues()
-        """The keys of each signer's orders, oldest first."""
+        """The identities of each signer's orders, oldest first."""
         self._numbers: Counter[str] = Counter()
         """How many orders each signer has."""
         self._heaviest = ""
         """The signer that had the most orders when it added one."""
         self._unpaid: dict[bytes, None] = {}
-        """The keys of orders that are not matched or pay nothing, oldest first."""
+        """The identities of orders that are not matched or pay nothing, oldest first."""
         self._demands: Queues[Terms, Verified[Order]] = Queues()
         self._offers: Queues[Terms, Verified[Order]] = Queues()
         self._aside: set[bytes] = set()
         """Orders in the book that are not matched."""
-        self._due: dict[int, list[bytes]] = {}
-        self._listed = 0
+        self._due: Queues[int, bytes] = Queues()
+        """The identities of the orders that leave in each block."""
 
     def __len__(self) -> int:
         return len(self._nodes)
 
     def __contains__(self, identity: bytes) -> bool:
-        return self._key(identity) in self._nodes
+        return identity in self._nodes
 
     @property
     def head(self) -> int:
@@ -143,16 +191,16 @@ class OrderBook:
 
     def remove(self, identity: bytes) -> Verified[Order] | None:
         """Remove and return the order with this identity; None if it is not in the book."""
-        key = self._key(identity)
-        node = self._nodes.pop(key, None)
+        node = self._nodes.pop(identity, None)
         if node is None:
             return None
+        self._due.remove(node.due, node.of_due)
         message, signer = node.item.message, node.item.signer
         self._signers.remove(signer, node.of_signer)
         self._numbers[signer] -= 1
         if not self._numbers[signer]:
             del self._numbers[signer]
-        self._unpaid.pop(key, None)
+        self._unpaid.pop(identity, None)
         if identity in self._aside:
             self._aside.remove(identity)
         else:
@@ -162,23 +210,16 @@ class OrderBook:
     def expire(self, head: int) -> list[Verified[Order]]:
         """Remove and return every order whose deadline, or time in the book, is not after block `head`.
 
-        O(blocks passed + orders expired).
-
-        A lower `head` than before (after a reorganisation) changes nothing.
+        O(blocks passed + orders expired). A lower `head` than before (after a reorganisation) changes nothing.
         """
         before, self._head = self._head, max(self._head, head)
         reached: Iterable[int] = range(before + 1, head + 1)
-        if head - before > len(self._due):
-            reached = sorted(block for block in self._due if block <= head)
+        if head - before > len(self._nodes):
+            reached = sorted({node.due for node in self._nodes.values() if node.due <= head})
         expired: list[Verified[Order]] = []
         for block in reached:
-            keys = self._due.pop(block, [])
-            self._listed -= len(keys)
-            for key in keys:
-                node = self._nodes.get(key)  # None, or another order, if the one listed has left the book
-                if node is not None and node.due == block:
-                    self.remove(order_id(node.item))
-                    expired.append(node.item)
+            while (node := self._due.first(block)) is not None and (order := self.remove(node.item)) is not None:
+                expired.append(order)
         return expired
 
     def orders(self) -> Iterator[Verified[Order]]:
@@ -187,7 +228,7 @@ class OrderBook:
 
     def of(self, signer: str) -> list[Verified[Order]]:
         """The open orders of a signer. O(those orders)."""
-        return [self._nodes[key].item for key in self._signers.items(signer)]
+        return [self._nodes[identity].item for identity in self._signers.items(signer)]
 
     def _refusal(self, order: Verified[Order]) -> Refusal | None:
         message = order.message
@@ -197,20 +238,18 @@ class OrderBook:
         return Refusal.EXPIRED if expired else Refusal.DUPLICATE if order_id(order) in self else None
 
     def _enter(self, order: Verified[Order]) -> None:
-        message = order.message
-        key = order.hash if order.hash not in self._nodes else order_id(order)
-        node = self._nodes[key] = _BookNode(order, min(message.deadline, self._head + self._deadline_limit), key)
-        if order_id(order) not in self._aside:
+        message, identity = order.message, order_id(order)
+        due = min(message.deadline, self._head + self._deadline_limit)
+        node = self._nodes[identity] = _BookNode(order, due, identity)
+        if identity not in self._aside:
             self._side(message).append(_terms(message), node)
-        if order_id(order) in self._aside or not _pays(message):
-            self._unpaid[key] = None
+        if identity in self._aside or not _pays(message):
+            self._unpaid[identity] = None
+        self._due.append(node.due, node.of_due)
         self._signers.append(order.signer, node.of_signer)
         self._numbers[order.signer] += 1
         if self._numbers[order.signer] >= self._numbers.get(self._heaviest, 0):
             self._heaviest = order.signer
-        self._list(key, node.due)
-        if self._listed > STALE + 2 * len(self._nodes):
-            self.compact()
 
     def _make_room(self, order: Verified[Order]) -> tuple[Verified[Order], ...] | None:
         """Evict an order if the book is full, and return it; None if the new one has no better right to a place."""
@@ -222,79 +261,27 @@ class OrderBook:
         if most > 1:
             last = self._signers.first(self._heaviest)
             assert last is not None
-            key = last.before.item
+            evicted = self.remove(last.before.item)
         elif self._unpaid:
-            key = next(iter(self._unpaid))
+            evicted = self.remove(next(iter(self._unpaid)))
         else:
             return None
-        evicted = self.remove(order_id(self._nodes[key].item))
         assert evicted is not None
         return (evicted,)
-
-    def _list(self, key: bytes, deadline: int) -> None:
-        self._due.setdefault(deadline, []).append(key)
-        self._listed += 1
-
-    def compact(self) -> None:
-        """Rebuild the lists without the keys of orders that left. O(open orders), but rare."""
-        self._due.clear()
-        self._listed = 0
-        for key, node in self._nodes.items():
-            self._list(key, node.due)
-
-    def _key(self, identity: bytes) -> bytes:
-        """The key of the order with this identity, whether it is in the book or not.
-
-        It is the hash, which the order holds anyway; for another signer's order with the same hash, the identity.
-        """
-        digest = identity[:HASH_SIZE]
-        node = self._nodes.get(digest)
-        return digest if node is not None and order_id(node.item) == identity else identity
 
     def _side(self, message: Order) -> Queues[Terms, Verified[Order]]:
         return self._demands if isinstance(message, Demand) else self._offers
 
 
 class _BookNode(QueueNode["Verified[Order]"]):
-    """An order in a book, the block in which it leaves, and the node of its key among its signer's."""
+    """An order in a book, when it leaves, and the nodes of its identity by signer and by block."""
 
-    __slots__ = ("due", "of_signer")
+    __slots__ = ("due", "of_due", "of_signer")
 
-    def __init__(self, order: Verified[Order], due: int, key: bytes) -> None:
+    def __init__(self, order: Verified[Order], due: int, identity: bytes) -> None:
         super().__init__(order)
         self.due = due
-        self.of_signer = QueueNode(key)
-
-
-def at_fault(match: Match, error: str, arguments: Sequence[Any]) -> tuple[Verified[Order], ...]:
-    """The orders that caused the contracts' `error` (name of a custom error) when the match was to be a liability.
-
-    Both orders, if the error and its arguments don't tell them apart.
-    """
-    both: tuple[Verified[Order], ...] = (match.demand, match.offer)
-    match error, *arguments:
-        case name, used if name == ORDER_USED:
-            return tuple(order for order in both if order.hash == _bytes(used)) or both
-        case "DeadlineReached", deadline:
-            return tuple(order for order in both if order.message.deadline == deadline) or both
-        case "WrongSigner" | "ERC20InsufficientBalance", str(address), *_:
-            return tuple(order for order in both if address_bytes(order.signer) == address_bytes(address)) or both
-        case "InvalidSignature", *_:
-            return both
-        case "ERC20InsufficientAllowance", _, _, needed if needed == match.offer.message.lighthouse_fee:
-            return both if needed in (match.demand.message.cost, match.demand.message.validator_fee) else (match.offer,)
-        case "ERC20InsufficientAllowance" | "ValidatorWithoutCode", *_:
-            return (match.demand,)
-    return both
-
-
-def reason_word(error: str) -> str:
-    """The machine-readable reason for a contract's error: its name, but never a text that a stranger's token chose."""
-    return error if error.isidentifier() else UNNAMED_ERROR
-
-
-def _bytes(value: bytes | str) -> bytes:
-    return bytes.fromhex(value.removeprefix("0x")) if isinstance(value, str) else bytes(value)
+        self.of_due, self.of_signer = QueueNode(identity), QueueNode(identity)
 
 
 def _pays(order: Order) -> bool:

@@ -1,30 +1,38 @@
-"""Rejections: why a provider can't use a message, signed and published for its sender."""
+"""Rejections: why a provider can't use a message, signed and published for its sender; and which order is at fault."""
 
 from __future__ import annotations
 
 import logging
 from typing import TYPE_CHECKING, Any, Final
 
+from mesh.chain.errors import Reverted
 from mesh.flood import Rate, RateLimiter
 from mesh.log_context import log_event
-from mesh.market.book import ORDER_USED, Refusal
-from schemas import RejectKey
+from mesh.market.book import Refusal
+from schemas import RejectKey, address_bytes
 from schemas.signing import Rejection
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from mesh.chain import Account
+    from mesh.errors import AiraError
     from mesh.flood import Drops
+    from mesh.market.book import Match, Order
     from mesh.market.earnings import EarningsLedger
     from mesh.network import Channel
     from schemas import Verified, Withdrawal
 
 log = logging.getLogger(__name__)
 
-
 PER_MAKER: Final = Rate(per_second=5.0, burst=500)
 """Rejections of one maker's messages."""
 TOTAL: Final = Rate(per_second=50.0, burst=1000)
 """Rejections in all: each is signed, logged and published."""
+ORDER_USED: Final = "OrderUsed"
+"""The contracts' error for an order that became a liability, or was withdrawn there."""
+UNNAMED_ERROR: Final = "Reverted"
+"""The reason of a rejection when the contract's error has no name."""
 
 
 class RejectionPublisher:
@@ -69,3 +77,35 @@ class RejectionPublisher:
         rejection = Rejection(order=order, reason=reason, detail=detail, provider=provider)
         key = str(RejectKey(self._channel.lighthouse, maker))
         self._channel.put(key, rejection.signed_by(self._account.signer).encode())
+
+
+def at_fault(match: Match, error: str, arguments: Sequence[Any]) -> tuple[Verified[Order], ...]:
+    """The orders that caused the contracts' `error` (name of a custom error) when the match was to be a liability.
+
+    Both orders, if the error and its arguments don't tell them apart.
+    """
+    both: tuple[Verified[Order], ...] = (match.demand, match.offer)
+    match error, *arguments:
+        case name, used if name == ORDER_USED:
+            return tuple(order for order in both if order.hash == _bytes(used)) or both
+        case "DeadlineReached", deadline:
+            return tuple(order for order in both if order.message.deadline == deadline) or both
+        case "WrongSigner" | "ERC20InsufficientBalance", str(address), *_:
+            return tuple(order for order in both if address_bytes(order.signer) == address_bytes(address)) or both
+        case "InvalidSignature", *_:
+            return both
+        case "ERC20InsufficientAllowance", _, _, needed if needed == match.offer.message.lighthouse_fee:
+            return both if needed in (match.demand.message.cost, match.demand.message.validator_fee) else (match.offer,)
+        case "ERC20InsufficientAllowance" | "ValidatorWithoutCode", *_:
+            return (match.demand,)
+    return both
+
+
+def reason_of(error: AiraError) -> str:
+    """The machine-readable reason of a rejection: never a text that a stranger's token chose."""
+    word = error.reason if isinstance(error, Reverted) else type(error).__name__
+    return word if word.isidentifier() else UNNAMED_ERROR
+
+
+def _bytes(value: bytes | str) -> bytes:
+    return bytes.fromhex(value.removeprefix("0x")) if isinstance(value, str) else bytes(value)

@@ -11,15 +11,16 @@ from __future__ import annotations
 
 import logging
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final
 
-from mesh.chain import NoContracts, NodeUnreachable, NotALiability, RequestRefused, Reverted, TransactionTimeout
+from mesh.chain import NodeUnreachable, RequestRefused, Reverted, TransactionTimeout
 from mesh.chain.admission import UNFUNDED_POLLS
 from mesh.errors import AiraError, ChainError, InputError
 from mesh.log_context import liability_context, log_event
-from mesh.market.book import ORDER_USED, Added, Match, Refusal, at_fault, order_id, reason_word
-from mesh.market.liability_events import OPEN_LIABILITIES, LiabilityEvents, Unconfirmed
-from mesh.market.rejections import RejectionPublisher
+from mesh.market.book import Added, Match, Refusal, order_id
+from mesh.market.liability_events import OPEN_LIABILITIES, LiabilityEvents
+from mesh.market.rejections import ORDER_USED, RejectionPublisher, at_fault, reason_of
+from mesh.market.unconfirmed import Unconfirmed
 from mesh.market.unfunded import UnfundedOrders
 from mesh.market.withdrawals import withdrawn_id
 from schemas import ZERO_ADDRESS, Result
@@ -35,11 +36,9 @@ if TYPE_CHECKING:
     from mesh.market.transaction_queue import TransactionQueue
     from mesh.market.withdrawals import Withdrawals
     from mesh.network import Channel
-    from schemas import Liability, Verified, Withdrawal
+    from schemas import Verified, Withdrawal
 
 log = logging.getLogger(__name__)
-
-T = TypeVar("T")
 
 
 class MatchWithdrawn(ChainError, code="match-withdrawn"):
@@ -158,11 +157,12 @@ class Settlement:
 
         A transaction that was sent already can't be stopped. If it was not, or fails, the order is refused then.
         """
-        if not self._withdrawals.add(withdrawal):
+        identity = withdrawn_id(withdrawal)
+        if not self._withdrawals.add(withdrawal, is_open=identity in self._book):
+            self._drops.count("withdrawals", withdrawal.signer)
             self.reject(withdrawal, Refusal.FULL.value, "too many withdrawals")
             self._forget(withdrawal)
             return
-        identity = withdrawn_id(withdrawal)
         self._book.remove(identity)
         if self._unconfirmed.get(identity) is None:
             self._publisher.honour(withdrawal)
@@ -181,8 +181,7 @@ class Settlement:
     async def add_result(self, result: Verified[Result]) -> None:
         """Finalize the liability that a result names, if the result may do that."""
         with liability_context(result.message.liability):
-            address = result.message.liability
-            liability = self.events.open.get(address) or await self._liability(address)
+            liability = await self.events.liability(result.message.liability)
             if result in self._unconfirmed:
                 return
             if liability is None or liability.is_finalized:  # which may not be confirmed either
@@ -192,14 +191,6 @@ class Settlement:
             else:
                 self._unconfirmed.begin(result)
                 self._tasks.create_task(self._finalize(result, priority=self._chain.costs.worth(liability)))
-
-    async def _liability(self, address: str) -> Liability | None:
-        """The record of a liability; None while the node knows none at that address."""
-        try:
-            return await self._when_reachable(partial(self._chain.liabilities.get, address))
-        except (NotALiability, NoContracts, RequestRefused) as error:  # or a reorganisation took it
-            log.debug("a result waits to be sent again: %s", error)
-            return None
 
     async def _create(self, match: Match) -> None:
         demand, offer = match
@@ -212,7 +203,7 @@ class Settlement:
         except MatchWithdrawn:
             self._put_back(match)
         except Reverted as error:
-            if error.reason == ORDER_USED or not await self._set_aside_unfunded(match, _reason(error), str(error)):
+            if error.reason == ORDER_USED or not await self._set_aside_unfunded(match, reason_of(error), str(error)):
                 await self._not_created(match, at_fault(match, error.reason, error.arguments), error)
         except (NodeUnreachable, RequestRefused, InputError) as error:
             await self._not_created(match, match, error)
@@ -275,32 +266,17 @@ class Settlement:
 
     async def _not_created(self, match: Match, rejected: tuple[Verified[Order], ...], error: AiraError) -> None:
         """Reject some orders of a match; put the other one back into the book, unless it was used meanwhile."""
-        reason = _reason(error)
+        reason = reason_of(error)
         for order in match:
             was_used = self._unconfirmed.end(order)
             if order in rejected and (reason == ORDER_USED or not was_used):
                 self.reject(order, reason, str(error))
             if was_used:
                 continue
-            if order in rejected or await self._chain.retrying(
-                partial(self._is_used, order), outages=self.events.lookups
-            ):
+            if order in rejected or await self.events.is_used(order):
                 self._forget(order)
             else:
                 self.add(order)
-
-    async def _is_used(self, order: Verified[Order]) -> bool:
-        """Whether an order became a liability, or was withdrawn on the chain."""
-        liabilities = self._chain.liabilities
-        try:
-            if order.message.generation == 3:
-                return await self._when_reachable(partial(liabilities.is_order_used, order.hash, order.signer))
-            return await self._when_reachable(partial(liabilities.next_nonce, order.signer)) > int(order.message.nonce)
-        except RequestRefused:
-            return False  # a used order is rejected when its next match fails
-
-    async def _when_reachable(self, question: Callable[[], Awaitable[T]]) -> T:
-        return await self._chain.retrying(question, outages=self.events.lookups, errors=(NodeUnreachable,))
 
     async def _finalize(self, result: Verified[Result], *, priority: int) -> None:
         message = result.message
@@ -310,7 +286,7 @@ class Settlement:
                 finalized = await self._queue.send(finalize, priority=priority)
             except (Reverted, NodeUnreachable, RequestRefused) as error:
                 if not isinstance(error, Reverted) or error.reason != "AlreadyFinalized":
-                    self.reject(result, _reason(error), str(error))
+                    self.reject(result, reason_of(error), str(error))
                 if not self._unconfirmed.end(result):
                     self._forget(result)
             else:
@@ -321,8 +297,3 @@ class Settlement:
                     self._earnings.reverted(finalized.tx)
                 if not self._unconfirmed.end(result):
                     await self.add_result(result)
-
-
-def _reason(error: AiraError) -> str:
-    """The machine-readable reason of a rejection."""
-    return reason_word(error.reason if isinstance(error, Reverted) else type(error).__name__)

@@ -9,6 +9,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Final, Self
 
 from mesh.errors import AiraError
+from mesh.flood import Rate, RateLimiter
 from mesh.outage_log import OutageLog
 from schemas import InvalidMessage, Verified, Withdrawal, address_bytes, decode, encode
 from schemas.wire import message_hash
@@ -22,6 +23,10 @@ log = logging.getLogger(__name__)
 LIMIT: Final = 16_384
 """Withdrawals that are kept, at most; about 15 MB, and what an answer to a query holds."""
 LIMIT_PER_SIGNER: Final = 1024
+PER_SIGNER: Final = Rate(per_second=20.0, burst=LIMIT_PER_SIGNER)
+"""Withdrawals of one signer's orders that the book does not hold. Each is written to the disk."""
+IN_TOTAL: Final = Rate(per_second=200.0, burst=LIMIT)
+"""The same of all signers."""
 _TABLE: Final = """
     PRAGMA journal_mode=WAL; PRAGMA synchronous=NORMAL;
     CREATE TABLE IF NOT EXISTS withdrawals (identity BLOB PRIMARY KEY, signer TEXT, payload BLOB) WITHOUT ROWID;
@@ -54,11 +59,17 @@ class Withdrawals:
     """
 
     def __init__(
-        self, path: Path | None = None, *, limit: int = LIMIT, limit_per_signer: int = LIMIT_PER_SIGNER
+        self,
+        path: Path | None = None,
+        *,
+        limit: int = LIMIT,
+        limit_per_signer: int = LIMIT_PER_SIGNER,
+        rate: Rate = IN_TOTAL,
     ) -> None:
         self._path = path
         self._limit = limit
         self._limit_per_signer = limit_per_signer
+        self._rate = RateLimiter(per_sender=PER_SIGNER, total=rate)
         self._known: dict[bytes, Verified[Withdrawal]] = {}
         self._due: list[tuple[int, bytes]] = []
         """Deadline and order of each, the earliest first."""
@@ -92,12 +103,15 @@ class Withdrawals:
     def __iter__(self) -> Iterator[Verified[Withdrawal]]:
         return iter(tuple(self._known.values()))
 
-    def add(self, withdrawal: Verified[Withdrawal]) -> bool:
-        """Know a withdrawal until its deadline; False if there is no room for it. One per order is kept."""
+    def add(self, withdrawal: Verified[Withdrawal], *, is_open: bool = False) -> bool:
+        """Know a withdrawal until its deadline; False if there is no room for it, or it is one too many for now.
+
+        The latter not if its order `is_open`. One per order is kept.
+        """
         identity = withdrawn_id(withdrawal)
         if identity in self._known:
             return True
-        if not self._take(identity, withdrawal):
+        if not (is_open or self._rate.allow(withdrawal.signer)) or not self._take(identity, withdrawal):
             return False
         row = identity, withdrawal.signer, encode(withdrawal.message)
         self._write("INSERT OR REPLACE INTO withdrawals VALUES (?, ?, ?)", [row])

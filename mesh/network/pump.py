@@ -57,14 +57,18 @@ SLOT_WAIT: Final = 0.002
 class _Lane(deque[tuple[Any, int]]):
     """Items with their sizes in bytes; the oldest are dropped beyond the bounds, but never the last one."""
 
-    size = 0
+    def __init__(self, capacity: int, capacity_bytes: int) -> None:
+        super().__init__()
+        self._capacity = capacity
+        self._capacity_bytes = capacity_bytes
+        self.size = 0
 
-    def add(self, item: Any, size: int, capacity: int, capacity_bytes: int) -> int:
+    def add(self, item: Any, size: int) -> int:
         """Add an item; returns how many were dropped for it."""
         self.append((item, size))
         self.size += size
         before = len(self)
-        while len(self) > capacity or (self.size > capacity_bytes and len(self) > 1):
+        while len(self) > self._capacity or (self.size > self._capacity_bytes and len(self) > 1):
             self.size -= self.popleft()[1]
         return before - len(self)
 
@@ -79,15 +83,17 @@ class ReceiveRing:
     """Received items that wait for their conversion, the oldest of which are dropped when there are too many.
 
     With `second_chance`, which needs hashable items, there is a lane for first copies, one for second ones, and so on.
-    All get the same share of the conversions, but for what others leave; of copies the newest go first. Honest senders
-    send again what has no effect. So in a flood of ever new messages their second copy gets through at once, also while
-    the first waits; in a flood of second copies the third does.
+    All get the same share of the conversions, but for what others leave. Of copies the newest go first, and fewer wait:
+    `capacity` and `capacity_bytes` by `COPIES` in each lane. Honest senders send again what has no effect. So in a
+    flood of ever new messages their second copy gets through at once, also while the first waits; in a flood of second
+    copies the third does.
     """
 
     def __init__(self, capacity: int, capacity_bytes: int, *, second_chance: bool) -> None:
-        self._bounds = capacity, capacity_bytes
         self._second_chance = second_chance
-        self._lanes = [_Lane() for _ in range(COPIES if second_chance else 1)]
+        self._lanes = [_Lane(capacity, capacity_bytes)]
+        if second_chance:
+            self._lanes += [_Lane(capacity // COPIES, capacity_bytes // COPIES) for _ in range(COPIES - 1)]
         self._copies: RecentDict[int, int] = RecentDict(REMEMBERED)
         """How often an item came, by its hash with a key that only this process knows."""
 
@@ -101,7 +107,7 @@ class ReceiveRing:
             number = hash(item)
             lane = self._copies.get(number, 0)
             self._copies[number] = min(lane + 1, COPIES - 1)
-        return self._lanes[lane].add(item, size, *self._bounds)
+        return self._lanes[lane].add(item, size)
 
     def take(self, number: int) -> list[Any]:
         """Remove up to `number` items."""

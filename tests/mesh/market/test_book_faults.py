@@ -6,8 +6,9 @@ from typing import Any
 
 import pytest
 
+from mesh.chain import Reverted
 from mesh.market import Match
-from mesh.market.book import at_fault, reason_word
+from mesh.market.rejections import at_fault, reason_of
 from tests.support.orders import LIGHTHOUSE, PERSON, ROBOT, STRANGER, verified_demand, verified_offer
 
 DEMAND = verified_demand(cost=10, validator_fee=20, deadline=50)
@@ -54,7 +55,7 @@ def test_each_error_names_the_orders_at_fault(
     ("reason", "word"), [("CostMismatch", "CostMismatch"), ("", "Reverted"), ("please pay\nme", "Reverted")]
 )
 def test_the_text_of_an_unknown_token_is_not_a_reason(reason: str, word: str) -> None:
-    assert reason_word(reason) == word
+    assert reason_of(Reverted(reason)) == word
 
 
 @pytest.mark.parametrize("fees", [{"cost": 30}, {"validator_fee": 30}], ids=lambda fees: next(iter(fees)))

@@ -113,10 +113,6 @@ class BookAgainstNaiveBook(RuleBasedStateMachine):
     def expire(self, head: int) -> None:
         assert by_deadline(self.book.expire(head)) == by_deadline(self.naive.expire(head))
 
-    @rule()
-    def compact(self) -> None:
-        self.book.compact()
-
     @invariant()
     def holds_the_same(self) -> None:
         assert list(self.book.orders()) == self.naive.open

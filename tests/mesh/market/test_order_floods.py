@@ -73,7 +73,6 @@ def test_an_order_leaves_the_book_at_its_limit_of_blocks() -> None:
     assert book.expire(109) == []
     assert book.expire(110) == [far]
     assert isinstance(book.add(far), Added), "its maker may send it again"
-    book.compact()
     assert book.expire(120) == [far]
 
 

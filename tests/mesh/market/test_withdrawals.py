@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import secrets
 import stat
 from typing import TYPE_CHECKING
 
+from mesh.flood import Rate
 from mesh.market import order_id
 from mesh.market.withdrawals import Withdrawals, withdrawn_id
 from schemas import Signer, Withdrawal, verify_message
@@ -61,6 +63,14 @@ def test_a_signer_can_have_a_limited_number() -> None:
         assert withdrawals.add(withdrawal(signer=STRANGER))
         withdrawals.expire(10)
         assert withdrawals.add(withdrawal(deadline=13))
+
+
+def test_a_flood_of_withdrawals_is_refused_but_for_open_orders() -> None:
+    with Withdrawals(rate=Rate(per_second=0.0, burst=2)) as withdrawals:
+        made = [withdrawal(signer=Signer(secrets.token_bytes(32))) for _ in range(3)]
+        assert [withdrawals.add(one) for one in made] == [True, True, False]
+        assert withdrawals.add(made[2], is_open=True)
+        assert withdrawals.add(made[0]), "it is known"
 
 
 def test_when_there_are_too_many_those_with_the_latest_deadline_are_forgotten() -> None:
