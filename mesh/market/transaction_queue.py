@@ -237,16 +237,17 @@ class TransactionQueue:
             await backoff.wait()
 
     async def _wait_for_turn(self, since: int) -> None:
-        backoff = Backoff(self._chain.node.timing.outage_retry)
+        """Wait until the turn has come; it comes with a block."""
+        heads, backoff = self._chain.node.heads, Backoff(self._chain.node.timing.outage_retry)
         while True:
             try:
+                seen = heads.latest or await heads.look()
                 if await self._turns.has_come(since=since):
                     return
+                await heads.next(seen.hash)
             except (NodeUnreachable, RequestRefused, NoContracts, NoStake) as error:
                 self._outages.failed(error, WAITS)
                 await backoff.wait()
-            else:
-                await asyncio.sleep(self._chain.node.timing.poll_interval)
 
     async def _is_our_turn(self) -> bool:
         try:

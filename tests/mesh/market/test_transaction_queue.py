@@ -10,15 +10,17 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from mesh.chain import InsufficientFunds, NodeUnreachable, RequestRefused, Reverted
+from mesh.chain.lighthouses import Lighthouses
 from mesh.market.earnings import EarningsLedger
 from mesh.market.transaction_queue import TransactionQueue
 from mesh.retry import RetryPolicy
-from tests.mesh.market.local_market import QUICK_RETRY
+from tests.mesh.market.local_market import QUICK, QUICK_RETRY
 from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from mesh.chain import LighthouseState
     from tests.mesh.market.local_market import LocalMarket
 
 NEVER = RetryPolicy(initial=3600, ceiling=3600)
@@ -30,6 +32,31 @@ async def queue_of(local: LocalMarket, **options: Any) -> AsyncIterator[Transact
     parts: dict[str, Any] = {"earnings": EarningsLedger(), "retry": QUICK_RETRY} | options
     async with local.chain_of("provider") as chain:
         yield TransactionQueue(chain, local.lighthouse, head=lambda: 0, **parts)
+
+
+async def test_the_turn_of_another_is_asked_for_once_in_each_block(
+    local: LocalMarket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await local.create_lighthouse(timeout_blocks=1000, provider=1, rival=1)
+    async with local.chain_of("rival") as chain:
+        asked: list[str] = []
+        get = Lighthouses.get
+
+        async def count(lighthouses: Lighthouses, lighthouse: str) -> LighthouseState:
+            asked.append(lighthouse)
+            return await get(lighthouses, lighthouse)
+
+        monkeypatch.setattr(Lighthouses, "get", count)
+        queue = TransactionQueue(chain, local.lighthouse, head=lambda: 0, earnings=EarningsLedger())
+        sending = asyncio.ensure_future(queue.send(Transaction()))
+        try:
+            for blocks in (1, 2):
+                await until(lambda blocks=blocks: len(asked) >= blocks)  # type: ignore[misc]
+                await asyncio.sleep(20 * QUICK.poll_interval)
+                assert len(asked) == blocks
+                await local.mine(1)
+        finally:
+            sending.cancel()
 
 
 class Transaction:
