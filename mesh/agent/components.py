@@ -13,7 +13,6 @@ from mesh.blocklist import blocklist_at
 from mesh.composition import chain_of, endpoints_of
 from mesh.content import Exchange, Store
 from mesh.errors import ConfigurationError
-from mesh.flood import Drops
 from mesh.network import Channel, Network, Services
 from mesh.outage_log import OutageLog
 from mesh.private_files import make_private_folder
@@ -25,8 +24,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from mesh.chain import Account, Chain
+    from mesh.flood import Drops
     from mesh.retry import RetryPolicy
-    from mesh.settings import MarketSettings, Settings
+    from mesh.settings import Settings
     from schemas import Signer
 
 
@@ -107,33 +107,21 @@ async def watching(settings: Settings, *, drops: Drops | None = None) -> AsyncIt
 
 @asynccontextmanager
 async def working(
-    settings: Settings,
-    account: Account,
-    chain: Chain | None,
-    *,
-    resend: RetryPolicy = RESEND,
-    drops: Drops | None = None,
+    settings: Settings, account: Account, chain: Chain | None, *, drops: Drops, resend: RetryPolicy = RESEND
 ) -> AsyncIterator[AgentComponents]:
-    """The components of an agent with an account, on `chain` (open), or on the chain that the settings name.
-
-    Its state is in the settings' folder by address, and what belongs to a chain in a folder for that chain.
-    """
-    drops = Drops() if drops is None else drops
+    """The components of an agent with an account, on `chain` (open), or on the chain that the settings name."""
     async with AsyncExitStack() as stack:
+        enter = stack.enter_async_context
         if chain is None:
-            chain = await stack.enter_async_context(chain_of(settings, account))
-        home = settings.state_directory / account.address
+            chain = await enter(chain_of(settings, account))
         directory = await state_folder(settings, chain, account.address)
-        ledger = await stack.enter_async_context(Ledger(directory / LEDGER))
+        ledger = await enter(Ledger(directory / LEDGER))
         # What an earlier run has not read may have made contracts of orders that have expired meanwhile.
         handled, _ = await ledger.cursor()
         chain_head = ChainHead(await chain.block_number() if handled is None else handled)
-        network = await stack.enter_async_context(Network(endpoints_of(settings)))
-        channel = await stack.enter_async_context(
-            await _channel_of(settings, network, chain=chain, head=chain_head, drops=drops)
-        )
+        network, channel = await enter(_connected(settings, chain, chain_head, drops))
         store = await asyncio.to_thread(
-            Store, home / "content", limit=settings.objective_expanded_limit, quota=settings.content_limit
+            Store, directory.parent / "content", limit=settings.objective_expanded_limit, quota=settings.content_limit
         )
         stack.callback(store.close)
         parts = AgentComponents(
@@ -145,10 +133,8 @@ async def working(
             ledger=ledger,
             outbox=Outbox(ledger, channel, network, head=lambda: chain_head.head, policy=resend),
             store=store,
-            exchange=await stack.enter_async_context(
-                Exchange(network.session, store, address=account.address.lower(), drops=drops)
-            ),
-            services=await stack.enter_async_context(Services(network.session, account.address, drops=drops)),
+            exchange=await enter(Exchange(network.session, store, address=account.address.lower(), drops=drops)),
+            services=await enter(Services(network.session, account.address, drops=drops)),
             chain_head=chain_head,
             outages=OutageLog(log, "chain"),
             drops=drops,
@@ -158,20 +144,25 @@ async def working(
         yield parts
 
 
-async def _channel_of(
-    settings: MarketSettings, network: Network, *, chain: Chain, head: ChainHead, drops: Drops
-) -> Channel:
-    """The channel of the lighthouse, not yet open, which resolves names and knows the head by the chain."""
-    return Channel(
-        network.session,
-        settings.lighthouse_contract,
-        address=await chain.names.address(settings.lighthouse_contract),
-        resolver=chain.names.address,
-        validators=chain.validators,
-        head=lambda: head.head,
-        blocked=blocklist_at(settings.blocked_signers),
-        drops=drops,
-    )
+@asynccontextmanager
+async def _connected(
+    settings: Settings, chain: Chain, head: ChainHead, drops: Drops
+) -> AsyncIterator[tuple[Network, Channel]]:
+    """A session, and the channel of the lighthouse, which resolves names and knows the head by the chain."""
+    async with (
+        Network(endpoints_of(settings)) as network,
+        Channel(
+            network.session,
+            settings.lighthouse_contract,
+            address=await chain.names.address(settings.lighthouse_contract),
+            resolver=chain.names.address,
+            validators=chain.validators,
+            head=lambda: head.head,
+            blocked=blocklist_at(settings.blocked_signers),
+            drops=drops,
+        ) as channel,
+    ):
+        yield network, channel
 
 
 async def state_folder(settings: Settings, chain: Chain, address: str) -> Path:

@@ -36,21 +36,7 @@ async def received_rejections(
     Anybody can publish one; only those that a provider signed count. A full order book is only logged. It is called
     again if it raises that the node is away.
     """
-    loop, session = asyncio.get_running_loop(), parts.network.session
     queue: asyncio.Queue[Rejection] = asyncio.Queue(QUEUED)
-
-    def put(rejection: Rejection) -> None:
-        if not queue.full():
-            queue.put_nowait(rejection)
-
-    def receive(sample: zenoh.Sample) -> None:
-        try:
-            rejection = Rejection.decode(sample.payload.to_bytes())
-        except InvalidRecord as error:
-            log.debug("an unreadable rejection: %s", error)
-            return
-        if rejection.order in orders and rejection.is_signed:  # others cost no more than reading them
-            call_in_loop(loop, put, rejection)
 
     async def check(rejection: Rejection) -> None:
         lighthouse = await parts.chain.lighthouses.get(parts.settings.lighthouse_contract)
@@ -68,12 +54,32 @@ async def received_rejections(
         while True:
             await parts.chain.retrying(partial(check, await queue.get()), outages=parts.outages)
 
-    selector = market_selector(parts.channel.lighthouse, "reject", parts.signer.address)
-    subscriber: Any = session.declare_subscriber(selector, receive)
+    subscriber = _subscribe(parts, orders, queue)
     try:
         async with Background() as tasks:
             tasks.start(check_all(), "rejections")
             yield
     finally:
-        if not session.is_closed():
+        if not parts.network.session.is_closed():
             subscriber.undeclare()
+
+
+def _subscribe(parts: AgentComponents, orders: Container[str], queue: asyncio.Queue[Rejection]) -> Any:
+    """Put the signed rejections of these orders into the queue, while it has room. Returns the subscriber."""
+    loop = asyncio.get_running_loop()
+
+    def put(rejection: Rejection) -> None:
+        if not queue.full():
+            queue.put_nowait(rejection)
+
+    def receive(sample: zenoh.Sample) -> None:
+        try:
+            rejection = Rejection.decode(sample.payload.to_bytes())
+        except InvalidRecord as error:
+            log.debug("an unreadable rejection: %s", error)
+            return
+        if rejection.order in orders and rejection.is_signed:  # others cost no more than reading them
+            call_in_loop(loop, put, rejection)
+
+    selector = market_selector(parts.channel.lighthouse, "reject", parts.signer.address)
+    return parts.network.session.declare_subscriber(selector, receive)

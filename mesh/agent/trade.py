@@ -54,12 +54,10 @@ class Trader(Lifecycle):
         self._address = parts.signer.address
         self._allowances = Allowances(parts.chain.tokens, parts.chain.factory, self._address)
         self.writer = TermsWriter(parts)
-        """Fills in and signs orders."""
         self._orders: dict[str, TradedOrder] = {}
         self._answers = OpenOffers()
         self._changing = asyncio.Lock()
         self.contracts = WatchedContracts(parts)
-        """The contracts whose end is waited for."""
         self.customers = KnownSenders()
         """Who demanded the contracts of this account."""
 

@@ -131,41 +131,18 @@ async def _withdraw(
 ) -> None:
     from mesh.agent.components import working
     from mesh.agent.orders import OrderState
-    from mesh.agent.rejections import received_rejections
     from mesh.agent.trade import Trader
     from mesh.composition import load_account
-    from mesh.market.book import Refusal
-
-    honoured = defaultdict[str, set[str]](set)
-
-    async def hear(rejection: Rejection) -> None:
-        if rejection.reason == Refusal.WITHDRAWN:
-            honoured[rejection.order].add(rejection.provider)
+    from mesh.flood import Drops
 
     account = await asyncio.to_thread(load_account, settings)
-    async with working(settings, account, None) as parts:
+    async with working(settings, account, None, drops=Drops()) as parts:
         trader = Trader(parts)
         await trader.load()
         orders = trader.orders(OrderState.OPEN, OrderState.WITHDRAWN)
         parts.outbox.hold(order.hash for order in orders if order.state is OrderState.OPEN)
         chosen = orders if everything else [_named(orders, digits) for digits in hashes]
-        async with received_rejections(parts, {order.hash for order in chosen}, hear):
-            withdrawn = [await order.withdraw() for order in chosen]
-            providers = await _providers(parts)
-            facts: list[dict[str, Any]] = [
-                {
-                    "hash": order.hash,
-                    "kind": order.kind,
-                    "deadline": order.deadline,
-                    "providers": providers,
-                    "confirmedBy": await _confirmations(
-                        parts, order, providers, honoured[order.hash] if before.state is OrderState.OPEN else None
-                    ),
-                    "honouredBy": sorted(honoured[order.hash]),
-                    "tx": await _withdraw_on_chain(parts, order) if on_chain else None,
-                }
-                for before, order in zip(chosen, withdrawn, strict=True)
-            ]
+        facts = await _withdraw_orders(parts, chosen, on_chain=on_chain)
     if as_json:
         print_json(facts)
         return
@@ -175,6 +152,37 @@ async def _withdraw(
             print_line(f"  provider {provider} honours it")
     if not facts:
         print_line("no open orders")
+
+
+async def _withdraw_orders(parts: AgentComponents, orders: Sequence[Order], *, on_chain: bool) -> list[dict[str, Any]]:
+    """Withdraw orders, and wait a moment for providers to confirm it; returns what is printed of each."""
+    from mesh.agent.orders import OrderState
+    from mesh.agent.rejections import received_rejections
+    from mesh.market.book import Refusal
+
+    honoured = defaultdict[str, set[str]](set)
+
+    async def hear(rejection: Rejection) -> None:
+        if rejection.reason == Refusal.WITHDRAWN:
+            honoured[rejection.order].add(rejection.provider)
+
+    async with received_rejections(parts, {order.hash for order in orders}, hear):
+        withdrawn = [await order.withdraw() for order in orders]
+        providers = await _providers(parts)
+        return [
+            {
+                "hash": order.hash,
+                "kind": order.kind,
+                "deadline": order.deadline,
+                "providers": providers,
+                "confirmedBy": await _confirmations(
+                    parts, order, providers, honoured[order.hash] if before.state is OrderState.OPEN else None
+                ),
+                "honouredBy": sorted(honoured[order.hash]),
+                "tx": await _withdraw_on_chain(parts, order) if on_chain else None,
+            }
+            for before, order in zip(orders, withdrawn, strict=True)
+        ]
 
 
 def _named(orders: Sequence[Order], digits: str) -> Order:

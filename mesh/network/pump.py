@@ -125,10 +125,9 @@ class Pump(Generic[T]):
     instead: `copy` takes what is needed out of a sample at once, and `convert_all` makes items of up to `BATCH` copies
     while others wait in the ring, and yields some of them every few milliseconds, so that Zenoh's queue is emptied in
     between. They run on the pump's own thread; the iterator raises what they raise. Items arrive in order, but for
-    copies. `capacity` and `capacity_bytes` bound the ring. Samples with more than `payload_limit` bytes
-    are refused. What is dropped or refused is counted in `drops`. Leaving `async with` undeclares the subscriber and
-    ends the thread and the iteration; undelivered samples are lost. Supports one consumer. Raises `ClosedError` before
-    it is entered.
+    copies. `capacity` and `capacity_bytes` bound the ring. Samples with more than `payload_limit` bytes are refused.
+    What is dropped or refused is counted in `drops`. Leaving `async with` ends the subscription, the thread and the
+    iteration; undelivered samples are lost. Supports one consumer. Raises `ClosedError` before it is entered.
     """
 
     def __init__(

@@ -15,6 +15,7 @@ from mesh.agent.listener import ChainListener
 from mesh.agent.runtime import AgentRuntime
 from mesh.agent.token_events import TokenEvents
 from mesh.background import Background
+from mesh.flood import Drops
 from mesh.work import Ledger
 from schemas import Demand, Offer, Result
 from tests.support.orders import RECORDING, terms
@@ -95,7 +96,7 @@ async def opened(
 ) -> AsyncIterator[RecordingListener]:
     """The robot's listener, which does not run yet."""
     settings, account = place.settings("robot"), place.market.accounts["robot"]
-    async with working(settings, account, chain or place.chains["robot"]) as parts:
+    async with working(settings, account, chain or place.chains["robot"], drops=Drops()) as parts:
         yield kind(dataclasses.replace(parts, ledger=ledger))
 
 
