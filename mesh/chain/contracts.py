@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from mesh.chain.errors import NoAccount, NotOffered, UnknownContracts
 from mesh.chain.lighthouse_state import GETTERS, LighthouseState, lighthouse_state, original_state
 from mesh.errors import InvalidMessage
+from mesh.flood import BoundedDict
 from schemas.cid import parse_cid
 from schemas.wire import message_hash
 
@@ -44,7 +45,7 @@ class ContractVersion:
         self.generation = generation
         self._node = node
         self._factory = node.contract("Factory", factory).functions
-        self._liabilities: dict[str, None] = {}
+        self._liabilities: BoundedDict[str, None] = BoundedDict(RECOGNISED_LIABILITIES)
 
     def check_order(self, order: Order) -> None:
         """Raise `InvalidMessage` for an order that the contracts can't read."""
@@ -90,9 +91,7 @@ class ContractVersion:
 
     def recognise(self, liability: str) -> None:
         """Remember an address as a liability, because the factory named it in an event."""
-        self._liabilities[liability] = None
-        if len(self._liabilities) > RECOGNISED_LIABILITIES:
-            del self._liabilities[next(iter(self._liabilities))]  # the factory still knows it
+        self._liabilities[liability] = None  # the factory still knows those that are forgotten
 
     async def is_liability(self, address: str) -> bool:
         """Whether the factory created the contract at an address."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections import OrderedDict
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 
 from mesh.chain.accounts import SignedTransaction
+from mesh.flood import BoundedDict
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
@@ -91,7 +91,7 @@ class PendingTransactions:
         self._store = store
         self._entries: dict[int, PendingTransaction] = {}
         self._elsewhere: frozenset[int] = frozenset()
-        self._mined: OrderedDict[int, PendingTransaction] = OrderedDict()
+        self._mined: BoundedDict[int, PendingTransaction] = BoundedDict(MINED_KEPT)
 
     async def refresh(self) -> None:
         """See what other processes did to the store."""
@@ -163,8 +163,6 @@ class PendingTransactions:
         """Drop a transaction that is mined and confirmed."""
         await self.forget(entry)
         self._mined[entry.nonce] = entry
-        if len(self._mined) > MINED_KEPT:
-            self._mined.popitem(last=False)
 
     async def forget(self, entry: PendingTransaction) -> None:
         """Drop a transaction that can't be mined any more, or that the node never accepted."""

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections import Counter, OrderedDict
+from collections import Counter
 from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, Self, TypeAlias, TypeVar
 
 import msgspec
 
 from mesh.background import Background
 from mesh.errors import AiraError, InputError
-from mesh.flood import Rate, RateLimiter
+from mesh.flood import BoundedDict, Rate, RateLimiter
 from mesh.network import Pump, ValidationStatistics
 from mesh.role import Lifecycle
 from schemas import (
@@ -110,23 +110,18 @@ class MarketCounters(msgspec.Struct, frozen=True, kw_only=True):
     lost: int
 
 
-class RecentSet:
+class RecentSet(BoundedDict[str, None]):
     """A set of the last `RECENT` texts."""
 
     def __init__(self) -> None:
-        self._texts: OrderedDict[str, None] = OrderedDict()
-
-    def __contains__(self, text: str) -> bool:
-        return text in self._texts
+        super().__init__(RECENT)
 
     def add(self, text: str) -> bool:
         """Add a text; False if it was there."""
-        if text in self._texts:
-            return False
-        self._texts[text] = None
-        if len(self._texts) > RECENT:
-            self._texts.popitem(last=False)
-        return True
+        is_new = text not in self
+        if is_new:
+            self[text] = None
+        return is_new
 
 
 class MarketWatch(Lifecycle):

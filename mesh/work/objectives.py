@@ -7,7 +7,7 @@ limited for each maker and in total, and a CID that nobody had is remembered for
 from __future__ import annotations
 
 import asyncio
-from collections import Counter, OrderedDict
+from collections import Counter
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 from weakref import WeakValueDictionary
@@ -15,7 +15,7 @@ from weakref import WeakValueDictionary
 from mesh.clock import SYSTEM_CLOCK
 from mesh.content import ContentUnavailable
 from mesh.errors import ContentError, InputError
-from mesh.flood import Rate, RateLimiter
+from mesh.flood import BoundedDict, Rate, RateLimiter
 from mesh.recording import Limits, preflight
 from mesh.retry import RetryPolicy
 from mesh.settings import LONGEST
@@ -76,19 +76,13 @@ class Objectives:
     """The objectives of jobs and of demands. With `handlers`, an objective must fit them."""
 
     def __init__(
-        self,
-        store: Store,
-        exchange: Exchange,
-        settings: ContentSettings,
-        handlers: TopicHandlers | None = None,
-        *,
-        clock: Clock = SYSTEM_CLOCK,
+        self, store: Store, exchange: Exchange, settings: ContentSettings, handlers: TopicHandlers | None = None
     ) -> None:
         self._store = store
         self._exchange = exchange
         self._settings = settings
         self._handlers = handlers
-        self._budget = FetchBudget(clock)
+        self._budget = FetchBudget()
         self._fetching = asyncio.Semaphore(FETCHES)
         self._checking = asyncio.Semaphore(PREFLIGHTS)
 
@@ -128,7 +122,7 @@ class FetchBudget:
         self._free = RateLimiter(per_sender=FETCH_RATE, total=FREE_FETCH_RATE, clock=clock)
         self._waiting: Counter[str] = Counter()
         self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
-        self._missing: OrderedDict[str, tuple[int, float]] = OrderedDict()
+        self._missing: BoundedDict[str, tuple[int, float]] = BoundedDict(MISSING_KEPT)
         """How often a CID was missing, and until when it is not looked for."""
 
     @asynccontextmanager
@@ -161,7 +155,5 @@ class FetchBudget:
             raise ObjectiveNotFetched(cid, "rate")
 
     def _remember(self, cid: str) -> None:
-        times = self._missing.pop(cid, (0, 0.0))[0] + 1
+        times = self._missing.get(cid, (0, 0.0))[0] + 1
         self._missing[cid] = times, self._clock.monotonic() + MISSING.delay(times)
-        if len(self._missing) > MISSING_KEPT:
-            self._missing.popitem(last=False)

@@ -190,27 +190,18 @@ class Outbox:
         for one in (*(one for one in unsent if one.kind != "offer"), *reversed(offers)):
             if one.identity in self._held or not is_due(one.identity):
                 continue
+            wait, attempts = LATER, self._attempts_at(one)
             if one.identity in self._fresh or self._limiter.allow(""):
                 self._fresh.discard(one.identity)
                 message = decode(one.payload)
                 assert isinstance(message, Demand | Offer | Withdrawal | Result)
                 self._channel.publish(message)
-                self._schedule(one)
-            else:
-                self._postpone(one)
+                wait = attempts.backoff.next_delay() or 0.0
+            attempts.next_at = self._clock() + wait
         self._attempts = {
             one.identity: self._attempts[one.identity] for one in unsent if one.identity in self._attempts
         }
         self._changed.set()
-
-    def _schedule(self, one: Outgoing) -> None:
-        """Set the time of the next attempt at a message that has just been sent."""
-        attempts = self._attempts_at(one)
-        attempts.next_at = self._clock() + (attempts.backoff.next_delay() or 0.0)
-
-    def _postpone(self, one: Outgoing) -> None:
-        """A message is due, but too many are."""
-        self._attempts_at(one).next_at = self._clock() + LATER
 
     def _attempts_at(self, one: Outgoing) -> _Attempts:
         if one.identity not in self._attempts:
