@@ -79,7 +79,7 @@ async def test_a_limited_number_of_messages_waits_for_names(here: zenoh.Session,
 
     async with listening(here, there, resolver=resolver) as (demands, theirs):
         for _ in range(LOOKUP_LIMIT):
-            there.put(KEY, with_name(ORDER))
+            there.put(KEY, with_name(demand()))
         theirs.publish(message := demand())
 
         assert contents(await take(demands, 1)) == [message]
