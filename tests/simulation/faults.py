@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Final
 
-from tests.simulation.deployment import BLOCK_SECONDS
 from tests.simulation.scheduler import SECOND
 
 if TYPE_CHECKING:
@@ -202,7 +201,9 @@ class Faults:
         is_new = reorganisations == self._reorganisations and any(chain.evm.logs(first, head))
         self._reorganisations = reorganisations
         if is_new and not self._market.is_calm and self._draw("event-replaced", self._plan.reorganise_after):
-            self._scheduler.call_later(self._draw.random.uniform(0, BLOCK_SECONDS), self._replace, first)
+            self._scheduler.call_later(
+                self._draw.random.uniform(0, self._market.plan.block_seconds), self._replace, first
+            )
 
     def _replace(self, first: int) -> None:
         chain, chance = self._market.deployed.chain, self._draw.random

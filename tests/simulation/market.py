@@ -7,6 +7,7 @@ import traceback
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
+from mesh.chain import NoContracts, NotALiability
 from mesh.errors import AiraError
 from mesh.recording.mcap_writer import McapWriter
 from mesh.running import cause_of
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from tests.simulation.audit import Audit
 
 WITHDRAWN: Final = (0.1, 0.2, 0.7)
+GONE: Final = (NoContracts, NotALiability)
+"""Errors about contracts that a reorganisation may take: no process may end by them."""
 REVOKED: Final = (0.0, 0.0, 0.5)
 
 
@@ -102,7 +105,7 @@ class Market:
             traceback.print_exception(error)
         if isinstance(error, BaseExceptionGroup):
             error = cause_of(error) or error
-        if not isinstance(error, AiraError):
+        if not isinstance(error, AiraError) or isinstance(error, GONE):
             self.violated("process-died", f"{role.name}: {_cause(error)}")
 
     def matched(self, provider: str, match: Match) -> None:

@@ -68,7 +68,7 @@ def planted(name: str) -> Mutation:
 
 
 CRASHES: Final = "crash,crash_every"
-REORGANISATIONS: Final = "reorganise_every"
+REORGANISATIONS: Final = "reorganise_every,reorganise_after,forget"
 
 MUTATIONS: Final = (
     Mutation(
@@ -76,7 +76,7 @@ MUTATIONS: Final = (
         "mesh.agent.listener:ChainListener._follow",
         "in block.reverted_events",
         "in ()",
-        REORGANISATIONS + ",forget",
+        REORGANISATIONS,
     ),
     Mutation(
         "a job that failed is a success",
@@ -97,7 +97,7 @@ MUTATIONS: Final = (
         "mesh.work.ledger:Ledger.set_aside",
         "aside = 1",
         "aside = 0",
-        REORGANISATIONS + ",forget",
+        REORGANISATIONS,
     ),
     Mutation(
         "a result is not stored with the end of its job",
@@ -114,13 +114,6 @@ MUTATIONS: Final = (
         "delay,leave_out,partition_every",
     ),
     Mutation(
-        "the listener's cursor runs ahead of what it has handled",
-        "mesh.agent.listener:ChainListener._follow",
-        "block.block_number - 1, history",
-        "block.block_number, history",
-        CRASHES,
-    ),
-    Mutation(
         "open orders of an earlier run are sent again without being taken up",
         "mesh.agent.trade:Trader.load",
         "for stored in await self._parts.ledger.orders():",
@@ -135,11 +128,108 @@ MUTATIONS: Final = (
         "spoilt",
     ),
     Mutation(
+        "the ledger is not synced",
+        "mesh.work.database:Database._set_sync",
+        "'FULL' if sync else 'NORMAL'",
+        "'OFF' if sync else 'NORMAL'",
+        CRASHES,
+        seeds=40,
+    ),
+    Mutation(
+        "nobody may take the cost back",
+        "mesh.chain.liabilities:RefundState.is_refundable",
+        "return not self.is_finalized",
+        "return self.is_finalized",
+        "leave",
+        seeds=40,
+    ),
+    Mutation(
+        "people are told the opposite of how a contract ended",
+        "mesh.agent.listener:ChainListener.finalized",
+        "Outcome(success=success, result=result)",
+        "Outcome(success=not success, result=result)",
+        "late",
+    ),
+    Mutation(
+        "a job that was paid stays open in the ledger",
+        "mesh.agent.listener:ChainListener.finalized",
+        "await self._ledger.set_phase(address, advance(address, job.phase, Phase.FINALIZED))",
+        "pass",
+        "late",
+    ),
+    Mutation(
+        "the signed result says the opposite of how the job ended",
+        "mesh.work.executor:Executor.owe_result",
+        "Result(liability=address, result=result, success=success)",
+        "Result(liability=address, result=result, success=not success)",
+        "late",
+    ),
+    Mutation(
+        "the recording of a job is not kept",
+        "mesh.work.executor:Executor.finish",
+        "cid = await asyncio.to_thread(self._store.put_file, summary.path, pin=address)",
+        'cid = __import__("schemas").cid_of_file(summary.path)',
+        "late",
+    ),
+    Mutation(
+        "the outbox sends everything once",
+        "mesh.work.outbox:Outbox._schedule",
+        "(attempts.backoff.next_delay() or 0.0)",
+        "1e9",
+        "drop",
+    ),
+    Mutation(
+        "a rejection is taken for the end of the order",
+        "mesh.agent.trade:Trader._rejected",
+        "elif order.reject(rejection):",
+        "elif fail_future(order.created, OrderExpired(identity, 0)) or order.reject(rejection):",
+        "late",
+    ),
+    Mutation(
+        "a withdrawal is not sent to the chain",
+        "mesh.agent.trade:Trader.withdraw_on_chain",
+        "tx = (await self._chain.liabilities.withdraw(order.signed)).tx",
+        'tx = ""',
+        "drop,delay,leave_out,partition_every",
+        seeds=40,
+    ),
+    Mutation(
+        "a reorganisation is not looked for",
+        "mesh.chain.following:_Follower._find_replaced",
+        "known = [",
+        "return None\n    known = [",
+        REORGANISATIONS,
+    ),
+    Mutation(
+        "open orders lose their allowance in a reorganisation",
+        "mesh.agent.trade:Trader.reorganised",
+        "self._send_when_covered(",
+        "list(",
+        REORGANISATIONS,
+    ),
+    Mutation(
+        "each transaction is sent twice",
+        "mesh.chain.transactions:TransactionSender.send",
+        "entry = before or await self._send_new(pending, fields)",
+        "entry = before or (await self._send_new(pending, fields), await self._send_new(pending, fields))[0]",
+        "late",
+    ),
+)
+
+CANDIDATES: Final = (
+    Mutation(
+        "the listener's cursor runs ahead of what it has handled",
+        "mesh.agent.listener:ChainListener._follow",
+        "block.block_number - 1, history",
+        "block.block_number, history",
+        CRASHES,
+    ),
+    Mutation(
         "the provider ignores withdrawals",
         "mesh.market.settlement:Settlement._refusal",
         "return Refusal.WITHDRAWN if order_id(order) in self._withdrawals else None",
         "return None",
-        "replay,delay,duplicate",
+        "repeat_every,delay",
     ),
     Mutation(
         "the ledger's position runs ahead of the recording",
@@ -156,63 +246,32 @@ MUTATIONS: Final = (
         "clock_every",
     ),
     Mutation(
-        "the ledger is not synced",
-        "mesh.work.database:Database._set_sync",
-        "'FULL' if sync else 'NORMAL'",
-        "'OFF' if sync else 'NORMAL'",
-        CRASHES,
-    ),
-    Mutation(
-        "nobody may take the cost back",
-        "mesh.chain.liabilities:RefundState.is_refundable",
-        "return not self.is_finalized",
-        "return self.is_finalized",
-        "leave",
-    ),
-    Mutation(
         "a job that was set aside is never taken up again",
         "mesh.work.ledger:Ledger.add_job",
         " DO UPDATE SET aside = 0 WHERE aside",
         " DO NOTHING",
         REORGANISATIONS,
     ),
-)
-
-CANDIDATES: Final = (
     Mutation(
         "a result or match whose event a reorganisation took is waited for",
         "mesh.market.liability_events:LiabilityEvents.is_confirmed",
         "missing < MISSING_CHECKS",
         "True",
-        REORGANISATIONS + ",forget",
+        REORGANISATIONS,
     ),
     Mutation(
         "the provider does not see a reorganisation",
         "mesh.market.liability_events:LiabilityEvents._revert",
         "created = [",
         "return\n    created = [",
-        REORGANISATIONS + ",forget",
-    ),
-    Mutation(
-        "the outbox sends everything once",
-        "mesh.work.outbox:Outbox.send_due",
-        "await self._send(",
-        "0 and (",
-        "drop",
+        REORGANISATIONS,
     ),
     Mutation(
         "an allowance that a reorganisation took is not approved again",
         "mesh.agent.trade:Trader.liability_reverted",
         "self._send_when_covered(again)",
         "again = []",
-        REORGANISATIONS + ",forget",
-    ),
-    Mutation(
-        "a rejection is taken for the end of the order",
-        "mesh.agent.trade:Trader._rejected",
-        "elif order.reject(rejection):",
-        "elif fail_future(order.created, OrderExpired(identity, 0)) or order.reject(rejection):",
-        "outage_every,unreachable,late",
+        REORGANISATIONS,
     ),
     Mutation(
         "a count that a node states is believed, whatever it is",
@@ -226,14 +285,7 @@ CANDIDATES: Final = (
         "mesh.market.withdrawals:Withdrawals._load",
         "if self._database is None:",
         "if True:",
-        CRASHES + ",replay,partition_every",
-    ),
-    Mutation(
-        "a withdrawal is not sent to the chain",
-        "mesh.agent.trade:Trader.withdraw_on_chain",
-        "tx = (await self._chain.liabilities.withdraw(order.signed)).tx",
-        'tx = ""',
-        "drop,delay,leave_out,partition_every",
+        "crash_every,repeat_every,partition_every",
     ),
     Mutation(
         "a success is signed although the recording lacks messages",
@@ -247,21 +299,14 @@ CANDIDATES: Final = (
         "mesh.agent.trade:Trader.liability_reverted",
         "await self._parts.outbox.unspend(address)",
         "None",
-        REORGANISATIONS + ",forget," + CRASHES,
-    ),
-    Mutation(
-        "a reorganisation is not looked for",
-        "mesh.chain.following:_Follower._find_replaced",
-        "known = [",
-        "return None\n    known = [",
-        REORGANISATIONS + ",forget",
+        REORGANISATIONS + ",crash_every",
     ),
     Mutation(
         "a reverted payment is not asked for again",
         "mesh.agent.listener:ChainListener.finalization_reverted",
         "await self._owe_result(job)",
         "pass",
-        REORGANISATIONS + ",forget," + CRASHES,
+        REORGANISATIONS + ",crash_every",
     ),
     Mutation(
         "the provider keeps out what it could not settle",
@@ -270,5 +315,54 @@ CANDIDATES: Final = (
         "pass",
         "outage_every,unreachable",
     ),
+    Mutation(
+        "a result for a contract that a reorganisation took ends the provider",
+        "mesh.market.liability_events:LiabilityEvents.liability",
+        "NoContracts, RequestRefused",
+        "RequestRefused",
+        REORGANISATIONS + ",duplicate,delay",
+    ),
+    Mutation(
+        "a transaction with an unknown outcome is sent with another nonce",
+        "mesh.chain.transactions:TransactionSender._sent_before",
+        "if not pending.abandoned:",
+        "if True:",
+        "lost_after_sending,leave_out,crash_every",
+    ),
+    Mutation(
+        "a match is settled twice",
+        "mesh.market.settlement:Settlement.add",
+        "self._tasks.create_task(self._create(outcome))",
+        "[self._tasks.create_task(self._create(outcome)) for _ in range(2)]",
+        "late",
+    ),
+    Mutation(
+        "a result under settlement is settled again",
+        "mesh.market.settlement:Settlement.add_result",
+        "if result in self._unconfirmed:",
+        "if False:",
+        "duplicate,replay",
+    ),
+    Mutation(
+        "an order that its maker can't pay is forgotten",
+        "mesh.market.settlement:Settlement._set_aside_unfunded",
+        "self._unfunded.add(order)",
+        "continue",
+        "late",
+    ),
+    Mutation(
+        "an order that was used by a reverted contract is taken for withdrawn",
+        "mesh.work.ledger:Ledger.unspend",
+        "UPDATE withdrawn SET used_by = '' WHERE used_by = ?",
+        "UPDATE withdrawn SET used_by = used_by WHERE used_by = ?",
+        REORGANISATIONS,
+    ),
+    Mutation(
+        "robots leave late results to providers",
+        "mesh.agent.listener:LateResults._finalize_if_late",
+        "if head < self._late_from[address]:",
+        "if True:",
+        "leave",
+    ),
 )
-"""Bugs for which the search has not been run to its end: `--mutant NAME` plants them as well."""
+"""Bugs that the simulator has not found within their seeds, or for which it has not searched so far."""
