@@ -18,6 +18,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import secrets
 import sys
 import tempfile
 import time
@@ -28,6 +29,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from aiohttp import ClientSession, WSMsgType, web
+from mcap.writer import Writer
 
 ROOT: Final = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))  # `peers` finds anvil
@@ -36,7 +38,6 @@ from common import SPAWN, arguments, router  # noqa: E402
 from mesh import Agent  # noqa: E402
 from mesh.chain import Account, Chain  # noqa: E402
 from mesh.composition import chain_of  # noqa: E402
-from mesh.demo.lamp import write_objective  # noqa: E402
 from mesh.devchain.anvil import find_anvil, serve_anvil  # noqa: E402
 from mesh.devchain.development import ROLES, deploy_market  # noqa: E402
 from mesh.market.provider import Provider  # noqa: E402
@@ -189,12 +190,24 @@ async def run_robot(settings: Settings, key: bytes, pipe: Any) -> None:
 async def run_person(settings: Settings, key: bytes, pipe: Any) -> None:
     """The person's process: it demands a job on request, and waits for its end."""
     objective = Path(settings.data_dir) / "objective.mcap"
-    write_objective(objective)
     async with Agent(MODEL, settings=settings, account=Account.from_key(key)) as person, asyncio.timeout(None):
         pipe.send("ready")
         while await asyncio.to_thread(pipe.recv):
+            write_objective(objective)
             contract = await person.demand(objective, cost=1)
-            pipe.send((await contract.outcome()).success)
+            outcome = await contract.outcome()
+            await contract.recording()
+            pipe.send(outcome.success)
+
+
+def write_objective(path: Path) -> None:
+    """Write an objective with one message, another one each time, as a job's mostly is."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/do", "json", 0)
+        writer.add_message(channel, log_time=0, publish_time=0, data=json.dumps(secrets.token_hex()).encode())
+        writer.finish()  # type: ignore[no-untyped-call]
 
 
 def run(role: str, settings: Settings, key: bytes, pipe: Any) -> None:
@@ -205,10 +218,11 @@ def run(role: str, settings: Settings, key: bytes, pipe: Any) -> None:
 
 
 class Market:
-    """The processes of one market, and the proxy that counts."""
+    """The processes of one market by role, and the proxy that counts."""
 
-    def __init__(self, seen: Calls, person: Any) -> None:
+    def __init__(self, seen: Calls, person: Any, processes: dict[str, int]) -> None:
         self.seen = seen
+        self.processes = processes
         self._person = person
 
     async def job(self) -> None:
@@ -235,7 +249,7 @@ async def market_of(case: Case) -> AsyncIterator[tuple[Market, Chain]]:
         await chain.node.request("evm_setIntervalMining", case.block_time)
         proxy = CountingProxy(node.url)
         port = await stack.enter_async_context(proxy.serve())
-        pipes = {}
+        pipes, processes = {}, {}
         for role, key in zip(ROLES, node.funded_keys, strict=False):
             settings = Settings(
                 connect=(endpoint,),
@@ -249,12 +263,14 @@ async def market_of(case: Case) -> AsyncIterator[tuple[Market, Chain]]:
             pipes[role], theirs = SPAWN.Pipe()
             process = SPAWN.Process(target=run, args=(role, settings, key, theirs), daemon=True)
             process.start()
+            assert process.pid is not None
+            processes[role] = process.pid
             stack.callback(process.join)
             stack.callback(process.terminate)
         for role, pipe in pipes.items():
             assert await asyncio.to_thread(pipe.poll, TIMEOUT), f"{role} does not start"
             pipe.recv()
-        yield Market(proxy.seen, pipes["person"]), chain
+        yield Market(proxy.seen, pipes["person"], processes), chain
 
 
 async def measure(case: Case, jobs: int, idle: int) -> dict[str, Any]:

@@ -138,9 +138,12 @@ class Assembly:
         with self._lock:
             return self._have, self._size
 
-    def finish(self) -> Path:
-        """Move the complete file to its CID, atomically, and return its path. Call it once every block was added."""
-        path = self._store.settle(self._file, self.cid, size=self._size, spans=self._spans.values())
+    def finish(self, *, sync: bool = True) -> Path:
+        """Move the complete file to its CID, atomically, and return its path. Call it once every block was added.
+
+        Without `sync`, a power loss may damage the file; then it counts as not held.
+        """
+        path = self._store.settle(self._file, self.cid, size=self._size, spans=self._spans.values(), sync=sync)
         self._settled = True
         return path
 

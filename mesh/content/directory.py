@@ -118,20 +118,25 @@ class StoreDirectory:
         cids = (name.removesuffix(DAMAGED_SUFFIX) for name in names if name.endswith(DAMAGED_SUFFIX))
         return tuple(sorted(cid for cid in cids if is_cid(cid)))
 
-    def pin(self, cid: str, label: str = USER) -> None:
+    def pin(self, cid: str, label: str = USER, *, sync: bool = True) -> None:
         """Protect the file from eviction, now or once it is held, until the pin of that label is removed.
+
+        Without `sync`, a power loss may remove the pin.
 
         Raises `InvalidCid`, and `InputError` unless the label is 1 to 64 letters, digits, `_` and `-`.
         """
         with directory_lock(self.directory):
-            self._pins.add(cid, label)
+            self._pins.add(cid, label, sync=sync)
 
     def unpin(self, cid: str, label: str = USER) -> None:
-        """Remove the pin of one label, if there is one. Raises as `pin` does."""
+        """Remove the pin of one label, if there is one; a power loss may bring it back. Raises as `pin` does."""
         self._pins.drop(cid, label)
 
     def release(self, label: str) -> None:
-        """Remove all pins of a label, whatever file they protect. Raises `InputError` if it is not a valid label."""
+        """Remove all pins of a label, whatever file they protect; a power loss may bring them back.
+
+        Raises `InputError` if it is not a valid label.
+        """
         self._pins.release(label)
 
     def pins(self) -> Mapping[str, frozenset[str]]:
@@ -172,12 +177,13 @@ class StoreDirectory:
         size: int,
         spans: Iterable[BlockSpan] = (),
         pin: str | None = None,
+        sync: bool = True,
     ) -> Path:
         """Rename a complete file to its CID, and index the blocks that are not yet indexed. It counts as checked."""
         path, name = self._path(cid), temporary.path.name
         aside = path.with_name(f"{cid}{DAMAGED_SUFFIX}")
         self._index.add(name, spans, size=size)
-        temporary.finish(size)
+        temporary.finish(size, sync=sync)
         with directory_lock(self.directory):
             if pin is not None:
                 self._pins.add(cid, pin)
@@ -186,7 +192,8 @@ class StoreDirectory:
             aside.unlink(missing_ok=True)
             self._index.forget(aside.name)
             seen = stamp(path)
-        sync_directory(self.directory)
+        if sync:
+            sync_directory(self.directory)
         with self._lock:
             self._checked[cid] = seen
         return path

@@ -58,6 +58,7 @@ class Download:
         timing: DownloadTiming,
         size_limit: int | None = None,
         progress: Progress | None = None,
+        sync: bool = True,
     ) -> None:
         self._store = store
         self._requester = requester
@@ -66,6 +67,7 @@ class Download:
         self._patience = patience
         self._timing = timing
         self._progress = progress
+        self._sync = sync
         self._stopped = threading.Event()
         self._lock = threading.Lock()
         self._last_block = time.monotonic()
@@ -97,7 +99,7 @@ class Download:
                 self.stop()
                 wait(running)
                 raise
-            return assembly.finish()
+            return assembly.finish(sync=self._sync)
 
     def _add_block(self, assembly: Assembly, ref: BlockRef) -> list[BlockRef]:
         block = assembly.local(ref)

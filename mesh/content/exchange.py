@@ -108,6 +108,7 @@ class Exchange:
         size_limit: int | None = None,
         timeout: float = DEFAULT_TIMEOUT,
         progress: Progress | None = None,
+        sync: bool = True,
     ) -> Path:
         """Where the file is in the store, once it is complete and every block of it was checked.
 
@@ -115,6 +116,7 @@ class Exchange:
         may appear late, and a large file may take long. `size_limit` is in bytes. Cancelling keeps the blocks that
         arrived; the next fetch continues with them, in this process or another. `progress` is called in the event loop
         with the bytes of the file that have arrived and its size. Pin a file before fetching it if it must stay.
+        Without `sync`, a power loss soon afterwards may damage the file, and it is fetched again.
 
         Raises `InvalidCid`, `ContentUnavailable`, `ContentTooLarge`, `ContentCorrupt` (with the holders, if all
         replies were wrong), `QuotaReached`, `StoreFull`.
@@ -122,7 +124,7 @@ class Exchange:
         lock = self._locks.setdefault(cid, asyncio.Lock())
         async with lock:
             held = await asyncio.to_thread(self._store.checked, cid)
-            return held or await self._download(cid, size_limit, timeout, progress)
+            return held or await self._download(cid, size_limit, timeout, progress, sync=sync)
 
     async def is_held(self, cid: str, *, timeout: float) -> bool:
         """Whether somebody on the mesh replies with the first block of a file within `timeout` seconds."""
@@ -145,7 +147,9 @@ class Exchange:
             corrupt_blocks=dict(self._corrupt),
         )
 
-    async def _download(self, cid: str, size_limit: int | None, timeout: float, progress: Progress | None) -> Path:
+    async def _download(
+        self, cid: str, size_limit: int | None, timeout: float, progress: Progress | None, *, sync: bool
+    ) -> Path:
         loop, requester = asyncio.get_running_loop(), BlockRequester(self._session, self._liars)
         download = Download(
             self._store,
@@ -155,6 +159,7 @@ class Exchange:
             timing=self._timing,
             size_limit=size_limit,
             progress=None if progress is None else _in_loop(loop, progress),
+            sync=sync,
         )
         with ThreadPoolExecutor(self._width + 1, thread_name_prefix=f"aira-fetch-{cid[-6:]}") as pool:
             running = loop.run_in_executor(pool, download.run, pool, self._width)

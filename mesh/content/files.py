@@ -115,12 +115,13 @@ class TemporaryFile:
         """Delete the file when the `with` block ends, even if it was kept."""
         self._delete_on_exit = True
 
-    def finish(self, size: int, *, mode: int = 0o400) -> None:
-        """Cut the file to `size` bytes and sync it to the disk. Raises `StoreFull`."""
+    def finish(self, size: int, *, mode: int = 0o400, sync: bool = True) -> None:
+        """Cut the file to `size` bytes and `sync` it to the disk. Raises `StoreFull`."""
         with raising_store_full(self.path.parent):
             os.ftruncate(self._descriptor, size)
             os.fchmod(self._descriptor, mode)
-            os.fsync(self._descriptor)
+            if sync:
+                os.fsync(self._descriptor)
 
     def rename(self, final: Path) -> None:
         """Give the file its final name, replacing any file of that name. Atomic; durable after `sync_directory`."""

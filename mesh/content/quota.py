@@ -45,8 +45,9 @@ class EvictionReport:
 class Pins:
     """The pins of one store's directory, each a CID and a label; several processes may set and remove them.
 
-    A pin is an empty file, so that it survives the loss of the index, and any crash. Deleting files requires the
-    directory's lock; so does pinning a file that exists.
+    A pin is an empty file, so that it survives the loss of the index, and any crash. One that was removed may come back
+    after a power loss: then it is removed once more. Deleting files requires the directory's lock; so does pinning a
+    file that exists.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -54,15 +55,15 @@ class Pins:
         self._directory.mkdir(mode=PRIVATE_FOLDER, exist_ok=True)
         sync_directory(directory)
 
-    def add(self, cid: str, label: str) -> None:
+    def add(self, cid: str, label: str, *, sync: bool = True) -> None:
         """Pin a CID, whether or not the file is held yet. Raises `InvalidCid`, and `InputError` for the label."""
         self._path(cid, label).touch(mode=PRIVATE_FILE)
-        sync_directory(self._directory)
+        if sync:
+            sync_directory(self._directory)
 
     def drop(self, cid: str, label: str) -> None:
         """Remove one pin, if it exists. Raises as `add` does."""
         self._path(cid, label).unlink(missing_ok=True)
-        sync_directory(self._directory)
 
     def release(self, label: str) -> None:
         """Remove all pins of a label. Raises `InputError` if it is not a valid label."""
@@ -70,7 +71,6 @@ class Pins:
         for cid, labels in self.by_cid().items():
             if label in labels:
                 self._path(cid, label).unlink(missing_ok=True)
-        sync_directory(self._directory)
 
     def by_cid(self) -> Mapping[str, frozenset[str]]:
         """All pinned CIDs, each with its labels."""

@@ -1,7 +1,8 @@
 """Files kept under their CID in one directory.
 
 All calls are synchronous and may wait for the disk: from an event loop, use a thread. One `Store` may be used from
-several threads, and one directory by several processes. A file is held whole or not at all, whatever happens.
+several threads, and one directory by several processes. A file is held whole or not at all, whatever happens. One that
+was not synced may be damaged after a power loss: reading finds that, and then it is not held.
 """
 
 from __future__ import annotations

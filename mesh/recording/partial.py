@@ -86,6 +86,8 @@ class PartialFile:
         self._channels: dict[str, tuple[PayloadType, MessageRole, WriterChannel]] = {}
         """The channel of the last message on each topic: the next one most likely has the same type and role."""
         self._unsynced_since: float | None = None
+        self._has_name = False
+        """Whether its name is on the disk."""
         self.recovered = 0
 
     def __enter__(self) -> Self:
@@ -123,9 +125,8 @@ class PartialFile:
         self._writer.add_metadata(
             CLOCK_RECORD, {name: f"{earlier.get(name, '')},{time}".lstrip(",") for name, time in times.items()}
         )
-        self.sync()
-        sync_directory(self._final.parent)
         if continues:
+            self.sync()
             self._cut.unlink()
             sync_directory(self._final.parent)
         return log_ns
@@ -159,20 +160,27 @@ class PartialFile:
         if self.seconds_until_due(every) == 0:
             self.sync()
 
-    def finish(self, closing: Mapping[str, str]) -> tuple[int, int]:
-        """End the file, sync it and give it its final name. Returns its numbers of messages and bytes."""
+    def finish(self, closing: Mapping[str, str], *, sync: bool) -> tuple[int, int]:
+        """End the file, `sync` it and give it its final name. Returns its numbers of messages and bytes."""
         messages = self._writer.messages
         self._writer.add_metadata(CLOSED, {"messages": str(messages), **closing})
         self._writer.finish()
-        self.sync()
+        if sync:
+            self.sync()
+        else:
+            self._writer.flush()
         self._part.rename(self._final)
-        sync_directory(self._final.parent)
+        if sync:
+            sync_directory(self._final.parent)
         return messages, self._stream.tell()
 
     def sync(self) -> None:
         """Write everything to the disk."""
         self._writer.flush()
         os.fsync(self._stream.fileno())
+        if not self._has_name:
+            sync_directory(self._final.parent)
+            self._has_name = True
         self._unsynced_since = None
 
     def _copy_cut(self) -> RecordingSource | None:

@@ -100,6 +100,7 @@ class Recorder:
         self._taken = 0
         self._topics: set[str] = set()
         self._closing = False
+        self._sync_at_end = True
         self._closed = threading.Event()
         self._lost = self._lost_played = 0
         self._recorded = 0
@@ -201,13 +202,14 @@ class Recorder:
         self._wake.set()
         return done
 
-    def close(self) -> RecordingSummary:
-        """Write the waiting messages, end and sync the file, and give it its final name. Safe to call twice.
+    def close(self, *, sync: bool = True) -> RecordingSummary:
+        """Write the waiting messages, end and `sync` the file, and give it its final name. Safe to call twice.
 
-        Raises `RecordingFailed` if the disk refused any of it; the `.part` stays for `recover`.
+        Without the sync, a power loss may leave what was synced before. Raises `RecordingFailed` if the disk refused
+        any of it; the `.part` stays for `recover`.
         """
         with self._lock:
-            self._closing = True
+            self._closing, self._sync_at_end = True, sync
         self._closed.set()
         self._wake.set()
         self._thread.join()
@@ -221,7 +223,7 @@ class Recorder:
             with self._file as file:
                 self._write(file)
                 lost = self._lost
-                messages, size = file.finish({"lost": str(lost)})
+                messages, size = file.finish({"lost": str(lost)}, sync=self._sync_at_end)
             counts = {"lost": lost, "lost_played": self._lost_played, "recovered": self.recovered}
             with self._lock:
                 self._summary = RecordingSummary(path=self.path, messages=messages, size=size, **counts)

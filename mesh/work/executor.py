@@ -122,9 +122,10 @@ class Executor:
             if job is not None:
                 await self._release(address)
 
-    async def owe_result(self, address: str, *, success: bool, result: str, note: str) -> None:
+    async def owe_result(self, address: str, *, success: bool, result: str, note: str, is_pinned: bool = False) -> None:
         """Complete a job in the ledger, together with its signed Result, which is sent until the chain has it."""
-        await asyncio.to_thread(self._store.pin, result, address)  # released if a reorganisation reverted the job
+        if not is_pinned:  # it was released if a reorganisation reverted the job
+            await asyncio.to_thread(self._store.pin, result, address)
         signed = self._signer.sign(Result(liability=address, result=result, success=success))
         await self._ledger.complete(address, success=success, result=result, note=note, outgoing=outgoing(signed))
 
@@ -145,7 +146,7 @@ class Executor:
             await self._playbacks.suspend(address)
             # In this order: after a crash in between, the position must not be past what the recording holds.
             await self._ledger.set_position(address, 0, recorded=0)
-            await asyncio.to_thread(self._playbacks.discard_recording, address)
+            await asyncio.to_thread(self._playbacks.discard_recording, address, sync=True)
             await self._begin(replace(job, position=0, recorded=0))
 
     @with_liability_context
@@ -176,12 +177,12 @@ class Executor:
             job = await self._job(address, asked="finish")
             advance(address, job.phase, Phase.COMPLETE)
             run = await self._playbacks.stop(address) or await self._playbacks.create(job)
-            summary = await run.close(note)
+            summary = await run.close(note, sync=False)  # its copy in the store is synced
             if success and (missing := run.missing + summary.lost_played):
                 success, note = False, note_of(RecordingIncomplete(address, missing))
                 log.error("%s", note, extra=log_event("recording-incomplete", missing=missing))
             cid = await asyncio.to_thread(self._store.put_file, summary.path, pin=address)
-            await self.owe_result(address, success=success, result=cid, note=note)
+            await self.owe_result(address, success=success, result=cid, note=note, is_pinned=True)
             await asyncio.to_thread(self._playbacks.discard_recording, address)
             self._fetched.pop(address, None)
         facts = log_event("job-finished", success=success, result=cid, messages=summary.messages)
@@ -195,7 +196,7 @@ class Executor:
         """Fetch and check the objective of a job: then it is ready, or complete without success."""
         address = liability.address
         try:
-            await asyncio.to_thread(self._store.pin, liability.objective, address)
+            await asyncio.to_thread(self._store.pin, liability.objective, address, sync=False)
             objective = await self._objectives.examine(liability.objective)
         except (ContentError, InputError) as error:
             log.warning("the objective is refused: %s", error, extra=log_event("objective-refused", code=error.code))

@@ -1,7 +1,8 @@
 """The ledger: an agent's jobs, its unsent messages, and how far it has read the chain, in one SQLite file.
 
-Every write is synced before the call returns, so it survives `kill -9`. Writes are idempotent: handling the same block
-or message twice changes nothing.
+Every write survives `kill -9` once the call has returned, and a power loss unless it can be repeated: see "What
+survives a crash" in docs/architecture.md. Writes are idempotent: handling the same block or message twice changes
+nothing.
 """
 
 from __future__ import annotations
@@ -154,7 +155,7 @@ class Ledger:
         await self._database.run(
             "UPDATE jobs SET phase = ?, position = COALESCE(?, position), changed = ? WHERE liability = ?",
             (phase, position, time.time(), liability),
-            sync=position is not None,
+            sync=False,
         )
 
     async def set_position(self, liability: str, position: int, *, recorded: int) -> None:

@@ -100,7 +100,7 @@ class Objectives:
 
     async def _fetch(self, cid: str, patience: float) -> Path:
         limit, timeout = self._settings.objective_size_limit, min(patience, self._settings.fetch_timeout)
-        return await self._exchange.fetch(cid, size_limit=limit, timeout=timeout)
+        return await self._exchange.fetch(cid, size_limit=limit, timeout=timeout, sync=False)
 
     async def _check(self, cid: str, path: Path) -> Objective:
         settings, handlers = self._settings, self._handlers

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import mesh
 from mesh.background import Background
+from mesh.content.files import sync_directory
 from mesh.errors import AiraError
 from mesh.log_context import liability_context, log_event
 from mesh.recording import AtOnce, RecordedTimes, Recorders, RecordingAbout
@@ -161,10 +162,15 @@ class Playbacks:
         """The addresses of the liabilities that have a recording here. Blocks on the disk."""
         return {path.name.partition(".")[0] for path in self._folder.glob("*.mcap*")}
 
-    def discard_recording(self, address: str) -> None:
-        """Delete what an earlier run of the liability at `address` has recorded. Blocks on the disk."""
+    def discard_recording(self, address: str, *, sync: bool = False) -> None:
+        """Delete what an earlier run of the liability at `address` has recorded. Blocks on the disk.
+
+        Without `sync`, a power loss may bring it back.
+        """
         for leftover in self._recording_files(address):
             leftover.unlink(missing_ok=True)
+        if sync and self._folder.exists():
+            sync_directory(self._folder)
 
     def _open_recorder(self, liability: Liability) -> Recorder:
         finished, partial, _ = self._recording_files(liability.address)

@@ -127,8 +127,11 @@ class JobRun(Job):
             await asyncio.to_thread(self._receive_sent)
         return SyncedRun(position, await asyncio.wrap_future(self._recorder.sync()))
 
-    async def close(self, note: str = "") -> RecordingSummary:
-        """Close the recording, which has everything that was received before. `note` is written at its end."""
+    async def close(self, note: str = "", *, sync: bool = True) -> RecordingSummary:
+        """Close the recording, which has everything that was received before, and `sync` it.
+
+        `note` is written at its end.
+        """
         self._closing = True
         if self._player is not None:
             self._player.cancel()
@@ -138,7 +141,7 @@ class JobRun(Job):
             await asyncio.to_thread(self._unsubscribe)
         if note:
             self._recorder.record(NOTE_TOPIC, String(note).encode(), STRING, role="agent")
-        return await asyncio.to_thread(self._recorder.close)
+        return await asyncio.to_thread(self._recorder.close, sync=sync)
 
     async def _publish_messages(self) -> None:
         assert self._objective is not None, "a run without an objective only records"

@@ -64,15 +64,14 @@ class PoweredRobot:
         self._recordings = recordings
         self._synced = synced
 
-    async def lose_power(self, *, keeps: Literal["the first sync", "the last sync"] = "the last sync") -> None:
-        """Wait for the end of the process, and cut every recording to the length that it had at that sync."""
+    async def lose_power(self, *, keeps: Literal["nothing", "the last sync"] = "the last sync") -> None:
+        """Wait for the end of the process, and cut every recording to the length that it had at the last sync, or to
+        nothing."""
         async with asyncio.timeout(SECONDS):
             _, said = await self._process.communicate()
         assert self._process.returncode == -signal.SIGKILL, said.decode()
         lines = [line.split() for line in self._synced.read_text().splitlines()]
-        if keeps == "the first sync":
-            lines.reverse()
-        lengths = {int(file): int(length) for file, length in lines}
+        lengths = {int(file): int(length) for file, length in lines if keeps != "nothing"}
         for path in self._recordings.rglob("*.mcap*"):
             status = path.stat()
             with path.open("rb+") as file:

@@ -55,7 +55,7 @@ async def test_a_job_whose_recording_lost_what_was_played_is_no_success(
     async with place.provider(), place.agent("person") as person:
         async with powered_robot(place, founded.node.funded_keys[ROBOT], last=len(WORDS)) as powered:
             contract = await person.demand(words(place), cost=COST)
-            await powered.lose_power(keeps="the first sync")
+            await powered.lose_power(keeps="nothing")
         async with speaking(place.agent("robot"), said) as robot:
             assert not (await contract.outcome()).success
             job = await robot.parts.ledger.job(contract.address)
