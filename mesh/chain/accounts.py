@@ -9,18 +9,21 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from coincurve import PrivateKey
-from eth_account import Account as EthAccount
 from eth_keyfile.keyfile import create_keyfile_json, decode_keyfile_json
 
 from mesh.errors import ConfigurationError, InputError
-from schemas.address import parse_address
+from schemas.address import keccak256, parse_address
 from schemas.signing import Signer
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
+
+
+SHORT: Final = 55
+"""The most bytes whose number RLP writes into one byte with their kind."""
 
 
 class KeyfileError(ConfigurationError, code="keyfile-error"):
@@ -62,7 +65,7 @@ class Account:
 
     def __init__(self, private_key: bytes) -> None:
         self.signer = Signer(private_key)
-        self._key = EthAccount.from_key(private_key)
+        self.__key = PrivateKey(private_key)
         self.address: str = self.signer.address
         """EIP-55."""
 
@@ -80,15 +83,52 @@ class Account:
         return cls(_open_keyfile(Path(keyfile), _read_password(Path(password_file)), password_from=password_file))
 
     def sign_transaction(self, fields: Mapping[str, Any]) -> SignedTransaction:
-        """Sign a transaction whose fields are complete, named as in JSON-RPC, with ints for quantities."""
-        signed = self._key.sign_transaction(dict(fields))
-        return SignedTransaction(raw=bytes(signed.raw_transaction), hash="0x" + bytes(signed.hash).hex())
+        """Sign a transaction whose fields are complete, named as in JSON-RPC, with ints for quantities.
+
+        It has two fees (EIP-1559, type 2) or, for chains without a base fee, a `gasPrice` (EIP-155).
+        """
+        chain, nonce = fields["chainId"], fields["nonce"]
+        content = (fields["gas"], _data(fields["to"]), fields["value"], _data(fields["data"]))
+        if "gasPrice" in fields:
+            members: tuple[Any, ...] = (nonce, fields["gasPrice"], *content)
+            *parts, parity = self._sign(keccak256(rlp((*members, chain, 0, 0))))
+            raw = rlp((*members, 2 * chain + 35 + parity, *parts))
+        else:
+            members = (chain, nonce, fields["maxPriorityFeePerGas"], fields["maxFeePerGas"], *content, ())
+            *parts, parity = self._sign(keccak256(b"\x02" + rlp(members)))
+            raw = b"\x02" + rlp((*members, parity, *parts))
+        return SignedTransaction(raw=raw, hash="0x" + keccak256(raw).hex())
+
+    def _sign(self, digest: bytes) -> tuple[int, int, int]:
+        """The signature of a transaction's hash: r, s, and the parity of the point."""
+        signature = self.__key.sign_recoverable(digest, hasher=None)
+        return int.from_bytes(signature[:32]), int.from_bytes(signature[32:64]), signature[64]
 
     def __repr__(self) -> str:
         return f"Account({self.address})"
 
     def __reduce__(self) -> Any:
         raise TypeError("an account is not pickled: it would carry its key along")
+
+
+def rlp(value: int | bytes | Sequence[Any]) -> bytes:
+    """The RLP encoding of a number, of bytes, or of several of them in a list."""
+    if isinstance(value, int):
+        value = value.to_bytes((value.bit_length() + 7) // 8)
+    if isinstance(value, bytes):
+        return value if len(value) == 1 and value[0] < 0x80 else _with_size(0x80, value)
+    return _with_size(0xC0, b"".join(map(rlp, value)))
+
+
+def _with_size(kind: int, content: bytes) -> bytes:
+    if len(content) <= SHORT:
+        return bytes((kind + len(content),)) + content
+    size = len(content).to_bytes((len(content).bit_length() + 7) // 8)
+    return bytes((kind + SHORT + len(size),)) + size + content
+
+
+def _data(given: str | bytes) -> bytes:
+    return bytes.fromhex(given.removeprefix("0x")) if isinstance(given, str) else given
 
 
 def new_private_key() -> bytes:

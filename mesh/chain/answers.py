@@ -11,11 +11,10 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import msgspec
-from eth_abi.abi import decode
-from eth_abi.exceptions import DecodingError
 from msgspec import Meta, Struct
 from msgspec.structs import force_setattr
 
+from mesh.chain.abi import MalformedAbi, decode
 from mesh.chain.errors import RequestRefused
 from mesh.errors import ChainError
 from schemas import keccak256
@@ -24,7 +23,7 @@ from schemas.cid import format_cid
 from schemas.errors import InvalidCid
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Mapping, Sequence
 
 MAX_ANSWER: Final = 32 << 20
 """Bytes of one answer."""
@@ -191,16 +190,12 @@ def decode_answer(method: str, response: object, kind: Any = Any) -> Any:
         raise SpoiledAnswer(f"its answer to {method} is invalid: {error}") from None
 
 
-def decode_values(types: list[str], data: bytes) -> tuple[Any, ...]:
+def decode_values(types: Sequence[str], data: bytes) -> tuple[Any, ...]:
     """ABI-encoded values that a contract returned. Raises `SpoiledAnswer`."""
     try:
-        values = decode(types, data)
-    except (DecodingError, UnicodeDecodeError, OverflowError) as error:
-        raise SpoiledAnswer(f"{len(data)} bytes are no {', '.join(types)}: {type(error).__name__}") from None
-    return tuple(
-        checksum_address(bytes.fromhex(value[2:])) if kind == "address" else value
-        for kind, value in zip(types, values, strict=True)
-    )
+        return decode(types, data)
+    except MalformedAbi as error:
+        raise SpoiledAnswer(f"{len(data)} bytes are no {', '.join(types)}: {error}") from None
 
 
 def decode_cid(data: bytes) -> str:

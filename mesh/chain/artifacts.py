@@ -6,7 +6,10 @@ import json
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 NAMES: Final = ("ENSRegistry", "Resolver", "XRT", "Factory", "Lighthouse", "Liability")
 
@@ -35,7 +38,7 @@ def load_artifact(name: str) -> Artifact:
     return Artifact(name=name, abi=tuple(content["abi"]), bytecode=bytecode, runtime=runtime)
 
 
-def signature_of(entry: dict[str, Any]) -> str:
+def signature_of(entry: Mapping[str, Any]) -> str:
     """The canonical signature of a function, event or error of an ABI: `name(type,type)`."""
     return f"{entry['name']}({','.join(member['type'] for member in entry['inputs'])})"
 

@@ -8,7 +8,7 @@ our contracts, which have both sets of names.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 from mesh.chain.errors import NoAccount, NotOffered, UnknownContracts
 from mesh.chain.lighthouse_state import GETTERS, LighthouseState, lighthouse_state, original_state
@@ -18,9 +18,7 @@ from schemas.cid import parse_cid
 from schemas.wire import message_hash
 
 if TYPE_CHECKING:
-    from web3.contract import AsyncContract
-    from web3.contract.async_contract import AsyncContractFunction, AsyncContractFunctions
-
+    from mesh.chain.abi import ContractCall, ContractFunctions
     from mesh.chain.names import Names
     from mesh.chain.node import Node
     from mesh.chain.transactions import Receipt, TransactionSender
@@ -44,36 +42,35 @@ class ContractVersion:
     def __init__(self, node: Node, factory: str, generation: int) -> None:
         self.generation = generation
         self._node = node
-        self._factory = node.contract("Factory", factory).functions
+        self._factory = node.contract("Factory", factory)
         self._liabilities: BoundedDict[str, None] = BoundedDict(RECOGNISED_LIABILITIES)
 
     def check_order(self, order: Order) -> None:
         """Raise `InvalidMessage` for an order that the contracts can't read."""
 
-    def finalization(self, lighthouse: AsyncContractFunctions, result: Result) -> AsyncContractFunction:
+    def finalization(self, lighthouse: ContractFunctions, result: Result) -> ContractCall:
         """The call by which a provider finalizes a liability with its result."""
         return lighthouse.finalizeLiability(result.liability, *result_arguments(result))
 
-    def finalization_without_turn(self, result: Result) -> AsyncContractFunction:
+    def finalization_without_turn(self, result: Result) -> ContractCall:
         """The call by which anybody finalizes a liability with its result. Raises `NotOffered`."""
         return self._factory.finalize(result.liability, *result_arguments(result))
 
-    def validation(self, result: Result, *, agree: bool) -> AsyncContractFunction:
+    def validation(self, result: Result, *, agree: bool) -> ContractCall:
         """The call by which a generation-3 validator finalizes. Raises `NotOffered`."""
-        call: AsyncContractFunction = self._liability(result.liability).finalize(*result_arguments(result), agree)
-        return call
+        return self._liability(result.liability).finalize(*result_arguments(result), agree)
 
-    def cancellation(self, liability: str, promisee: bytes, promisor: bytes) -> AsyncContractFunction:
+    def cancellation(self, liability: str, promisee: bytes, promisor: bytes) -> ContractCall:
         """The call that ends a liability by the signatures of both parties. Raises `NotOffered`."""
         return self._factory.cancel(liability, promisee, promisor)
 
-    def withdrawal(self, order: Order) -> AsyncContractFunction:
+    def withdrawal(self, order: Order) -> ContractCall:
         """The call by which an order's maker makes it unusable. Raises `NotOffered`."""
         if order.generation == 5:
             return self._factory.withdrawNonce(int(order.nonce))
         return self._factory.withdrawOrder(message_hash(order))
 
-    def refund(self, liability: str) -> AsyncContractFunction:
+    def refund(self, liability: str) -> ContractCall:
         """The call that pays a promisee back. Raises `NotOffered`."""
         return self._factory.refund(liability)
 
@@ -105,14 +102,14 @@ class ContractVersion:
 
     async def is_turn(self, lighthouse: str, provider: str) -> bool:
         """Whether a provider may send in the next block."""
-        functions = self._node.contract("Lighthouse", lighthouse).functions
+        functions = self._node.contract("Lighthouse", lighthouse)
         return bool(await self._node.read(functions.isTurnOf(provider), block="pending"))
 
     async def _asked_is_liability(self, address: str) -> bool:
         return bool(await self._node.read(self._factory.isLiability(address)))
 
-    def _liability(self, address: str) -> Any:
-        return self._node.contract("Liability", address).functions
+    def _liability(self, address: str) -> ContractFunctions:
+        return self._node.contract("Liability", address)
 
 
 class OriginalContracts(ContractVersion):
@@ -129,27 +126,27 @@ class OriginalContracts(ContractVersion):
                 detail=f"the contracts are of generation {self.generation}, the order of {order.generation}",
             )
 
-    def finalization(self, lighthouse: AsyncContractFunctions, result: Result) -> AsyncContractFunction:
+    def finalization(self, lighthouse: ContractFunctions, result: Result) -> ContractCall:
         if self.generation == 5:
             return super().finalization(lighthouse, result)
         call = super().validation(result, agree=AGREE)
-        return lighthouse.to(result.liability, bytes.fromhex(call._encode_transaction_data()[2:]))
+        return lighthouse.to(result.liability, call.data)
 
-    def finalization_without_turn(self, result: Result) -> AsyncContractFunction:
+    def finalization_without_turn(self, result: Result) -> ContractCall:
         raise NotOffered("finalization without a turn", self.generation)
 
-    def validation(self, result: Result, *, agree: bool) -> AsyncContractFunction:
+    def validation(self, result: Result, *, agree: bool) -> ContractCall:
         if self.generation == 5:
             raise NotOffered("finalization by a validator's own account", self.generation)
         return super().validation(result, agree=agree)
 
-    def cancellation(self, liability: str, promisee: bytes, promisor: bytes) -> AsyncContractFunction:
+    def cancellation(self, liability: str, promisee: bytes, promisor: bytes) -> ContractCall:
         raise NotOffered("cancellation", self.generation)
 
-    def withdrawal(self, order: Order) -> AsyncContractFunction:
+    def withdrawal(self, order: Order) -> ContractCall:
         raise NotOffered("withdrawal of orders", self.generation)
 
-    def refund(self, liability: str) -> AsyncContractFunction:
+    def refund(self, liability: str) -> ContractCall:
         raise NotOffered("refund", self.generation)
 
     async def refundable_from(self, liability: str) -> int:
@@ -215,18 +212,18 @@ class Contracts:
             raise NoAccount
         return self.sender
 
-    async def send(self, function: AsyncContractFunction) -> Receipt:
+    async def send(self, call: ContractCall) -> Receipt:
         """Send a call as the account and wait until it is mined. Raises as `TransactionSender.send` does."""
-        return await self.signing().call(function)
+        return await self.signing().call(call)
 
     async def address_or_own(self, name_or_address: str | None) -> str:
         """The address of a name; the account's own for None."""
         return self.own_address if name_or_address is None else await self.names.address(name_or_address)
 
-    def factory_contract(self) -> AsyncContract:
+    def factory_contract(self) -> ContractFunctions:
         """The factory."""
         return self.node.contract("Factory", self.factory)
 
-    async def lighthouse_contract(self, lighthouse: str) -> AsyncContract:
+    async def lighthouse_contract(self, lighthouse: str) -> ContractFunctions:
         """The lighthouse of that name or address."""
         return self.node.contract("Lighthouse", await self.names.lighthouse(lighthouse))

@@ -13,9 +13,7 @@ from mesh.chain.transactions import TransactionSender
 from schemas import keccak256
 
 if TYPE_CHECKING:
-    from web3.contract import AsyncContract
-    from web3.contract.async_contract import AsyncContractFunction
-
+    from mesh.chain.abi import ContractCall, ContractFunctions
     from mesh.chain.accounts import Account
     from mesh.chain.transactions import Receipt
     from mesh.chain.web3_provider import Endpoint
@@ -90,9 +88,9 @@ class _Deployer:
         resolver = await self._create("Resolver", ens)
         xrt = await self._create("XRT", plan.initial_supply)
         factory = await self._create("Factory", ens, xrt, plan.refund_delay)
-        await self._call(self._node.contract("XRT", xrt).functions.setMinter(factory))
+        await self._call(self._node.contract("XRT", xrt).setMinter(factory))
         await self._name(self._node.contract("ENSRegistry", ens), resolver, xrt=xrt, factory=factory)
-        create = self._node.contract("Factory", factory).functions.createLighthouse
+        create = self._node.contract("Factory", factory).createLighthouse
         receipt = await self._call(create(plan.minimal_stake, plan.timeout_blocks, plan.lighthouse))
         return Deployment(
             ens=ens,
@@ -111,15 +109,15 @@ class _Deployer:
         self._gas_used += receipt.gas_used
         return receipt.contract
 
-    async def _call(self, function: AsyncContractFunction) -> Receipt:
-        receipt = await self._sender.call(function)
+    async def _call(self, call: ContractCall) -> Receipt:
+        receipt = await self._sender.call(call)
         self._gas_used += receipt.gas_used
         return receipt
 
-    async def _name(self, registry: AsyncContract, resolver: str, *, xrt: str, factory: str) -> None:
+    async def _name(self, registry: ContractFunctions, resolver: str, *, xrt: str, factory: str) -> None:
         """Name the contracts under the roots of both generations; the factory names the lighthouses."""
-        set_record = registry.functions.setSubnodeRecord
-        set_address = self._node.contract("Resolver", resolver).functions.setAddr
+        set_record = registry.setSubnodeRecord
+        set_address = self._node.contract("Resolver", resolver).setAddr
 
         async def own(parent: str, label: str, owner: str) -> None:
             await self._call(set_record(namehash(parent), keccak256(label.encode()), owner, resolver, 0))

@@ -142,7 +142,7 @@ class Liabilities:
         """
         for order in (demand, offer):
             self._contracts.version.check_order(order)
-        functions = (await self._contracts.lighthouse_contract(lighthouse)).functions
+        functions = await self._contracts.lighthouse_contract(lighthouse)
         receipt = await self._contracts.send(functions.createLiability(order_abi(demand), order_abi(offer)))
         made = liability_created(receipt.logs, factory=self._contracts.factory)
         created = Created(made.liability, receipt.tx, receipt.gas_used, receipt.wei)
@@ -172,7 +172,7 @@ class Liabilities:
 
     async def finalize(self, lighthouse: str, result: Result) -> Settled:
         """Finalize a liability by its signed result, as a provider of the lighthouse."""
-        functions = (await self._contracts.lighthouse_contract(lighthouse)).functions
+        functions = await self._contracts.lighthouse_contract(lighthouse)
         receipt = await self._contracts.send(self._contracts.version.finalization(functions, result))
         return self._settled(receipt)
 
@@ -240,7 +240,7 @@ class Liabilities:
     async def _matching(self, address: str, filters: Mapping[str, str]) -> Liability | None:
         """The record of a liability; None if it does not match the filters, or a reorganisation reverted it."""
         self._contracts.version.recognise(address)
-        functions = self._contracts.node.contract("Liability", address).functions
+        functions = self._contracts.node.contract("Liability", address)
         try:
             for getter, whose in filters.items():
                 if await self._contracts.node.read(functions[getter]()) != whose:
@@ -260,7 +260,7 @@ class Liabilities:
             return None
 
     async def _is_finalized(self, address: str, block: int) -> bool:
-        functions = self._contracts.node.contract("Liability", address).functions
+        functions = self._contracts.node.contract("Liability", address)
         return bool(await self._contracts.node.read(functions.isFinalized(), block=block))
 
 

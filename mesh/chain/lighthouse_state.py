@@ -70,7 +70,7 @@ async def lighthouse_state(node: Node, address: str) -> LighthouseState:
 
     Raises `NoContracts` if there is none, `InvalidAnswer` if it has too many providers, `NodeUnreachable`.
     """
-    functions = node.contract("Lighthouse", address).functions
+    functions = node.contract("Lighthouse", address)
     rules = [functions[name]() for name in (*GETTERS[5].rules, "current")]
     (*first, rest), *values = await node.read_all((functions.queue(ZERO_ADDRESS, PAGE), *rules), block="latest")
     if rest == ZERO_ADDRESS:
@@ -84,7 +84,7 @@ async def lighthouse_state(node: Node, address: str) -> LighthouseState:
 async def original_state(node: Node, address: str, names: LighthouseGetters) -> LighthouseState:
     """The state of an original lighthouse, whose list of providers is in the order of turns. Raises as above."""
     block = await node.block_number()
-    functions = node.contract("Lighthouse", address).functions
+    functions = node.contract("Lighthouse", address)
     count = await node.read(functions[names.length](), block=block)
     _check_count(address, count)
     found = await node.read_all((functions[names.at](index) for index in range(count)), block=block)
@@ -110,7 +110,7 @@ def _state(address: str, rules: list[int], current: str, stakes: dict[str, int])
 
 async def _queue(node: Node, address: str, block: int) -> dict[str, int]:
     """The providers of a lighthouse of ours and their stakes, from the current one on."""
-    functions = node.contract("Lighthouse", address).functions
+    functions = node.contract("Lighthouse", address)
     stakes: dict[str, int] = {}
     first = ZERO_ADDRESS
     while not stakes or first != ZERO_ADDRESS:

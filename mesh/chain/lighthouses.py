@@ -28,7 +28,7 @@ class Lighthouses:
 
     async def exists(self, address: str) -> bool:
         """Whether the factory created the lighthouse at an address."""
-        functions = self._contracts.factory_contract().functions
+        functions = self._contracts.factory_contract()
         return bool(
             await self._contracts.node.read(functions.isLighthouse(await self._contracts.names.address(address)))
         )
@@ -66,7 +66,7 @@ class Lighthouses:
 
     async def create(self, *, minimal_stake: int, timeout_blocks: int, name: str) -> NewLighthouse:
         """Create a lighthouse. `minimal_stake` is in wn; `name` is one label of ENS, of a to z, 0 to 9 and -."""
-        function = self._contracts.factory_contract().functions.createLighthouse
+        function = self._contracts.factory_contract().createLighthouse
         return lighthouse_created((await self._contracts.send(function(minimal_stake, timeout_blocks, name))).logs)
 
     async def become_provider(self, lighthouse: str, stake: int) -> LighthouseState:
@@ -95,14 +95,8 @@ class Lighthouses:
 
     async def refill(self, lighthouse: str, value: int) -> str:
         """Stake `value` wn, which the lighthouse must be allowed to take, and become a provider; the tx hash."""
-        return (
-            await self._contracts.send((await self._contracts.lighthouse_contract(lighthouse)).functions.refill(value))
-        ).tx
+        return (await self._contracts.send((await self._contracts.lighthouse_contract(lighthouse)).refill(value))).tx
 
     async def withdraw(self, lighthouse: str, value: int) -> str:
         """Withdraw `value` wn of the stake, or all of it if less than the minimum would remain; the tx hash."""
-        return (
-            await self._contracts.send(
-                (await self._contracts.lighthouse_contract(lighthouse)).functions.withdraw(value)
-            )
-        ).tx
+        return (await self._contracts.send((await self._contracts.lighthouse_contract(lighthouse)).withdraw(value))).tx

@@ -8,20 +8,18 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from functools import cache
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias
 
+from mesh.chain.abi import our_functions
 from mesh.chain.answers import InvalidAnswer, SpoiledAnswer, decode_values
-from mesh.chain.artifacts import load_artifact, signature_of
+from mesh.chain.artifacts import load_artifact
 from mesh.chain.errors import NoContracts, RequestRefused, Reverted
-from schemas import keccak256
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from web3.contract.async_contract import AsyncContractFunction
+    from mesh.chain.abi import ContractCall
 
-    ContractCall: TypeAlias = "AsyncContractFunction | Getter"
     Call: TypeAlias = tuple[str, bytes]
     """An address and data."""
 
@@ -37,28 +35,10 @@ LONGEST: Final = 0xFFFF
 """Bytes of an answer."""
 
 
-class Getter(NamedTuple):
-    """A call of a function without arguments. web3 takes a hundred times as long to prepare one."""
-
-    address: str
-    fn_name: str
-    data: str
-    abi: Mapping[str, Any]
-
-    def _encode_transaction_data(self) -> str:
-        return self.data
-
-
-@cache
-def _getter(contract: str, name: str) -> tuple[str, Mapping[str, Any]]:
-    """The data of a call of a getter of one of our contracts, and its ABI."""
-    (abi,) = (entry for entry in load_artifact(contract).abi if entry.get("name") == name and not entry["inputs"])
-    return "0x" + keccak256(signature_of(abi).encode())[:4].hex(), abi
-
-
-def getters(contract: str, address: str, names: Iterable[str]) -> list[Getter]:
+def getters(contract: str, address: str, names: Iterable[str]) -> list[ContractCall]:
     """Calls of the getters `names` at an address that holds one of our contracts (`artifacts.NAMES`)."""
-    return [Getter(address, name, *_getter(contract, name)) for name in names]
+    functions = our_functions(contract)
+    return [functions[name].at(address) for name in names]
 
 
 class Caller(Protocol):
@@ -73,7 +53,7 @@ class Caller(Protocol):
 
 async def read(node: Caller, call: ContractCall, *, block: int | str) -> Any:
     """See `Node.read`."""
-    request = {"to": call.address, "data": call._encode_transaction_data()}
+    request = {"to": call.address, "data": "0x" + call.data.hex()}
     for attempt in range(READ_ATTEMPTS):
         returned = await node.call(request, block=block)
         try:
@@ -98,7 +78,7 @@ async def read_all(node: Caller, calls: Sequence[ContractCall], *, block: int | 
 
 async def _read_at_once(node: Caller, calls: Sequence[ContractCall], block: int | str) -> list[Any] | None:
     """What the functions return; None if one of them fails, or the node refuses."""
-    requests = [(str(call.address), bytes.fromhex(call._encode_transaction_data()[2:])) for call in calls]
+    requests = [(call.address, call.data) for call in calls]
     try:
         answers = decode_answers(await node.call({"data": "0x" + encode_calls(requests).hex()}, block=block))
         return [_decoded(call, answer) for call, answer in zip(calls, answers, strict=True)]
@@ -120,7 +100,7 @@ def _decoded(call: ContractCall, returned: bytes | None) -> Any:
     """What a contract's function returned, several values as a tuple. Raises `SpoiledAnswer`."""
     if returned is None:
         raise SpoiledAnswer(f"{call.fn_name} failed")
-    values = decode_values([output["type"] for output in call.abi["outputs"]], returned)
+    values = decode_values(call.outputs, returned)
     return values[0] if len(values) == 1 else values
 
 

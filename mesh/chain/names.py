@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Final
 
+from mesh.chain.abi import ContractFunctions, functions_of
 from mesh.chain.errors import InvalidName, NoContracts, Reverted, UnknownName
 from schemas import keccak256
 from schemas.address import ZERO_ADDRESS, is_ens_name, parse_address
@@ -91,7 +92,7 @@ class Names:
         if time.monotonic() < until:
             return known
         resolver = self._node.contract("Resolver", await self._resolver(name))
-        address = str(await self._node.read(resolver.functions.addr(namehash(name))))
+        address = str(await self._node.read(resolver.addr(namehash(name))))
         if address == ZERO_ADDRESS:
             raise UnknownName(name)
         if len(self._addresses) >= RESOLVERS_KEPT:
@@ -108,9 +109,9 @@ class Names:
             parse_cid(name_or_cid)
             return name_or_cid
         name = parse_name(name_or_cid)
-        resolver = self._node.contract_with_abi(await self._resolver(name), MULTIHASH_ABI)
+        resolver = ContractFunctions(await self._resolver(name), functions_of(MULTIHASH_ABI))
         try:
-            return format_cid(bytes(await self._node.read(resolver.functions.multihash(namehash(name)))))
+            return format_cid(bytes(await self._node.read(resolver.multihash(namehash(name)))))
         except (InvalidCid, Reverted):
             raise UnknownName(name) from None
 
@@ -124,7 +125,7 @@ class Names:
         root = root_of(name)
         if root not in self._resolvers:
             registry = self._node.contract("ENSRegistry", self.registry)
-            resolver = str(await self._node.read(registry.functions.resolver(namehash(root))))
+            resolver = str(await self._node.read(registry.resolver(namehash(root))))
             if resolver == ZERO_ADDRESS:
                 raise UnknownName(name)
             if len(self._resolvers) >= RESOLVERS_KEPT:  # roots come from strangers' messages, too

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import time
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final
 
-from web3 import AsyncWeb3
-from web3.providers.async_base import AsyncBaseProvider
-
+from mesh.chain.abi import ContractFunctions, encode, our_functions
 from mesh.chain.answers import ANSWERS, InvalidAnswer
 from mesh.chain.artifacts import load_artifact
 from mesh.chain.errors import METHOD_NOT_FOUND, NodeUnreachable, RequestRefused
@@ -26,15 +23,10 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import Self
 
-    from eth_typing import ChecksumAddress
-    from web3.contract import AsyncContract
-    from web3.contract.async_contract import AsyncContractFunction
-
+    from mesh.chain.abi import ContractCall
     from mesh.chain.answers import BlockHeader, Log, MinedTransaction
-    from mesh.chain.multicall import ContractCall
     from mesh.chain.web3_provider import Endpoint
 
-CONTRACTS_KEPT: Final = 1024
 PRIORITY_SECONDS: Final = 60.0
 """How long the priority fee that the node suggests is used; the base fee is that of the latest block."""
 
@@ -73,10 +65,7 @@ class Node:
         """The latest block, for all who wait for the next one."""
         self._priority = 0.0, 0
         self._chain_id: int | None = None
-        self._web3: AsyncWeb3[Any] = AsyncWeb3(AsyncBaseProvider(), middleware=[])
-        self._contract_kinds: dict[str, type[AsyncContract]] = {}
         self._pending: dict[str, PendingTransactions] = {}
-        self.contract = lru_cache(maxsize=CONTRACTS_KEPT)(self._contract)
 
     @property
     def endpoint(self) -> str:
@@ -211,7 +200,7 @@ class Node:
         receipt: MinedTransaction | None = await self._ask("eth_getTransactionReceipt", tx)
         return receipt
 
-    async def read(self, call: AsyncContractFunction, *, block: int | str = "latest") -> Any:
+    async def read(self, call: ContractCall, *, block: int | str = "latest") -> Any:
         """What a contract's function returns, several values as a tuple; asked again if it does not decode.
 
         Raises `Reverted`, `NoContracts` if there is no such contract, `InvalidAnswer` for other data.
@@ -225,8 +214,8 @@ class Node:
     def creation_code(self, name: str, *arguments: Any) -> bytes:
         """The data of a transaction that deploys one of our contracts (`artifacts.NAMES`)."""
         artifact = load_artifact(name)
-        contract = self._web3.eth.contract(abi=artifact.abi, bytecode=artifact.bytecode)
-        return bytes.fromhex(contract.constructor(*arguments).data_in_transaction[2:])
+        inputs = next((entry["inputs"] for entry in artifact.abi if entry["type"] == "constructor"), ())
+        return artifact.bytecode + encode([member["type"] for member in inputs], arguments)
 
     def pending_transactions(self, address: str) -> PendingTransactions:
         """What all senders of one account through this node share. Raises `ConfigurationError` for the folder."""
@@ -256,19 +245,9 @@ class Node:
     def _request_pushes(self) -> None:
         self._provider.push_heads(self.heads.pushed)
 
-    def contract_with_abi(self, address: str, abi: Any) -> AsyncContract:
-        """The contract at an address with any ABI."""
-        return self._web3.eth.contract(cast("ChecksumAddress", address), abi=abi)
-
-    def _contract(self, name: str, address: str) -> AsyncContract:
-        """The contract at an address with the ABI of one of ours (`artifacts.NAMES`); cached."""
-        return self._contract_kind(name)(cast("ChecksumAddress", address))
-
-    def _contract_kind(self, name: str) -> type[AsyncContract]:
-        """The class of the contracts with that ABI, which takes longer to make than a contract."""
-        if name not in self._contract_kinds:
-            self._contract_kinds[name] = self._web3.eth.contract(abi=load_artifact(name).abi)
-        return self._contract_kinds[name]
+    def contract(self, name: str, address: str) -> ContractFunctions:
+        """The functions of the contract at an address with the ABI of one of ours (`artifacts.NAMES`)."""
+        return ContractFunctions(address, our_functions(name))
 
 
 def _block(identifier: int | str) -> str:

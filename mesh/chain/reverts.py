@@ -9,14 +9,11 @@ from __future__ import annotations
 from functools import cache
 from typing import TYPE_CHECKING, Final
 
-from eth_abi.abi import decode
-from eth_abi.exceptions import DecodingError
-
+from mesh.chain.abi import MalformedAbi, decode
 from mesh.chain.answers import LONGEST_TEXT
 from mesh.chain.artifacts import NAMES, load_artifact, signature_of
 from mesh.chain.errors import Reverted
 from schemas import keccak256
-from schemas.address import parse_address
 
 if TYPE_CHECKING:
     from mesh.chain.answers import RpcFailure
@@ -49,10 +46,8 @@ def explain(data: bytes, *, message: str = "") -> Reverted:
             return Reverted("Panic", arguments=decode(["uint256"], body), data=data)
         if selector in custom_errors():
             name, types = custom_errors()[selector]
-            values = decode(types, body)
-            arguments = (parse_address(v) if t == "address" else v for t, v in zip(types, values, strict=True))
-            return Reverted(name, arguments=tuple(arguments), data=data)
-    except (DecodingError, UnicodeDecodeError):
+            return Reverted(name, arguments=decode(types, body), data=data)
+    except MalformedAbi:
         return Reverted("", data=data)
     _, _, reason = message.partition("execution reverted: ")
     return Reverted("" if data else reason, data=data)

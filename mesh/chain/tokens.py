@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
-from eth_abi.abi import decode
-from eth_abi.exceptions import DecodingError
-
+from mesh.chain.abi import decode
 from mesh.chain.errors import NoContracts, Reverted
 
 if TYPE_CHECKING:
-    from web3.contract import AsyncContract
-    from web3.contract.async_contract import AsyncContractFunction
-
+    from mesh.chain.abi import ContractCall, ContractFunctions
     from mesh.chain.contracts import Contracts
 
 LONGEST_LABEL: Final = 64
@@ -53,27 +49,24 @@ class Tokens:
 
     async def info(self, token: str | None = None) -> Token:
         """A token's description (XRT by default). Raises `NoContracts` for an address without an ERC-20 token."""
-        contract = await self._token(token)
-        functions = contract.functions
+        functions = await self._token(token)
         total_supply = int(await self._contracts.node.read(functions.totalSupply()))
         return Token(
-            address=str(contract.address),
-            symbol=_label(await self._ask(contract, functions.symbol())),
-            name=_label(await self._ask(contract, functions.name())),
-            decimals=_decimals(await self._ask(contract, functions.decimals())),
+            address=functions.address,
+            symbol=_label(await self._ask(functions.symbol())),
+            name=_label(await self._ask(functions.name())),
+            decimals=_decimals(await self._ask(functions.decimals())),
             total_supply=total_supply,
         )
 
     async def balance(self, address: str | None = None, *, token: str | None = None) -> int:
         """Units of a token (XRT by default) that an account holds."""
         contract = await self._token(token)
-        return int(
-            await self._contracts.node.read(contract.functions.balanceOf(await self._contracts.address_or_own(address)))
-        )
+        return int(await self._contracts.node.read(contract.balanceOf(await self._contracts.address_or_own(address))))
 
     async def allowance(self, owner: str, spender: str, *, token: str | None = None) -> int:
         """Units of a token (XRT by default) that `spender` may take from `owner`."""
-        functions = (await self._token(token)).functions
+        functions = await self._token(token)
         return int(
             await self._contracts.node.read(
                 functions.allowance(await self._address(owner), await self._address(spender))
@@ -82,24 +75,24 @@ class Tokens:
 
     async def balance_and_allowance(self, owner: str, spender: str, *, token: str | None = None) -> tuple[int, int]:
         """The same as `balance` and `allowance`, in one call."""
-        functions, owner = (await self._token(token)).functions, await self._address(owner)
+        functions, owner = await self._token(token), await self._address(owner)
         calls = (functions.balanceOf(owner), functions.allowance(owner, await self._address(spender)))
         balance, allowance = await self._contracts.node.read_all(calls, block="latest")
         return int(balance), int(allowance)
 
     async def approve(self, spender: str, value: int, *, token: str | None = None) -> str:
         """Let `spender` take up to `value` units of a token (XRT by default); the transaction's hash."""
-        functions = (await self._token(token)).functions
+        functions = await self._token(token)
         return (await self._contracts.send(functions.approve(await self._address(spender), value))).tx
 
     async def transfer(self, to: str, value: int, *, token: str | None = None) -> str:
         """Send units of a token (XRT by default); the transaction's hash."""
-        functions = (await self._token(token)).functions
+        functions = await self._token(token)
         return (await self._contracts.send(functions.transfer(await self._address(to), value))).tx
 
     async def transfer_from(self, owner: str, to: str, value: int, *, token: str | None = None) -> str:
         """Send what `owner` approved for this account; the transaction's hash."""
-        functions = (await self._token(token)).functions
+        functions = await self._token(token)
         return (
             await self._contracts.send(
                 functions.transferFrom(await self._address(owner), await self._address(to), value)
@@ -109,15 +102,15 @@ class Tokens:
     async def _address(self, name_or_address: str) -> str:
         return await self._contracts.names.address(name_or_address)
 
-    async def _token(self, token: str | None) -> AsyncContract:
+    async def _token(self, token: str | None) -> ContractFunctions:
         address = self._contracts.xrt if token is None else await self._address(token)
         return self._contracts.node.contract("XRT", address)
 
-    async def _ask(self, contract: AsyncContract, function: AsyncContractFunction) -> bytes:
+    async def _ask(self, call: ContractCall) -> bytes:
         """The bytes that an optional function of a token returns; empty if the token lacks it."""
-        call: Any = {"to": contract.address, "data": function._encode_transaction_data()}
+        request = {"to": call.address, "data": "0x" + call.data.hex()}
         try:
-            return await self._contracts.node.call(call)
+            return await self._contracts.node.call(request)
         except (Reverted, NoContracts):
             return b""
 
@@ -126,7 +119,7 @@ def _label(answer: bytes) -> str:
     """A printable text. Old tokens return 32 bytes instead of a string."""
     try:
         text = answer.rstrip(b"\0").decode() if len(answer) == 32 else decode(["string"], answer)[0]
-    except (DecodingError, UnicodeDecodeError):
+    except ValueError:
         return ""
     return "".join(character for character in text if character.isprintable())[:LONGEST_LABEL].strip()
 

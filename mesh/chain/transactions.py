@@ -29,8 +29,7 @@ from mesh.log_context import log_event
 from mesh.retry import Backoff, RetryPolicy
 
 if TYPE_CHECKING:
-    from web3.contract.async_contract import AsyncContractFunction
-
+    from mesh.chain.abi import ContractCall
     from mesh.chain.accounts import Account, SignedTransaction
     from mesh.chain.answers import Log, MinedTransaction
     from mesh.chain.node import Node
@@ -79,9 +78,9 @@ class TransactionSender:
         self.account = account
         self._node = node
 
-    async def call(self, function: AsyncContractFunction) -> Receipt:
+    async def call(self, call: ContractCall) -> Receipt:
         """Send a call of a contract's function, and wait until it is mined. Raises as `send` does."""
-        return await self.send(to=function.address, data=bytes.fromhex(function._encode_transaction_data()[2:]))
+        return await self.send(to=call.address, data=call.data)
 
     async def send(self, *, to: str | None, data: bytes, value: int = 0) -> Receipt:
         """Send `data` and `value` (wei) to an address, or deploy `data` if `to` is None; wait until it is mined.

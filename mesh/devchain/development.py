@@ -136,7 +136,7 @@ async def load_market(endpoint: str, keys: Sequence[bytes]) -> DevelopmentMarket
             return None
         async with Chain(node, account=provider) as chain:
             root = namehash("3.robonomics.eth")
-            resolver = await node.read(node.contract("ENSRegistry", chain.ens).functions.resolver(root))
+            resolver = await node.read(node.contract("ENSRegistry", chain.ens).resolver(root))
             created = next(iter(await chain.lighthouses.list()), None)
             if created is None or provider.address not in (await chain.lighthouses.get(created.lighthouse)).stakes:
                 raise NoContracts("lighthouse with a provider", chain.chain_id)

@@ -135,7 +135,7 @@ class Twins:
         addresses = {name: address_bytes(getattr(found, name)) for name in names}
         async with Node(endpoint) as node:
             sender = TransactionSender(node, Account.from_key(evm.funded_keys[0]))
-            token = node.contract("XRT", found.xrt).functions
+            token = node.contract("XRT", found.xrt)
             for key in evm.funded_keys[3:PEOPLE]:
                 await sender.call(token.transfer(Signer(key).address, 30 * XRT))
             for key in evm.funded_keys[:PEOPLE]:

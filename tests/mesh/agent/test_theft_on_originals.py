@@ -73,8 +73,8 @@ class OriginalMarket:
         auction = await self.create("DutchAuction", self.owner.address, XRT, 1)
         self.factory = await self.create("LiabilityFactory", *shared, auction, self.xrt, self.ens)
         await self.send(self.owner, self.contract("XRT", self.xrt).functions.addMinter(self.factory))
-        names = self.node.contract("ENSRegistry", self.ens).functions
-        addresses = self.node.contract("Resolver", resolver).functions
+        names = self.node.contract("ENSRegistry", self.ens)
+        addresses = self.node.contract("Resolver", resolver)
         own = self.owner.address
         for parent, label, owner, address in (
             ("", "eth", own, ""),
@@ -103,7 +103,7 @@ class OriginalMarket:
         return lighthouse_created((await self.send(by, create)).logs).lighthouse
 
     async def balance(self, account: Account) -> int:
-        return int(await self.node.read(self.node.contract("XRT", self.xrt).functions.balanceOf(account.address)))
+        return int(await self.node.read(self.node.contract("XRT", self.xrt).balanceOf(account.address)))
 
     async def demand(self, objective: str) -> Demand:
         """The stranger's demand, whose validator is the lighthouse that it made."""

@@ -9,6 +9,9 @@ import stat
 from typing import TYPE_CHECKING
 
 import pytest
+from eth_account import Account as EthAccount
+from hypothesis import given
+from hypothesis import strategies as st
 
 from mesh.chain import Account, KeyfileError, WrongPassword, keyfile_address, new_private_key, write_keyfile
 from mesh.chain.accounts import KeyfileExists, NotAKeyfile
@@ -54,6 +57,26 @@ def _password_file(folder: Path, text: str) -> Path:
     path = folder / "password"
     path.write_text(text)
     return path
+
+
+@given(
+    st.integers(0, 2**64 - 1),
+    st.integers(0, 2**70),
+    st.sampled_from([b"", bytes.fromhex(ADDRESS[2:])]),
+    st.one_of(st.binary(max_size=100), st.just(bytes(70_000))),
+    st.sampled_from([1, 127, 128, 31337, 2**40]),
+    st.booleans(),
+)
+def test_transactions_are_signed_as_by_the_library(
+    number: int, wei: int, to: bytes, data: bytes, chain: int, is_legacy: bool
+) -> None:
+    fees = {"gasPrice": wei} if is_legacy else {"type": 2, "maxFeePerGas": wei, "maxPriorityFeePerGas": number % 100}
+    fields = {"nonce": number, "gas": 21_000, "to": to, "value": wei, "data": data, "chainId": chain} | fees
+    expected = EthAccount.from_key(KEY).sign_transaction(fields)
+    for form in (data, "0x" + data.hex()):
+        signed = Account.from_key(KEY).sign_transaction(fields | {"data": form})
+        assert signed.raw == expected.raw_transaction
+        assert signed.hash == "0x" + expected.hash.hex()
 
 
 def test_an_account_has_the_address_of_its_key() -> None:

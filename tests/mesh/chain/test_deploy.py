@@ -31,7 +31,7 @@ async def test_the_deployment_follows_its_plan() -> None:
             state = await chain.lighthouses.get("home")
             assert (state.minimal_stake, state.timeout_blocks) == (5, 9)
             assert await chain.block_number() == deployment.block_number
-            refund_delay = chain.node.contract("Factory", chain.factory).functions.refundDelay()
+            refund_delay = chain.node.contract("Factory", chain.factory).refundDelay()
             assert await chain.node.read(refund_delay) == 33
 
 

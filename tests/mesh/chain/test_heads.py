@@ -14,8 +14,7 @@ from mesh.chain import Node
 from mesh.chain.answers import NO_TRANSACTIONS, BlockHeader
 from mesh.chain.events import topics_of
 from mesh.chain.heads import Heads, Pace
-from mesh.chain.liabilities import GETTERS
-from mesh.chain.multicall import decode_calls, encode_calls, getters
+from mesh.chain.multicall import decode_calls, encode_calls
 from mesh.chain.transports import HttpTransport
 from schemas import keccak256
 from schemas.address import address_bytes
@@ -196,7 +195,7 @@ async def test_the_bloom_filters_of_nodes_show_the_events_that_are_read(market: 
 
 async def test_many_functions_are_read_in_one_call(anvil: Anvil, market: DeployedMarket) -> None:
     async with market.chain() as chain:
-        functions = chain.node.contract("XRT", chain.xrt).functions
+        functions = chain.node.contract("XRT", chain.xrt)
         accounts = [market.provider.address, market.promisee.address, chain.factory] * 40
         calls = [functions.balanceOf(account) for account in accounts]
         requests: list[Any] = []
@@ -215,12 +214,3 @@ def test_the_calls_in_a_multicall_can_be_read_back() -> None:
     calls = [("0x" + "11" * 20, b"\x01\x02"), ("0x" + "22" * 20, b"")]
     assert decode_calls(encode_calls(calls)) == calls
     assert decode_calls(b"\x60\x00") is None
-
-
-def test_a_getter_is_encoded_as_by_web3() -> None:
-    node, address = Node("http://127.0.0.1:1"), "0x" + "11" * 20
-    functions = node.contract("Liability", address).functions
-    for name, getter in zip(GETTERS, getters("Liability", address, GETTERS), strict=True):
-        call = functions[name]()
-        assert (getter.address, getter._encode_transaction_data()) == (call.address, call._encode_transaction_data())
-        assert getter.abi["outputs"] == call.abi["outputs"]

@@ -252,6 +252,6 @@ async def test_an_address_that_is_not_a_lighthouse_is_an_error(market: DeployedM
     async with market.chain() as chain:
         with no_contracts("queue"):
             await chain.lighthouses.get(market.promisee.address)
-        functions = chain.node.contract("Liability", market.promisee.address).functions
+        functions = chain.node.contract("Liability", market.promisee.address)
         with pytest.raises(NoContracts):
             await chain.node.read_all((functions.model(), functions.cost()), block="latest")

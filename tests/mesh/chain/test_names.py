@@ -75,5 +75,5 @@ async def test_a_model_is_a_cid_or_a_name_of_one() -> None:
             sender = TransactionSender(chain.node, account)
             resolver = (await sender.send(to=None, data=_content_resolver(parse_cid(cid(1))))).contract
             registry = chain.node.contract("ENSRegistry", chain.ens)
-            await sender.call(registry.functions.setResolver(namehash("3.robonomics.eth"), resolver))
+            await sender.call(registry.setResolver(namehash("3.robonomics.eth"), resolver))
             assert await chain.names.model("Sensor.model.3.robonomics.eth") == cid(1)

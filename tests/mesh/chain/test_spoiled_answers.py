@@ -187,9 +187,9 @@ async def test_what_does_not_decode_is_an_error(market: DeployedMarket, digits: 
     async with market.chain() as chain:
         await chain.node.request("anvil_setCode", liar, "0x" + code)
         for name in ("Liability", "Lighthouse", "XRT"):
-            functions: Any = chain.node.contract(name, liar).functions
+            functions = chain.node.contract(name, liar)
             for function in functions:
-                if function.abi["inputs"] or not function.abi["outputs"]:
+                if function.inputs or not function.outputs:
                     continue
                 with suppress(InvalidAnswer, NoContracts):
-                    await chain.node.read(function())
+                    await chain.node.read(function.at(liar))

@@ -150,7 +150,7 @@ async def test_whole_blocks_contain_their_transactions(node: EmbeddedChain, serv
     """As the JavaScript of generation 3 does: by `to`, and then by the receipt's logs."""
     async with token(node) as (chain, deployment), Node(server.url, timing=QUICK) as way:
         receipt = await TransactionSender(chain.node, Account.from_key(node.funded_keys[0])).call(
-            chain.node.contract("XRT", deployment.xrt).functions.transfer(deployment.factory, XRT)
+            chain.node.contract("XRT", deployment.xrt).transfer(deployment.factory, XRT)
         )
         block = await way.request("eth_getBlockByNumber", hex(receipt.block_number), True)
         [sent] = [one for one in block["transactions"] if one["to"] == deployment.xrt.lower()]
