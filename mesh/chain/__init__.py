@@ -20,7 +20,7 @@ with needs_extra("chain", "the chain"):
         new_private_key,
         write_keyfile,
     )
-    from mesh.chain.admission import Allowances, UnsafeValidator
+    from mesh.chain.admission import Allowances, OrderCosts, UnsafeValidator
     from mesh.chain.answers import BlockHeader
     from mesh.chain.client import Chain
     from mesh.chain.deploy import XRT, Deployment, DeploymentPlan, deploy
@@ -55,6 +55,7 @@ with needs_extra("chain", "the chain"):
         Transfer,
     )
     from mesh.chain.following import BlockEvents, History, Reorganisation
+    from mesh.chain.funds import Funding, Holding
     from mesh.chain.liabilities import Created, RefundState, Settled
     from mesh.chain.lighthouse_state import LighthouseState
     from mesh.chain.names import namehash

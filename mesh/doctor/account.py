@@ -120,7 +120,7 @@ class AccountChecks:
 
     async def check_stake(self) -> CheckResult:
         """Whether the account has a stake at its lighthouse. Raises `NoStake`."""
-        from mesh.market.transaction_queue import NoStake
+        from mesh.market.turns import NoStake
 
         chain, name = self._chain_checks.chain, self._context.settings.lighthouse_contract
         state = await chain.lighthouses.get(name)

@@ -20,7 +20,8 @@ from mesh.market.earnings import Earnings, EarningsLedger
 from mesh.market.liability_events import OPEN_LIABILITIES
 from mesh.market.services import OrderBookService, ProviderStatusService
 from mesh.market.settlement import Settlement
-from mesh.market.transaction_queue import LEAST_GAS, RETRY, NoStake, TransactionQueue
+from mesh.market.transaction_queue import LEAST_GAS, RETRY, TransactionQueue
+from mesh.market.turns import NoStake
 from mesh.market.withdrawals import Withdrawals
 from mesh.network.channel import Channel
 from mesh.network.metrics import link_state, network_families

@@ -18,6 +18,7 @@ from mesh.chain.admission import UNFUNDED_POLLS
 from mesh.errors import AiraError, ChainError, InputError
 from mesh.log_context import liability_context, log_event
 from mesh.market.book import Added, Match, Refusal, order_id
+from mesh.market.commitments import Commitments, creation_stakes
 from mesh.market.liability_events import OPEN_LIABILITIES, LiabilityEvents
 from mesh.market.rejections import ORDER_USED, RejectionPublisher, at_fault, reason_of
 from mesh.market.unconfirmed import Unconfirmed
@@ -27,9 +28,9 @@ from schemas import ZERO_ADDRESS, Result
 
 if TYPE_CHECKING:
     import asyncio
-    from collections.abc import Awaitable, Callable, Sequence
+    from collections.abc import Awaitable, Callable, Mapping, Sequence
 
-    from mesh.chain import Chain, Created
+    from mesh.chain import Chain, Created, Funding, Holding
     from mesh.flood import Drops
     from mesh.market.book import Order, OrderBook
     from mesh.market.earnings import EarningsLedger
@@ -94,6 +95,7 @@ class Settlement:
             forget=forget,
             open_limit=open_limit,
         )
+        self._commitments = Commitments(self._funding, waiting=queue.counted)
         self._unfunded_pause = UNFUNDED_POLLS * chain.node.timing.poll_interval
         self._unfunded = UnfundedOrders(book, self.shortages, funded=self.add, interval=chain.node.timing.poll_interval)
 
@@ -194,12 +196,13 @@ class Settlement:
 
     async def _create(self, match: Match) -> None:
         demand, offer = match
-        if shortage := next(filter(None, await self.shortages(match)), ""):
-            await self._set_aside_unfunded(match, shortage, "its maker can't pay any more")
-            return
         try:
-            priority = self._chain.costs.worth(demand.message)
-            created = await self._queue.send(self._creation(match), priority=priority)
+            async with self._commitments.take(creation_stakes(match, self._chain.costs)):
+                if shortage := next(filter(None, await self.shortages(match)), ""):
+                    await self._set_aside_unfunded(match, shortage, "its maker can't pay any more")
+                    return
+                priority = self._chain.costs.worth(demand.message)
+                created = await self._queue.send(self._creation(match), priority=priority)
         except MatchWithdrawn:
             self._put_back(match)
         except Reverted as error:
@@ -264,6 +267,11 @@ class Settlement:
         question = partial(self._chain.costs.shortages, orders, fresh=fresh)
         return await self._chain.retrying(question, outages=self.events.lookups)
 
+    async def _funding(self, holdings: Sequence[Holding]) -> Mapping[Holding, Funding | None]:
+        """What there is of holdings now."""
+        question = partial(self._chain.funds.of, holdings, fresh=True)
+        return await self._chain.retrying(question, outages=self.events.lookups)
+
     async def _not_created(self, match: Match, rejected: tuple[Verified[Order], ...], error: AiraError) -> None:
         """Reject some orders of a match; put the other one back into the book, unless it was used meanwhile."""
         reason = reason_of(error)
@@ -282,8 +290,9 @@ class Settlement:
         message = result.message
         with liability_context(message.liability):
             try:
-                finalize = partial(self._chain.liabilities.finalize, self._lighthouse, message)
-                finalized = await self._queue.send(finalize, priority=priority)
+                async with self._commitments.take({message.liability: 1}):
+                    finalize = partial(self._chain.liabilities.finalize, self._lighthouse, message)
+                    finalized = await self._queue.send(finalize, priority=priority)
             except (Reverted, NodeUnreachable, RequestRefused) as error:
                 if not isinstance(error, Reverted) or error.reason != "AlreadyFinalized":
                     self.reject(result, reason_of(error), str(error))

@@ -71,6 +71,44 @@ async def test_a_restarted_process_sends_transactions_again_that_the_node_lost(a
     assert _files(tmp_path) == [], "settled transactions are not kept"
 
 
+async def test_a_restarted_process_continues_several_transactions_and_sends_none_twice(
+    anvil: Anvil, tmp_path: Path
+) -> None:
+    friend, values = unused_address(), range(1, 6)
+    async with open_sender(anvil, transactions=tmp_path) as (node, sender):
+        sending = [asyncio.create_task(sender.send(to=friend, data=b"", value=value)) for value in values]
+        before = await until_pending(node, 5)
+        for task in sending:
+            task.cancel()
+        await asyncio.wait(sending)
+        await node.request("anvil_dropTransaction", before[1])
+        await node.request("anvil_dropTransaction", before[3])
+    async with open_sender(anvil, transactions=tmp_path) as (node, sender):
+        sending = [asyncio.create_task(sender.send(to=friend, data=b"", value=value)) for value in reversed(values)]
+        assert await until_pending(node, 5) == before
+        await node.request("evm_mine")
+        assert {receipt.tx for receipt in await asyncio.gather(*sending)} == set(before.values())
+        assert await node.eth_balance(friend) == sum(values)
+        assert await node.transaction_count(sender.account.address) == 5
+    assert _files(tmp_path) == []
+
+
+async def test_of_several_stuck_transactions_the_first_is_replaced_and_all_are_mined_once(anvil: Anvil) -> None:
+    friend = unused_address()
+    async with open_sender(anvil, replace(QUICK, replace_after=0.5)) as (node, sender):
+        sending = [asyncio.create_task(sender.send(to=friend, data=b"", value=value)) for value in (1, 2, 3)]
+        before = await until_pending(node, 3)
+        async with asyncio.timeout(30):
+            while (now := await pending_hashes(node))[0] == before[0]:
+                await asyncio.sleep(0.05)
+        assert len(now) == 3
+        await node.request("evm_setAutomine", True)
+        await node.request("evm_mine")
+        await asyncio.gather(*sending)
+        assert await node.eth_balance(friend) == 6
+        assert await node.transaction_count(sender.account.address) == 3
+
+
 async def test_the_nonce_of_a_forgotten_transaction_is_used_again(anvil: Anvil, tmp_path: Path) -> None:
     friend = unused_address()
     await dropped(anvil, friend, transactions=tmp_path)

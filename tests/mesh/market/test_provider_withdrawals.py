@@ -69,7 +69,7 @@ async def test_a_match_is_not_made_if_an_order_is_withdrawn_before_its_turn(loca
     async with local.provider("rival") as rival:
         demand, offer = local.demand(), local.offer()
         local.publish(demand, offer)
-        await until(lambda: len(rival.book) == 0 and rival.queue.waiting == 0 and rival.ledger.turnover().matches == 1)
+        await until(lambda: len(rival.book) == 0 and rival.queue.waiting == 1 and rival.ledger.turnover().matches == 1)
         local.publish(withdrawal := withdrawal_of(local, demand))
         await until(lambda: withdrawn_id(verify_message(withdrawal)) in rival.withdrawals)
         assert local.rejections == []  # a transaction may be on its way

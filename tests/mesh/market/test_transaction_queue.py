@@ -1,4 +1,4 @@
-"""A provider's transactions: one at a time, in their order, and again after failures that may pass."""
+"""A provider's transactions: several under way, in their order, and again after failures that may pass."""
 
 from __future__ import annotations
 
@@ -82,10 +82,34 @@ async def test_transactions_are_sent_in_their_order_one_at_a_time(local: LocalMa
         events.append(f"{name} ends")
         return name
 
-    async with queue_of(local) as queue:
+    async with queue_of(local, under_way=1) as queue:
         assert await asyncio.gather(*(queue.send(partial(transaction, name)) for name in "abc")) == ["a", "b", "c"]
 
     assert events == ["a begins", "a ends", "b begins", "b ends", "c begins", "c ends"]
+
+
+async def test_several_transactions_are_under_way_and_a_failure_does_not_hold_up_the_others(local: LocalMarket) -> None:
+    begun: list[int] = []
+    failing, lasting = asyncio.Event(), asyncio.Event()
+
+    async def transaction(number: int) -> int:
+        begun.append(number)
+        if number == 1:
+            await failing.wait()
+            raise Reverted("OrderUsed", gas_used=1)
+        await lasting.wait()
+        return number
+
+    async with queue_of(local, under_way=3) as queue:
+        tasks = [asyncio.create_task(queue.send(partial(transaction, number))) for number in range(5)]
+        await until(lambda: len(begun) == 3)
+        await asyncio.sleep(0.05)
+        assert (begun, queue.waiting) == ([0, 1, 2], 2)
+        failing.set()
+        await until(lambda: begun == [0, 1, 2, 3])
+        assert isinstance(tasks[1].exception(), Reverted)
+        lasting.set()
+        assert await asyncio.gather(*tasks[:1], *tasks[2:]) == [0, 2, 3, 4]
 
 
 async def test_the_highest_priority_goes_first_also_after_others_were_cancelled(local: LocalMarket) -> None:
@@ -96,7 +120,7 @@ async def test_the_highest_priority_goes_first_also_after_others_were_cancelled(
         await free.wait()
         sent.append(name)
 
-    async with queue_of(local) as queue, asyncio.TaskGroup() as tasks:
+    async with queue_of(local, under_way=1) as queue, asyncio.TaskGroup() as tasks:
         for name, priority in (("first", 0), ("free", 0), ("cancelled", 9), ("low", 1), ("high", 5), ("high too", 5)):
             task = tasks.create_task(queue.send(partial(transaction, name), priority=priority), name=name)
             await asyncio.sleep(0)
@@ -113,7 +137,7 @@ async def test_new_work_waits_while_the_queue_is_full(local: LocalMarket) -> Non
     async def transaction() -> None:
         await free.wait()
 
-    async with queue_of(local, limit=2) as queue, asyncio.TaskGroup() as tasks:
+    async with queue_of(local, limit=2, under_way=1) as queue, asyncio.TaskGroup() as tasks:
         for _ in range(2):  # the first is being sent, the second waits
             async with asyncio.timeout(5):
                 await queue.has_room()
@@ -135,7 +159,7 @@ async def test_tasks_created_just_before_count_as_queued(local: LocalMarket) -> 
     async def transaction() -> None:
         await asyncio.Event().wait()
 
-    async with queue_of(local, limit=2) as queue:
+    async with queue_of(local, limit=2, under_way=1) as queue:
         tasks = [asyncio.create_task(queue.send(transaction)) for _ in range(3)]
         waiting = asyncio.create_task(queue.has_room())
         await asyncio.sleep(0.01)
@@ -158,7 +182,7 @@ async def test_transactions_that_wait_when_all_is_cancelled_are_never_sent(local
         begun.append(number)
         await asyncio.Event().wait()
 
-    async with queue_of(local) as queue:
+    async with queue_of(local, under_way=1) as queue:
         tasks = [asyncio.create_task(queue.send(partial(transaction, number))) for number in range(3)]
         await until(lambda: begun)
         for task in tasks:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from mesh.chain import XRT
-from mesh.market.transaction_queue import NoStake, Turns
+from mesh.market.turns import NoStake, Turns
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 
 @asynccontextmanager
-async def turns(local: LocalMarket, role: str) -> AsyncIterator[Turns]:
+async def turns(local: LocalMarket, role: str, **options: int) -> AsyncIterator[Turns]:
     async with local.chain_of(role) as chain:
-        yield Turns(chain, local.lighthouse)
+        yield Turns(chain, local.lighthouse, **options)
 
 
 async def head(local: LocalMarket) -> int:
@@ -38,10 +38,33 @@ async def test_a_turn_lasts_as_many_transactions_as_the_quota(local: LocalMarket
         for _ in range(2):
             assert await ours.has_come(since=0)
             assert not await theirs.has_come(since=0)
+            ours.take_one()
             await send_one(local, "provider")
-            ours.took_one()
+            ours.ended()
         assert not await ours.has_come(since=0)
         assert await theirs.has_come(since=0)
+
+
+async def test_while_transactions_are_under_way_no_more_are_sent_than_the_turn_has(local: LocalMarket) -> None:
+    await local.create_lighthouse(timeout_blocks=1000, provider=2, rival=1)
+    async with turns(local, "provider", most=16) as ours:
+        for _ in range(2):
+            assert await ours.has_come(since=0)
+            ours.take_one()
+        assert not await ours.has_come(since=0)
+        ours.ended()
+        assert not await ours.has_come(since=0)
+        ours.ended()
+        assert await ours.has_come(since=0)  # they were not mined
+
+
+async def test_a_single_provider_may_have_more_transactions_under_way_than_its_quota(local: LocalMarket) -> None:
+    await local.create_lighthouse(timeout_blocks=1000, provider=1)
+    async with turns(local, "provider", most=3) as ours:
+        for _ in range(3):
+            assert await ours.has_come(since=0)
+            ours.take_one()
+        assert not await ours.has_come(since=0)
 
 
 async def test_a_single_provider_always_has_the_turn(local: LocalMarket) -> None:
@@ -49,8 +72,9 @@ async def test_a_single_provider_always_has_the_turn(local: LocalMarket) -> None
     async with turns(local, "provider") as ours:
         for _ in range(3):
             assert await ours.has_come(since=await head(local))
+            ours.take_one()
             await send_one(local, "provider")
-            ours.took_one()
+            ours.ended()
 
 
 async def test_after_a_pause_a_new_job_is_left_to_the_provider_on_turn(local: LocalMarket) -> None:
