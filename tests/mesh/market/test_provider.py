@@ -13,6 +13,7 @@ from mesh.market import Match, order_id
 from mesh.market.provider import Earnings, Provider
 from mesh.network import message_key
 from schemas import Demand, PresenceKey, encode, verify_message
+from tests.mesh.market.held_node import HeldNode
 from tests.support.waiting import until, until_found
 
 if TYPE_CHECKING:
@@ -255,3 +256,16 @@ async def until_present(local: LocalMarket, expected: list[PresenceKey]) -> None
         return await local.channel.present() == expected
 
     await until_found(search, what=f"the presence of {expected}")
+
+
+async def test_several_transactions_wait_to_be_mined_at_the_same_time(local: LocalMarket) -> None:
+    async with HeldNode(local.node) as node, local.provider(endpoint=node) as provider:
+        demands = [local.demand() for _ in range(3)]
+        with node.back("eth_getTransactionReceipt"):
+            for demand in demands:
+                local.publish(demand, local.offer())
+            for demand in demands:
+                await local.liability_of(demand)
+            assert not provider.queue.is_down, "none had to fail before the next was sent"
+        await until(lambda: provider.earnings().created == 3)
+        assert local.rejections == []
