@@ -99,11 +99,12 @@ class TransactionQueue:
         self._limit = limit
         self._set_aside_limit = set_aside_limit
         self._turns = Turns(chain, lighthouse, most=under_way)
-        self._places = asyncio.Semaphore(under_way)
+        self._free = under_way
+        """Places among those under way."""
         self._taking_turn = asyncio.Lock()
         self._has_first = False
         self._waiting: list[tuple[int, int, asyncio.Future[None]]] = []
-        """A heap of those that wait behind the first: the negative priority, a serial number, and what wakes them."""
+        """A heap of those that wait for a place: the negative priority, a serial number, and what wakes them."""
         self._numbers = itertools.count()
         self._queued = 0
         self._set_aside = 0
@@ -154,14 +155,13 @@ class TransactionQueue:
         with self.counted():
             await self._become_first(priority)
             try:
-                await self._places.acquire()
-                try:
-                    await self._take_turn(attempts.since)
-                except BaseException:
-                    self._places.release()
-                    raise
+                await self._take_turn(attempts.since)
+            except BaseException:
+                self._free += 1
+                raise
             finally:
-                self._pass_on()
+                self._has_first = False
+                self._admit()
 
     @contextmanager
     def counted(self) -> Iterator[None]:
@@ -177,26 +177,25 @@ class TransactionQueue:
                 self._room.set()
 
     async def _become_first(self, priority: int) -> None:
-        if not self._has_first:
-            self._has_first = True
-            return
+        """Take a place when one is free, and be the one that waits for the turn."""
         waiter = asyncio.get_running_loop().create_future()
         heapq.heappush(self._waiting, (-priority, next(self._numbers), waiter))
+        self._admit()
         try:
             await waiter
         except asyncio.CancelledError:
             if not waiter.cancelled():  # it was woken and cancelled at once
-                self._pass_on()
+                self._free, self._has_first = self._free + 1, False
+                self._admit()
             raise
 
-    def _pass_on(self) -> None:
-        """Let the next one be the first."""
-        while self._waiting:
+    def _admit(self) -> None:
+        """Let the next one be the first, if there is a place for it."""
+        while self._waiting and self._free and not self._has_first:
             *_, waiter = heapq.heappop(self._waiting)
             if not waiter.done():
+                self._free, self._has_first = self._free - 1, True
                 waiter.set_result(None)
-                return
-        self._has_first = False
 
     async def _wait_aside(self, attempts: _SendAttempts, error: NodeUnreachable | RequestRefused | Reverted) -> None:
         """Wait for the next attempt at a transaction while others are sent; raise `error` where there is none."""
@@ -244,7 +243,8 @@ class TransactionQueue:
                 await backoff.wait()
                 await self._take_turn(attempts.since)
         finally:
-            self._places.release()
+            self._free += 1
+            self._admit()
 
     async def _take_turn(self, since: int) -> None:
         """Wait for the turn, which comes with a block, and take one of its transactions."""

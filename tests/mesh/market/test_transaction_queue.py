@@ -131,6 +131,24 @@ async def test_the_highest_priority_goes_first_also_after_others_were_cancelled(
     assert sent == ["first", "high", "high too", "low", "free"]
 
 
+async def test_a_place_that_becomes_free_goes_to_the_highest_priority_then(local: LocalMarket) -> None:
+    sent: list[str] = []
+    free = {name: asyncio.Event() for name in ("first", "low", "high")}
+
+    async def transaction(name: str) -> None:
+        sent.append(name)
+        await free[name].wait()
+
+    async with queue_of(local, under_way=1) as queue, asyncio.TaskGroup() as tasks:
+        for name, priority in (("first", 0), ("low", 1), ("high", 5)):
+            tasks.create_task(queue.send(partial(transaction, name), priority=priority))
+            await until(lambda: sent)
+        for name in ("first", "high", "low"):
+            free[name].set()
+
+    assert sent == ["first", "high", "low"]
+
+
 async def test_new_work_waits_while_the_queue_is_full(local: LocalMarket) -> None:
     free = asyncio.Event()
 
