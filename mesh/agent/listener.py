@@ -38,6 +38,8 @@ from mesh.work.outbox import result_identity
 from schemas import Result, decode
 
 if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+
     from mesh.agent.components import AgentComponents
     from mesh.agent.trade import Trader
     from mesh.chain import ChainEvent
@@ -101,8 +103,7 @@ class ChainListener:
                 if block.events:
                     # If it is handled only in part, and replaced before the agent is back, it is reverted like others.
                     await self._ledger.set_cursor(block.block_number - 1, history=history.encode())
-                for event in block.events:
-                    await self.handle(event)
+                await self.handle_all(block.events)
                 await self._ledger.set_cursor(block.block_number, history=history.encode())
                 await self.new_head(block.block_number)
                 backoff.reset()
@@ -133,6 +134,13 @@ class ChainListener:
         self._parts.chain_head.begin_after(last)
         return last + 1, history
 
+    async def handle_all(self, events: Sequence[ChainEvent]) -> None:
+        """Act on the events of a block; of new liabilities, on those that name this account."""
+        foreign = await self._foreign(events)
+        for event in events:
+            if event not in foreign:
+                await self.handle(event)
+
     async def handle(self, event: ChainEvent) -> None:
         """Act on an event of the chain."""
         match event:
@@ -153,6 +161,15 @@ class ChainListener:
                 await self.finalization_reverted(event.liability)
             case Transfer() | Approval():
                 self.token_events.revert(event)
+
+    async def _foreign(self, events: Sequence[ChainEvent]) -> Collection[ChainEvent]:
+        """Those of several new liabilities in a block that are between others, found out in one call."""
+        created = [event for event in events if isinstance(event, NewLiability)]
+        if len(created) < 2:
+            return ()
+        read = partial(self._chain.liabilities.parties, [event.liability for event in created])
+        parties = await self._chain.retrying(read, outages=self._parts.outages)
+        return {event for event, named in zip(created, parties, strict=True) if self._account not in named}
 
     async def _read_new(self, address: str) -> None:
         """Read a new liability and, if it names this account, its orders."""

@@ -97,6 +97,17 @@ class Liabilities:
         """The same as `get` and `order_hashes`, in one call."""
         return await _read(self._contracts.node, await self._recognised(address))
 
+    async def get_all_with_orders(self, addresses: Sequence[str]) -> list[tuple[Liability, tuple[bytes, bytes]]]:
+        """The same for several liabilities, six or more of them in one call."""
+        recognised = [await self._recognised(address) for address in addresses]
+        return await _read_all(self._contracts.node, recognised)
+
+    async def parties(self, addresses: Sequence[str]) -> list[tuple[str, str]]:
+        """Promisee and promisor of each of these, which are known to be liabilities, in one call for fifty."""
+        calls = [call for address in addresses for call in getters("Liability", address, ("promisee", "promisor"))]
+        found = await self._contracts.node.read_all(calls, block="latest")
+        return list(zip(found[::2], found[1::2], strict=True))
+
     async def get(self, address: str) -> Liability:
         """The record of a liability. Raises `NotALiability` unless the factory created it."""
         return (await self.get_with_orders(address))[0]
@@ -269,9 +280,19 @@ async def _read(node: Node, address: str, *, block: int | str = "latest") -> tup
 
     Raises `NodeUnreachable`, and `NoContracts` for a block before its creation.
     """
-    values = await node.read_all(getters("Liability", address, GETTERS), block=block)
-    *_, demand_hash, offer_hash = values
-    return _record(address, dict(zip(GETTERS, values, strict=True))), (bytes(demand_hash), bytes(offer_hash))
+    return (await _read_all(node, [address], block=block))[0]
+
+
+async def _read_all(
+    node: Node, addresses: Sequence[str], *, block: int | str = "latest"
+) -> list[tuple[Liability, tuple[bytes, bytes]]]:
+    calls = [call for address in addresses for call in getters("Liability", address, GETTERS)]
+    values = await node.read_all(calls, block=block)
+    found = []
+    for number, address in enumerate(addresses):
+        held = dict(zip(GETTERS, values[number * len(GETTERS) :], strict=False))
+        found.append((_record(address, held), (held["demandHash"], held["offerHash"])))
+    return found
 
 
 def _record(address: str, held: Mapping[str, Any]) -> Liability:

@@ -153,11 +153,13 @@ class LiabilityEvents:
         return await self._chain.retrying(partial(node.has_transaction, tx), outages=self.lookups)
 
     async def _take_block(self, block: BlockEvents) -> None:
+        created = [event.liability for event in block.events if isinstance(event, NewLiability)]
+        records = dict(zip(created, await self._chain.liabilities.get_all_with_orders(created), strict=True))
         for event in block.events:
             if isinstance(event, NewLiability | Finalized):
                 self._earnings.mined(event.tx)
             if isinstance(event, NewLiability):
-                await self._take_created(event.liability, block.block_number)
+                self._take_created(*records[event.liability], block.block_number)
             elif isinstance(event, Finalized):
                 self.open.pop(event.liability, None)
                 self._unconfirmed.finalized(event.liability, block.block_number)
@@ -169,20 +171,19 @@ class LiabilityEvents:
             expired = log_event("order-expired", order=order.hash.hex(), signer=order.signer)
             log.info("expired order %s of %s", order.hash.hex(), order.signer, extra=expired)
 
-    async def _take_created(self, address: str, block: int) -> None:
+    def _take_created(self, liability: Liability, order_hashes: tuple[bytes, bytes], block: int) -> None:
         """Take the orders of a new liability, created in that block, out of the book."""
-        liability, (demand_hash, offer_hash) = await self._chain.liabilities.get_with_orders(address)
         if liability.lighthouse != self._lighthouse:
             return
         self.parties.add(liability.promisee)
         self.parties.add(liability.promisor)
-        for digest, signer in ((demand_hash, liability.promisee), (offer_hash, liability.promisor)):
+        for digest, signer in zip(order_hashes, (liability.promisee, liability.promisor), strict=True):
             identity = digest + address_bytes(signer)
             order = self._book.remove(identity) or self._unconfirmed.get(identity)
             if order is not None:
-                self._unconfirmed.created(address, block, order)
+                self._unconfirmed.created(liability.address, block, order)
         if not liability.is_finalized:
-            self.open[address] = liability
+            self.open[liability.address] = liability
             if len(self.open) > self._open_limit:
                 del self.open[next(iter(self.open))]
 

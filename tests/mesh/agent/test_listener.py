@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from mesh.chain import Chain, Timing
+from mesh.chain import Chain, NewLiability, Timing
+from mesh.chain.liabilities import Liabilities
 from mesh.devchain import JsonRpcServer
 from schemas import message_hash
 from tests.mesh.agent.listeners import RecordingListener, contract, finalize, ledger, listening, opened, started
@@ -43,6 +44,25 @@ async def test_contracts_of_others_are_left_out(place: Place, ledger: Ledger) ->
         mine, *_ = await contract(place)
         await until(lambda: listener.liabilities)
     assert [liability.address for liability, *_ in listener.liabilities] == [mine]
+
+
+async def test_of_several_new_contracts_in_a_block_only_those_of_the_account_are_read(
+    place: Place, ledger: Ledger, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[str] = []
+    get = Liabilities.get_with_orders
+
+    async def counted(liabilities: Liabilities, address: str) -> Any:
+        read.append(address)
+        return await get(liabilities, address)
+
+    monkeypatch.setattr(Liabilities, "get_with_orders", counted)
+    async with opened(place, ledger) as listener:
+        made = [(await contract(place, promisor=who))[0] for who in ("provider", "robot", "provider", "robot")]
+        for address in made:
+            assert await place.chains["robot"].liabilities.exists(address)
+        await listener.handle_all([NewLiability(address, "0x") for address in made])
+    assert [liability.address for liability, *_ in listener.liabilities] == read == made[1::2]
 
 
 async def test_a_finalization_is_reported_with_its_result(place: Place, ledger: Ledger) -> None:
