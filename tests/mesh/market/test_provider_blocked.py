@@ -49,7 +49,7 @@ async def test_no_contract_is_made_with_a_signer_that_is_blocked_before_its_turn
     async with local.provider("rival", blocked=Blocklist(path)) as rival:
         demand, offer = local.demand(), local.offer()
         local.publish(demand, offer)
-        await until(lambda: len(rival.book) == 0 and rival.queue.waiting == 0 and rival.ledger.turnover().matches == 1)
+        await until(lambda: len(rival.book) == 0 and rival.queue.waiting == 1 and rival.ledger.turnover().matches == 1)
         path.write_text(local.address("person"))
         await until(lambda: local.address("person") in rival.settlement.blocked)
 
