@@ -173,8 +173,8 @@ MUTATIONS: Final = (
     ),
     Mutation(
         "the outbox sends everything once",
-        "mesh.work.outbox:Outbox._schedule",
-        "(attempts.backoff.next_delay() or 0.0)",
+        "mesh.work.outbox:Outbox._send",
+        "attempts.backoff.next_delay() or 0.0",
         "1e9",
         "drop",
     ),
