@@ -205,7 +205,7 @@ MUTATIONS: Final = (
         "mesh.agent.trade:Trader.reorganised",
         "self._send_when_covered(",
         "list(",
-        REORGANISATIONS,
+        "reorganise_after,forget",
     ),
     Mutation(
         "each transaction is sent twice",
