@@ -105,7 +105,10 @@ class Market:
             traceback.print_exception(error)
         if isinstance(error, BaseExceptionGroup):
             error = cause_of(error) or error
-        if not isinstance(error, AiraError) or isinstance(error, GONE):
+        is_gone = (
+            isinstance(error, GONE) and not self.draw.counts["answer-spoilt"]
+        )  # which may say that nothing is there
+        if not isinstance(error, AiraError) or is_gone:
             self.violated("process-died", f"{role.name}: {_cause(error)}")
 
     def matched(self, provider: str, match: Match) -> None:
