@@ -223,9 +223,13 @@ class Ledger:
         return [Outgoing(*row) for row in rows]
 
     async def contracts(self, kind: str) -> list[tuple[bytes, str]]:
-        """The 64 latest orders of a kind that became contracts: their payloads, and the contracts' addresses."""
-        statement = "SELECT payload, liability FROM spent WHERE kind = ? ORDER BY rowid DESC LIMIT 64"
-        return await self._database.rows(statement, (kind,))
+        """The 64 latest orders of a kind, also withdrawn, that became contracts: payload, contract's address."""
+        return await self._database.rows(
+            "SELECT payload, liability FROM (SELECT kind, payload, liability, posted FROM spent"
+            " UNION ALL SELECT kind, payload, used_by, posted FROM withdrawn WHERE length(used_by) = 42)"
+            " WHERE kind = ? ORDER BY posted DESC LIMIT 64",
+            (kind,),
+        )
 
     async def unspend(self, liability: str) -> None:
         """Move the orders of a reverted contract back into the outbox. Withdrawn ones stay withdrawn."""

@@ -235,13 +235,25 @@ async def test_a_withdrawn_order_that_becomes_a_contract_stays_withdrawn_after_a
     assert await ledger.outbox(head=0) == [withdrawn]
 
 
+async def test_the_contract_of_a_withdrawn_order_is_listed_like_others(ledger: Ledger) -> None:
+    signed, kept = demand(), demand()
+    for order in (outgoing(signed), outgoing(kept)):
+        await ledger.post(order)
+    await ledger.withdraw(outgoing(signed).identity, outgoing(withdrawal(signed)))
+    assert await ledger.contracts("demand") == []
+    for order, address in ((outgoing(kept), "0x" + "1" * 40), (outgoing(signed), "0x" + "2" * 40)):
+        await ledger.spend(order.identity, address)
+    assert {address for _, address in await ledger.contracts("demand")} == {"0x" + "1" * 40, "0x" + "2" * 40}
+
+
 async def test_an_order_withdrawn_on_the_chain_can_not_become_a_contract(ledger: Ledger) -> None:
     signed = demand()
     order, withdrawn = outgoing(signed), outgoing(withdrawal(signed))
     await ledger.post(order)
     await ledger.withdraw(order.identity, withdrawn)
-    await ledger.use_up(order.identity, "0xtransaction")
+    await ledger.use_up(order.identity, "0x" + "a" * 64)
     assert await ledger.orders() == []
+    assert await ledger.contracts("demand") == []
 
 
 async def test_an_order_is_replaced_at_its_place_in_one_step(ledger: Ledger) -> None:
