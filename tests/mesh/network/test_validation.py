@@ -249,7 +249,7 @@ def test_the_signature_of_a_message_that_comes_twice_at_once_is_verified_once(mo
 
     monkeypatch.setattr(validation, "recover_keys", recover)
     messages = [demand() for _ in range(validation.SLICE)]
-    copies = [json.dumps(json.loads(encode(messages[place]))).encode() for place in (0, -1)]
+    copies = [json.dumps(json.loads(encode(messages[place]))).encode() for place in (0, 1)]
     payloads = [encode(messages[0]), copies[0], *map(encode, messages[1:]), copies[1]]
 
     found = [
