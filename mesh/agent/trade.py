@@ -205,7 +205,8 @@ class Trader(Lifecycle):
         self._parts.outbox.hold(order.identity for order in orders)
         costly = [order for order in orders if any(self._chain.costs.of(order.signed).values())]
         free = {order.identity for order in orders} - {order.identity for order in costly}
-        self._tasks.start(self._parts.outbox.release(free), "resume free orders")
+        if free:
+            self._tasks.start(self._parts.outbox.release(free), "resume free orders")
         for order in costly:
             self._tasks.start(self._cover_and_send(order), f"resume {order.identity}")
 

@@ -82,6 +82,7 @@ def run_history(
         scheduler.watch_switches(Path(switches))
     # Relative, so that the paths are the same in each run.
     folder = FOLDER / str(os.getpid())
+    shutil.rmtree(folder, ignore_errors=True)  # of a process that was killed and had the same number
     folder.mkdir(parents=True)
     os.chdir(folder)
     try:
