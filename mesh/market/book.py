@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 K = TypeVar("K", bound="Hashable")
 T = TypeVar("T")
 
-LIMIT: Final = 32_768
+LIMIT: Final = 24_576
 """Open orders that a book holds by default: with up to 2 KB each, a provider stays below 200 MB."""
 UNLIMITED: Final = 2**256
 

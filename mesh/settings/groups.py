@@ -166,7 +166,7 @@ class MarketSettings:
 
     lighthouse_contract: str = option("", "ENS name of the lighthouse, the market to trade on")
     erc20_token: str = option("", "ENS name or address of the token that pays for work")
-    open_orders_limit: PositiveInt = option(32_768, "most open orders that a provider keeps, 2 KB each")
+    open_orders_limit: PositiveInt = option(24_576, "most open orders that a provider keeps, 2 KB each")
     deadline_limit: PositiveInt = option(
         DEADLINE_LIMIT,
         "blocks after which a provider drops an order, and an agent's offer for a demand ends, before its deadline",
