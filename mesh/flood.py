@@ -32,6 +32,8 @@ REPORT_INTERVAL: Final = 60.0
 """Seconds between two log lines about drops."""
 HEAVIEST: Final = 3
 """Senders that a log line names for each reason."""
+UNFUNDED_POLLS: Final = 15
+"""Intervals between polls of the chain after which a copy of an order is worth a look whose maker could not pay."""
 
 
 class BoundedDict(OrderedDict[K, V]):

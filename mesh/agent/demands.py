@@ -12,9 +12,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from mesh.agent.handlers import call
-from mesh.chain.admission import UNFUNDED_POLLS
 from mesh.content import ContentUnavailable
-from mesh.flood import FairQueue, Rate, RateLimiter
+from mesh.flood import UNFUNDED_POLLS, FairQueue, Rate, RateLimiter
 from mesh.work.objectives import Buyer, ObjectiveNotFetched
 
 if TYPE_CHECKING:

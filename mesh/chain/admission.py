@@ -40,8 +40,6 @@ REMEMBERED: Final = 4096
 """Validators whose verdict is remembered, the latest ones."""
 RECHECK: Final = 60.0
 """Seconds after which a verdict is asked for again that a transaction can change."""
-UNFUNDED_POLLS: Final = 15
-"""Intervals between polls of the chain after which a copy of an order is worth a look whose maker could not pay."""
 TOKEN_UNREADABLE: Final = "TokenUnreadable"
 """The reason of a rejection when a contract does not tell balances and allowances, so that it can't be paid with."""
 LEAST_AHEAD: Final = 4

@@ -14,8 +14,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from mesh.chain import NodeUnreachable, RequestRefused, Reverted, TransactionTimeout
-from mesh.chain.admission import UNFUNDED_POLLS
 from mesh.errors import AiraError, ChainError, InputError
+from mesh.flood import UNFUNDED_POLLS
 from mesh.log_context import liability_context, log_event
 from mesh.market.arrivals import UnfundedOrders
 from mesh.market.book import Added, Match, Refusal, order_id

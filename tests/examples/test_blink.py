@@ -115,4 +115,4 @@ def test_the_argument_chooses_the_lamp(protocol: str, market: dict[str, str], tm
         assert green.returncode == 1
         assert "[job-not-done]" in green.stderr
         assert uno.pins == []
-    assert [text for text, _ in said_on(out, "/aira/note")] == ["there is no green lamp"]
+    assert [text for text, _ in said_on(out, "/aira/note")] == ["there is no green lamp [job-failed]"]

@@ -148,7 +148,8 @@ async def test_a_late_agent_receives_all_of_many_open_orders(place: Place) -> No
         heard.add(message.hash)
 
     deadline = await place.chains["provider"].block_number() + 10_000
-    orders = [verified_demand(lighthouse=place.market.deployment.lighthouse, deadline=deadline) for _ in range(10_000)]
+    lighthouse = place.market.deployment.lighthouse
+    orders = [verified_demand(lighthouse=lighthouse, cost=0, deadline=deadline) for _ in range(10_000)]
     async with place.provider() as provider:
         for order in orders:
             provider.book.add(order)
