@@ -144,7 +144,7 @@ async def crashed_at(refuse: Callable[[Path], None], place: Place, person: Agent
         async with speaking(offering(place.agent("robot")), []) as robot, place.provider():
             ledgers.append(robot.parts.directory / "ledger.sqlite")
             refuse(*ledgers)
-            await person.demand(words(place), cost=COST)
+            await person.order(words(place), cost=COST)  # `demand` would withdraw it when it is cancelled
             await asyncio.sleep(60)
 
     with pytest.raises(ExceptionGroup):
