@@ -18,6 +18,8 @@ BENCHES := $(shell grep -l __main__ bench/*.py)
 JOBS ?= 3
 # CI measures coverage, which takes time.
 COVERAGE := $(if $(filter true,$(CI)),--cov --cov-report=term --durations=10)
+# A busy machine may delay or drop what a test waits for. At most three tests run a second time, each with its traceback.
+RERUNS := --reruns 1 --max-suite-reruns 3 --rerun-show-tracebacks
 
 .PHONY: help setup demo test simulate simulate-mutants compose-test crash-test lint peers bench contracts contracts-check \
 	slither firmware lock clean
@@ -47,7 +49,7 @@ demo: $(INSTALLED) ## a whole market on this machine, in one process; ARGS="..."
 	@$(BIN)/aira demo $(ARGS)
 
 test: $(INSTALLED) ## the tests, without containers; ARGS="-k name" chooses some
-	@$(BIN)/pytest -n $(JOBS) --dist loadfile -m "not compose" $(COVERAGE) $(ARGS)
+	@$(BIN)/pytest -n $(JOBS) --dist loadfile -m "not compose" $(RERUNS) $(COVERAGE) $(ARGS)
 
 simulate: $(INSTALLED) ## whole markets in simulated time, with faults; ARGS="--seed N --jobs J --json"
 	@$(BIN)/python -m tests.simulation $(ARGS)
