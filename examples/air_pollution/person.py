@@ -53,7 +53,7 @@ async def answer() -> Played:
     """Ask until the sensor answers; returns the measurement in the recording that its Result names."""
     cid = None
     while cid is None:  # a sensor that starts later does not receive earlier demands
-        agent.publish(await question())
+        agent.send(await question())
         try:
             cid = await asyncio.wait_for(answers.get(), 5)
         except TimeoutError:

@@ -31,7 +31,7 @@ async def take(demand: Verified[Demand]) -> None:
 
 def answer(asker: str, cid: str) -> None:
     """Publish a Result without a contract: it names the asker's address as its liability."""
-    agent.publish(Result(liability=asker, result=cid, success=True))
+    agent.send(Result(liability=asker, result=cid, success=True))
     print(f"answered {asker}: {cid}", flush=True)
 
 

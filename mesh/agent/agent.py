@@ -5,58 +5,35 @@ from __future__ import annotations
 import asyncio
 import logging
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, TypedDict, Unpack, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from mesh.agent.components import watching, working
-from mesh.agent.demands import HANDLED, current_buyer
+from mesh.agent.demands import HANDLED
 from mesh.agent.handlers import HandlerDecorators, dispatch, repeat
-from mesh.agent.orders import Order, OrderState
 from mesh.agent.status import WatcherStatus
+from mesh.agent.trading_agent import TradingAgent
 from mesh.background import Background
 from mesh.composition import load_account
-from mesh.errors import ClosedError, ConfigurationError
 from mesh.flood import Drops
 from mesh.log_context import LogSource, log_event, source_context
-from mesh.role import Lifecycle
-from mesh.settings import load
 from mesh.starting import open_when_ready, wait_for_files
 from mesh.telemetry.logs import set_process_source
 from mesh.telemetry.serving import Telemetry
 from mesh.work.outbox import RESEND
-from schemas import Demand, Offer, Result, Verified
+from schemas import Demand, Result
 
 if TYPE_CHECKING:
     from contextlib import AsyncExitStack
-    from pathlib import Path
 
-    from mesh.agent.components import AgentComponents
-    from mesh.agent.contract import Contract
-    from mesh.agent.orders import OnRejection
     from mesh.agent.runtime import AgentRuntime
     from mesh.chain import Account, Chain
-    from mesh.network import Channel
-    from mesh.recording import Objective
     from mesh.retry import RetryPolicy
     from mesh.settings import Settings
 
 log = logging.getLogger(__name__)
 
-FETCH_PATIENCE: Final = 10.0
-"""Seconds without a new block of an objective after which no offer is made for it."""
 
-
-class DemandTerms(TypedDict, total=False):
-    """The optional arguments of `Agent.order` and `Agent.demand`."""
-
-    cost: int
-    model: str
-    token: str
-    validator: str
-    validator_fee: int
-    lifetime: int | None
-
-
-class Agent(HandlerDecorators, Lifecycle):
+class Agent(HandlerDecorators, TradingAgent):
     """A participant of the market: `agent = Agent(model)`, handlers, then `agent.run()` or `async with agent`.
 
     `model` is the CID of the behaviour that it offers or demands ('' for any). With an account (`account`, or a keyfile
@@ -64,8 +41,6 @@ class Agent(HandlerDecorators, Lifecycle):
     `async with`. Any number of agents can run in one event loop. `chain`, if given, is an open chain to use instead of
     the one that the settings name; `resend` is how often messages without effect are sent again.
     """
-
-    title = "agent"
 
     def __init__(
         self,
@@ -76,9 +51,8 @@ class Agent(HandlerDecorators, Lifecycle):
         chain: Chain | None = None,
         resend: RetryPolicy = RESEND,
     ) -> None:
-        super().__init__()
-        self.model = model
-        self.settings = load() if settings is None else settings
+        HandlerDecorators.__init__(self)
+        TradingAgent.__init__(self, model, settings)
         self._account = account
         self._given_chain = chain
         self._resend = resend
@@ -86,8 +60,6 @@ class Agent(HandlerDecorators, Lifecycle):
         """Serves its metrics and its health if the settings say where."""
         self.drops = Drops()
         """Counts what was dropped, of what strangers sent."""
-        self._channel: Channel | None = None
-        self._runtime: AgentRuntime | None = None
 
     def run(self) -> None:
         """Serve until Ctrl-C or SIGTERM. Prints errors that people can fix in one line, with exit code 1 or 2."""
@@ -99,147 +71,6 @@ class Agent(HandlerDecorators, Lifecycle):
         """Serve until cancelled."""
         async with self:
             await asyncio.Event().wait()
-
-    @property
-    def runtime(self) -> AgentRuntime:
-        """The working side of a running agent. Raises `ClosedError` if it is not running or has no account."""
-        self.channel  # raises when the agent is not running  # noqa: B018
-        if self._runtime is None:
-            raise ConfigurationError(
-                "this agent has no account, it only watches",
-                hint="give it one: keyfile and keyfile_password_file in the settings",
-            )
-        return self._runtime
-
-    @property
-    def parts(self) -> AgentComponents:
-        """The components of a running agent. Raises as `runtime` does."""
-        return self.runtime.parts
-
-    @property
-    def channel(self) -> Channel:
-        """The lighthouse's channel. Raises `ClosedError` if the agent is not running."""
-        if self._channel is None:
-            raise ClosedError("the agent is not running", hint="use it inside `async with`")
-        return self._channel
-
-    @property
-    def address(self) -> str:
-        """The account's address (EIP-55)."""
-        return self.parts.signer.address
-
-    async def offer(
-        self,
-        demand: Verified[Demand] | Demand | None = None,
-        *,
-        objective: str = "",
-        cost: int = 0,
-        token: str = "",
-        validator: str = "",
-        lighthouse_fee: int = 0,
-        lifetime: int | None = None,
-    ) -> str:
-        """Offer to do a job; returns the order's hash (hex). The offer is resent until it is matched or expires.
-
-        With a `demand` the offer agrees to its terms, once its objective was examined; else `objective` (CID), `cost`
-        (the token's smallest unit), `token` and `validator` (names or addresses) are the terms, valid for `lifetime`
-        blocks, by default about ten minutes. `lighthouse_fee` is in wn, and paid to the provider.
-
-        Raises `InsufficientTokens`, and for an objective that can't be played `ObjectiveUnfit` or a `ContentError`.
-        """
-        trader = self.runtime.trader
-        if demand is not None:
-            wanted = demand.message if isinstance(demand, Verified) else demand
-            await self.examine(wanted.objective)
-            terms = trader.writer.terms_of(wanted)
-        else:
-            terms = await trader.writer.terms(
-                model=self.model, objective=objective, cost=cost, token=token, validator=validator, lifetime=lifetime
-            )
-        return (await trader.post(Offer, terms, lighthouse_fee=lighthouse_fee)).hash
-
-    async def examine(self, cid: str) -> Objective:
-        """The objective with that CID, fetched if needed, after it was checked as before a job.
-
-        Raises `ObjectiveUnfit`, whose `reason` is a word for programs, and branches of `ContentError`; while a demand
-        is handled also `ObjectiveNotFetched`, as what strangers make an agent fetch is limited.
-        """
-        return await self.runtime.objectives.examine(cid, patience=FETCH_PATIENCE, buyer=current_buyer())
-
-    async def order(
-        self,
-        objective: str | Path,
-        *,
-        cost: int = 0,
-        model: str = "",
-        token: str = "",
-        validator: str = "",
-        validator_fee: int = 0,
-        lifetime: int | None = None,
-    ) -> Order:
-        """Demand a job; returns the open order, to be waited for or withdrawn: `await order.contract()`.
-
-        `objective` is a CID, or the path of a file, which the agent then serves. The other terms are as for `offer`.
-        The factory gets the allowance that they need. A restarted agent sends the order again.
-
-        Raises `InsufficientTokens`.
-        """
-        writer = self.runtime.trader.writer
-        cid = objective if isinstance(objective, str) else await self.add(objective)
-        terms = await writer.terms(
-            model=model or self.model, objective=cid, cost=cost, token=token, validator=validator, lifetime=lifetime
-        )
-        return await self.runtime.trader.post(Demand, terms, validator_fee=validator_fee)
-
-    async def demand(
-        self, objective: str | Path, *, on_rejection: OnRejection = lambda rejection: None, **terms: Unpack[DemandTerms]
-    ) -> Contract:
-        """Demand a job and wait for the contract: `contract = await agent.demand(…); await contract.outcome()`.
-
-        The terms are those of `order`, `on_rejection` that of `Order.contract`. Cancelling withdraws the demand. Raises
-        `OrderExpired`, `OrderClosed` (withdrawn elsewhere) and `InsufficientTokens`.
-        """
-        order = await self.order(objective, **terms)
-        try:
-            return await order.contract(on_rejection=on_rejection)
-        except asyncio.CancelledError:
-            if self._runtime is not None:
-                await order.withdraw()
-            raise
-
-    def orders(self, *states: OrderState) -> list[Order]:
-        """The account's orders in these states, oldest first; by default the open ones, those of earlier runs included.
-
-        Withdrawn ones are listed until their deadline. Matched and expired ones are not listed.
-        """
-        return self.runtime.trader.orders(*(states or (OrderState.OPEN,)))
-
-    async def contract(self, address: str) -> Contract:
-        """The contract at `address`, of any account; `outcome` waits for its end. Raises `NotALiability`."""
-        return await self.runtime.trader.contracts.read(address)
-
-    async def finish(self, address: str, *, success: bool) -> str:
-        """End the job of the liability at `address` now; returns the recording's CID. Raises `WrongPhase`."""
-        return await self.runtime.executor.finish(address, success=success)
-
-    def publish(self, message: Demand | Offer | Result) -> str:
-        """Sign a message with the agent's account and publish it once; returns its key. It is not resent.
-
-        Raises `UnsafeValidator` for an order with a validator that was not checked on the chain before, as `demand` and
-        `offer` do.
-        """
-        if isinstance(message, Demand | Offer):
-            self.parts.chain.validators.check_known(message)
-        return self.channel.publish(self.parts.signer.sign(message))
-
-    async def add(self, path: Path) -> str:
-        """Copy a file to the agent's store, which serves it to others; returns its CID."""
-        return await asyncio.to_thread(self.parts.store.put_file, path)
-
-    async def fetch(self, cid: str) -> Path:
-        """The file with that CID, from the store or fetched from others and checked. Raises a `ContentError`."""
-        limit, timeout = self.settings.objective_expanded_limit, self.settings.fetch_timeout
-        return await self.parts.exchange.fetch(cid, size_limit=limit, timeout=timeout)
 
     async def _open(self, stack: AsyncExitStack) -> None:
         stack.callback(self._closed)

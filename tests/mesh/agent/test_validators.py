@@ -77,6 +77,6 @@ async def test_an_order_is_published_only_with_a_validator_that_was_checked(plac
     async with place.agent("robot") as robot:
         for validator in (lighthouse, contract):
             with pytest.raises(UnsafeValidator):
-                robot.publish(Offer(**terms(validator=validator), lighthouse_fee=0))
+                robot.send(Offer(**terms(validator=validator), lighthouse_fee=0))
         assert await robot.parts.chain.validators.is_safe(contract)
-        robot.publish(Offer(**terms(validator=contract), lighthouse_fee=0))
+        robot.send(Offer(**terms(validator=contract), lighthouse_fee=0))
