@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from mesh.agent import (
         Agent,
         Contract,
+        Declined,
         Job,
         JobFailed,
         LiabilityReverted,
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
         OrderState,
         Outcome,
         Phase,
+        Progress,
     )
     from mesh.chain import InsufficientTokens, NodeUnreachable, NotALiability
     from mesh.content import ContentUnavailable
@@ -56,8 +58,9 @@ if TYPE_CHECKING:
 _NAMES: Final = {
     "mesh.agent.agent": "Agent",
     "mesh.agent.contract": "Contract Outcome",
-    "mesh.agent.errors": "LiabilityReverted OrderClosed OrderExpired",
+    "mesh.agent.errors": "Declined LiabilityReverted OrderClosed OrderExpired",
     "mesh.agent.orders": "Order OrderState",
+    "mesh.agent.progress": "Progress",
     "mesh.chain": "InsufficientTokens NodeUnreachable NotALiability",
     "mesh.content": "ContentUnavailable",
     "mesh.errors": (
@@ -101,6 +104,7 @@ __all__ = [
     "ContentError",
     "ContentUnavailable",
     "Contract",
+    "Declined",
     "Demand",
     "Empty",
     "InputError",
@@ -123,6 +127,7 @@ __all__ = [
     "Outcome",
     "Phase",
     "Played",
+    "Progress",
     "Recorder",
     "RecordingAbout",
     "RemoteError",

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         EventKey,
         LiabilityTopicKey,
         ObjectiveTopicKey,
+        ProgressKey,
         RpcKey,
     )
     from schemas.cid import cid_of_digest, format_cid, parse_cid
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
         InvalidRecord,
     )
     from schemas.keys import (
+        DeclineKey,
         DemandKey,
         FeedbackKey,
         Key,
@@ -63,7 +65,7 @@ if TYPE_CHECKING:
         resolve_names,
     )
     from schemas.payloads import EMPTY, JSON, RAW, STRING, Empty, PayloadType, String, payload_type
-    from schemas.records import Liability, Record
+    from schemas.records import Liability, PlaybackPosition, Record
     from schemas.selectors import (
         cid_selector,
         device_selector,
@@ -91,13 +93,16 @@ _NAMES: Final = {
     "schemas.address": (
         "ZERO_ADDRESS address_bytes checksum_address is_ens_name keccak256 parse_address parse_address_or_name"
     ),
-    "schemas.agent_keys": "CidKey DeviceTopicKey EthEventKey EventKey LiabilityTopicKey ObjectiveTopicKey RpcKey",
+    "schemas.agent_keys": (
+        "CidKey DeviceTopicKey EthEventKey EventKey LiabilityTopicKey ObjectiveTopicKey ProgressKey RpcKey"
+    ),
     "schemas.cid": "cid_of_digest format_cid parse_cid",
     "schemas.errors": (
         "AiraError InputError InvalidAddress InvalidCid InvalidKey InvalidMessage InvalidPayload InvalidRecord"
     ),
     "schemas.keys": (
-        "DemandKey FeedbackKey Key OfferKey PendingKey PresenceKey RejectKey ResultKey WithdrawalKey parse_key"
+        "DeclineKey DemandKey FeedbackKey Key OfferKey PendingKey PresenceKey RejectKey ResultKey WithdrawalKey "
+        "parse_key"
     ),
     "schemas.message_fields": "MAX_UINT256",
     "schemas.messages": (
@@ -105,7 +110,7 @@ _NAMES: Final = {
         "resolve_names"
     ),
     "schemas.payloads": "EMPTY Empty JSON PayloadType RAW STRING String payload_type",
-    "schemas.records": "Liability Record",
+    "schemas.records": "Liability PlaybackPosition Record",
     "schemas.selectors": (
         "cid_selector device_selector event_selector lighthouse_selector market_selector objective_selector "
         "presence_selector requested_cid topic_selector"

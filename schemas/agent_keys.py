@@ -113,6 +113,14 @@ class BaseKey(Struct, frozen=True, gc=False):
                 force_setattr(self, field, canonical)
 
 
+class ProgressKey(BaseKey, frozen=True):
+    """How far the playback for `liability` is, a `PlaybackPosition`; put by the agent."""
+
+    pattern: ClassVar = "aira/agent/{agent}/liability/{liability}/progress"
+    agent: str
+    liability: str
+
+
 class EventKey(BaseKey, frozen=True):
     """What happened to `liability`: `incoming`, `ready`, `complete` or `finalized`; put by the agent."""
 
@@ -175,7 +183,10 @@ class CidKey(BaseKey, frozen=True):
     cid: str
 
 
-AgentKey: TypeAlias = EventKey | ObjectiveTopicKey | LiabilityTopicKey | DeviceTopicKey | RpcKey | EthEventKey | CidKey
+# The first that fits decides, so the key with a fixed last chunk goes before the one with any.
+AgentKey: TypeAlias = (
+    ProgressKey | EventKey | ObjectiveTopicKey | LiabilityTopicKey | DeviceTopicKey | RpcKey | EthEventKey | CidKey
+)
 
 
 class KeyParser(Generic[KeyT]):

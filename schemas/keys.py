@@ -8,9 +8,9 @@ A lighthouse is given by its ENS name in lower case, or by its address if it has
 classes accept any case). A topic is written as in ROS, `/a/b`, and becomes the chunks `a/b`. To add a family of keys,
 add its class, its pattern in `_parse`, and a selector.
 
-A market's keys name only what subscribers select by: the model of an order, the maker of what is rejected. Hashes are
-not in them. A router looks up a key that somebody subscribed to, but compares a new one with all its siblings, so the
-cost of a message would grow with the number of models.
+A market's keys name only what subscribers select by: the model of an order, the maker of what is rejected or declined.
+Hashes are not in them. A router looks up a key that somebody subscribed to, but compares a new one with all its
+siblings, so the cost of a message would grow with the number of models.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from schemas.errors import InvalidAddress, InvalidKey
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-MarketKind: TypeAlias = Literal["demand", "offer", "withdrawal", "result", "feedback", "pending", "reject"]
+MarketKind: TypeAlias = Literal["demand", "offer", "withdrawal", "result", "feedback", "pending", "reject", "decline"]
 
 
 @lru_cache(maxsize=CACHED)
@@ -110,6 +110,14 @@ class RejectKey(_Key, frozen=True):
     maker: str
 
 
+class DeclineKey(_Key, frozen=True):
+    """The agents' declines of demands that `maker` has signed."""
+
+    pattern: ClassVar = "aira/{lighthouse}/decline/{maker}"
+    lighthouse: str
+    maker: str
+
+
 class PresenceKey(_Key, frozen=True):
     """The liveliness token of `agent` in its role (`provider`, `agent`, `edge`, …); no wildcard matches `@agent`."""
 
@@ -119,7 +127,9 @@ class PresenceKey(_Key, frozen=True):
     agent: str
 
 
-MarketKey: TypeAlias = DemandKey | OfferKey | WithdrawalKey | ResultKey | FeedbackKey | PendingKey | RejectKey
+MarketKey: TypeAlias = (
+    DemandKey | OfferKey | WithdrawalKey | ResultKey | FeedbackKey | PendingKey | RejectKey | DeclineKey
+)
 Key: TypeAlias = MarketKey | AgentKey | PresenceKey
 
 

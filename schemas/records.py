@@ -18,6 +18,7 @@ from schemas.message_fields import MAX_UINT256
 MAX_RECORD_SIZE: Final = 65_536
 """The longest record, in bytes, that is decoded."""
 
+_MAX_TOTAL: Final = 2**53
 _MAX_DIGITS: Final = len(str(MAX_UINT256))
 
 if TYPE_CHECKING:
@@ -81,6 +82,18 @@ class Liability(Record, frozen=True, kw_only=True, rename="camel"):
     validator_fee: UInt256
     is_success: bool
     is_finalized: bool
+
+
+class PlaybackPosition(Record, frozen=True, kw_only=True):
+    """How far a job's playback is: `position` messages of `total` were played and handled."""
+
+    position: int
+    total: int
+
+    def __post_init__(self) -> None:
+        Record.__post_init__(self)
+        if not 0 <= self.position <= self.total < _MAX_TOTAL:
+            raise InvalidRecord("PlaybackPosition", f"position: expected one from 0 to the total, below {_MAX_TOTAL}")
 
 
 @lru_cache(maxsize=128)

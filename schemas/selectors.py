@@ -30,6 +30,7 @@ _SUBJECTS: Final[Mapping[str, Callable[[str], str] | None]] = MappingProxyType(
         "feedback": None,
         "pending": None,
         "reject": address_chunk,
+        "decline": address_chunk,
     }
 )
 """The check of the chunk behind each kind of message; None where there is no such chunk."""
@@ -38,7 +39,8 @@ _SUBJECTS: Final[Mapping[str, Callable[[str], str] | None]] = MappingProxyType(
 def market_selector(lighthouse: str, kind: MarketKind, subject: str = "*") -> str:
     """All messages of a kind on a lighthouse, or those of one subject.
 
-    The subject is the model of a demand or offer, or the maker (an address) of what is rejected. Other kinds have none.
+    The subject is the model of a demand or offer, or the maker (an address) of what is rejected or
+    declined. Other kinds have none.
     """
     if kind not in _SUBJECTS:
         raise InvalidKey(kind, f"it is not one of the kinds {', '.join(_SUBJECTS)}")
@@ -67,9 +69,9 @@ def presence_selector(lighthouse: str, role: str = "*", agent: str = "*") -> str
     return f"aira/{lighthouse_chunk(lighthouse)}/@agent/{_any_or(name_chunk, role)}/{_any_or(address_chunk, agent)}"
 
 
-def event_selector(agent: str = "*") -> str:
-    """All events of all liabilities of an agent, or of all agents."""
-    return f"aira/agent/{_any_or(address_chunk, agent)}/liability/*/*"
+def event_selector(agent: str = "*", liability: str = "*") -> str:
+    """The events of an agent's liability and the progress of its playback; by default of all agents and liabilities."""
+    return f"aira/agent/{_any_or(address_chunk, agent)}/liability/{_any_or(address_chunk, liability)}/*"
 
 
 def objective_selector(agent: str, liability: str) -> str:

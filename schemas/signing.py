@@ -1,4 +1,4 @@
-"""Signatures of messages and of rejections: ECDSA on secp256k1 over the hash as a personal message of Ethereum.
+"""Signatures of messages, rejections and declines: ECDSA on secp256k1 over the hash as a personal message of Ethereum.
 
 `verify` checks every received message once, where it enters the process. It costs one public-key recovery and little
 else; addresses and CIDs, which repeat between messages, are cached.
@@ -9,9 +9,10 @@ travel under two texts.
 
 from __future__ import annotations
 
+import re
 import threading
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, Self, TypeAlias, TypeVar
 
 from coincurve import PrivateKey
 from coincurve._libsecp256k1 import ffi, lib  # type: ignore[import-not-found]
@@ -20,8 +21,8 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from schemas.address import ZERO_ADDRESS, checksum_address, keccak256
-from schemas.errors import InputError, InvalidMessage
-from schemas.message_fields import SIGNATURE_SIZE
+from schemas.errors import InputError, InvalidMessage, InvalidRecord
+from schemas.message_fields import SIGNATURE_SIZE, hex_digits
 from schemas.messages import Demand, Offer, OrderFeedback, SignedMessage, TransactionFeedback
 from schemas.records import Record
 from schemas.wire import decode, message_hash
@@ -39,8 +40,10 @@ _V_OFFSET: Final = 27
 _RECOVERY_IDS: Final = {27: 0, 28: 1}
 _CONTEXT: Final = GLOBAL_CONTEXT.ctx
 _CACHED: Final = 8192
-_REJECTION_DOMAIN: Final = b"aira rejection\0"
-"""The prefix of what a rejection's signature covers; no message of the market begins like this."""
+LONGEST_DETAIL: Final = 500
+"""Characters of a decline's detail."""
+_WORD: Final = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
+_LONGEST_WORD: Final = 64
 
 
 class Verified(Struct, Generic[_M_co], frozen=True, gc=False):
@@ -174,36 +177,79 @@ def verify_recovered(message: _M, digest: bytes, key: bytes) -> Verified[_M]:
     return Verified(message, digest, signer)
 
 
-class Rejection(Record, frozen=True, kw_only=True):
-    """A provider's statement that it can't use an order or a result; put on `aira/{lighthouse}/reject/{maker}`.
+class _Statement(Record, frozen=True, kw_only=True):
+    """What an account states about an order. Anybody may put one: check `is_signed`, and who its author is."""
 
-    `order` is the message's hash (64 hexadecimal digits), `reason` a word for programs (a rejection by the order book,
-    or the name of the contracts' error), `detail` is for people, `provider` the EIP-55 address of the provider, and
-    `signature` (130 hexadecimal digits) its signature. Anybody may put one: trust it only if it `is_signed` by a
-    provider of the lighthouse.
-    """
+    domain: ClassVar[bytes]
+    """The prefix of what the signature covers; no message of the market begins like this."""
+    author: ClassVar[str]
+    """The field with the author's EIP-55 address."""
 
     order: str
-    reason: str
+    """The order's hash: 64 hexadecimal digits."""
     detail: str
-    provider: str
+    """For people."""
     signature: str = ""
+    """130 hexadecimal digits."""
 
     def signed_by(self, signer: Signer) -> Self:
-        """The same with the signature of `signer`, whose address must be `provider`."""
+        """The same with the signature of `signer`, whose address must be the author's."""
         return replace(self, signature=signer.sign_hash(self._hash()).hex())
 
     @property
     def is_signed(self) -> bool:
-        """Whether the signature is the provider's."""
+        """Whether the signature is the author's."""
         try:
-            return recover(self._hash(), self.signature) == self.provider
+            return bool(recover(self._hash(), self.signature) == getattr(self, self.author))
         except InvalidMessage:
             return False
 
     def _hash(self) -> bytes:
         """The hash of the JSON without the signature, whose encoding is canonical."""
-        return keccak256(_REJECTION_DOMAIN + replace(self, signature="").encode())
+        return keccak256(self.domain + replace(self, signature="").encode())
+
+
+class Rejection(_Statement, frozen=True, kw_only=True):
+    """A provider's statement that it can't use an order or a result; put on `aira/{lighthouse}/reject/{maker}`.
+
+    `reason` is a word for programs (a rejection by the order book, or the name of the contracts' error), `provider` the
+    EIP-55 address of the provider. Trust it only if it `is_signed` by a provider of the lighthouse.
+    """
+
+    domain: ClassVar = b"aira rejection\0"
+    author: ClassVar = "provider"
+
+    reason: str
+    provider: str
+
+
+class Decline(_Statement, frozen=True, kw_only=True):
+    """An agent's statement that it does not work for a demand; put on `aira/{lighthouse}/decline/{maker}`.
+
+    `code` is a word for programs: `unknown-topic`, `unfit-message`, or another reason why the objective does not fit;
+    `objective-unavailable`, `busy`, or a word of the agent's own, as `too-cheap`. `detail` has at most `LONGEST_DETAIL`
+    characters; `agent` is the EIP-55 address of the agent. Trust it only if it `is_signed` by an agent that is present.
+    """
+
+    domain: ClassVar = b"aira decline\0"
+    author: ClassVar = "agent"
+
+    code: str
+    agent: str
+
+    def __post_init__(self) -> None:
+        Record.__post_init__(self)
+        if hex_digits(self.order, 32) != self.order:
+            raise InvalidRecord("Decline", "order: expected 64 hexadecimal digits")
+        if not is_word(self.code):
+            raise InvalidRecord("Decline", f"code: expected words of letters and digits, at most {_LONGEST_WORD}")
+        if len(self.detail) > LONGEST_DETAIL:
+            raise InvalidRecord("Decline", f"detail: expected at most {LONGEST_DETAIL} characters")
+
+
+def is_word(text: str) -> bool:
+    """Whether a text is a word for programs: lower-case letters, digits and single hyphens, 64 characters at most."""
+    return len(text) <= _LONGEST_WORD and _WORD.fullmatch(text) is not None
 
 
 def _check_sender(message: SignedMessage, signer: str) -> None:

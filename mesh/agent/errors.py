@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from mesh.errors import AiraError
+from mesh.errors import AiraError, InputError
+from schemas.signing import LONGEST_DETAIL, is_word
 
 
 class OrderClosed(AiraError, code="order-closed"):
@@ -17,6 +18,21 @@ class OrderClosed(AiraError, code="order-closed"):
         self.order = order
         self.state = state
         self.liability = liability
+
+
+class Declined(AiraError, code="declined"):
+    """Raise it in a demand's handler: the agent does not work for this demand, and its maker gets a `Decline`.
+
+    `reason` is a word for programs (`too-cheap`: lower-case letters, digits, hyphens), `detail` a line for people, cut
+    after `LONGEST_DETAIL` characters. Raises `InputError` for another word.
+    """
+
+    def __init__(self, reason: str, detail: str = "") -> None:
+        if not is_word(reason):
+            raise InputError(f"{reason!r} is no word for programs", hint="use lower-case letters, digits and hyphens")
+        super().__init__(f"declined ({reason}): {detail}" if detail else f"declined ({reason})")
+        self.reason = reason
+        self.detail = detail[:LONGEST_DETAIL]
 
 
 class OrderExpired(AiraError, code="order-expired"):
@@ -54,4 +70,4 @@ class ServiceClosed(AiraError, code="service-closed"):
         self.service = service
 
 
-__all__ = ["LiabilityReverted", "OrderClosed", "OrderExpired", "ServiceClosed"]
+__all__ = ["Declined", "LiabilityReverted", "OrderClosed", "OrderExpired", "ServiceClosed"]

@@ -102,6 +102,7 @@ ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
             _OWN_SPACE,
             *_READ_MARKET,
             _orders("offer", "withdrawal", "result"),
+            _grant("put", "aira/{market}/decline/*"),
             _presence("agent"),
             _READ_CONTENT,
         ),

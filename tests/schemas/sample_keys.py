@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from schemas import (
     CidKey,
+    DeclineKey,
     DemandKey,
     DeviceTopicKey,
     EthEventKey,
@@ -15,6 +16,7 @@ from schemas import (
     OfferKey,
     PendingKey,
     PresenceKey,
+    ProgressKey,
     RejectKey,
     ResultKey,
     RpcKey,
@@ -34,7 +36,9 @@ KEYS: list[tuple[Key, str]] = [
     (FeedbackKey(NAME), f"aira/{NAME}/feedback"),
     (PendingKey(NAME), f"aira/{NAME}/pending"),
     (RejectKey(NAME, SENDER), f"aira/{NAME}/reject/{A}"),
+    (DeclineKey(NAME, SENDER), f"aira/{NAME}/decline/{A}"),
     (PresenceKey(NAME, "provider", SENDER), f"aira/{NAME}/@agent/provider/{A}"),
+    (ProgressKey(SENDER, LIGHTHOUSE), f"aira/agent/{A}/liability/{L}/progress"),
     (EventKey(SENDER, LIGHTHOUSE, "ready"), f"aira/agent/{A}/liability/{L}/ready"),
     (ObjectiveTopicKey(SENDER, LIGHTHOUSE, "/a/b"), f"aira/agent/{A}/liability/{L}/objective/a/b"),
     (LiabilityTopicKey(SENDER, LIGHTHOUSE, "/blink"), f"aira/agent/{A}/liability/{L}/topic/blink"),

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas import MAX_UINT256, ZERO_ADDRESS, InvalidRecord, Liability, Record
+from schemas import MAX_UINT256, ZERO_ADDRESS, InvalidRecord, Liability, PlaybackPosition, Record
 from schemas.message_requests import SignDemand
 from schemas.rpc import (
     SERVICES,
@@ -224,3 +224,15 @@ def test_records_are_frozen() -> None:
     with pytest.raises(AttributeError):
         LIABILITY.cost = 1  # type: ignore[misc]
     assert msgspec.structs.replace(LIABILITY, cost=1).cost == 1
+
+
+@pytest.mark.parametrize(("position", "total"), [(0, 0), (0, 3), (3, 3)])
+def test_a_position_is_read_as_written(position: int, total: int) -> None:
+    playback = PlaybackPosition(position=position, total=total)
+    assert PlaybackPosition.decode(playback.encode()) == playback
+
+
+@pytest.mark.parametrize(("position", "total"), [(-1, 3), (4, 3), (0, 2**53), (0, -1)])
+def test_a_position_lies_within_its_total(position: int, total: int) -> None:
+    with pytest.raises(InvalidRecord):
+        PlaybackPosition.decode(json.dumps({"position": position, "total": total}).encode())

@@ -10,8 +10,13 @@ import pytest
 import zenoh
 
 from schemas import (
+    DeviceTopicKey,
+    EventKey,
     InvalidKey,
     Key,
+    LiabilityTopicKey,
+    ObjectiveTopicKey,
+    ProgressKey,
     device_selector,
     event_selector,
     lighthouse_selector,
@@ -29,6 +34,7 @@ from tests.schemas.samples import LIGHTHOUSE_NAME as NAME
 def test_market_selectors() -> None:
     assert market_selector(NAME, "demand") == f"aira/{NAME}/demand/*"
     assert market_selector(NAME.upper(), "offer", MODEL) == f"aira/{NAME}/offer/{MODEL}"
+    assert market_selector(NAME, "decline", SENDER) == f"aira/{NAME}/decline/{A}"
     assert market_selector(NAME, "reject") == f"aira/{NAME}/reject/*"
     assert market_selector(NAME, "reject", SENDER) == f"aira/{NAME}/reject/{A}"
     one_key: tuple[Any, ...] = ("result", "withdrawal", "feedback", "pending")
@@ -43,7 +49,7 @@ def test_withdrawals_of_one_order_are_asked_for_by_its_hash() -> None:
             withdrawal_selector(NAME, text)
 
 
-@pytest.mark.parametrize(("key", "text"), KEYS[:7], ids=lambda value: value if isinstance(value, str) else "")
+@pytest.mark.parametrize(("key", "text"), KEYS[:8], ids=lambda value: value if isinstance(value, str) else "")
 def test_market_selector_finds_its_kind(key: Key, text: str) -> None:
     kind: Any = text.split("/")[2]
     found = zenoh.KeyExpr(market_selector(NAME, kind))
@@ -54,21 +60,22 @@ def test_market_selector_finds_its_kind(key: Key, text: str) -> None:
 
 
 def test_selectors_of_an_agent_find_their_keys() -> None:
-    for selector, index in (
-        (event_selector(SENDER), 8),
-        (objective_selector(SENDER, LIGHTHOUSE), 9),
-        (topic_selector(SENDER, LIGHTHOUSE), 10),
-        (topic_selector(SENDER, topic="/blink"), 10),
-        (event_selector(), 8),
-        (device_selector(SENDER), 11),
-        (device_selector(SENDER, "tty-0"), 11),
+    for selector, kinds in (
+        (event_selector(SENDER), (EventKey, ProgressKey)),
+        (event_selector(SENDER, LIGHTHOUSE), (EventKey, ProgressKey)),
+        (objective_selector(SENDER, LIGHTHOUSE), (ObjectiveTopicKey,)),
+        (topic_selector(SENDER, LIGHTHOUSE), (LiabilityTopicKey,)),
+        (topic_selector(SENDER, topic="/blink"), (LiabilityTopicKey,)),
+        (event_selector(), (EventKey, ProgressKey)),
+        (device_selector(SENDER), (DeviceTopicKey,)),
+        (device_selector(SENDER, "tty-0"), (DeviceTopicKey,)),
     ):
-        found = [zenoh.KeyExpr(selector).intersects(zenoh.KeyExpr(text)) for _, text in KEYS]
-        assert found == [position == index for position in range(len(KEYS))]
+        for key, text in KEYS:
+            assert zenoh.KeyExpr(selector).intersects(zenoh.KeyExpr(text)) == isinstance(key, kinds)
 
 
 def test_presence_is_found_by_its_own_selector_only() -> None:
-    presence = zenoh.KeyExpr(KEYS[7][1])
+    presence = zenoh.KeyExpr(KEYS[8][1])
     assert zenoh.KeyExpr(presence_selector(NAME)).includes(presence)
     assert zenoh.KeyExpr(presence_selector(NAME, "provider")).includes(presence)
     assert not zenoh.KeyExpr(presence_selector(NAME, "agent")).intersects(presence)

@@ -18,6 +18,7 @@ from schemas import (
     Demand,
     InputError,
     InvalidMessage,
+    InvalidRecord,
     Offer,
     Result,
     SignedMessage,
@@ -30,7 +31,7 @@ from schemas import (
     verify_message,
 )
 from schemas.address import address_bytes
-from schemas.signing import Rejection, recover_keys, signed_digest, signer_of
+from schemas.signing import Decline, Rejection, recover_keys, signed_digest, signer_of
 from tests.schemas.samples import (
     DEMAND,
     DEMAND_5,
@@ -249,3 +250,46 @@ def test_a_rejection_signed_by_another_account_is_not_signed() -> None:
     rejection = Rejection(order=NONCE, reason="full", detail="", provider=SENDER)
     assert not rejection.is_signed
     assert not rejection.signed_by(Signer(b"\x07" * 32)).is_signed
+
+
+DECLINE = {"order": NONCE, "code": "too-cheap", "detail": "costs at least 5 XRT"}
+
+
+def test_a_signed_decline_is_signed_and_read_as_written() -> None:
+    signer = Signer(b"\x07" * 32)
+    decline = Decline(**DECLINE, agent=signer.address)
+    assert not decline.is_signed
+    read = Decline.decode(decline.signed_by(signer).encode())
+    assert read.is_signed
+    assert replace(read, signature="") == decline
+    assert not decline.signed_by(Signer(b"\x08" * 32)).is_signed
+
+
+@pytest.mark.parametrize(
+    ("field", "text"), [("order", "ab" * 32), ("code", "busy"), ("detail", ""), ("agent", SENDER), ("signature", "ab")]
+)
+def test_a_changed_decline_is_not_signed(field: str, text: str) -> None:
+    signer = Signer(b"\x07" * 32)
+    decline = Decline(**DECLINE, agent=signer.address).signed_by(signer)
+    assert not replace(decline, **{field: text}).is_signed
+
+
+def test_a_signature_of_a_rejection_is_none_of_a_decline() -> None:
+    signer = Signer(b"\x07" * 32)
+    rejection = Rejection(order=NONCE, reason="busy", detail="", provider=signer.address).signed_by(signer)
+    assert not Decline(
+        order=NONCE, code="busy", detail="", agent=signer.address, signature=rejection.signature
+    ).is_signed
+
+
+@pytest.mark.parametrize(
+    ("field", "text"),
+    [("order", "12"), ("order", NONCE.upper()), ("code", ""), ("code", "Too cheap"), ("code", "a" * 65), 
+     ("code", "a\n"), ("code", "a--b"), ("detail", "a" * 501)],
+)  # fmt: skip
+def test_a_decline_has_bounded_words(field: str, text: str) -> None:
+    fields = DECLINE | {"agent": SENDER, field: text}
+    with pytest.raises(InvalidRecord):
+        Decline(**fields)
+    with pytest.raises(InvalidRecord):
+        Decline.decode(json.dumps(fields).encode())

@@ -10,6 +10,7 @@ from typing import Any
 from mesh.identity import Member
 from schemas import (
     CidKey,
+    DeclineKey,
     DemandKey,
     DeviceTopicKey,
     EthEventKey,
@@ -77,6 +78,8 @@ def keys_of(who: str) -> dict[str, str]:
         "pending": PendingKey(MARKET),
         "reject": RejectKey(MARKET, own),
         "other reject": RejectKey(MARKET, other),
+        "decline": DeclineKey(MARKET, own),
+        "other decline": DeclineKey(MARKET, other),
         "other market": DemandKey("elsewhere.lighthouse.3.robonomics.eth", MODEL),
         "other presence": PresenceKey(MARKET, "agent", other),
         "nowhere": "aira/nowhere",
@@ -93,12 +96,15 @@ def keys_of(who: str) -> dict[str, str]:
 KEYS = {who: keys_of(who) for who in WHO}
 OWN = {"own event", "own objective", "own topic", "own device", "own rpc", "own eth", "own cid"}
 OTHER = {"other event", "other objective", "other topic", "other device", "other rpc", "other eth", "other cid"}
-MARKETS = {"demand", "offer", "withdrawal", "result", "feedback", "pending", "reject", "other reject"}
+MARKETS = {"demand", "offer", "withdrawal", "result", "feedback", "pending", "reject", "other reject"} | {
+    "decline",
+    "other decline",
+}
 PRESENCES = {name for name in KEYS["arm"] if name.startswith("as ")} | {"other presence"}
 NOBODY: dict[str, set[str]] = {who: set() for who in WHO}
 
 PUT = NOBODY | {
-    "arm": OWN | {"offer", "withdrawal", "result"},
+    "arm": OWN | {"offer", "withdrawal", "result", "decline", "other decline"},
     "ann": OWN | {"demand", "withdrawal"},
     "miner": OWN | {"feedback", "pending", "reject", "other reject"},
     "boss": OWN,
