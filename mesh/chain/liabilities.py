@@ -93,6 +93,12 @@ class Liabilities:
         """Whether a generation-3 order of `signer` (address) was used or withdrawn; generation 5 uses nonces."""
         return await self._contracts.version.is_order_used(order_hash, signer)
 
+    async def is_used(self, order: Order, *, order_hash: bytes, signer: str) -> bool:
+        """Whether an order has become a liability, or was withdrawn on the chain."""
+        if order.generation == 3:
+            return await self.is_order_used(order_hash, signer)
+        return await self.next_nonce(signer) > int(order.nonce)
+
     async def get_with_orders(self, address: str) -> tuple[Liability, tuple[bytes, bytes]]:
         """The same as `get` and `order_hashes`, in one call."""
         return await _read(self._contracts.node, await self._recognised(address))

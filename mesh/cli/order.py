@@ -88,11 +88,7 @@ async def _stored_orders(settings: Settings, chain: Chain, address: str) -> Sequ
 async def _state(chain: Chain, stored: StoredOrder, message: Demand | Offer, address: str) -> str:
     if stored.is_withdrawn:
         return "withdrawn"
-    liabilities = chain.liabilities
-    if message.generation == 3:
-        is_used = await liabilities.is_order_used(bytes.fromhex(stored.identity), address)
-    else:
-        is_used = await liabilities.next_nonce(address) > int(message.nonce)
+    is_used = await chain.liabilities.is_used(message, order_hash=bytes.fromhex(stored.identity), signer=address)
     return "matched" if is_used else "open"
 
 

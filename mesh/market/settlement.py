@@ -17,12 +17,10 @@ from mesh.chain import NodeUnreachable, RequestRefused, Reverted, TransactionTim
 from mesh.errors import AiraError, ChainError, InputError
 from mesh.flood import UNFUNDED_POLLS
 from mesh.log_context import liability_context, log_event
-from mesh.market.arrivals import UnfundedOrders
 from mesh.market.book import Added, Match, Refusal, order_id
-from mesh.market.commitments import Commitments, creation_stakes
-from mesh.market.liability_events import OPEN_LIABILITIES, LiabilityEvents
+from mesh.market.funding import Commitments, UnfundedOrders, creation_stakes
+from mesh.market.liability_events import OPEN_LIABILITIES, LiabilityEvents, Unconfirmed
 from mesh.market.rejections import ORDER_USED, RejectionPublisher, at_fault, reason_of
-from mesh.market.unconfirmed import Unconfirmed
 from mesh.market.withdrawals import withdrawn_id
 from schemas import ZERO_ADDRESS, Result
 

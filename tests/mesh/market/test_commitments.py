@@ -7,7 +7,7 @@ from contextlib import AsyncExitStack
 from typing import TYPE_CHECKING
 
 from mesh.chain import Funding, Holding
-from mesh.market.commitments import Commitments
+from mesh.market.funding import Commitments
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from mesh.background import Background
 from mesh.market import Match, OrderBook, Refusal, order_id
-from mesh.market.arrivals import CHECKS, UnfundedOrders
+from mesh.market.funding import CHECKS, UnfundedOrders
 from mesh.retry import RetryPolicy
 from schemas import verify_message
 from tests.mesh.market.observation import until_read

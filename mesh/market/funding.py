@@ -1,91 +1,42 @@
-"""Orders on their way into a provider's book: signers in turn, and none whose maker can't pay.
+"""Whether the makers of orders can pay: before their orders are matched, and while transactions are under way.
 
 An order that can't be paid for must not be matched: its match would take an honest order out of the book, and a turn of
 the lighthouse, to learn that from the contracts. It stays in the book, unmatched, and is tried again.
+
+Each transaction is simulated before it is sent, but the simulation may not know of those that were sent just before,
+and a transaction that fails when it is mined costs gas. So what two transactions compete for is taken here first.
 """
 
 from __future__ import annotations
 
 import asyncio
 import heapq
+from collections import Counter
+from contextlib import asynccontextmanager, nullcontext
 from itertools import count
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Final, TypeAlias
 
-from mesh.flood import FairQueue
+from mesh.chain import Holding
 from mesh.market.book import order_id
 from mesh.retry import Backoff, RetryPolicy
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Sequence
+    from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+    from contextlib import AbstractContextManager
 
-    from mesh.flood import Drops, KnownSenders
-    from mesh.market.book import Order, OrderBook
-    from mesh.network import Subscription
+    from mesh.chain import Funding, OrderCosts
+    from mesh.market.book import Match, Order, OrderBook
     from schemas import Verified
 
-CHECKED: Final = 512
-"""Orders whose makers' funds are asked for at once."""
-WAITING: Final = 32_768
-"""Orders that wait for that."""
+    Stakes: TypeAlias = Mapping["Holding | str", int]
+    """What a transaction takes: amounts of holdings, and by name what only one transaction may take at a time."""
+
 RETRY: Final = RetryPolicy(initial=2.0, ceiling=60.0)
 """When an order's maker is asked after again."""
 LIMIT: Final = 4096
 """Orders that may wait for their makers' funds at the same time."""
 CHECKS: Final = 256
 """Orders that are looked at in one round, at most."""
-
-
-class TakesOrders(Protocol):
-    """What orders are passed to: the settlement."""
-
-    async def shortages(self, orders: Sequence[Verified[Order]]) -> Sequence[str]:
-        """What the maker of each lacks; empty for one who can pay."""
-        ...
-
-    def set_aside(self, order: Verified[Order], reason: str) -> object:
-        """Keep an order whose maker can't pay."""
-        ...
-
-    def add(self, order: Verified[Order]) -> object:
-        """Take an order whose maker can pay."""
-        ...
-
-
-class Arrivals:
-    """Takes orders from subscriptions (`take`), and passes them to `settlement` (`run`).
-
-    Those of known signers go first. What an order says that it pays counts only when its maker can pay it.
-    """
-
-    def __init__(
-        self, settlement: TakesOrders, *, known: KnownSenders, has_room: Callable[[], Awaitable[None]], drops: Drops
-    ) -> None:
-        self._settlement = settlement
-        self._known = known
-        self._has_room = has_room
-        self._drops = drops
-        self._queue: FairQueue[tuple[Verified[Order], Subscription[Any]]] = FairQueue(per_sender=WAITING, total=WAITING)
-
-    async def take(self, orders: Subscription[Any]) -> None:
-        """Take the open orders of other providers, then those that are published, until cancelled."""
-        await orders.recall()
-        async for order in orders:
-            is_known = order.signer in self._known
-            for dropped, subscription in self._queue.put(order.signer, (order, orders), priority=int(is_known)):
-                self._drops.count("queue-full", dropped.signer)
-                subscription.forget(dropped)
-
-    async def run(self) -> None:
-        """Pass on what was taken, until cancelled."""
-        while True:
-            batch = [order for order, _ in await self._queue.get_batch(CHECKED)]
-            await self._has_room()
-            for order, shortage in zip(batch, await self._settlement.shortages(batch), strict=True):
-                if shortage:
-                    self._drops.count("unfunded", order.signer)
-                    self._settlement.set_aside(order, shortage)
-                else:
-                    self._settlement.add(order)
 
 
 class UnfundedOrders:
@@ -165,3 +116,77 @@ class UnfundedOrders:
     def _enter(self, order: Verified[Order], at: float, backoff: Backoff) -> None:
         self._waiting[order_id(order)] = at, backoff
         heapq.heappush(self._queue, (at, next(self._numbers), order))
+
+
+class Commitments:
+    """What the transactions under way take.
+
+    `funding` asks the chain for what is there of holdings. What waits does so within `waiting()`.
+    """
+
+    def __init__(
+        self,
+        funding: Callable[[Sequence[Holding]], Awaitable[Mapping[Holding, Funding | None]]],
+        *,
+        waiting: Callable[[], AbstractContextManager[object]] = nullcontext,
+    ) -> None:
+        self._funding = funding
+        self._waiting = waiting
+        self._taken: Counter[Holding | str] = Counter()
+        self._there: dict[Holding, Funding | None] = {}
+        """Of holdings of which something is taken: what there was after anything was given back the last time."""
+        self._wanted: set[Holding] = set()
+        self._asking = asyncio.Lock()
+        self._released = asyncio.Event()
+
+    @asynccontextmanager
+    async def take(self, stakes: Stakes) -> AsyncIterator[None]:
+        """Meanwhile take something, as soon as those before leave enough of it, or take nothing of the kind."""
+        with self._waiting():
+            while not await self._is_left(stakes):
+                await self._released.wait()
+        self._taken.update(stakes)
+        try:
+            yield
+        finally:
+            self._give_back(stakes)
+
+    def _give_back(self, stakes: Stakes) -> None:
+        for what, amount in stakes.items():
+            self._taken[what] -= amount
+            if not self._taken[what]:
+                del self._taken[what]
+            if isinstance(what, Holding):  # it may have been spent
+                self._there.pop(what, None)
+                self._wanted.discard(what)
+        self._released.set()
+        self._released = asyncio.Event()
+
+    async def _is_left(self, stakes: Stakes) -> bool:
+        """Whether it can be taken, as of the moment in which this returns."""
+        while True:
+            shared = [what for what in stakes if self._taken[what]]
+            holdings = [what for what in shared if isinstance(what, Holding)]
+            if len(holdings) < len(shared):
+                return False
+            if all(holding in self._there for holding in holdings):
+                return all(self._left(holding) >= stakes[holding] for holding in holdings)
+            async with self._asking:
+                self._wanted = {holding for holding in holdings if holding not in self._there}
+                if self._wanted:
+                    found = await self._funding(list(self._wanted))
+                    self._there |= {holding: found[holding] for holding in self._wanted}
+
+    def _left(self, holding: Holding) -> int:
+        there = self._there[holding]
+        return -1 if there is None else min(there) - self._taken[holding]
+
+
+def creation_stakes(match: Match, costs: OrderCosts) -> Stakes:
+    """What creating the liability of a match takes: what its orders cost, and the nonces of generation 5 in turn."""
+    stakes: Counter[Holding | str] = Counter()
+    for order in match:
+        stakes.update({Holding(token, order.signer): amount for token, amount in costs.of(order.message).items()})
+        if order.message.generation == 5:
+            stakes[f"nonce of {order.signer}"] = 1
+    return +stakes
