@@ -170,9 +170,9 @@ async def test_a_transaction_waits_for_cheaper_gas_and_logs_it_once(
         await base_fee(local, 900 * GWEI)
         demand = local.demand()
         local.publish(demand, local.offer())
-        await until(lambda: outages(caplog, "transactions"))
+        await until(lambda: "fee-too-high" in outages(caplog, "transactions"))
         await asyncio.sleep(0.5)  # for some more attempts
-        assert outages(caplog, "transactions") == ["fee-too-high"]
+        assert outages(caplog, "transactions").count("fee-too-high") == 1
 
         await base_fee(local, GWEI)
 
