@@ -57,7 +57,7 @@ class PinChange:
 def simulator(header: Path = HEADER) -> Path:
     """The simulator's program, compiled if necessary. Raises `ConfigurationError` where libsimavr or gcc is missing."""
     source = SOURCE.read_bytes()
-    program = _cache() / f"board-{hashlib.sha256(source).hexdigest()[:12]}"
+    program = cache_folder() / f"board-{hashlib.sha256(source).hexdigest()[:12]}"
     if program.exists():
         return program
     hint = "on Debian: apt-get install libsimavr-dev gcc; `make peers` does it"
@@ -219,6 +219,6 @@ class SimulatedBoard:
         return self._process
 
 
-def _cache() -> Path:
+def cache_folder() -> Path:
     """The folder that `make peers` also uses; it may be deleted at any time."""
     return Path(os.environ.get("AIRA_PEERS_CACHE") or "~/.cache/aira-mesh").expanduser()

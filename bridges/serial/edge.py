@@ -174,7 +174,9 @@ class Edge:
             self._token = self._session.liveliness().declare_token(self._key(PRESENT))
         topics = ", ".join(self._name_of.values()) or "no topics"
         ready = log_event("board-ready", name=info.name, version=info.version, topics=topics)
-        log.info("the board %s %s is present: %s", info.name, info.version, topics, extra=ready)
+        log.info(
+            "%s is present: %s", " ".join(filter(None, ("the board", info.name, info.version))), topics, extra=ready
+        )
 
     def _valid_names(self, info: DeviceInfo) -> Iterator[tuple[BoardTopic, str]]:
         """The board's topics with their names in the mesh; those without a valid one are left out."""

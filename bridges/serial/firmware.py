@@ -1,12 +1,14 @@
 """Arduino sketches compiled for an Uno: `python -m bridges.serial.firmware SKETCH… -o FOLDER -L LIBRARIES`.
 
-A sketch is a folder with a `.ino` file of its name. `LIBRARIES` is a folder of Arduino libraries, each with its `src`;
-those of this project are in examples/firmware.
+A sketch is a folder with a `.ino` file of its name; other sources in the folder, and in its `src`, belong to it.
+`LIBRARIES` is a folder of Arduino libraries, as the Arduino IDE has, or a library; those that the sketch includes are
+compiled. The libraries of this project are in examples/firmware; those of the Arduino core are always found.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import re
 import subprocess
 import tempfile
@@ -14,6 +16,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from bridges.serial.boards import cache_folder
+from bridges.serial.libraries import libraries_in, source_files, used_libraries, without_comments
 from mesh.errors import AiraError, ConfigurationError, InputError
 from mesh.running import fail
 
@@ -21,6 +25,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 CORE: Final = Path("/usr/share/arduino/hardware/arduino/avr")
+CORE_INCLUDES: Final = (CORE / "cores/arduino", CORE / "variants/standard")
+AVR_HEADERS: Final = Path("/usr/lib/avr/include")
+SKETCHES: Final = (".ino", ".pde")
+"""How the files of a sketch end; the second one is that of the IDE before 1.0."""
 FLAGS: Final = (
     "-mmcu=atmega328p",
     "-DF_CPU=16000000L",
@@ -35,8 +43,12 @@ FLAGS: Final = (
     "-fdata-sections",
 )
 CXX_FLAGS: Final = ("-std=gnu++11", "-fno-exceptions", "-fno-threadsafe-statics", "-fpermissive")
-FUNCTION: Final = re.compile(r"^(?!static|inline)([A-Za-z_][\w:<>*& ]*\s[*&]?\w+\([^;{}()]*\))\s*\{", re.MULTILINE)
-"""The head of a function at the beginning of a line; the Arduino IDE generates a prototype for it."""
+FUNCTION: Final = re.compile(
+    r"^(?!(?:static|inline|else|return|template|typedef)\b)"
+    r"([A-Za-z_][\w:<>*& ]*[\s*&]\s*(?!(?:if|while|for|switch)\b)\w+\s*\([^;{}()=]*\))\s*\{",
+    re.MULTILINE,
+)
+"""The head of a function at the beginning of a line, without default arguments; the IDE makes a prototype of it."""
 
 
 class CompilationFailed(InputError, code="compilation-failed"):
@@ -45,40 +57,67 @@ class CompilationFailed(InputError, code="compilation-failed"):
 
 def compile_sketch(sketch: Path, elf: Path, *, libraries: Sequence[Path] = (), defines: Sequence[str] = ()) -> Path:
     """Compile the sketch in the folder `sketch` into `elf`, for an Uno. `defines` are as for the compiler's `-D`,
-    `libraries` are folders of Arduino libraries.
+    `libraries` are Arduino libraries and folders of them.
 
-    Raises `CompilationFailed`, and `ConfigurationError` if the tools are not installed.
+    Raises `CompilationFailed`, `InputError` for a folder that is missing or no sketch, and `ConfigurationError` if the
+    tools are not installed.
     """
-    source = sketch / f"{sketch.name}.ino"
-    if not source.is_file():
-        raise InputError(f"{sketch} is not a sketch: {source.name} is missing")
+    written = sketch_files(sketch)
     if not CORE.is_dir():
         raise ConfigurationError("the Arduino core is not installed", hint="install gcc-avr avr-libc arduino-core-avr")
-    includes = [CORE / "cores/arduino", CORE / "variants/standard", sketch]
-    includes += [source for folder in libraries for source in sorted(folder.glob("*/src"))]
-    flags = [*FLAGS, *(f"-D{define}" for define in defines), *(f"-I{path}" for path in includes)]
+    includes = [*CORE_INCLUDES, sketch]
+    own = source_files([*sketch.iterdir(), *(sketch / "src").rglob("*")])
+    available = libraries_in([*libraries, CORE / "libraries"])
+    used = used_libraries([*written, *own], available, folders=[*includes, AVR_HEADERS])
+    includes += [folder for library in used for folder in library.includes]
+    macros = [f"-D{define}" for define in defines]
+    core = compiled_core(macros)
     elf.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="aira-firmware-") as folder:
         generated = Path(folder) / "sketch.cpp"
-        generated.write_text(as_cpp(source.read_text(encoding="utf-8"), source))
-        core = CORE / "cores/arduino"
-        sources = [generated, *sorted(core.glob("*.c")), *sorted(core.glob("*.cpp")), *sorted(core.glob("*.S"))]
-        with ThreadPoolExecutor(2) as workers:
-            main, *rest = workers.map(lambda source: _object(source, Path(folder), flags), sources)
-        # An archive, as the Arduino IDE makes it, leaves out the parts of the core that the sketch does not use.
-        archive = Path(folder) / "core.a"
-        _run("avr-gcc-ar", "rcs", archive, *rest)
-        _run("avr-gcc", *FLAGS, "-Wl,--gc-sections", "-fuse-linker-plugin", main, archive, "-lm", "-o", elf)
+        generated.write_text(as_cpp(written))
+        parts = [generated, *own, *(source for library in used for source in library.sources)]
+        made = _objects(parts, Path(folder), [*macros, *(f"-I{path}" for path in includes)])
+        _run("avr-gcc", *FLAGS, "-Wl,--gc-sections", "-fuse-linker-plugin", *made, core, "-lm", "-o", elf)
     return elf
 
 
-def as_cpp(sketch: str, source: Path) -> str:
+def compiled_core(macros: Sequence[str]) -> Path:
+    """The Arduino core, compiled with these macros: an archive, of which the linker takes only what a sketch uses.
+
+    It is kept in the cache folder, as compiling it takes most of the time.
+    """
+    sources = source_files((CORE / "cores/arduino").iterdir())
+    parts = [*FLAGS, *CXX_FLAGS, *macros, _run("avr-gcc", "--version"), *map(str, sources)]
+    archive = cache_folder() / f"core-{hashlib.sha256(' '.join(parts).encode()).hexdigest()[:12]}.a"
+    if not archive.exists():
+        archive.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=archive.parent) as folder:
+            made = _objects(sources, Path(folder), [*macros, *(f"-I{path}" for path in CORE_INCLUDES)])
+            _run("avr-gcc-ar", "rcs", Path(folder) / "core.a", *made)
+            (Path(folder) / "core.a").replace(archive)
+    return archive
+
+
+def sketch_files(sketch: Path) -> list[Path]:
+    """The `.ino` files of a sketch: first that with its name. Raises `InputError` if there is none."""
+    main = [path for suffix in SKETCHES if (path := sketch / f"{sketch.name}{suffix}").is_file()]
+    if not main:
+        raise InputError(f"{sketch} is not a sketch: {sketch.name}.ino is missing")
+    others = sorted(path for path in sketch.iterdir() if path.suffix == main[0].suffix and path != main[0])
+    return [main[0], *others]
+
+
+def as_cpp(files: Sequence[Path]) -> str:
     """The C++ that the Arduino IDE generates from a sketch: functions may be used before they are defined."""
-    first = FUNCTION.search(sketch)
-    at = first.start() if first else len(sketch)
-    prototypes = "".join(f"{head};\n" for head in FUNCTION.findall(sketch) if "aira::" not in head)
-    line = sketch.count("\n", 0, at) + 1
-    return f'#include <Arduino.h>\n{sketch[:at]}\n{prototypes}#line {line} "{source}"\n{sketch[at:]}'
+    text = "".join(f'#line 1 "{path}"\n{path.read_text(encoding="utf-8")}\n' for path in files)
+    heads = list(FUNCTION.finditer(without_comments(text)))
+    at = heads[0].start() if heads else len(text)
+    prototypes = "".join(f"{head[1]};\n" for head in heads)
+    file = text[text.rindex("#line 1 ", 0, at) : at]
+    name = file.partition("\n")[0].removeprefix("#line 1 ")
+    line = file.count("\n")
+    return f"#include <Arduino.h>\n{text[:at]}\n{prototypes}#line {line} {name}\n{text[at:]}"
 
 
 def size_of(elf: Path) -> tuple[int, int]:
@@ -88,14 +127,19 @@ def size_of(elf: Path) -> tuple[int, int]:
     return sizes["text"] + sizes.get("data", 0), sizes.get("data", 0) + sizes.get("bss", 0) + sizes.get("noinit", 0)
 
 
-def _object(source: Path, folder: Path, flags: Sequence[str]) -> Path:
-    compiled = folder / f"{source.name}.o"
-    if source.suffix == ".cpp":
-        _run("avr-g++", *flags, *CXX_FLAGS, "-c", source, "-o", compiled)
-    else:
-        more = ["-x", "assembler-with-cpp"] if source.suffix == ".S" else ["-std=gnu11"]
-        _run("avr-gcc", *flags, *more, "-c", source, "-o", compiled)
-    return compiled
+def _objects(sources: Sequence[Path], folder: Path, flags: Sequence[str]) -> list[Path]:
+    """Compile these sources into files in `folder`."""
+
+    def compiled(source: Path, into: Path) -> Path:
+        if source.suffix == ".cpp":
+            _run("avr-g++", *FLAGS, *flags, *CXX_FLAGS, "-c", source, "-o", into)
+        else:
+            language = ["-x", "assembler-with-cpp"] if source.suffix == ".S" else ["-std=gnu11"]
+            _run("avr-gcc", *FLAGS, *flags, *language, "-c", source, "-o", into)
+        return into
+
+    with ThreadPoolExecutor(2) as workers:
+        return list(workers.map(compiled, sources, (folder / f"{number}.o" for number in range(len(sources)))))
 
 
 def _run(*command: str | Path) -> str:
@@ -104,7 +148,9 @@ def _run(*command: str | Path) -> str:
     except FileNotFoundError:
         raise ConfigurationError(f"{command[0]} is not installed", hint="install gcc-avr and avr-libc") from None
     if done.returncode:
-        raise CompilationFailed(f"{command[0]} failed:\n{done.stderr.strip()}")
+        lacks = re.search(r"fatal error: (\S+): No such file", done.stderr)
+        hint = f"-L FOLDER names a folder that has the library with {lacks[1]}" if lacks else ""
+        raise CompilationFailed(f"{command[0]} failed:\n{done.stderr.strip()}", hint=hint)
     return done.stdout
 
 
@@ -113,7 +159,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Compile Arduino sketches for an Uno.")
     parser.add_argument("sketches", nargs="+", type=Path, metavar="SKETCH", help="a sketch's folder")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the ELF files")
-    parser.add_argument("-L", "--libraries", type=Path, action="append", default=[], help="a folder of libraries")
+    parser.add_argument(
+        "-L", "--libraries", type=Path, action="append", default=[], help="a library, or a folder of libraries"
+    )
     parser.add_argument("-D", "--define", action="append", default=[], help="a macro, NAME or NAME=VALUE")
     given = parser.parse_args()
     try:

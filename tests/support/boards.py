@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bridges.serial import firmware as compiler
+from bridges.serial import libraries
 from bridges.serial.boards import SimulatedBoard
 from tests.support.commands import AIRA, Serving
 from tests.support.peers import require
@@ -46,7 +47,11 @@ def firmware(sketch: str, *defines: str) -> Path:
 
 
 def _digest(sketch: Path, defines: tuple[str, ...]) -> str:
-    sources = [Path(compiler.__file__), *(path for top in (sketch, LIBRARIES) for path in sorted(top.rglob("*")))]
+    sources = [
+        Path(compiler.__file__),
+        Path(libraries.__file__),
+        *(path for top in (sketch, LIBRARIES) for path in sorted(top.rglob("*"))),
+    ]
     parts = [repr(defines).encode(), *(path.read_bytes() for path in sources if path.is_file())]
     return hashlib.sha256(b"\0".join(parts)).hexdigest()[:12]
 

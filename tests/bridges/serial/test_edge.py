@@ -138,6 +138,17 @@ def test_an_edge_agent_loads_neither_openssl_nor_unicodes_tables() -> None:
     assert loaded_by("['frames']", "_hashlib", "unicodedata") == []
 
 
+@pytest.mark.parametrize(
+    ("sketch", "protocol", "named"),
+    [(COUNTER, "frames", "the board counter 1.0 is present"), (ROSSERIAL_ECHO, "rosserial", "the board is present")],
+)
+async def test_the_log_names_the_board_if_it_has_a_name(place: Place, sketch: str, protocol: str, named: str) -> None:
+    options = ("--protocol", protocol)
+    with board(sketch) as uno, edge(uno.port, place.address("robot"), place.endpoint, *options) as process:
+        await until(lambda: "is present: " in process.log(), what="the board", seconds=LONG)
+        assert f"{named}: /" in process.log()
+
+
 async def test_a_board_that_never_answers_is_logged_once(place: Place) -> None:
     options = ("--protocol", "rosserial")
     with board(COUNTER) as uno, edge(uno.port, place.address("robot"), place.endpoint, *options) as process:
