@@ -207,8 +207,10 @@ class Ledger:
 
     async def spend(self, identity: str, liability: str) -> None:
         """Take an order out of the outbox that became the contract at `liability`, and keep it for `unspend`."""
+        keep = "INSERT OR REPLACE INTO spent SELECT identity, kind, payload, deadline, posted, ? FROM"
         await self._database.run_together(
-            ("INSERT OR REPLACE INTO spent SELECT *, ? FROM outbox WHERE identity = ?", (liability, identity)),
+            (f"{keep} outbox WHERE identity = ?", (liability, identity)),
+            (f"{keep} withdrawn WHERE identity = ?", (liability, identity)),
             ("DELETE FROM outbox WHERE identity = ?", (identity,)),
             ("UPDATE withdrawn SET used_by = ? WHERE identity = ?", (liability, identity)),
             ("DELETE FROM spent WHERE rowid <= (SELECT MAX(rowid) FROM spent) - ?", (self._spent_kept,)),
@@ -217,25 +219,23 @@ class Ledger:
 
     async def spent(self, liability: str) -> list[Outgoing]:
         """The orders that became the contract at this address, withdrawn ones included."""
-        spent = "SELECT identity, kind, payload, deadline FROM spent WHERE liability = ?"
-        withdrawn = "SELECT identity, kind, payload, deadline FROM withdrawn WHERE used_by = ?"
-        rows = await self._database.rows(f"{spent} UNION ALL {withdrawn}", (liability, liability))
-        return [Outgoing(*row) for row in rows]
+        statement = "SELECT identity, kind, payload, deadline FROM spent WHERE liability = ?"
+        return [Outgoing(*row) for row in await self._database.rows(statement, (liability,))]
 
     async def contracts(self, kind: str) -> list[tuple[bytes, str]]:
         """The 64 latest orders of a kind, also withdrawn, that became contracts: payload, contract's address."""
-        return await self._database.rows(
-            "SELECT payload, liability FROM (SELECT kind, payload, liability, posted FROM spent"
-            " UNION ALL SELECT kind, payload, used_by, posted FROM withdrawn WHERE length(used_by) = 42)"
-            " WHERE kind = ? ORDER BY posted DESC LIMIT 64",
-            (kind,),
-        )
+        statement = "SELECT payload, liability FROM spent WHERE kind = ? ORDER BY posted DESC LIMIT 64"
+        return await self._database.rows(statement, (kind,))
 
     async def unspend(self, liability: str) -> None:
         """Move the orders of a reverted contract back into the outbox. Withdrawn ones stay withdrawn."""
         columns = "identity, kind, payload, deadline, posted"
         await self._database.run_together(
-            (f"INSERT OR IGNORE INTO outbox ({columns}) SELECT {columns} FROM spent WHERE liability = ?", (liability,)),
+            (
+                f"INSERT OR IGNORE INTO outbox ({columns}) SELECT {columns} FROM spent"
+                " WHERE liability = ? AND identity NOT IN (SELECT identity FROM withdrawn)",
+                (liability,),
+            ),
             ("DELETE FROM spent WHERE liability = ?", (liability,)),
             ("UPDATE withdrawn SET used_by = '' WHERE used_by = ?", (liability,)),
             sync=False,
