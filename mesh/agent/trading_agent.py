@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final, TypedDict, Unpack
 
 from mesh.agent.demands import current_buyer
+from mesh.agent.errors import OrderClosed
 from mesh.agent.orders import Order, OrderState
 from mesh.errors import ClosedError, ConfigurationError
 from mesh.role import Lifecycle
@@ -154,7 +156,8 @@ class TradingAgent(Lifecycle):
             return await order.contract(on_rejection=on_rejection)
         except asyncio.CancelledError:
             if self._runtime is not None:
-                await order.withdraw()
+                with suppress(OrderClosed):  # it has just become a contract
+                    await order.withdraw()
             raise
 
     def orders(self, *states: OrderState) -> list[Order]:

@@ -137,6 +137,17 @@ async def test_a_cancelled_demand_is_withdrawn(place: Place) -> None:
         assert await waiting(person) == ["withdrawal"]
 
 
+async def test_a_demand_that_is_cancelled_when_it_has_just_become_a_contract_is_cancelled(place: Place) -> None:
+    async with place.provider(), working(place.agent("robot")), place.agent("person") as person:
+        demand = asyncio.create_task(person.demand(job(place)))
+        await posted(person)
+        while person.orders():  # until the demand is matched, and its task has not noticed yet
+            await asyncio.sleep(0)
+        demand.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await demand
+
+
 async def test_closing_the_agent_fails_the_wait_for_a_contract(place: Place) -> None:
     async with place.agent("person") as person:
         demand = asyncio.create_task(person.demand(OBJECTIVE))

@@ -208,7 +208,7 @@ async def test_a_frozen_node_is_skipped_and_asked_last_afterwards() -> None:
             started = time.monotonic()
             for _ in range(5):
                 await node.block_number()
-            assert timing.request_timeout <= time.monotonic() - started < 2 * timing.request_timeout
+            assert 0.9 * timing.request_timeout < time.monotonic() - started < 2 * timing.request_timeout
             await asyncio.to_thread(frozen.resume)
 
 

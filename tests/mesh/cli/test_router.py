@@ -17,7 +17,7 @@ from mesh.network import Network, NetworkChange
 from tests.support.commands import AIRA, Serving, invoke, refused
 from tests.support.ports import free_port
 from tests.support.sites import Site, SiteZenohd
-from tests.support.waiting import until, until_heard
+from tests.support.waiting import until, until_found, until_heard
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -73,8 +73,13 @@ async def speak(speaker: Network, listener: Network, key: str) -> None:
     heard: list[str] = []
     with listener.session.declare_subscriber(key, lambda sample: heard.append(str(sample.key_expr))):
         await until_heard(speaker.session, key)
-        speaker.session.put(key, b"")
-        await until(lambda: heard, seconds=SECONDS)
+
+        async def is_heard() -> bool:
+            speaker.session.put(key, b"")  # again: one that is put while its session is ended is lost
+            await asyncio.sleep(0.05)
+            return bool(heard)
+
+        await until_found(is_heard, seconds=SECONDS)
 
 
 async def test_a_revoked_member_is_disconnected_and_the_others_are_not(site: Site) -> None:
