@@ -34,6 +34,7 @@ if TYPE_CHECKING:
         NetworkUnavailable,
         RemoteError,
     )
+    from mesh.network import Reading
     from mesh.recording import Objective, Played, Recorder, RecordingAbout, open_objective, pack
     from mesh.running import fail, run_to_end
     from mesh.settings import Settings
@@ -66,6 +67,7 @@ _NAMES: Final = {
     "mesh.errors": (
         "AiraError ChainError ClosedError ConfigurationError ContentError InputError NetworkUnavailable RemoteError"
     ),
+    "mesh.network": "Reading",
     "mesh.recording": "Objective Played Recorder RecordingAbout open_objective pack",
     "mesh.running": "fail run_to_end",
     "mesh.settings": "Settings",
@@ -128,6 +130,7 @@ __all__ = [
     "Phase",
     "Played",
     "Progress",
+    "Reading",
     "Recorder",
     "RecordingAbout",
     "RemoteError",

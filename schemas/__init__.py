@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         LiabilityTopicKey,
         ObjectiveTopicKey,
         ProgressKey,
+        ReadingKey,
         RpcKey,
     )
     from schemas.cid import cid_of_digest, format_cid, parse_cid
@@ -74,6 +75,7 @@ if TYPE_CHECKING:
         market_selector,
         objective_selector,
         presence_selector,
+        reading_selector,
         requested_cid,
         topic_selector,
     )
@@ -94,7 +96,7 @@ _NAMES: Final = {
         "ZERO_ADDRESS address_bytes checksum_address is_ens_name keccak256 parse_address parse_address_or_name"
     ),
     "schemas.agent_keys": (
-        "CidKey DeviceTopicKey EthEventKey EventKey LiabilityTopicKey ObjectiveTopicKey ProgressKey RpcKey"
+        "CidKey DeviceTopicKey EthEventKey EventKey LiabilityTopicKey ObjectiveTopicKey ProgressKey ReadingKey RpcKey"
     ),
     "schemas.cid": "cid_of_digest format_cid parse_cid",
     "schemas.errors": (
@@ -113,7 +115,7 @@ _NAMES: Final = {
     "schemas.records": "Liability PlaybackPosition Record",
     "schemas.selectors": (
         "cid_selector device_selector event_selector lighthouse_selector market_selector objective_selector "
-        "presence_selector requested_cid topic_selector"
+        "presence_selector reading_selector requested_cid topic_selector"
     ),
     "schemas.signing": "Signer Verified recover verify verify_message",
     "schemas.unixfs": "CHUNK_SIZE MAX_LINKS blocks_of_stream cid_of_bytes cid_of_file cid_of_stream parse_block",

@@ -158,6 +158,14 @@ class DeviceTopicKey(BaseKey, frozen=True):
     topic: str
 
 
+class ReadingKey(BaseKey, frozen=True):
+    """A topic on which the agent publishes outside any job: `/battery`."""
+
+    pattern: ClassVar = "aira/agent/{agent}/reading{topic}"
+    agent: str
+    topic: str
+
+
 class RpcKey(BaseKey, frozen=True):
     """A service of the agent, a queryable: `start`, `finish`, `eth/accounts`, …"""
 
@@ -185,7 +193,15 @@ class CidKey(BaseKey, frozen=True):
 
 # The first that fits decides, so the key with a fixed last chunk goes before the one with any.
 AgentKey: TypeAlias = (
-    ProgressKey | EventKey | ObjectiveTopicKey | LiabilityTopicKey | DeviceTopicKey | RpcKey | EthEventKey | CidKey
+    ProgressKey
+    | EventKey
+    | ObjectiveTopicKey
+    | LiabilityTopicKey
+    | DeviceTopicKey
+    | ReadingKey
+    | RpcKey
+    | EthEventKey
+    | CidKey
 )
 
 

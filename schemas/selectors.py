@@ -90,6 +90,12 @@ def device_selector(agent: str, device: str = "*") -> str:
     return f"aira/agent/{address_chunk(agent)}/device/{_any_or(name_chunk, device)}/**"
 
 
+def reading_selector(agent: str = "*", topic: str = "/**") -> str:
+    """What an agent, or any, publishes outside any job: on all topics, or on one."""
+    of_topic = topic if topic == "/**" else topic_chunks(topic)
+    return f"aira/agent/{_any_or(address_chunk, agent)}/reading{of_topic}"
+
+
 def cid_selector(agent: str = "*", cid: str = "*") -> str:
     """A block or a file in the store of one agent or of any; or all that an agent's store has."""
     return f"aira/agent/{_any_or(address_chunk, agent)}/cid/{_any_or(cid_chunk, cid)}"

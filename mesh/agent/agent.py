@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, cast
 from mesh.agent.components import watching, working
 from mesh.agent.demands import HANDLED
 from mesh.agent.handlers import HandlerDecorators, dispatch, repeat
+from mesh.agent.reading_agent import ReadingAgent
 from mesh.agent.status import WatcherStatus
-from mesh.agent.trading_agent import TradingAgent
 from mesh.background import Background
 from mesh.composition import load_account
 from mesh.flood import Drops
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-class Agent(HandlerDecorators, TradingAgent):
+class Agent(HandlerDecorators, ReadingAgent):
     """A participant of the market: `agent = Agent(model)`, handlers, then `agent.run()` or `async with agent`.
 
     `model` is the CID of the behaviour that it offers or demands ('' for any). With an account (`account`, or a keyfile
@@ -52,7 +52,7 @@ class Agent(HandlerDecorators, TradingAgent):
         resend: RetryPolicy = RESEND,
     ) -> None:
         HandlerDecorators.__init__(self)
-        TradingAgent.__init__(self, model, settings)
+        ReadingAgent.__init__(self, model, settings)
         self._account = account
         self._given_chain = chain
         self._resend = resend
@@ -90,11 +90,12 @@ class Agent(HandlerDecorators, TradingAgent):
         status: WatcherStatus | AgentRuntime
         if account is None:
             network, channel = await stack.enter_async_context(watching(self.settings, drops=self.drops))
-            status, self._channel = WatcherStatus(network, channel, self.drops), channel
+            status = WatcherStatus(network, channel, self.drops)
+            self._network, self._channel = network, channel
         else:
             status = self._runtime = await self._open_runtime(stack, account)
             network, channel = status.parts.network, status.parts.channel
-            self._channel = channel
+            self._network, self._channel = network, channel
             channel.announce("agent", account.address)
         facts = log_event("agent-started", address=account and account.address, zenoh_id=network.id)
         who = f"account {account.address}" if account else "watching"
@@ -117,6 +118,9 @@ class Agent(HandlerDecorators, TradingAgent):
                 tasks.start(self._runtime.handle_demands(cast("Any", subscription), handlers), "demands")
             else:
                 tasks.start(dispatch(subscription, handlers, concurrency=HANDLED if kind is Demand else 1), "handlers")
+        for topic, agent, listener in self._handlers.readings:
+            heard = await stack.enter_async_context(self.readings(topic, agent=agent))
+            tasks.start(dispatch(heard, [listener], concurrency=1), f"readings on {topic}")
         for seconds, handler in self._handlers.periodic:
             tasks.start(repeat(seconds, handler), f"every {seconds:g} s")
 
@@ -128,4 +132,4 @@ class Agent(HandlerDecorators, TradingAgent):
         return await stack.enter_async_context(AgentRuntime(parts, self._handlers))
 
     def _closed(self) -> None:
-        self._channel = self._runtime = None
+        self._network = self._channel = self._runtime = None

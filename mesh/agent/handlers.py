@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 from mesh.errors import AiraError
 from mesh.log_context import log_event
 from mesh.work.job import TopicHandlers
-from schemas import Demand, Liability, Offer, Result, Verified
+from schemas import Demand, Liability, Offer, Result, Verified, reading_selector
 
 if TYPE_CHECKING:
-    from mesh.network import Subscription
+    from mesh.network import Reading, ReadingSubscription, Subscription
     from mesh.work.job import Job
     from mesh.work.ledger import Phase
 
@@ -25,6 +25,7 @@ DemandHandler = Callable[[Verified[Demand]], Awaitable[object]]
 OfferHandler = Callable[[Verified[Offer]], Awaitable[object]]
 ResultHandler = Callable[[Verified[Result]], Awaitable[object]]
 LiabilityHandler = Callable[["Phase", Liability], Awaitable[object]]
+ReadingHandler = Callable[["Reading"], Awaitable[object]]
 PeriodicHandler = Callable[[], Awaitable[object]]
 
 
@@ -35,6 +36,8 @@ class Handlers:
     topics: TopicHandlers = field(default_factory=TopicHandlers)
     market: dict[type[Demand | Offer | Result], list[Handler]] = field(default_factory=dict)
     liabilities: list[LiabilityHandler] = field(default_factory=list)
+    readings: list[tuple[str, str, ReadingHandler]] = field(default_factory=list)
+    """The topic, the agent (`*` for any), and the handler."""
     periodic: list[tuple[float, PeriodicHandler]] = field(default_factory=list)
 
 
@@ -42,6 +45,7 @@ D = TypeVar("D", bound=DemandHandler)
 O = TypeVar("O", bound=OfferHandler)  # noqa: E741
 R = TypeVar("R", bound=ResultHandler)
 L = TypeVar("L", bound=LiabilityHandler)
+G = TypeVar("G", bound=ReadingHandler)
 P = TypeVar("P", bound=PeriodicHandler)
 K = TypeVar("K")
 
@@ -97,6 +101,19 @@ class HandlerDecorators:
         self._handlers.liabilities.append(handler)
         return handler
 
+    def on_reading(self, topic: str, *, agent: str = "*") -> Callable[[G], G]:
+        """Handle what agents, or one (address), publish on `topic` outside of jobs: `async def handler(reading)`.
+
+        A `Reading` has the `agent`, the `topic` and the `value`. They are handled one after the other.
+        """
+        reading_selector(agent, topic)  # raises InvalidKey
+
+        def register(handler: G) -> G:
+            self._handlers.readings.append((topic, agent, handler))
+            return handler
+
+        return register
+
     def every(self, seconds: float) -> Callable[[P], P]:
         """Call the handler, which takes no argument, at the start and then every `seconds` seconds."""
 
@@ -136,7 +153,9 @@ async def call(
     return None
 
 
-async def dispatch(subscription: Subscription[Any], handlers: list[Handler], *, concurrency: int) -> None:
+async def dispatch(
+    subscription: Subscription[Any] | ReadingSubscription, handlers: Sequence[Handler], *, concurrency: int
+) -> None:
     """Call all handlers with each message, one after the other; up to `concurrency` messages at once."""
     slots = asyncio.Semaphore(concurrency)
 

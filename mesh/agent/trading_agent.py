@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mesh.agent.contract import Contract
     from mesh.agent.orders import OnRejection
     from mesh.agent.runtime import AgentRuntime
-    from mesh.network import Channel
+    from mesh.network import Channel, Network
     from mesh.recording import Objective
     from mesh.settings import Settings
 
@@ -49,6 +49,7 @@ class TradingAgent(Lifecycle):
         super().__init__()
         self.model = model
         self.settings = load() if settings is None else settings
+        self._network: Network | None = None
         self._channel: Channel | None = None
         self._runtime: AgentRuntime | None = None
 
@@ -67,6 +68,13 @@ class TradingAgent(Lifecycle):
     def parts(self) -> AgentComponents:
         """The components of a running agent. Raises as `runtime` does."""
         return self.runtime.parts
+
+    @property
+    def network(self) -> Network:
+        """The Zenoh session and its state. Raises `ClosedError` if the agent is not running."""
+        self.channel  # raises when the agent is not running  # noqa: B018
+        assert self._network is not None
+        return self._network
 
     @property
     def channel(self) -> Channel:

@@ -7,6 +7,7 @@ import signal
 from contextlib import AsyncExitStack, asynccontextmanager
 from datetime import UTC, datetime
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
@@ -16,10 +17,11 @@ from mesh.background import Background
 from mesh.cli.amounts import XRT, Unit
 from mesh.cli.options import with_json, with_settings
 from mesh.cli.output import plural, print_json, print_line, printable, short_address, wait_for_broken_pipe
+from mesh.network import Reading
 from mesh.running import run_until_stopped
 from mesh.settings import NetworkSettings, options_of
 from mesh.telemetry.logs import configure_logging
-from mesh.watching import JobEvent, SensorReading
+from mesh.watching import JobEvent
 from schemas import Demand, Empty, InvalidAddress, Result, String, Verified, parse_address, parse_cid
 from schemas.signing import Rejection
 
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     import zenoh
 
     from mesh.network import Channel, Network
+    from mesh.recording import Recorder
     from mesh.settings import Settings
     from mesh.watching import MarketCounters, MarketEvent, MarketWatch
     from schemas import Liability, Offer
@@ -37,12 +40,15 @@ if TYPE_CHECKING:
 @click.command("watch")
 @click.option("--model", help="print only events of this model (CID)")
 @click.option("--open", "with_open", is_flag=True, help="first print the orders that are open now")
+@click.option("--readings", is_flag=True, help="also print what agents publish outside of jobs, and their answers")
 @click.option(
-    "--readings", is_flag=True, help="also print the content of results without a contract, such as sensor readings"
+    "--out", type=click.Path(dir_okay=False, path_type=Path), help="record the readings to this MCAP file (new)"
 )
 @with_json
 @with_settings(*options_of(NetworkSettings), "lighthouse_contract", "xrt_contract")
-def command(settings: Settings, model: str | None, with_open: bool, readings: bool, as_json: bool) -> None:
+def command(
+    settings: Settings, model: str | None, with_open: bool, readings: bool, out: Path | None, as_json: bool
+) -> None:
     """Print one line for each event on a lighthouse's channel: orders, rejections, contracts, jobs and results. Ctrl-C
     stops it.
 
@@ -51,13 +57,26 @@ def command(settings: Settings, model: str | None, with_open: bool, readings: bo
     in the token's smallest unit. With --model, only results of contracts seen since the start are printed.
 
     Agents report the contracts; `aira liability watch` reads them from the chain.
+
+    --readings prints, of any model, the readings of agents, such as the state of a battery, and the content of results
+    without a contract, with which agents answer. --out also records them; their topics begin with the agent's address.
     """
     configure_logging(level="warning")
-    run_until_stopped(lambda: watch(settings, model, with_open=with_open, readings=readings, as_json=as_json))
+    run_until_stopped(
+        lambda: watch(
+            settings, model, with_open=with_open, readings=readings or out is not None, out=out, as_json=as_json
+        )
+    )
 
 
 async def watch(
-    settings: Settings, model: str | None, *, with_open: bool, as_json: bool, readings: bool = False
+    settings: Settings,
+    model: str | None,
+    *,
+    with_open: bool,
+    as_json: bool,
+    readings: bool = False,
+    out: Path | None = None,
 ) -> None:
     from mesh.agent.components import watching
     from mesh.watching import MarketWatch, ReadingFetcher
@@ -67,9 +86,11 @@ async def watch(
     async with AsyncExitStack() as stack:
         network, channel = await stack.enter_async_context(watching(settings))
         formatter = None if as_json else EventFormatter(await _xrt(settings, network.session, channel))
-        show = partial(_print_event, formatter)
+        recorder = None if out is None else await stack.enter_async_context(_recording(out, channel.lighthouse))
+        show = partial(_show_event, formatter, recorder)
         fetcher = await stack.enter_async_context(ReadingFetcher(network.session, show)) if readings else None
-        seen = await stack.enter_async_context(MarketWatch(network.session, channel, model=model or "*"))
+        watched = MarketWatch(network.session, channel, model=model or "*", readings=readings)
+        seen = await stack.enter_async_context(watched)
         tasks = await stack.enter_async_context(_report_beside(network, seen))
         if not as_json:
             click.echo(f"watching {channel.lighthouse}; Ctrl-C stops it", err=True)
@@ -81,8 +102,23 @@ async def watch(
                 fetcher.handle(event)
 
 
-def _print_event(formatter: EventFormatter | None, event: MarketEvent | SensorReading) -> None:
-    """Print an event: as a line by `formatter`, without one as JSON."""
+@asynccontextmanager
+async def _recording(out: Path, lighthouse: str) -> AsyncIterator[Recorder]:
+    """The recorder of readings, which says at the end how many it has."""
+    from mesh.recording import Recorder, RecordingAbout
+
+    recorder = await asyncio.to_thread(Recorder, out, RecordingAbout(lighthouse=lighthouse))
+    try:
+        yield recorder
+    finally:
+        summary = await asyncio.to_thread(recorder.close)
+        click.echo(f"{out}: {plural(summary.messages, 'reading')}", err=True)
+
+
+def _show_event(formatter: EventFormatter | None, recorder: Recorder | None, event: MarketEvent) -> None:
+    """Print an event: as a line by `formatter`, without one as JSON. Record it if it is a reading."""
+    if isinstance(event, Reading) and recorder is not None:
+        recorder.record(f"/{event.agent.lower()}{event.topic}", event.payload, event.type)
     now = datetime.now(UTC)
     if formatter is None:
         print_json(event_json(event, time=now.isoformat(timespec="milliseconds").replace("+00:00", "Z")))
@@ -153,7 +189,7 @@ EVENT_WIDTH: Final = 9
 """Columns of the event's name."""
 
 
-def event_json(seen: MarketEvent | SensorReading, *, time: str) -> dict[str, Any]:
+def event_json(seen: MarketEvent, *, time: str) -> dict[str, Any]:
     """An event at `time` (ISO 8601) for JSON. Amounts are text, in the smallest unit."""
     match seen:
         case Verified():
@@ -167,9 +203,10 @@ def event_json(seen: MarketEvent | SensorReading, *, time: str) -> dict[str, Any
         case Rejection():
             about = {"event": "rejected", "order": seen.order, "provider": seen.provider}
             about |= {"reason": seen.reason, "detail": seen.detail}
-        case SensorReading():
-            about = {"event": "reading", "signer": seen.signer, "result": seen.result, "topic": seen.topic}
-            about["value"] = _value(seen)
+        case Reading():
+            about = {"event": "reading", "agent": seen.agent, "topic": seen.topic, "value": _value(seen)}
+            if seen.result:
+                about |= {"signer": seen.agent, "result": seen.result}
         case JobEvent(agent, event, liability):
             about = {"event": event, "agent": agent, "liability": msgspec.json.decode(liability.encode())}
     return {"time": time} | about
@@ -199,7 +236,7 @@ class EventFormatter:
     def __init__(self, xrt: str | None) -> None:
         self._xrt = xrt
 
-    def line(self, seen: MarketEvent | SensorReading) -> str:
+    def line(self, seen: MarketEvent) -> str:
         """The line of an event, without the time."""
         match seen:
             case Verified():
@@ -208,8 +245,8 @@ class EventFormatter:
             case Rejection():
                 why = printable(seen.detail[:LONGEST_TEXT] or seen.reason[:LONGEST_TEXT])
                 kind, words = "rejected", f"{seen.order[:HASH_DIGITS]} by {short_address(seen.provider)}: {why}"
-            case SensorReading():
-                kind, words = "reading", f"{printable(seen.topic)}  {_shown(seen)}, from {short_address(seen.signer)}"
+            case Reading():
+                kind, words = "reading", f"{printable(seen.topic)}  {_shown(seen)}, from {short_address(seen.agent)}"
             case JobEvent(_, kind, liability):
                 words = self._work(liability)
         return f"{kind:<{EVENT_WIDTH}}  {words}"
@@ -237,7 +274,7 @@ class EventFormatter:
         return f"{job.address}  {parties}" + (f", {_ended(job.is_success)}: {job.result}" if job.result else "")
 
 
-def _value(reading: SensorReading) -> Any:
+def _value(reading: Reading) -> Any:
     """The value of a reading for JSON, in which bytes become base64."""
     match reading.value:
         case Empty():
@@ -248,7 +285,7 @@ def _value(reading: SensorReading) -> Any:
             return value
 
 
-def _shown(reading: SensorReading) -> str:
+def _shown(reading: Reading) -> str:
     value = _value(reading)
     text = value if isinstance(value, str) else msgspec.json.encode(value).decode()
     return printable(text[:LONGEST_TEXT] + ("…" if len(text) > LONGEST_TEXT else ""))

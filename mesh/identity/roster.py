@@ -95,6 +95,7 @@ _READ_MARKET: Final = (
 )
 _READ_CONTENT: Final = _grant("get", "aira/agent/*/cid/*")
 """Who holds content serves it in its own space."""
+_READINGS: Final = _grant("subscribe", "aira/agent/*/reading/**")
 
 ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
     {
@@ -105,6 +106,7 @@ ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
             _grant("put", "aira/{market}/decline/*"),
             _presence("agent"),
             _READ_CONTENT,
+            _READINGS,
         ),
         # A person who orders work also runs an agent.
         "person": (
@@ -113,6 +115,7 @@ ROLES: Final[Mapping[Role, tuple[Grant, ...]]] = MappingProxyType(
             _orders("demand", "withdrawal"),
             _presence("agent", "person"),
             _READ_CONTENT,
+            _READINGS,
         ),
         "provider": (
             _OWN_SPACE,

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from mesh.network.connecting import NotAdmitted
     from mesh.network.endpoints import Endpoints, free_endpoint
     from mesh.network.pump import Pump
+    from mesh.network.readings import Reading, ReadingSubscription
     from mesh.network.services import ServiceFailed, Services, call
     from mesh.network.session import Network, NetworkChange
     from mesh.network.tls import Tls
@@ -21,6 +22,7 @@ _NAMES: Final = {
     "mesh.network.connecting": "NotAdmitted",
     "mesh.network.endpoints": "Endpoints free_endpoint",
     "mesh.network.pump": "Pump",
+    "mesh.network.readings": "Reading ReadingSubscription",
     "mesh.network.services": "ServiceFailed Services call",
     "mesh.network.session": "Network NetworkChange",
     "mesh.network.tls": "Tls",

@@ -4,4 +4,4 @@ from __future__ import annotations
 
 from mesh.watching.market import JobEvent, MarketCounters, MarketEvent, MarketWatch
 from mesh.watching.presence import BRIDGE, PROVIDER, PresentPeer, RoleStatus, present, status_of, statuses
-from mesh.watching.readings import ReadingFetcher, SensorReading
+from mesh.watching.readings import ReadingFetcher

@@ -16,7 +16,7 @@ import msgspec
 from mesh.background import Background
 from mesh.errors import AiraError, InputError
 from mesh.flood import BoundedDict, Rate, RateLimiter
-from mesh.network import Pump, ValidationStatistics
+from mesh.network import Pump, Reading, ReadingSubscription, ValidationStatistics
 from mesh.role import Lifecycle
 from schemas import (
     Demand,
@@ -61,7 +61,7 @@ class JobEvent(NamedTuple):
     liability: Liability
 
 
-MarketEvent: TypeAlias = Verified[Demand] | Verified[Offer] | Verified[Result] | Rejection | JobEvent
+MarketEvent: TypeAlias = Verified[Demand] | Verified[Offer] | Verified[Result] | Rejection | JobEvent | Reading
 Claim: TypeAlias = Rejection | JobEvent
 C = TypeVar("C", bound=Claim)
 
@@ -128,16 +128,18 @@ class MarketWatch(Lifecycle):
     """Events on an open channel from now on: `async with MarketWatch(session, channel) as watch`, then iterate.
 
     With `model` (CIDv0), only events about orders and liabilities of that model; a result counts once its agent has
-    reported the liability. Job events are taken from agents that are present when one arrives. For one consumer.
-    Leaving `async with` ends it; the caller closes session and channel.
+    reported the liability. With `readings` also those of agents, which name no model. Readings and job events are taken
+    from agents that are present when one arrives. For one consumer. Leaving `async with` ends it; the
+    caller closes session and channel.
     """
 
     title = "market watch"
 
-    def __init__(self, session: zenoh.Session, channel: Channel, *, model: str = "*") -> None:
+    def __init__(self, session: zenoh.Session, channel: Channel, *, model: str = "*", readings: bool = False) -> None:
         self._session = session
         self._channel = channel
         self._model = model
+        self._readings = ReadingSubscription(session) if readings else None
         self._queue: asyncio.Queue[MarketEvent] = asyncio.Queue(WAITING)
         self._agents = RecentSet()
         self._questions = RateLimiter(per_sender=PER_AGENT, total=QUESTIONS)
@@ -155,6 +157,8 @@ class MarketWatch(Lifecycle):
         selector = market_selector(channel.lighthouse, "reject")
         self._rejected = await stack.enter_async_context(Pump(self._session, selector, self._rejection_reader))
         self._events = await stack.enter_async_context(Pump(self._session, event_selector(), self._event_reader))
+        if self._readings is not None:
+            await stack.enter_async_context(self._readings)
         tasks = await stack.enter_async_context(Background())
         for name, items in (
             ("demands", self._seen_orders(self._demands)),
@@ -164,6 +168,8 @@ class MarketWatch(Lifecycle):
             ("events", self._seen_events()),
         ):
             tasks.start(self._move(items), f"watched {name}")
+        if self._readings is not None:
+            tasks.start(self._move(self._known_readings(self._readings)), "watched readings")
 
     def __aiter__(self) -> Self:
         return self
@@ -184,6 +190,7 @@ class MarketWatch(Lifecycle):
             [
                 *(subscription.statistics() for subscription in (self._demands, self._offers, self._results)),
                 *(reader.statistics(received=pump.received, dropped=pump.dropped) for pump, reader in claims),
+                *([] if self._readings is None else [self._readings.statistics()]),
             ]
         )
 
@@ -223,6 +230,13 @@ class MarketWatch(Lifecycle):
             elif self._model in ("*", event.liability.model):
                 self._contracts.add(event.liability.address)
                 yield event
+
+    async def _known_readings(self, readings: ReadingSubscription) -> AsyncIterator[MarketEvent]:
+        async for reading in readings:
+            if await self._is_known(reading.agent):
+                yield reading
+            else:
+                readings.refuse(reading.agent)
 
 
 def read_rejection(key: str, payload: bytes) -> Rejection:

@@ -1,4 +1,4 @@
-"""Sensor readings: the messages in results that belong to no liability."""
+"""Answers: the readings in results that belong to no liability."""
 
 from __future__ import annotations
 
@@ -6,14 +6,13 @@ import asyncio
 import logging
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
-
-import msgspec
+from typing import TYPE_CHECKING, Final
 
 from mesh.background import Background
 from mesh.content import Exchange, Store
 from mesh.errors import AiraError
 from mesh.log_context import log_event
+from mesh.network import Reading
 from mesh.recording import Limits, open_objective
 from mesh.role import Lifecycle
 from mesh.watching.market import JobEvent, RecentSet
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LARGEST: Final = 64 * 1024
-"""Bytes of a result that is fetched. ReadingFetcher are small; larger recordings are not fetched unasked."""
+"""Bytes of a result that is fetched. Answers are small; larger recordings are not fetched unasked."""
 LIMITS: Final = Limits(size=LARGEST, expanded=LARGEST, messages=100)
 KEPT: Final = 16 * 1024 * 1024
 """Bytes of results kept in the temporary store; beyond, the oldest are evicted."""
@@ -43,16 +42,6 @@ TIMEOUT: Final = 10.0
 """Seconds without a block after which fetching a result fails."""
 
 
-class SensorReading(msgspec.Struct, frozen=True):
-    """A message in a result without a liability: its signer, the CID of the result, topic and value."""
-
-    signer: str
-    result: str
-    topic: str
-    value: Any
-    """`Empty`, `String`, JSON data or bytes."""
-
-
 class ReadingFetcher(Lifecycle):
     """Fetches the results without a liability among the events given to `handle`, and passes each reading to `deliver`.
 
@@ -62,9 +51,7 @@ class ReadingFetcher(Lifecycle):
 
     title = "fetcher of readings"
 
-    def __init__(
-        self, session: zenoh.Session, deliver: Callable[[SensorReading], None], *, timeout: float = TIMEOUT
-    ) -> None:
+    def __init__(self, session: zenoh.Session, deliver: Callable[[Reading], None], *, timeout: float = TIMEOUT) -> None:
         self._session = session
         self._deliver = deliver
         self._timeout = timeout
@@ -114,8 +101,8 @@ class ReadingFetcher(Lifecycle):
             self._pending -= 1
 
 
-def _read(path: Path, cid: str, signer: str) -> list[SensorReading]:
+def _read(path: Path, cid: str, signer: str) -> list[Reading]:
     return [
-        SensorReading(signer, cid, message.topic, decode_value(message.payload, message.type))
-        for message in open_objective(path, LIMITS).messages()
+        Reading(signer, one.topic, decode_value(one.payload, one.type), one.payload, one.type, cid)
+        for one in open_objective(path, LIMITS).messages()
     ]

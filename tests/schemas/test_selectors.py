@@ -17,12 +17,14 @@ from schemas import (
     LiabilityTopicKey,
     ObjectiveTopicKey,
     ProgressKey,
+    ReadingKey,
     device_selector,
     event_selector,
     lighthouse_selector,
     market_selector,
     objective_selector,
     presence_selector,
+    reading_selector,
     topic_selector,
 )
 from schemas.selectors import withdrawal_selector
@@ -67,6 +69,8 @@ def test_selectors_of_an_agent_find_their_keys() -> None:
         (topic_selector(SENDER, LIGHTHOUSE), (LiabilityTopicKey,)),
         (topic_selector(SENDER, topic="/blink"), (LiabilityTopicKey,)),
         (event_selector(), (EventKey, ProgressKey)),
+        (reading_selector(), (ReadingKey,)),
+        (reading_selector(SENDER, "/battery"), (ReadingKey,)),
         (device_selector(SENDER), (DeviceTopicKey,)),
         (device_selector(SENDER, "tty-0"), (DeviceTopicKey,)),
     ):

@@ -14,21 +14,24 @@ import pytest
 
 from mesh.cli.watch import watch
 from mesh.errors import InvalidCid, NetworkUnavailable
-from mesh.network import Channel, Endpoints, Network, message_key
+from mesh.network import Channel, Endpoints, Network, Reading, message_key
+from mesh.recording import open_objective
 from mesh.settings import Settings
-from mesh.watching import JobEvent, ReadingFetcher, SensorReading
-from schemas import RejectKey, Result, encode, message_hash, verify_message
+from mesh.watching import JobEvent, ReadingFetcher
+from schemas import ReadingKey, RejectKey, Result, encode, message_hash, verify_message
+from schemas.payloads import decode_value
 from schemas.signing import Rejection
 from tests.mesh.watching.test_market import EVENT, JOB
 from tests.support.commands import AIRA, environment, invoke, refused
 from tests.support.log_events import logged_events
 from tests.support.market import MODEL, offering
 from tests.support.objectives import objective
-from tests.support.orders import CONTRACT, MARKET, PERSON, ROBOT, demand, result
+from tests.support.orders import CONTRACT, MARKET, PERSON, ROBOT, STRANGER, demand, result
 from tests.support.waiting import until, until_heard
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
+    from pathlib import Path
 
     from mesh.agent import Agent
     from tests.support.market import Place
@@ -211,10 +214,36 @@ async def test_the_readings_of_a_result_without_a_contract_are_printed(place: Pl
     }
 
 
+async def test_the_readings_of_agents_are_printed_and_recorded(
+    place: Place, printed: PrintedOutput, tmp_path: Path
+) -> None:
+    out = tmp_path / "readings.mcap"
+    options: dict[str, Any] = {"with_open": False, "as_json": True, "readings": True, "out": out}
+    work = asyncio.create_task(watch(place.settings("watcher"), None, **options))
+    async with place.agent("robot") as robot:
+        await until_heard(robot.network.session, str(ReadingKey(robot.address, "/battery")))
+        stranger = str(ReadingKey(STRANGER.address, "/battery"))
+        robot.network.session.put(stranger, b"1.5", encoding="application/json")  # is not present on the market
+        for volts in (98.5, 98.25):
+            robot.publish("/battery", volts)
+        await until(lambda: len(printed.events()) >= 2, what="the readings", seconds=30)
+    work.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await work
+    shown = [{name: event[name] for name in ("event", "agent", "topic", "value")} for event in printed.events()]
+    common = {"event": "reading", "agent": place.address("robot"), "topic": "/battery"}
+    assert shown == [common | {"value": 98.5}, common | {"value": 98.25}]
+    recorded = list(open_objective(out).messages())
+    assert {message.topic for message in recorded} == {f"/{place.address('robot').lower()}/battery"}
+    assert [decode_value(message.payload, message.type) for message in recorded] == [98.5, 98.25]
+    assert f"{out}: 2 readings" in printed.err
+    assert "1 invalid (1 reading)" in printed.err
+
+
 async def test_a_result_that_cannot_be_fetched_is_logged_and_blocks_nothing(
     router: EmbeddedRouter, printed: PrintedOutput, caplog: pytest.LogCaptureFixture
 ) -> None:
-    readings: list[SensorReading] = []
+    readings: list[Reading] = []
     async with (
         Network(Endpoints(connect=(router.endpoint,))) as network,
         ReadingFetcher(network.session, readings.append, timeout=0.5) as fetcher,

@@ -7,8 +7,10 @@ from typing import Any
 import msgspec
 
 from mesh.cli.watch import EventFormatter, event_json, format_counters
-from mesh.watching import JobEvent, MarketCounters, SensorReading
+from mesh.network import Reading
+from mesh.watching import JobEvent, MarketCounters
 from schemas import Empty, String, verify_message
+from schemas.payloads import encode_value
 from schemas.signing import Rejection
 from tests.mesh.watching.test_market import JOB
 from tests.support.orders import CONTRACT, RECORDING, ROBOT, TOKEN, demand, offer, result
@@ -77,17 +79,23 @@ def test_counters_are_printed_as_a_sentence() -> None:
     )
 
 
+def read(value: Any, *, result: str = "") -> Reading:
+    payload, kind = encode_value(value)
+    return Reading(ROBOT.address, "/air", value, payload, kind, result)
+
+
+def test_a_reading_is_printed_as_json_with_the_result_in_which_it_came() -> None:
+    facts = {"time": NOON, "event": "reading", "agent": ROBOT.address, "topic": "/air", "value": 4.5}
+    assert event_json(read(4.5), time=NOON) == facts
+    in_result = facts | {"signer": ROBOT.address, "result": RECORDING}
+    assert event_json(read(4.5, result=RECORDING), time=NOON) == in_result
+
+
 def test_the_line_of_a_reading_is_short_and_has_no_control_characters() -> None:
-    line = format_line(SensorReading(ROBOT.address, RECORDING, "/air", String("\x1b[2J" + "y" * 500)))
+    line = format_line(read(String("\x1b[2J" + "y" * 500)))
     assert line.startswith("reading    /air  ")
     assert "\x1b" not in line
     assert len(line) < 300
-    assert format_line(SensorReading(ROBOT.address, RECORDING, "/air", {"CO": 1})).startswith(
-        'reading    /air  {"CO":1}, from 0x'
-    )
-    assert format_line(SensorReading(ROBOT.address, RECORDING, "/air", Empty())).startswith(
-        "reading    /air  null, from 0x"
-    )
-    assert format_line(SensorReading(ROBOT.address, RECORDING, "/air", b"ab")).startswith(
-        'reading    /air  "YWI=", from 0x'
-    )
+    assert format_line(read({"CO": 1})).startswith('reading    /air  {"CO":1}, from 0x')
+    assert format_line(read(Empty())).startswith("reading    /air  null, from 0x")
+    assert format_line(read(b"ab")).startswith('reading    /air  "YWI=", from 0x')

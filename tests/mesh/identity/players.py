@@ -21,6 +21,7 @@ from schemas import (
     OfferKey,
     PendingKey,
     PresenceKey,
+    ReadingKey,
     RejectKey,
     ResultKey,
     RpcKey,
@@ -59,6 +60,7 @@ def space(agent: str, device: str) -> dict[str, str]:
         "objective": str(ObjectiveTopicKey(agent, LIABILITY, "/a/b")),
         "topic": str(LiabilityTopicKey(agent, LIABILITY, "/a/b")),
         "device": str(DeviceTopicKey(agent, device, "/a/b")),
+        "reading": str(ReadingKey(agent, "/a/b")),
         "rpc": str(RpcKey(agent, "eth/transfer")),
         "eth": str(EthEventKey(agent, "transfer")),
         "cid": str(CidKey(agent, MODEL)),
@@ -94,8 +96,17 @@ def keys_of(who: str) -> dict[str, str]:
 
 
 KEYS = {who: keys_of(who) for who in WHO}
-OWN = {"own event", "own objective", "own topic", "own device", "own rpc", "own eth", "own cid"}
-OTHER = {"other event", "other objective", "other topic", "other device", "other rpc", "other eth", "other cid"}
+OWN = {"own event", "own objective", "own topic", "own device", "own reading", "own rpc", "own eth", "own cid"}
+OTHER = {
+    "other event",
+    "other objective",
+    "other topic",
+    "other device",
+    "other reading",
+    "other rpc",
+    "other eth",
+    "other cid",
+}
 MARKETS = {"demand", "offer", "withdrawal", "result", "feedback", "pending", "reject", "other reject"} | {
     "decline",
     "other decline",
@@ -138,8 +149,8 @@ GET = NOBODY | {
     "screen": MARKETS | {"own cid", "other cid"},
 }
 SUBSCRIBE = NOBODY | {
-    "arm": OWN | MARKETS,
-    "ann": OWN | MARKETS,
+    "arm": OWN | MARKETS | {"other reading"},
+    "ann": OWN | MARKETS | {"other reading"},
     "miner": OWN | MARKETS,
     "boss": OWN | OTHER | MARKETS,
     "board": {"robot topic", "robot device", "robot event", "robot objective"},
